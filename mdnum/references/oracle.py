@@ -1,0 +1,225 @@
+"""Which pairs are inside the cutoff, decided by trying all of them and, near the threshold, exactly."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fractions import Fraction
+from itertools import product
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray
+
+from mdnum.errors import InputError
+
+_BLOCK = 2_000_000  # pairs looked at in one go: 48 MB of displacements
+
+
+@dataclass(frozen=True)
+class PairSet:
+    """Pairs of atoms and images of atoms, each once.
+
+    Attributes:
+        i: first atom; i <= j.
+        j: second atom; i == j for an atom and an image of itself.
+        shift: lattice vectors added to atom j: displacement = x_j - x_i + shift @ cell.
+        distance: length of that displacement as float64 computes it.
+        inside: whether the pair is within the cutoff, by real arithmetic.
+        exact: the pairs so close to the cutoff that `inside` was decided in rational arithmetic.
+    """
+
+    i: Int[ndarray, "pairs"]
+    j: Int[ndarray, "pairs"]
+    shift: Int[ndarray, "pairs 3"]
+    distance: Float[ndarray, "pairs"]
+    inside: Bool[ndarray, "pairs"]
+    exact: Bool[ndarray, "pairs"]
+
+    def __len__(self) -> int:
+        return len(self.i)
+
+    def select(self, mask: Bool[ndarray, "pairs"]) -> PairSet:
+        """The pairs where mask is true."""
+        return PairSet(
+            self.i[mask], self.j[mask], self.shift[mask], self.distance[mask], self.inside[mask], self.exact[mask]
+        )
+
+
+def widths(cell: Float[ndarray, "3 3"]) -> Float[ndarray, "3"]:
+    """Distances between opposite faces of the cell (the perpendicular widths)."""
+    return 1.0 / np.linalg.norm(np.linalg.inv(cell), axis=0)
+
+
+def rounding_bound(
+    positions: Float[ndarray, "atoms 3"],
+    cell: Float[ndarray, "3 3"],
+    r_cut: float,
+    *,
+    unit_roundoff: float = 2.0**-53,
+) -> float:
+    """How far a computed distance near r_cut can lie from the real one, in the length unit.
+
+    Covers a code that wraps the coordinates, adds a lattice vector, subtracts and takes the norm: each
+    of these acts on numbers no larger than the coordinates plus the cell and rounds each once or twice.
+    A bound, not an estimate; typical errors are ten times smaller.
+
+    Args:
+        positions: coordinates as the code is given them.
+        cell: cell vectors as rows; zero rows for directions without one.
+        r_cut: cutoff radius.
+        unit_roundoff: 2**-53 for float64, 2**-24 for float32.
+    Source: Higham, Accuracy and Stability of Numerical Algorithms, 2nd ed., section 3.1.
+    """
+    largest = float(np.abs(positions).max(initial=0.0)) + float(np.abs(cell).sum(axis=0).max()) + r_cut
+    return 8.0 * unit_roundoff * largest
+
+
+def exact_squared_distance(
+    positions: Float[ndarray, "atoms 3"],
+    cell: Float[ndarray, "3 3"],
+    i: int,
+    j: int,
+    shift: Int[ndarray, "3"] | tuple[int, int, int] = (0, 0, 0),
+) -> Fraction:
+    """|x_j - x_i + shift @ cell|² of the numbers as stored, without any rounding."""
+    total = Fraction(0)
+    for axis in range(3):
+        component = Fraction(float(positions[j, axis])) - Fraction(float(positions[i, axis]))
+        for row in range(3):
+            component += int(shift[row]) * Fraction(float(cell[row, axis]))
+        total += component * component
+    return total
+
+
+def exactly_inside(
+    positions: Float[ndarray, "atoms 3"],
+    cell: Float[ndarray, "3 3"],
+    i: int,
+    j: int,
+    shift: Int[ndarray, "3"] | tuple[int, int, int],
+    r_cut: float,
+    *,
+    closed: bool = False,
+) -> bool:
+    """Whether the pair is inside r_cut by real arithmetic; closed counts r == r_cut as inside.
+
+    r < r_cut and r² < r_cut² are the same statement here: they differ only through rounding.
+    """
+    squared, threshold = exact_squared_distance(positions, cell, i, j, shift), Fraction(float(r_cut)) ** 2
+    return squared <= threshold if closed else squared < threshold
+
+
+def all_pairs(
+    positions: Float[ndarray, "atoms 3"],
+    cell: Float[ndarray, "3 3"],
+    pbc: Bool[ndarray, "3"],
+    r_cut: float,
+    *,
+    closed: bool = False,
+    reach: float | None = None,
+) -> PairSet:
+    """Every pair within reach, with whether it is inside r_cut.
+
+    No cell list and no skin: all atom pairs are looked at, with every lattice vector that could bring
+    them together, so it holds for triclinic cells, periodicity per axis, atoms outside the cell and cells
+    smaller than the cutoff (a pair then appears once per image). Costs atoms² and is meant to.
+
+    Args:
+        positions: coordinates, wrapped or not.
+        cell: cell vectors as rows; rows of directions that are not periodic are ignored.
+        pbc: which directions are periodic.
+        r_cut: cutoff radius.
+        closed: whether r == r_cut counts as inside.
+        reach: list pairs out to here (default: r_cut plus the rounding bound).
+    Raises:
+        InputError: a periodic direction without a cell vector, or positions that are not finite.
+    Error: `inside` is that of real arithmetic: within the rounding bound of r_cut it is decided with
+        `fractions.Fraction`, beyond it float64 cannot be wrong.
+    """
+    positions = np.ascontiguousarray(positions, dtype=np.float64)
+    pbc = np.asarray(pbc, dtype=bool)
+    cell = _usable_cell(np.asarray(cell, dtype=np.float64), pbc)
+    if not np.isfinite(positions).all():
+        raise InputError("positions contain numbers that are not finite", where="pair oracle")
+    stored = np.where(pbc[:, None], cell, 0.0)
+    bound = rounding_bound(positions, stored, r_cut)
+    reach = r_cut + bound if reach is None else max(reach, r_cut + bound)
+
+    parts = [
+        part for shifts in _images(positions, cell, pbc, reach) for part in _within(positions, stored, shifts, reach)
+    ]
+    i, j, shift, distance = (np.concatenate([part[k] for part in parts]) for k in range(4))
+    order = np.lexsort((shift[:, 2], shift[:, 1], shift[:, 0], j, i))
+    i, j, shift, distance = i[order], j[order], shift[order], distance[order]
+    exact = np.abs(distance - r_cut) <= bound
+    inside = distance < r_cut
+    for row in np.flatnonzero(exact):
+        inside[row] = exactly_inside(positions, stored, i[row], j[row], shift[row], r_cut, closed=closed)
+    return PairSet(i, j, shift, distance, inside, exact)
+
+
+def _usable_cell(cell: ndarray, pbc: ndarray) -> ndarray:
+    """The cell with directions that are not periodic replaced by unit normals of the others."""
+    lengths = np.linalg.norm(cell, axis=1)
+    for axis in np.flatnonzero(pbc):
+        if not lengths[axis] > 0.0:
+            raise InputError(
+                f"direction {axis} is periodic but has no cell vector",
+                remedy="give the structure a cell, or set pbc to false along it",
+                where="pair oracle",
+            )
+    if pbc.all():
+        return cell
+    free = np.flatnonzero(~pbc)
+    basis = np.linalg.svd(np.vstack([cell[pbc], np.zeros((1, 3))]), full_matrices=True)[2]
+    completed = cell.copy()
+    completed[free] = basis[3 - len(free) :]
+    return completed
+
+
+def _images(positions: ndarray, cell: ndarray, pbc: ndarray, reach: float):
+    """Functions that give the shift to try for a block of pairs: one where one image can be in reach."""
+    fractional = np.linalg.solve(cell.T, positions.T).T
+    home = np.where(pbc, -np.floor(fractional), 0.0)
+    width = widths(cell)
+
+    # |normal component| <= reach, so when reach is under half a width the image in reach can only be
+    # the one whose fractional difference rounds to zero, in a triclinic cell as well
+    if not pbc.any() or reach < 0.499 * width[pbc].min():
+
+        def nearest(first: ndarray, second: ndarray) -> ndarray:
+            return np.where(pbc, -np.rint(fractional[second] - fractional[first]), 0.0)
+
+        return [(nearest, False)]
+
+    # atoms brought home differ by less than one cell, so one vector beyond reach / width is enough
+    most = np.where(pbc, (reach / width).astype(int) + 1, 0)
+    span = [range(-count, count + 1) for count in most]
+    tries = []
+    for vector in product(*span):
+
+        def given(first: ndarray, second: ndarray, vector=vector) -> ndarray:
+            return np.asarray(vector, dtype=float) + home[second] - home[first]
+
+        tries.append((given, vector > (0, 0, 0)))
+    return tries
+
+
+def _within(positions: ndarray, cell: ndarray, image, reach: float):
+    """(i, j, shift, distance) of the pairs within reach for one choice of image, block by block."""
+    shift_of, own_image = image
+    n = len(positions)
+    rows = max(1, _BLOCK // max(n, 1))
+    yield np.empty(0, int), np.empty(0, int), np.empty((0, 3), int), np.empty(0)
+    for start in range(0, n, rows):
+        first, second = np.meshgrid(np.arange(start, min(start + rows, n)), np.arange(n), indexing="ij")
+        keep = second > first
+        if own_image:  # an atom and its own image: one of the two opposite shifts, never the null shift
+            keep |= second == first
+        first, second = first[keep], second[keep]
+        shift = shift_of(first, second)
+        displacement = positions[second] - positions[first] + shift @ cell
+        dx, dy, dz = displacement.T
+        distance = np.sqrt(dx * dx + dy * dy + dz * dz)
+        near = distance <= reach
+        yield first[near], second[near], shift[near].astype(int), distance[near]

@@ -1,0 +1,72 @@
+"""Answers that are right by construction, for any test to compare with: slow, short, nothing shared with mdnum."""
+
+from __future__ import annotations
+
+from collections import Counter
+from fractions import Fraction
+from itertools import product
+
+import numpy as np
+
+COMPARISONS = ("r2 <", "r2 <=", "r <", "r <=")
+
+
+def exact_r2(positions, cell, i, j, shift=(0, 0, 0)) -> Fraction:
+    """Squared distance of the stored numbers in rational arithmetic."""
+    total = Fraction(0)
+    for axis in range(3):
+        d = Fraction(float(positions[j][axis])) - Fraction(float(positions[i][axis]))
+        d += sum(int(s) * Fraction(float(row[axis])) for s, row in zip(shift, cell, strict=True))
+        total += d * d
+    return total
+
+
+def exact_inside(positions, cell, i, j, shift, r_cut, compare="r2 <") -> bool:
+    """The decision of real arithmetic: the space (r or r2) does not matter, the comparison does."""
+    assert compare in COMPARISONS
+    squared, threshold = exact_r2(positions, cell, i, j, shift), Fraction(float(r_cut)) ** 2
+    return squared <= threshold if compare.endswith("<=") else squared < threshold
+
+
+def image_pairs(positions, cell, pbc, r_cut, compare="r2 <") -> Counter:
+    """{(i, j): number of images inside}, i <= j, every lattice vector in range tried, decided exactly.
+
+    Cubic in patience: for at most some tens of atoms.
+    """
+    positions, cell = np.asarray(positions, float), np.asarray(cell, float)
+    cell = np.where(np.asarray(pbc, bool)[:, None], cell, 0.0)
+    inverse = np.linalg.pinv(cell)
+    spread = np.abs((positions[:, None] - positions[None]) @ inverse).max(axis=(0, 1), initial=0.0)
+    reach = r_cut * np.linalg.norm(inverse, axis=0) + spread + 1.0
+    spans = [range(-int(n), int(n) + 1) if p else range(1) for n, p in zip(reach, pbc, strict=True)]
+    found: Counter = Counter()
+    for shift in product(*spans):
+        d = positions[None, :, :] - positions[:, None, :] + np.asarray(shift, float) @ cell
+        for i, j in np.argwhere(np.sqrt((d * d).sum(axis=-1)) <= r_cut * (1 + 1e-6)):
+            if (i < j or (i == j and shift > (0, 0, 0))) and exact_inside(
+                positions, cell, i, j, shift, r_cut, compare
+            ):
+                found[int(i), int(j)] += 1
+    return found
+
+
+def minimum_image_pairs(positions, cell, pbc, r_cut, compare="r2 <") -> set:
+    """{(i, j)}, i < j, by float64 minimum image: for cells wider than twice the cutoff.
+
+    The decision is the float64 one, in the space that compare names (r2 is d·d against r_cut*r_cut).
+    """
+    positions, cell = np.asarray(positions, float), np.asarray(cell, float)
+    pbc = np.asarray(pbc, bool)
+    full = np.where(np.linalg.norm(cell, axis=1)[:, None] > 0, cell, np.eye(3))
+    i, j = np.triu_indices(len(positions), 1)
+    d = positions[j] - positions[i]
+    shift = np.where(pbc, -np.rint(np.linalg.solve(full.T, d.T).T), 0.0)
+    d = d + shift @ np.where(pbc[:, None], cell, 0.0)
+    r2 = (d * d).sum(axis=1)
+    inside = {
+        "r2 <": r2 < r_cut * r_cut,
+        "r2 <=": r2 <= r_cut * r_cut,
+        "r <": np.sqrt(r2) < r_cut,
+        "r <=": np.sqrt(r2) <= r_cut,
+    }[compare]
+    return set(zip(i[inside].tolist(), j[inside].tolist(), strict=True))
