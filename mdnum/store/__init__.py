@@ -1,0 +1,8 @@
+"""One run = one folder: tables that survive a kill, exact frames, JSON and text, all written atomically."""
+
+from __future__ import annotations
+
+from mdnum.store.folder import RunFolder
+from mdnum.store.tables import COLUMNS
+
+__all__ = ["COLUMNS", "RunFolder"]

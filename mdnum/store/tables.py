@@ -1,0 +1,247 @@
+"""A table that grows by part files named after their first row, and is merged into one file at the end."""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from mdnum.errors import FolderError
+from mdnum.store.atomic import disk_errors, write_bytes
+
+_FLOAT, _INT, _SHORT, _BOOL, _TEXT = pa.float64(), pa.int64(), pa.int32(), pa.bool_(), pa.string()
+
+
+def _columns(**columns: pa.DataType) -> Mapping[str, pa.DataType]:
+    return MappingProxyType(columns)
+
+
+#: The columns every run folder has, per table; a writer may add more.
+COLUMNS: Mapping[str, Mapping[str, pa.DataType]] = MappingProxyType(
+    {
+        "series": _columns(
+            step=_INT, time=_FLOAT, potential=_FLOAT, kinetic=_FLOAT, total=_FLOAT, temperature=_FLOAT,
+            pressure=_FLOAT, pairs=_INT, entered=_SHORT, left=_SHORT, displacement=_FLOAT,
+            energy_jump=_FLOAT, ambiguous=_SHORT, min_margin=_FLOAT, conserved=_FLOAT,
+        ),
+        "flips": _columns(
+            step=_INT, i=_SHORT, j=_SHORT, entered=_BOOL, distance=_FLOAT, margin=_FLOAT,
+            radial_speed=_FLOAT, energy_jump=_FLOAT, force_jump=_FLOAT, bound=_FLOAT, ambiguous=_BOOL,
+        ),
+        "epochs": _columns(
+            epoch=_INT, start=_INT, length=_INT, displacement=_FLOAT, skin_consumed=_FLOAT,
+            pairs_listed=_INT, capacity=_INT, occupancy=_INT, reason=_TEXT, dangerous=_BOOL,
+            lost_pairs=_INT, lost_pair_steps=_INT, first_lost_step=_INT, build_ms=_FLOAT,
+        ),
+    }
+)  # fmt: skip
+
+# rows held back before a part is written without waiting for a checkpoint: bounds the memory of a run
+_BUFFER_ROWS = 500_000
+# fixed, so that the merged file has the same bytes however the run was cut into parts
+_GROUP_ROWS = 262_144
+
+
+class TableStream:
+    """Rows 0, 1, 2, ... of one table, spread over `<name>.parquet` and `parts/<name>-<first row>.parquet`.
+
+    Which rows a file holds follows from its name, so no step of writing, merging or truncating
+    leaves a folder whose rows cannot be told apart, wherever it was killed.
+    """
+
+    def __init__(self, root: Path, name: str):
+        self.name = name
+        self.merged_path = root / f"{name}.parquet"
+        self.parts_folder = root / "parts"
+        self._buffer: list[pa.Table] = []
+        self._buffered = 0
+        self._schema: pa.Schema | None = None
+        files = self.files()
+        self.flushed = sum(rows for _, rows in files)
+        if files:
+            self._schema = pq.read_schema(files[0][0])
+
+    @property
+    def rows(self) -> int:
+        """Rows appended so far, those still in memory included."""
+        return self.flushed + self._buffered
+
+    def parts(self) -> list[tuple[int, Path]]:
+        """(first row, path) of the part files, in order."""
+        found = self.parts_folder.glob(f"{self.name}-*.parquet")
+        return sorted((int(path.stem.rsplit("-", 1)[1]), path) for path in found)
+
+    def files(self) -> list[tuple[Path, int]]:
+        """(path, rows) of the files that make up the table, gap-free; parts already merged are skipped."""
+        files: list[tuple[Path, int]] = []
+        rows = 0
+        if self.merged_path.exists():
+            rows = _row_count(self.merged_path)
+            files.append((self.merged_path, rows))
+        for start, path in self.parts():
+            if start < rows:
+                continue
+            if start > rows:
+                raise FolderError(
+                    f"rows {rows} to {start - 1} of table {self.name!r} are missing",
+                    remedy="A part file was removed; run again in a new folder",
+                    where=str(self.parts_folder),
+                )
+            count = _row_count(path)
+            files.append((path, count))
+            rows += count
+        return files
+
+    def append(self, columns: Mapping[str, Any]) -> None:
+        """Adds rows, in memory until the next flush.
+
+        Args:
+            columns: equally long arrays by column name; at least the table's own columns.
+        """
+        table = self._table(columns)
+        if not table.num_rows:
+            return
+        self._buffer.append(table)
+        self._buffered += table.num_rows
+        if self._buffered >= _BUFFER_ROWS:
+            self.flush()
+
+    def flush(self) -> None:
+        """Writes what is in memory as one part file."""
+        if not self._buffered:
+            return
+        table = pa.concat_tables(self._buffer).combine_chunks()
+        with disk_errors(self.parts_folder):
+            self.parts_folder.mkdir(exist_ok=True)
+        sink = io.BytesIO()
+        pq.write_table(table, sink, compression="zstd")
+        write_bytes(self.parts_folder / f"{self.name}-{self.flushed:012d}.parquet", sink.getbuffer())
+        self.flushed += self._buffered
+        self._buffer, self._buffered = [], 0
+
+    def truncate(self, rows: int) -> None:
+        """Keeps the first rows of the table, in memory and on disk."""
+        self._buffer, self._buffered = [], 0
+        files = self.files()
+        have = sum(count for _, count in files)
+        if have < rows:
+            raise FolderError(
+                f"table {self.name!r} has {have} rows where its checkpoint counts {rows}",
+                remedy="The folder was changed since; run again in a new folder",
+                where=str(self.merged_path.parent),
+            )
+        # parts of a merge that was killed before it removed them: their rows are in the merged file
+        for _, path in self.parts():
+            if path not in [used for used, _ in files]:
+                path.unlink()
+        first = 0
+        for path, count in files:
+            if first >= rows:
+                path.unlink()
+            elif rows < first + count:
+                sink = io.BytesIO()
+                with pq.ParquetFile(path) as file:
+                    pq.write_table(file.read().slice(0, rows - first), sink, compression="zstd")
+                write_bytes(path, sink.getbuffer())
+            first += count
+        self.flushed = rows
+
+    def merge(self) -> None:
+        """Writes all rows into one file and removes the parts; a table without a row gets an empty file."""
+        self.flush()
+        if not self.parts() and self.merged_path.exists():
+            return
+        if self._schema is None:
+            self._schema = pa.schema(list(COLUMNS.get(self.name, {}).items()))
+        temporary = self.merged_path.with_name(f".{self.merged_path.name}.part")
+        with disk_errors(self.merged_path):
+            try:
+                with pq.ParquetWriter(temporary, self._schema, compression="zstd") as writer:
+                    for group in _regroup(self.batches(), _GROUP_ROWS):
+                        writer.write_table(group, row_group_size=_GROUP_ROWS)
+                os.replace(temporary, self.merged_path)
+            except OSError:
+                temporary.unlink(missing_ok=True)
+                raise
+            for _, path in self.parts():
+                path.unlink()
+
+    def batches(self, columns: Sequence[str] | None = None) -> Iterator[pa.Table]:
+        """The rows on disk in order, a file or row group at a time."""
+        for path, _ in self.files():
+            # partitioning is off: pyarrow would otherwise read meaning into the folder's name
+            with pq.ParquetFile(path) as file:
+                for group in range(file.num_row_groups):
+                    yield file.read_row_group(group, columns=columns)
+
+    def read(self, columns: Sequence[str] | None = None, rows: int | None = None) -> pa.Table:
+        """The rows on disk as one table.
+
+        Args:
+            columns: only these.
+            rows: only the first rows.
+        """
+        tables = list(self.batches(columns))
+        if not tables:
+            fields = COLUMNS.get(self.name, {})
+            names = fields if columns is None else columns
+            return pa.schema([(name, fields[name]) for name in names]).empty_table()
+        table = pa.concat_tables(tables)
+        return table if rows is None else table.slice(0, rows)
+
+    def _table(self, columns: Mapping[str, Any]) -> pa.Table:
+        schema = self._schema
+        if schema is None:
+            known = COLUMNS.get(self.name, {})
+            extra = {key: pa.array(np.asarray(columns[key])).type for key in columns if key not in known}
+            schema = pa.schema([*known.items(), *extra.items()])
+        missing = [name for name in schema.names if name not in columns]
+        unknown = [name for name in columns if name not in schema.names]
+        if missing or unknown:
+            raise ValueError(f"table {self.name!r}: columns missing {missing}, not expected {unknown}")
+        arrays = [_array(columns[field.name], field.type) for field in schema]
+        lengths = {field.name: len(array) for field, array in zip(schema, arrays, strict=True)}
+        if len(set(lengths.values())) > 1:
+            raise ValueError(f"table {self.name!r}: columns of different length: {lengths}")
+        self._schema = schema
+        return pa.Table.from_arrays(arrays, schema=schema)
+
+
+def _array(values: Any, kind: pa.DataType) -> pa.Array:
+    # a private copy: arrow would otherwise share the caller's memory until the flush
+    values = np.array(values)
+    if pa.types.is_string(kind):
+        return pa.array(values.tolist(), kind)
+    # NaN stays NaN (from_pandas would make it null); a float that is no integer is refused by the cast
+    return pa.array(values, from_pandas=False).cast(kind) if values.size else pa.array([], kind)
+
+
+def _row_count(path: Path) -> int:
+    try:
+        return pq.read_metadata(path).num_rows
+    except (OSError, pa.ArrowInvalid) as error:
+        raise FolderError(
+            f"not a readable parquet file ({error})", where=str(path), remedy="Run again in a new folder"
+        ) from error
+
+
+def _regroup(tables: Iterator[pa.Table], rows: int) -> Iterator[pa.Table]:
+    held: list[pa.Table] = []
+    count = 0
+    for table in tables:
+        held.append(table)
+        count += table.num_rows
+        while count >= rows:
+            whole = pa.concat_tables(held)
+            yield whole.slice(0, rows).combine_chunks()
+            held = [whole.slice(rows)]
+            count -= rows
+    if count:
+        yield pa.concat_tables(held).combine_chunks()

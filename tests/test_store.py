@@ -1,0 +1,375 @@
+"""A run folder: whatever happens to the process or the disk, its rows, frames and state are whole."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import subprocess
+import sys
+import textwrap
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from ase import Atoms
+from ase.io import read as ase_read
+
+from mdnum.errors import FolderError
+from mdnum.store import COLUMNS, RunFolder, atomic, frames, tables
+
+
+def series_rows(start: int, stop: int) -> dict[str, np.ndarray]:
+    steps = np.arange(start, stop)
+    columns = {}
+    for name, kind in COLUMNS["series"].items():
+        # irrational values: every bit of a float is in use
+        columns[name] = np.sin(steps + len(name)) if str(kind) == "double" else steps * 3
+    return columns | {"step": steps}
+
+
+def flip_rows(start: int, stop: int) -> dict[str, np.ndarray]:
+    steps = np.repeat(np.arange(start, stop), 3)
+    columns = {}
+    for name, kind in COLUMNS["flips"].items():
+        columns[name] = np.cos(steps * 0.1 + len(name)) if str(kind) == "double" else steps % 7
+    return columns | {"step": steps, "entered": steps % 2 == 0, "ambiguous": steps % 5 == 0}
+
+
+def epoch_row(index: int) -> dict[str, object]:
+    row = {name: [index] for name in COLUMNS["epochs"]}
+    return row | {"reason": ["displacement"], "dangerous": [False], "displacement": [0.5 / (index + 1)]}
+
+
+def frame(step: int) -> Atoms:
+    positions = np.sin(np.arange(12.0) + step).reshape(4, 3)
+    atoms = Atoms("Ar4", positions=positions, cell=np.diag([5.0, 6.0, 7.0]), pbc=True)
+    atoms.set_momenta(np.cos(positions * 3))
+    return atoms
+
+
+def write_run(folder: RunFolder, start: int, stop: int, chunk: int = 10) -> None:
+    """A rollout's calls, a chunk at a time, a forced checkpoint after each."""
+    for step in range(start, stop, chunk):
+        folder.append("series", series_rows(step, step + chunk))
+        folder.append("flips", flip_rows(step, step + chunk))
+        folder.append("epochs", epoch_row(step // chunk))
+        folder.append_frame(frame(step))
+        folder.log(f"{step:8d} {np.sin(step):.12f}")
+        folder.checkpoint(state_at(step + chunk), force=True)
+
+
+def state_at(step: int) -> dict[str, object]:
+    return {"step": step, "positions": np.sin(np.arange(12.0) + step), "key": np.uint32([step, 7]),
+            "drift": 0.1 + step / 3, "reasons": ["interval", None], "on": True}  # fmt: skip
+
+
+def content(folder: RunFolder) -> dict[str, bytes]:
+    names = (
+        "series.parquet",
+        "flips.parquet",
+        "epochs.parquet",
+        "trajectory.traj",
+        "log.txt",
+        "checkpoint.npz",
+    )
+    return {name: (folder.path / name).read_bytes() for name in names}
+
+
+@pytest.fixture
+def whole(tmp_path):
+    folder = RunFolder.create(tmp_path / "whole")
+    write_run(folder, 0, 600)
+    folder.finalize()
+    return folder
+
+
+def test_what_is_appended_is_read_back_bit_for_bit(whole):
+    for name, expected in (("series", series_rows(0, 600)), ("flips", flip_rows(0, 600))):
+        found = RunFolder.open(whole.path).read(name)
+        assert list(found) == list(expected)
+        for key, values in expected.items():
+            np.testing.assert_array_equal(found[key], values, err_msg=key)
+    table = pq.read_table(whole.path / "flips.parquet")
+    assert {field.name: field.type for field in table.schema} == dict(COLUMNS["flips"])
+    assert not (whole.path / "parts").exists()
+    for step, atoms in enumerate(ase_read(whole.path / "trajectory.traj", index=":")):
+        assert atoms.positions.tobytes() == frame(10 * step).positions.tobytes()
+        assert atoms.get_momenta().tobytes() == frame(10 * step).get_momenta().tobytes()
+
+
+def test_state_comes_back_bit_for_bit(whole):
+    state = whole.load_checkpoint()
+    expected = state_at(600)
+    assert state.keys() == expected.keys()
+    assert state["positions"].tobytes() == expected["positions"].tobytes()
+    assert state["key"].dtype == np.uint32
+    assert {key: state[key] for key in ("step", "drift", "reasons", "on")} == {
+        key: expected[key] for key in ("step", "drift", "reasons", "on")
+    }
+
+
+@pytest.mark.parametrize("kept", [10, 420, 430])  # ASE moves its offset table at frames 2 and 43
+def test_resumed_run_ends_with_the_same_bytes(tmp_path, whole, kept):
+    folder = RunFolder.create(tmp_path / "killed")
+    write_run(folder, 0, kept)
+    # what a killed run leaves behind after its checkpoint: parts, frames, log lines, a half-written frame
+    folder.append("series", series_rows(kept, kept + 70))
+    folder.append("flips", flip_rows(kept, kept + 70))
+    for stream in folder._streams.values():
+        stream.flush()
+    for step in range(3):
+        folder.append_frame(frame(9_000 + step))
+    folder.log("a line of the part that was lost")
+    folder.close()
+    with open(folder.path / "trajectory.traj", "ab") as file:
+        file.write(b"half a frame")
+    (folder.path / "parts" / ".series-000000000999.parquet.part").write_bytes(b"half a part")
+
+    resumed = RunFolder.open(folder.path)
+    assert len(resumed.read("series")["step"]) == kept
+    assert resumed.resume()["step"] == kept
+    write_run(resumed, kept, 600)
+    resumed.finalize()
+    assert content(resumed) == content(whole)
+
+
+def test_killed_process_resumes_from_its_last_checkpoint(tmp_path, whole):
+    program = textwrap.dedent(
+        f"""
+        import os, signal, sys
+        sys.path.insert(0, {os.path.dirname(__file__)!r})
+        from test_store import *
+        folder = RunFolder.create({str(tmp_path / "killed")!r})
+        write_run(folder, 0, 150)
+        folder.append("series", series_rows(150, 155))
+        os.kill(os.getpid(), signal.SIGKILL)
+        """
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == -9, done.stderr
+    folder = RunFolder.open(tmp_path / "killed")
+    assert folder.resume()["step"] == 150
+    write_run(folder, 150, 600)
+    folder.finalize()
+    assert content(folder) == content(whole)
+
+
+def test_finished_run_can_be_carried_on(tmp_path, whole):
+    folder = RunFolder.create(tmp_path / "longer")
+    write_run(folder, 0, 300)
+    folder.finalize()
+    folder = RunFolder.open(folder.path)
+    folder.resume()
+    write_run(folder, 300, 600)
+    folder.finalize()
+    assert content(folder) == content(whole)
+
+
+def test_failed_run_keeps_the_rows_after_its_checkpoint(tmp_path):
+    folder = RunFolder.create(tmp_path / "blown-up")
+    write_run(folder, 0, 100)
+    folder.append("series", series_rows(100, 107))
+    folder.finalize()
+    assert len(folder.read("series")["step"]) == 107
+    resumed = RunFolder.open(folder.path)
+    assert resumed.resume()["step"] == 100
+    assert len(resumed.read("series")["step"]) == 100
+
+
+@pytest.mark.parametrize("killed_at", range(1, 8))
+def test_merge_killed_anywhere_loses_and_doubles_nothing(tmp_path, monkeypatch, killed_at):
+    folder = RunFolder.create(tmp_path / "run")
+    write_run(folder, 0, 60, chunk=20)
+
+    class Killed(BaseException):
+        pass
+
+    calls = iter(range(1, 100))
+
+    def dies(function):
+        def wrapper(*args, **kwargs):
+            if next(calls) == killed_at:
+                raise Killed
+            return function(*args, **kwargs)
+
+        return wrapper
+
+    with monkeypatch.context() as patch:
+        patch.setattr(tables.os, "replace", dies(os.replace))
+        patch.setattr(tables.Path, "unlink", dies(tables.Path.unlink))
+        with pytest.raises(Killed):
+            folder.finalize()
+    folder.close()
+    reopened = RunFolder.open(folder.path)
+    np.testing.assert_array_equal(reopened.read("series")["step"], np.arange(60))
+    reopened.resume()
+    write_run(reopened, 60, 80, chunk=20)
+    reopened.finalize()
+    np.testing.assert_array_equal(reopened.read("series")["step"], np.arange(80))
+    np.testing.assert_array_equal(reopened.read("flips")["step"], np.repeat(np.arange(80), 3))
+    np.testing.assert_array_equal(reopened.read("epochs")["epoch"], np.arange(4))
+
+
+def test_checkpoints_are_spaced_and_the_last_one_is_made_up_for(tmp_path):
+    folder = RunFolder.create(tmp_path / "run")
+    assert folder.checkpoint({"step": 0})
+    folder.append("series", series_rows(0, 5))
+    assert not folder.checkpoint({"step": 5})
+    assert folder.load_checkpoint()["step"] == 0
+    folder.finalize()
+    assert folder.load_checkpoint()["step"] == 5
+
+
+def test_long_table_is_flushed_without_a_checkpoint(tmp_path, monkeypatch):
+    monkeypatch.setattr(tables, "_BUFFER_ROWS", 100)
+    folder = RunFolder.create(tmp_path / "run")
+    folder.append("series", series_rows(0, 150))
+    assert len(list((folder.path / "parts").iterdir())) == 1
+    assert len(RunFolder.open(folder.path).read("series")["step"]) == 150
+
+
+def test_row_groups_do_not_depend_on_the_parts(tmp_path, monkeypatch):
+    monkeypatch.setattr(tables, "_GROUP_ROWS", 64)
+    for name, chunk in (("a", 10), ("b", 50)):
+        folder = RunFolder.create(tmp_path / name)
+        write_run(folder, 0, 300, chunk=chunk)
+        folder.finalize()
+        assert pq.read_metadata(folder.path / "series.parquet").row_group(0).num_rows == 64
+    assert (tmp_path / "a/series.parquet").read_bytes() == (tmp_path / "b/series.parquet").read_bytes()
+
+
+def test_empty_run_has_tables_with_columns(tmp_path):
+    folder = RunFolder.create(tmp_path / "run")
+    folder.finalize()
+    for name, columns in COLUMNS.items():
+        assert list(folder.read(name)) == list(columns)
+
+
+def test_rows_that_do_not_fit_are_refused(tmp_path):
+    folder = RunFolder.create(tmp_path / "run")
+    short = series_rows(0, 5)
+    with pytest.raises(ValueError, match=r"missing.*kinetic"):
+        folder.append("series", {key: value for key, value in short.items() if key != "kinetic"})
+    with pytest.raises(ValueError, match="different length"):
+        folder.append("series", short | {"kinetic": np.zeros(4)})
+    folder.append("series", short | {"extra": np.arange(5)})
+    with pytest.raises(ValueError, match=r"missing \['extra'\]"):
+        folder.append("series", short)
+    with pytest.raises(TypeError, match="dtype object"):
+        folder.checkpoint({"bad": np.array([object()])}, force=True)
+
+
+def test_existing_folders_are_not_overwritten(tmp_path, whole):
+    with pytest.raises(FolderError, match="already holds a run") as caught:
+        RunFolder.create(whole.path)
+    assert caught.value.exit_code == 2
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.tex").write_text("x")
+    with pytest.raises(FolderError, match=r"not empty \(it holds 'thesis.tex'\)"):
+        RunFolder.create(tmp_path / "mine")
+    with pytest.raises(FolderError, match="is a file"):
+        RunFolder.create(tmp_path / "mine" / "thesis.tex")
+    with pytest.raises(FolderError, match="holds no run"):
+        RunFolder.open(tmp_path / "mine")
+    with pytest.raises(FolderError, match="no such folder"):
+        RunFolder.open(tmp_path / "nowhere")
+
+    (whole.path / "notes.md").write_text("mine")
+    again = RunFolder.create(whole.path, overwrite=True)
+    assert sorted(path.name for path in again.path.iterdir() if path.is_file()) == [".lock", "notes.md"]
+
+
+def test_two_writers_are_refused(tmp_path):
+    first = RunFolder.create(tmp_path / "run")
+    write_run(first, 0, 10)
+    with pytest.raises(FolderError, match="another process is writing"):
+        RunFolder.open(first.path).resume()
+    first.close()
+    assert RunFolder.open(first.path).resume()["step"] == 10
+
+
+def test_changed_folder_is_not_resumed(tmp_path):
+    folder = RunFolder.create(tmp_path / "run")
+    write_run(folder, 0, 30)
+    folder.close()
+    (folder.path / "parts" / "series-000000000010.parquet").unlink()
+    with pytest.raises(FolderError, match="rows 10 to 19 of table 'series' are missing"):
+        RunFolder.open(folder.path).resume()
+
+
+def test_broken_files_are_named(tmp_path):
+    folder = RunFolder.create(tmp_path / "run")
+    with pytest.raises(FolderError, match="no checkpoint to resume from"):
+        folder.load_checkpoint()
+    (folder.path / "checkpoint.npz").write_bytes(b"PK nonsense")
+    with pytest.raises(FolderError, match=r"checkpoint\.npz"):
+        folder.load_checkpoint()
+    (folder.path / "summary.json").write_text("{")
+    with pytest.raises(FolderError, match=r"summary\.json"):
+        _ = folder.summary
+
+
+def test_json_holds_what_json_has(tmp_path):
+    folder = RunFolder.create(tmp_path / "run")
+    folder.write_summary(
+        {"a": np.float64(0.1), "b": np.arange(3), "c": float("nan"), "d": (np.bool_(True), None)}
+    )
+    assert json.loads((folder.path / "summary.json").read_text()) == {"a": 0.1, "b": [0, 1, 2], "c": None,
+                                                                     "d": [True, None]}  # fmt: skip
+    assert folder.provenance == {}
+
+
+def test_full_disk_is_one_clear_line_and_leaves_the_last_checkpoint(tmp_path, monkeypatch):
+    folder = RunFolder.create(tmp_path / "run")
+    write_run(folder, 0, 20)
+    folder.append("series", series_rows(20, 30))
+
+    def full(*args):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(atomic.os, "fsync", full)
+        with pytest.raises(
+            FolderError, match=r"the disk is full. Free some space, then continue with --resume."
+        ):
+            folder.checkpoint(state_at(30), force=True)
+    assert not list(folder.path.rglob("*.part"))
+    folder.close()
+    assert RunFolder.open(folder.path).resume()["step"] == 20
+
+
+def test_full_disk_in_the_middle_of_a_frame_keeps_the_frames_before(tmp_path, monkeypatch):
+    folder = RunFolder.create(tmp_path / "run")
+    folder.append_frame(frame(0))
+    folder.append_frame(frame(1))
+
+    from ase.io.trajectory import TrajectoryWriter
+
+    def full(self, atoms):
+        self.backend.write(positions=atoms.positions)
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(TrajectoryWriter, "write", full)
+        with pytest.raises(FolderError, match="disk is full"):
+            folder.append_frame(frame(2))
+    assert len(ase_read(folder.path / "trajectory.traj", index=":")) == 2
+    folder.append_frame(frame(2))
+    images = ase_read(folder.path / "trajectory.traj", index=":")
+    assert [image.positions.tobytes() for image in images] == [
+        frame(step).positions.tobytes() for step in range(3)
+    ]
+
+
+def test_trajectory_shorter_than_its_checkpoint_is_refused(tmp_path):
+    file = frames.FrameFile(tmp_path / "trajectory.traj")
+    file.append(frame(0))
+    count, table, size = file.mark()
+    with pytest.raises(FolderError, match="shorter than its checkpoint"):
+        file.truncate((count, table, size + 100))
+
+
+def test_store_does_not_import_jax():
+    code = "import sys, mdnum.store; assert not {'jax', 'jax_md'} & set(sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
