@@ -1,5 +1,73 @@
-"""mdnum: neighbor-set flips, forks and gradients of cutoff-based molecular dynamics."""
+"""mdnum: neighbor-set flips, forks and gradients of cutoff-based molecular dynamics.
+
+The names below are imported on first use (PEP 562), because jax takes half a second to import and
+jax_md takes six, and `mdnum --help` needs neither.
+"""
 
 from __future__ import annotations
 
+import importlib
+from typing import TYPE_CHECKING, Any
+
 __version__ = "0.1.0"
+
+# where each public name lives; a value without ":" is the module itself
+_HOMES = {
+    "CapacityError": "mdnum.errors:CapacityError",
+    "FolderError": "mdnum.errors:FolderError",
+    "InputError": "mdnum.errors:InputError",
+    "LostPairsError": "mdnum.errors:LostPairsError",
+    "MdnumCalculator": "mdnum.references:MdnumCalculator",
+    "MdnumError": "mdnum.errors:MdnumError",
+    "NumericalError": "mdnum.errors:NumericalError",
+    "build": "mdnum.systems:build",
+    "diagnose": "mdnum.doctor:diagnose",
+    "load": "mdnum.systems:load",
+    "run": "mdnum.rollout:run",
+    "systems": "mdnum.systems",
+}
+
+if TYPE_CHECKING:
+    from mdnum import systems as systems
+    from mdnum.doctor import diagnose as diagnose
+    from mdnum.errors import CapacityError as CapacityError
+    from mdnum.errors import FolderError as FolderError
+    from mdnum.errors import InputError as InputError
+    from mdnum.errors import LostPairsError as LostPairsError
+    from mdnum.errors import MdnumError as MdnumError
+    from mdnum.errors import NumericalError as NumericalError
+    from mdnum.references import MdnumCalculator as MdnumCalculator
+    from mdnum.rollout import run as run
+    from mdnum.systems import build as build
+    from mdnum.systems import load as load
+
+__all__ = [
+    "CapacityError",
+    "FolderError",
+    "InputError",
+    "LostPairsError",
+    "MdnumCalculator",
+    "MdnumError",
+    "NumericalError",
+    "build",
+    "diagnose",
+    "load",
+    "run",
+    "systems",
+    "__version__",
+]
+
+
+def __getattr__(name: str) -> Any:
+    home = _HOMES.get(name)
+    if home is None:
+        raise AttributeError(f"module 'mdnum' has no attribute {name!r}")
+    module_name, _, attribute = home.partition(":")
+    module = importlib.import_module(module_name)
+    value = getattr(module, attribute) if attribute else module
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

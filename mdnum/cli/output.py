@@ -1,0 +1,153 @@
+"""What the verbs print: errors in one line, one JSON document, tables for people."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from mdnum.errors import InputError, MdnumError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+EXIT_FINE = 0
+EXIT_FINDINGS = 1
+EXIT_USAGE = 2
+EXIT_STOPPED = 130  # what a shell reports for a process ended by control-C
+
+# how a person should read a severity; the exit code is 1 for the last two
+_STYLE = {"info": "dim", "ok": "green", "warning": "yellow", "error": "bold red", "unsafe": "bold red"}
+
+JSON_OPTION = typer.Option(False, "--json", help="Print one JSON document instead of text.")
+SET_OPTION = typer.Option(
+    None, "--set", metavar="KEY=VALUE", help="Override a key of the system file; repeatable."
+)
+
+
+def parse_overrides(settings: Sequence[str] | None) -> dict[str, str]:
+    """The `--set key=value` words as a mapping.
+
+    Raises:
+        InputError: a word without "=", or a key given twice.
+    """
+    overrides: dict[str, str] = {}
+    for setting in settings or ():
+        key, equals, value = setting.partition("=")
+        key = key.strip()
+        if not equals or not key:
+            raise InputError(
+                f"--set {setting!r} is not of the form key=value",
+                remedy="Write for example --set cutoff.kind=switched",
+            )
+        if key in overrides:
+            raise InputError(f"--set gives {key!r} twice", remedy="Keep one of them")
+        overrides[key] = value.strip()
+    return overrides
+
+
+def plain(value: Any) -> Any:
+    """value as JSON can say it: numpy to Python, paths to text, non-finite numbers to null."""
+    if value is None or isinstance(value, bool | str | int):
+        return value
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    tolist = getattr(value, "tolist", None)  # numpy and jax arrays and scalars, without importing either
+    if tolist is not None:
+        return plain(tolist())
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {part.name: plain(getattr(value, part.name)) for part in dataclasses.fields(value)}
+    if isinstance(value, Iterable):
+        return [plain(item) for item in value]
+    raise TypeError(f"{type(value).__name__} has no JSON form here")
+
+
+def print_json(document: Mapping[str, Any]) -> None:
+    """The one JSON document of a verb, to stdout."""
+    typer.echo(json.dumps(plain(document), indent=2, ensure_ascii=False, allow_nan=False))
+
+
+def print_error(error: MdnumError, *, as_json: bool) -> None:
+    """An error as one line on stderr, and as the JSON document when one was asked for."""
+    typer.echo("mdnum: " + " ".join(str(error).split()), err=True)
+    if as_json:
+        print_json(
+            {
+                "error": {
+                    "type": type(error).__name__,
+                    "message": error.message,
+                    "where": error.where,
+                    "remedy": error.remedy,
+                    "exit_code": error.exit_code,
+                }
+            }
+        )
+
+
+def console() -> Console:
+    """rich's console on stdout, made when first needed because importing rich is slow."""
+    from rich.console import Console
+
+    # no highlighting: a number is not more important for being a number
+    return Console(highlight=False, soft_wrap=not sys.stdout.isatty())
+
+
+def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """A table for people; cells that name a severity are colored."""
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title=title, title_justify="left", box=None, pad_edge=False, header_style="bold")
+    for column in columns:
+        table.add_column(column, overflow="fold")
+    for row in rows:
+        table.add_row(*(Text(show(cell), style=_STYLE.get(str(cell), "")) for cell in row))
+    console().print(table)
+
+
+def show(cell: Any) -> str:
+    """A table cell as text: floats short, None as a dash, yes and no in words."""
+    if cell is None:
+        return "-"
+    if isinstance(cell, bool):
+        return "yes" if cell else "no"
+    if isinstance(cell, float):
+        return f"{cell:.6g}"
+    return str(cell)
+
+
+def field(finding: Any, name: str) -> str:
+    """A part of a finding, which is a mapping when read from a folder and a dataclass otherwise."""
+    value = finding.get(name) if isinstance(finding, Mapping) else getattr(finding, name, None)
+    return "" if value is None else str(value)
+
+
+def print_findings(findings: Iterable[Any]) -> None:
+    """Each finding as a title line, what was seen, and what to do."""
+    from rich.text import Text
+
+    out = console()
+    for finding in findings:
+        severity = field(finding, "severity")
+        line = Text(severity, style=_STYLE.get(severity, ""))
+        line.append(f": {field(finding, 'title')}", style="bold")
+        out.print(line)
+        for name in ("text", "remedy"):
+            if text := field(finding, name):
+                out.print(Text(f"  {text}"))
+
+
+def exit_code(findings: Iterable[Any], *, ok: bool = True) -> int:
+    """1 when a finding asks for attention or the check failed, else 0; information is no finding."""
+    matters = any(field(finding, "severity") in ("warning", "error") for finding in findings)
+    return EXIT_FINDINGS if matters or not ok else EXIT_FINE

@@ -1,0 +1,112 @@
+"""The progress bar of a run: on stderr, only at a terminal, only once a run has proved to be long."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self, TextIO
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
+
+_WORDS = {"compile": "compiling", "run": "running", "check": "checking", "report": "writing the report"}
+
+
+class ProgressBar:
+    """Called by a rollout as progress(step, steps, info); shows steps/s, flips, rebuilds and ETA.
+
+    The bar is started by a timer rather than by a call, because the first thing a run does is compile,
+    for seconds, without calling.
+
+    Args:
+        stream: where to draw; nothing is drawn unless it is a terminal.
+        delay: seconds of run before the bar appears.
+    """
+
+    def __init__(self, stream: TextIO | None = None, delay: float = 2.0):
+        self._stream = sys.stderr if stream is None else stream
+        self._delay = delay
+        self._lock = threading.Lock()
+        self._bar: Progress | None = None
+        self._task: TaskID | None = None
+        self._timer: threading.Timer | None = None
+        self._last: tuple[int, int, dict[str, Any]] = (0, 0, {"phase": "compile"})
+        self._closed = False
+
+    def __enter__(self) -> Self:
+        if self._stream.isatty():
+            self._timer = threading.Timer(self._delay, self._start)
+            self._timer.daemon = True
+            self._timer.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with self._lock:
+            self._closed = True
+            if self._timer is not None:
+                self._timer.cancel()
+            if self._bar is not None:
+                self._bar.stop()
+
+    def __call__(self, step: int, steps: int, info: dict[str, Any]) -> None:
+        """What a rollout reports: the step reached, of how many, and counts so far."""
+        with self._lock:
+            self._last = (step, steps, dict(info))
+            self._draw()
+
+    @property
+    def shown(self) -> bool:
+        """Whether the bar has appeared."""
+        return self._bar is not None
+
+    def _start(self) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn
+
+        with self._lock:
+            if self._closed:
+                return
+            self._bar = Progress(
+                SpinnerColumn(),
+                TextColumn("{task.description}"),
+                BarColumn(bar_width=None),
+                TextColumn("{task.fields[line]}"),
+                console=Console(file=self._stream),
+                transient=True,
+                expand=True,
+            )
+            self._task = self._bar.add_task("", total=None, line="")
+            self._bar.start()
+            self._draw()
+
+    def _draw(self) -> None:
+        if self._bar is None or self._task is None:
+            return
+        step, steps, info = self._last
+        phase = str(info.get("phase", "run"))
+        counting = phase == "run" and steps > 0
+        self._bar.update(
+            self._task,
+            description=_WORDS.get(phase, phase),
+            total=steps if counting else None,
+            completed=step,
+            line=describe(step, steps, info) if counting else "",
+        )
+
+
+def describe(step: int, steps: int, info: dict[str, Any]) -> str:
+    """The numbers beside the bar, in one line."""
+    parts = [f"{step:,} of {steps:,} steps"]
+    rate = info.get("steps_per_second")
+    if rate:
+        parts.append(f"{rate:,.0f} steps/s")
+    for name in ("flips", "rebuilds"):
+        if name in info:
+            parts.append(f"{info[name]:,} {name}")
+    if rate:
+        parts.append("ETA " + time.strftime("%H:%M:%S", time.gmtime((steps - step) / rate)))
+    return "  ".join(parts)

@@ -1,0 +1,24 @@
+"""`mdnum report`: write the report of a run folder again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import typer
+
+from mdnum.cli import output
+
+
+def report(
+    folder: Path = typer.Argument(metavar="DIR", help="A run folder."),
+    as_json: bool = output.JSON_OPTION,
+) -> int:
+    """Write the report of a run folder again."""
+    from mdnum.report.html import write_report
+
+    written = write_report(folder)
+    if as_json:
+        output.print_json({"folder": folder, "report": written})
+    else:
+        typer.echo(f"wrote {written}")
+    return output.EXIT_FINE

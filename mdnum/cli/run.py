@@ -1,0 +1,128 @@
+"""`mdnum run`: simulate a system, record its flips, check it, and write a run folder."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from mdnum.cli import output
+from mdnum.cli.progress import ProgressBar
+from mdnum.errors import InputError
+
+_RUNS = Path("runs")
+
+
+def run(
+    system: str | None = typer.Argument(
+        None, metavar="SYSTEM", help="A name from `mdnum systems list`, or the path of a TOML file."
+    ),
+    out: Path | None = typer.Option(
+        None, "-o", "--out", metavar="DIR", help="The run folder; runs/NAME-N by default."
+    ),
+    steps: int | None = typer.Option(None, min=1, help="Steps to run, instead of the system's own."),
+    save_every: int | None = typer.Option(
+        None, min=0, metavar="K", help="Write every K-th frame to trajectory.traj; 0 writes none."
+    ),
+    settings: list[str] | None = output.SET_OPTION,
+    resume: Path | None = typer.Option(None, metavar="DIR", help="Continue the run in this folder."),
+    no_check: bool = typer.Option(False, "--no-check", help="Do not compare with ASE."),
+    no_report: bool = typer.Option(False, "--no-report", help="Do not write report.html."),
+    as_json: bool = output.JSON_OPTION,
+) -> int:
+    """Simulate a system and record every flip."""
+    overrides = output.parse_overrides(settings)
+    if resume is None and system is None:
+        raise InputError("no system given", remedy="`mdnum systems list` names those that come with mdnum")
+    if resume is not None and out is not None and out != resume:
+        raise InputError(
+            "--resume continues in its own folder, so --out cannot name another", remedy="Leave out --out"
+        )
+    if resume is not None and overrides:
+        raise InputError(
+            "--set would make the rest of a resumed run another run", remedy="Start a new run instead"
+        )
+    if resume is None:
+        out = default_folder(str(system)) if out is None else out
+
+    from mdnum.rollout import run as run_system
+
+    with ProgressBar() as progress:
+        result = run_system(
+            system,
+            out=out,
+            steps=steps,
+            save_every=save_every,
+            overrides=overrides,
+            resume=resume,
+            check=not no_check,
+            report=not no_report,
+            progress=progress,
+        )
+    summary = dict(result.summary)
+    if as_json:
+        output.print_json({"folder": result.folder, **summary})
+    else:
+        _print_summary(summary, result.folder)
+    return output.exit_code(summary.get("findings", ()), ok=summary.get("status", "complete") == "complete")
+
+
+def default_folder(system: str, runs: Path = _RUNS) -> Path:
+    """runs/NAME-N with the system's name in dashes and the first N past those that exist.
+
+    Args:
+        system: a system's name, or the path of its file.
+        runs: the folder of run folders.
+    """
+    path = Path(system)
+    word = path.stem if path.suffix == ".toml" else system
+    slug = re.sub(r"[^A-Za-z0-9._]+", "-", word).strip("-.") or "run"
+    taken = re.compile(re.escape(slug) + r"-(\d+)")
+    numbers = [
+        int(match[1])
+        for entry in (runs.iterdir() if runs.is_dir() else ())
+        if (match := taken.fullmatch(entry.name))
+    ]
+    return runs / f"{slug}-{max(numbers, default=0) + 1}"
+
+
+def _print_summary(summary: dict[str, Any], folder: Path | None) -> None:
+    out = output.console()
+    ase = summary.get("ase") or {}
+    rows = [
+        ("system", f"{summary.get('system')}, {summary.get('atoms')} atoms, {summary.get('steps'):,} steps"),
+        ("flips", f"{summary.get('flips_entered'):,} entered, {summary.get('flips_left'):,} left"),
+        ("ambiguous", summary.get("ambiguous")),
+        (
+            "neighbor lists",
+            f"{summary.get('rebuilds'):,} rebuilds, {summary.get('dangerous_builds'):,} dangerous,"
+            f" {summary.get('lost_pairs'):,} pairs lost",
+        ),
+        ("energy drift", f"{output.show(summary.get('energy_drift'))} per atom and time unit"),
+        ("energy budget", _budget(summary)),
+        (
+            "against ASE",
+            f"energy {output.show(ase.get('energy_rel'))} relative,"
+            f" forces {output.show(ase.get('force_max'))} at most"
+            if ase.get("energy_rel") is not None
+            else "not compared",
+        ),
+        ("speed", f"{output.show(summary.get('steps_per_second'))} steps/s"),
+    ]
+    if verdict := summary.get("verdict"):
+        out.print(verdict, style="bold", markup=False)
+    output.print_table("", ("", ""), rows)
+    output.print_findings(summary.get("findings", ()))
+    if folder is not None:
+        report = folder / "report.html"
+        out.print(f"wrote {report if report.exists() else folder}", markup=False)
+
+
+def _budget(summary: dict[str, Any]) -> str:
+    closes = summary.get("energy_budget_closes")
+    residual = output.show(summary.get("energy_budget_residual"))
+    if closes is None:
+        return f"residual {residual}"
+    return f"{'closes' if closes else 'does not close'}, residual {residual}"

@@ -1,0 +1,80 @@
+"""`mdnum systems`: list, show, check and copy system files."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from mdnum.cli import output
+
+_SYSTEM = typer.Argument(metavar="SYSTEM", help="A name from `mdnum systems list`, or a TOML file.")
+
+
+def list_systems(as_json: bool = output.JSON_OPTION) -> int:
+    """List the systems that come with mdnum."""
+    from mdnum import systems
+
+    rows = []
+    for name in systems.names():
+        system = systems.load(name)
+        rows.append({"name": name, "atoms": len(system.atoms), "about": system.spec.about})
+    if as_json:
+        output.print_json({"systems": rows})
+    else:
+        output.print_table("", ("name", "atoms", "about"), [tuple(row.values()) for row in rows])
+    return output.EXIT_FINE
+
+
+def show(
+    system: str = _SYSTEM,
+    settings: list[str] | None = output.SET_OPTION,
+    as_json: bool = output.JSON_OPTION,
+) -> int:
+    """Print a system file with every default filled in."""
+    loaded = _load(system, settings)
+    text = loaded.to_toml()
+    if as_json:
+        output.print_json(tomllib.loads(text))
+    else:
+        typer.echo(text.rstrip())
+    return output.EXIT_FINE
+
+
+def check(
+    system: str = _SYSTEM,
+    settings: list[str] | None = output.SET_OPTION,
+    as_json: bool = output.JSON_OPTION,
+) -> int:
+    """Read a system file and its structure, and say whether it can be run."""
+    loaded = _load(system, settings)
+    document = {"system": loaded.name, "ok": True, "atoms": len(loaded.atoms), "path": loaded.path}
+    if as_json:
+        output.print_json(document)
+    else:
+        typer.echo(f"{loaded.name}: fine, {document['atoms']} atoms")
+    return output.EXIT_FINE
+
+
+def copy(
+    system: str = _SYSTEM,
+    target: Path = typer.Argument(Path(), metavar="[DIR]", help="Where to; here by default."),
+    as_json: bool = output.JSON_OPTION,
+) -> int:
+    """Copy a system file and its structure, to change and run."""
+    from mdnum import systems
+
+    copied = systems.copy(system, target)
+    if as_json:
+        output.print_json({"system": system, "path": copied})
+    else:
+        typer.echo(f"wrote {copied}")
+    return output.EXIT_FINE
+
+
+def _load(system: str, settings: list[str] | None) -> Any:
+    from mdnum import systems
+
+    return systems.load(system, output.parse_overrides(settings))

@@ -1,0 +1,200 @@
+"""What was run, with what, on what: enough to explain why two runs of one input differ.
+
+Two runs of the same system file on the same structure can be expected to agree bit for bit when their
+fingerprints agree. The fingerprint covers what XLA's code generation and mdnum's arithmetic depend on:
+the versions, the processor's instruction set, the devices, XLA's flags, jax's settings and the dtypes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import json
+import os
+import platform
+import shlex
+import subprocess
+import sys
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Protocol
+
+import mdnum.precision  # noqa: F401 (float64 is among the settings recorded)
+
+# code generation differs between processors that differ in these; the rest of the flags is noise
+_FLAGS_THAT_MATTER = ("sse4_2", "avx", "fma", "avx2", "avx512f", "avx512_bf16", "amx_tile", "asimd", "sve")
+_PACKAGES = (
+    "mdnum", "jax", "jaxlib", "jax-md", "equinox", "numpy", "numba", "ase", "MDAnalysis", "vesin",
+    "matscipy", "pyarrow",
+)  # fmt: skip
+# those whose code decides a bit of a trajectory
+_ARITHMETIC = ("mdnum", "jax", "jaxlib", "jax-md", "numpy", "numba")
+_JAX_SETTINGS = (
+    "jax_enable_x64",
+    "jax_default_matmul_precision",
+    "jax_disable_jit",
+    "jax_numpy_dtype_promotion",
+    "jax_threefry_partitionable",
+)
+
+
+class _System(Protocol):
+    """What is asked of a system: a structural type, because systems stand above this file."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def spec(self) -> Any: ...
+    @property
+    def path(self) -> Path | None: ...
+    @property
+    def atoms(self) -> Any: ...
+
+
+def collect(system: _System) -> dict[str, Any]:
+    """Everything outside the system file that a run depends on, and hashes of what is inside.
+
+    Args:
+        system: the system as loaded.
+
+    Returns:
+        A mapping of plain values, ready for JSON.
+    """
+    import jax
+
+    versions = package_versions()
+    processor = cpu()
+    devices = [{"platform": device.platform, "kind": device.device_kind} for device in jax.devices()]
+    settings = {name: getattr(jax.config, name, None) for name in _JAX_SETTINGS}
+    environment = {
+        name: value for name, value in sorted(os.environ.items()) if name.startswith(("XLA_", "JAX_"))
+    }
+    precision = getattr(system.spec, "precision", None)
+    dtypes = precision.model_dump(mode="json") if precision is not None else {}
+    return {
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+        "command": shlex.join(sys.argv),
+        "folder": str(Path.cwd()),
+        "system": system.name,
+        "hashes": hashes(system),
+        "dtypes": dtypes,
+        "versions": versions,
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "cpu": processor,
+        "devices": devices,
+        "jax_settings": settings,
+        "environment": environment,
+        "commit": commit(Path(__file__).resolve().parent),
+        "fingerprint": fingerprint(
+            {
+                "versions": {name: versions.get(name) for name in _ARITHMETIC},
+                "machine": platform.machine(),
+                "flags": processor["flags"],
+                "devices": devices,
+                "jax_settings": settings,
+                "xla_flags": os.environ.get("XLA_FLAGS", ""),
+                "dtypes": dtypes,
+            }
+        ),
+    }
+
+
+def fingerprint(parts: Mapping[str, Any]) -> str:
+    """A short name of the arithmetic: equal parts, equal fingerprint.
+
+    Args:
+        parts: plain values; the order of keys does not matter.
+    """
+    text = json.dumps(parts, sort_keys=True, separators=(",", ":"), default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def package_versions() -> dict[str, str | None]:
+    """The versions of the packages that a result can depend on, None where one is not installed."""
+    found: dict[str, str | None] = {}
+    for package in _PACKAGES:
+        try:
+            found[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            found[package] = None
+    return found
+
+
+def cpu(cpuinfo: Path = Path("/proc/cpuinfo")) -> dict[str, Any]:
+    """The processor's name, its cores, and those of its instruction sets that change bits.
+
+    Args:
+        cpuinfo: Linux's description of the processor; elsewhere the platform's own words are used.
+
+    Returns:
+        model, cores, flags; flags is None where they cannot be told.
+    """
+    fields: dict[str, str] = {}
+    if cpuinfo.exists():
+        for line in cpuinfo.read_text(errors="replace").splitlines():
+            key, colon, value = line.partition(":")
+            if colon:
+                fields.setdefault(key.strip().lower(), value.strip())
+    words = fields.get("flags", fields.get("features", "")).split()
+    return {
+        "model": fields.get("model name") or platform.processor() or platform.machine(),
+        "cores": os.cpu_count(),
+        "flags": [flag for flag in _FLAGS_THAT_MATTER if flag in words] if words else None,
+    }
+
+
+def hashes(system: _System) -> dict[str, str | None]:
+    """SHA-256 of the system file as written and of the structure as it was read.
+
+    The structure is hashed as numbers (species, masses, positions, velocities, cell, periodicity), so
+    that a file in another format with the same atoms has the same hash.
+
+    Returns:
+        file (None for a system that did not come from a file) and structure.
+    """
+    file = None
+    if system.path is not None and Path(system.path).is_file():
+        file = hashlib.sha256(Path(system.path).read_bytes()).hexdigest()
+    atoms = system.atoms
+    digest = hashlib.sha256()
+    for name, array in (
+        ("numbers", atoms.get_atomic_numbers()),
+        ("masses", atoms.get_masses()),
+        ("positions", atoms.get_positions()),
+        ("momenta", atoms.get_momenta()),
+        ("cell", atoms.cell.array),
+        ("pbc", atoms.pbc),
+    ):
+        digest.update(f"{name} {array.dtype.str} {array.shape}".encode())
+        digest.update(array.tobytes())
+    return {"file": file, "structure": digest.hexdigest()}
+
+
+def commit(package: Path) -> str | None:
+    """The git commit that mdnum runs from, with "+" when its files were changed since.
+
+    Args:
+        package: the folder of the package.
+
+    Returns:
+        None for an installed wheel, without git, or when the folder belongs to another repository.
+    """
+
+    def git(*words: str) -> str | None:
+        try:
+            done = subprocess.run(
+                ["git", "-C", str(package), *words], capture_output=True, text=True, timeout=10, check=False
+            )
+        except (OSError, subprocess.TimeoutExpired):
+            return None  # no git here: a commit is worth knowing, not worth failing for
+        return done.stdout.strip() if done.returncode == 0 else None
+
+    # an environment inside somebody's repository is not mdnum's repository
+    if not git("ls-files", "--", "provenance.py"):
+        return None
+    head = git("rev-parse", "HEAD")
+    if head is None:
+        return None
+    return head + ("+" if git("status", "--porcelain", "--untracked-files=no", "--", ".") else "")
