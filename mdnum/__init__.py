@@ -49,12 +49,12 @@ __all__ = [
     "MdnumCalculator",
     "MdnumError",
     "NumericalError",
+    "__version__",
     "build",
     "diagnose",
     "load",
     "run",
     "systems",
-    "__version__",
 ]
 
 
