@@ -1,0 +1,172 @@
+"""Pair potentials and cutoffs written a second time, in plain numpy, from the formulas alone.
+
+Nothing here is shared with mdnum.md: it is the judge where ASE has no class for a potential or a cutoff,
+and the third opinion where it has one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from itertools import combinations_with_replacement
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy import ndarray
+
+from mdnum.errors import InputError
+
+Form = Callable[[ndarray], tuple[ndarray, ndarray]]  # r -> u(r), u'(r)
+
+ONSET_FRACTION = 0.9
+
+
+@dataclass(frozen=True)
+class PairForm:
+    """The interaction of one pair of species.
+
+    Attributes:
+        species: the two symbols, sorted.
+        kind: potential.
+        constants: its constants by name, in the units of the system file.
+        cutoff: cutoff kind.
+        r_cut: cutoff radius.
+        r_onset: where switching starts; r_cut for cutoffs that do not switch.
+        compare: what inside means: "r2 <", "r2 <=", "r <" or "r <=".
+    """
+
+    species: tuple[str, str]
+    kind: str
+    constants: Mapping[str, float]
+    cutoff: str
+    r_cut: float
+    r_onset: float
+    compare: str
+
+    def inside(self, distance: Float[ndarray, "pairs"]) -> Bool[ndarray, "pairs"]:
+        """Whether distances count as inside, in the space and with the comparison of the system file."""
+        space, comparison = self.compare.split()
+        quantity, threshold = (distance**2, self.r_cut**2) if space == "r2" else (distance, self.r_cut)
+        return quantity <= threshold if comparison == "<=" else quantity < threshold
+
+    def bare(self, r: Float[ndarray, "pairs"]) -> tuple[Float[ndarray, "pairs"], Float[ndarray, "pairs"]]:
+        """u(r) and u'(r) without any cutoff."""
+        return _BARE[self.kind](r, **self.constants)
+
+    def __call__(self, r: Float[ndarray, "pairs"]) -> tuple[Float[ndarray, "pairs"], Float[ndarray, "pairs"]]:
+        """Energy and its derivative with respect to r, cut off, for pairs that are inside."""
+        u, du = self.bare(r)
+        at_cut, slope_at_cut = (float(x[0]) for x in self.bare(np.array([self.r_cut])))
+        if self.cutoff == "hard":
+            return u, du
+        if self.cutoff == "shifted":
+            return u - at_cut, du
+        if self.cutoff == "force-shifted":
+            return u - at_cut - (r - self.r_cut) * slope_at_cut, du - slope_at_cut
+        s, ds = _SWITCH[self.cutoff](r, self.r_onset, self.r_cut)
+        beyond = r > self.r_onset
+        s, ds = np.where(beyond, s, 1.0), np.where(beyond, ds, 0.0)
+        return s * u, s * du + ds * u
+
+
+def pair_forms(spec: Any) -> dict[tuple[str, str], PairForm]:
+    """The interaction of every pair of species in a system file with a pair potential.
+
+    Args:
+        spec: `mdnum.systems.schema.SystemSpec`.
+    Returns: by sorted pair of symbols; a single entry ("*", "*") where the file has no pairs tables.
+    """
+    potential, cutoff = spec.potential, spec.cutoff
+    names = {name for table in (potential.pairs, cutoff.pairs) if table for name in table}
+    species = sorted({symbol for name in names for symbol in name.split("-")})
+    pairs = list(combinations_with_replacement(species, 2)) or [("*", "*")]
+    base = {key: getattr(potential, key) for key in _CONSTANTS[potential.kind]}
+    forms = {}
+    for pair in pairs:
+        own = _of_pair(potential.pairs, pair)
+        constants = {key: getattr(own, key) for key in base} if own is not None else base
+        if any(value is None for value in constants.values()):
+            continue  # a pair of species that the file gives no constants for does not occur in the structure
+        radius = _of_pair(cutoff.pairs, pair)
+        if radius is None:
+            radius = cutoff.radius if cutoff.radius is not None else cutoff.in_sigma * constants["sigma"]
+        whole = cutoff.radius if cutoff.radius is not None else cutoff.in_sigma
+        onset = getattr(cutoff, "onset", None)
+        fraction = onset / whole if onset is not None else ONSET_FRACTION
+        forms[pair] = PairForm(
+            pair,
+            potential.kind,
+            constants,
+            cutoff.kind,
+            float(radius),
+            float(radius * fraction if cutoff.kind in _SWITCH else radius),
+            cutoff.compare,
+        )
+    return forms
+
+
+def form_of(forms: Mapping[tuple[str, str], PairForm], a: str, b: str) -> PairForm:
+    """The form for two species.
+
+    Raises:
+        InputError: none is given for them.
+    """
+    found = forms.get((min(a, b), max(a, b))) or forms.get(("*", "*"))
+    if found is None:
+        raise InputError(f"no constants for the pair {a}-{b}", where="potential")
+    return found
+
+
+def _of_pair(table: Mapping[str, Any] | None, pair: tuple[str, str]) -> Any:
+    for name, value in (table or {}).items():
+        if tuple(sorted(name.split("-"))) == pair:
+            return value
+    return None
+
+
+def _lennard_jones(r: ndarray, sigma: float, epsilon: float) -> tuple[ndarray, ndarray]:
+    sixth = (sigma / r) ** 6
+    return 4.0 * epsilon * sixth * (sixth - 1.0), -24.0 * epsilon * sixth * (2.0 * sixth - 1.0) / r
+
+
+def _morse(r: ndarray, depth: float, alpha: float, r0: float) -> tuple[ndarray, ndarray]:
+    decay = np.exp(-alpha * (r - r0))
+    return depth * decay * (decay - 2.0), -2.0 * depth * alpha * decay * (decay - 1.0)
+
+
+def _soft_sphere(r: ndarray, sigma: float, epsilon: float, alpha: float) -> tuple[ndarray, ndarray]:
+    overlap = np.maximum(1.0 - r / sigma, 0.0)
+    return epsilon / alpha * overlap**alpha, -epsilon / sigma * np.where(overlap > 0, overlap ** (alpha - 1.0), 0.0)
+
+
+def _switched(r: ndarray, onset: float, cut: float) -> tuple[ndarray, ndarray]:
+    """HOOMD's XPLOR switch: a cubic in r², C1 at both ends."""
+    x, a, b = r * r, onset * onset, cut * cut
+    width = (b - a) ** 3
+    return (b - x) ** 2 * (b + 2.0 * x - 3.0 * a) / width, 12.0 * r * (b - x) * (a - x) / width
+
+
+def _quintic(r: ndarray, onset: float, cut: float) -> tuple[ndarray, ndarray]:
+    """1 - smootherstep in r, C2 at both ends."""
+    x = (r - onset) / (cut - onset)
+    return 1.0 - x**3 * (10.0 - 15.0 * x + 6.0 * x * x), -30.0 * x * x * (1.0 - x) ** 2 / (cut - onset)
+
+
+def _cosine(r: ndarray, onset: float, cut: float) -> tuple[ndarray, ndarray]:
+    """Half a cosine in r, C1 at both ends."""
+    phase = np.pi * (r - onset) / (cut - onset)
+    return 0.5 * (1.0 + np.cos(phase)), -0.5 * np.pi / (cut - onset) * np.sin(phase)
+
+
+_CONSTANTS = {
+    "lennard-jones": ("sigma", "epsilon"),
+    "morse": ("depth", "alpha", "r0"),
+    "soft-sphere": ("sigma", "epsilon", "alpha"),
+}
+_BARE: dict[str, Callable[..., tuple[ndarray, ndarray]]] = {
+    "lennard-jones": _lennard_jones,
+    "morse": _morse,
+    "soft-sphere": _soft_sphere,
+}
+_SWITCH = {"switched": _switched, "quintic": _quintic, "cosine": _cosine}

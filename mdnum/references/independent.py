@@ -1,0 +1,280 @@
+"""Energies, forces and stress in plain numpy on ASE's neighbor list: a judge that shares nothing with mdnum.md.
+
+A model sees directed edges (i -> j, displacement d) and returns the energy of each atom and the gradient of
+the total energy with respect to every d. Forces and stress follow from that gradient in one place:
+F_i += g, F_j -= g, stress = sum(g outer d) / volume.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from ase.calculators.calculator import Calculator, all_changes
+from ase.neighborlist import neighbor_list
+from ase.stress import full_3x3_to_voigt_6_stress
+from numpy import ndarray
+
+from mdnum.references.closed_forms import PairForm, form_of
+
+
+@dataclass(frozen=True)
+class Edges:
+    """A full neighbor list: both directions of every pair.
+
+    Attributes:
+        symbols: chemical symbol of each atom.
+        i: atom an edge starts from, ascending.
+        j: atom it leads to.
+        d: displacement x_j - x_i with the lattice vector added, (edges, 3).
+        r: its length.
+    """
+
+    symbols: ndarray
+    i: ndarray
+    j: ndarray
+    d: ndarray
+    r: ndarray
+
+
+class Model(Protocol):
+    """What `OnNeighborList` evaluates."""
+
+    @property
+    def reach(self) -> float:
+        """No edge longer than this matters."""
+        ...
+
+    def __call__(self, edges: Edges) -> tuple[ndarray, ndarray]:
+        """(energy of each atom, gradient of the total energy with respect to each displacement)."""
+        ...
+
+
+class OnNeighborList(Calculator):
+    """An ASE calculator for a model of edges.
+
+    Args:
+        model: what to evaluate.
+    """
+
+    implemented_properties = ["energy", "energies", "free_energy", "forces", "stress"]  # noqa: RUF012
+    nolabel = True
+
+    def __init__(self, model: Model, **kwargs: Any):
+        super().__init__(**kwargs)
+        self.model = model
+        self.pairs_inside = 0
+
+    def calculate(self, atoms=None, properties=None, system_changes=all_changes):
+        """Evaluate the model on ASE's neighbor list (see ase.calculators.calculator.Calculator)."""
+        super().calculate(atoms, properties or ["energy"], system_changes)
+        atoms = self.atoms
+        # a hair further than the reach: ASE's list is strict, and whether the end counts is the model's to say
+        i, j, r, d = neighbor_list("ijdD", atoms, self.model.reach * (1 + 1e-12))
+        energies, gradient = self.model(Edges(np.array(atoms.get_chemical_symbols()), i, j, d, r))
+        n = len(atoms)
+        forces = np.stack(
+            [np.bincount(i, gradient[:, k], n) - np.bincount(j, gradient[:, k], n) for k in range(3)], axis=1
+        )
+        energy = float(energies.sum())
+        self.results = {"energy": energy, "free_energy": energy, "energies": energies, "forces": forces}
+        if atoms.cell.rank == 3:
+            self.results["stress"] = full_3x3_to_voigt_6_stress(gradient.T @ d / atoms.get_volume())
+
+
+@dataclass(frozen=True)
+class PairModel:
+    """Any pair potential with any cutoff, species by species.
+
+    Attributes:
+        forms: see `mdnum.references.closed_forms.pair_forms`.
+    """
+
+    forms: Mapping[tuple[str, str], PairForm]
+
+    @property
+    def reach(self) -> float:
+        return max(form.r_cut for form in self.forms.values())
+
+    def groups(self, edges: Edges) -> list[tuple[PairForm, ndarray]]:
+        """The edges inside the cutoff, by the form that applies to them: (form, edge numbers)."""
+        if set(self.forms) == {("*", "*")}:
+            form = self.forms["*", "*"]
+            return [(form, np.flatnonzero(form.inside(edges.r)))]
+        found = []
+        present = sorted(set(edges.symbols.tolist()))
+        first, second = edges.symbols[edges.i], edges.symbols[edges.j]
+        for a in present:
+            for b in present:
+                chosen = np.flatnonzero((first == a) & (second == b))
+                if len(chosen):
+                    form = form_of(self.forms, a, b)
+                    found.append((form, chosen[form.inside(edges.r[chosen])]))
+        return found
+
+    def __call__(self, edges: Edges) -> tuple[ndarray, ndarray]:
+        energies, gradient = np.zeros(len(edges.symbols)), np.zeros_like(edges.d)
+        for form, rows in self.groups(edges):
+            u, du = form(edges.r[rows])
+            energies += np.bincount(edges.i[rows], 0.5 * u, len(edges.symbols))
+            gradient[rows] = (0.5 * du / edges.r[rows])[:, None] * edges.d[rows]
+        return energies, gradient
+
+
+def _triplets(edges: Edges) -> tuple[ndarray, ndarray]:
+    """Ordered pairs (e, f), e != f, of edges that start from the same atom."""
+    starts = np.searchsorted(edges.i, np.arange(len(edges.symbols) + 1))
+    first, second = [], []
+    for begin, end in zip(starts[:-1], starts[1:], strict=True):
+        e, f = np.meshgrid(np.arange(begin, end), np.arange(begin, end), indexing="ij")
+        keep = e != f
+        first.append(e[keep])
+        second.append(f[keep])
+    return np.concatenate(first).astype(int), np.concatenate(second).astype(int)
+
+
+def _only(edges: Edges, keep: ndarray) -> Edges:
+    return Edges(edges.symbols, edges.i[keep], edges.j[keep], edges.d[keep], edges.r[keep])
+
+
+def _cosines(edges: Edges, e: ndarray, f: ndarray) -> tuple[ndarray, ndarray, ndarray]:
+    """cos of the angle between edges e and f, with its gradients with respect to d_e and d_f."""
+    re, rf = edges.r[e], edges.r[f]
+    ne, nf = edges.d[e] / re[:, None], edges.d[f] / rf[:, None]
+    cosine = np.einsum("ta,ta->t", ne, nf)
+    return cosine, (nf - cosine[:, None] * ne) / re[:, None], (ne - cosine[:, None] * nf) / rf[:, None]
+
+
+def _add_rows(target: ndarray, rows: ndarray, values: ndarray) -> None:
+    for axis in range(values.shape[1]):
+        target[:, axis] += np.bincount(rows, values[:, axis], len(target))
+
+
+@dataclass(frozen=True)
+class StillingerWeberModel:
+    """Stillinger and Weber's silicon (Phys. Rev. B 31, 5262, 1985, equations 2.1 to 2.5).
+
+    Attributes: the constants of the paper; epsilon in eV, sigma in Å.
+    """
+
+    epsilon: float = 2.1683
+    sigma: float = 2.0951
+    a: float = 1.80
+    lam: float = 21.0
+    gamma: float = 1.20
+    A: float = 7.049556277
+    B: float = 0.6022245584
+    p: float = 4.0
+    q: float = 0.0
+    cos0: float = -1.0 / 3.0
+
+    @property
+    def reach(self) -> float:
+        return self.a * self.sigma
+
+    def __call__(self, edges: Edges) -> tuple[ndarray, ndarray]:
+        everything, inside = edges, edges.r < self.reach
+        edges = _only(edges, inside)
+        x = edges.r / self.sigma
+        tail = np.exp(1.0 / (x - self.a))
+        dtail = -tail / (x - self.a) ** 2
+        core = self.B * x**-self.p - x**-self.q
+        dcore = -self.p * self.B * x ** (-self.p - 1) + self.q * x ** (-self.q - 1)
+        pair = 0.5 * self.epsilon * self.A * core * tail
+        slope = 0.5 * self.epsilon * self.A * (dcore * tail + core * dtail) / self.sigma
+        unit = edges.d / edges.r[:, None]
+        inner = slope[:, None] * unit
+
+        e, f = _triplets(edges)
+        e, f = e[e < f], f[e < f]  # each angle once
+        cosine, dce, dcf = _cosines(edges, e, f)
+        arm = np.exp(self.gamma / (x - self.a))
+        darm = -self.gamma / (x - self.a) ** 2 * arm / self.sigma
+        excess = cosine - self.cos0
+        strength = self.epsilon * self.lam
+        angle = strength * arm[e] * arm[f] * excess**2
+        twist = 2.0 * strength * arm[e] * arm[f] * excess
+        bend = strength * excess**2
+        _add_rows(inner, e, twist[:, None] * dce + (bend * darm[e] * arm[f])[:, None] * unit[e])
+        _add_rows(inner, f, twist[:, None] * dcf + (bend * arm[e] * darm[f])[:, None] * unit[f])
+
+        n = len(edges.symbols)
+        gradient = np.zeros_like(everything.d)
+        gradient[inside] = inner
+        return np.bincount(edges.i, pair, n) + np.bincount(edges.i[e], angle, n), gradient
+
+
+@dataclass(frozen=True)
+class TersoffModel:
+    """Tersoff's bond order for one species (Phys. Rev. B 38, 9902, 1988), in LAMMPS's names.
+
+    Attributes: the 14 constants of a LAMMPS or ASE entry; the default is Tersoff's T3 silicon.
+    """
+
+    m: float = 3.0
+    gamma: float = 1.0
+    lambda3: float = 1.7322
+    c: float = 1.0039e5
+    d: float = 16.218
+    h: float = -0.59826
+    n: float = 0.78734
+    beta: float = 1.0999e-6
+    lambda2: float = 1.7322
+    B: float = 471.18
+    R: float = 2.85
+    D: float = 0.15
+    lambda1: float = 2.4799
+    A: float = 1830.8
+
+    @property
+    def reach(self) -> float:
+        return self.R + self.D
+
+    def _taper(self, r: ndarray) -> tuple[ndarray, ndarray]:
+        phase = 0.5 * np.pi * (r - self.R) / self.D
+        within = r > self.R - self.D
+        return (
+            np.where(within, 0.5 * (1.0 - np.sin(phase)), 1.0),
+            np.where(within, -0.25 * np.pi / self.D * np.cos(phase), 0.0),
+        )
+
+    def __call__(self, edges: Edges) -> tuple[ndarray, ndarray]:
+        everything, inside = edges, edges.r < self.reach
+        edges = _only(edges, inside)
+        r, unit = edges.r, edges.d / edges.r[:, None]
+        taper, dtaper = self._taper(r)
+
+        # zeta of edge e: a sum over the other edges f of the same atom
+        e, f = _triplets(edges)
+        cosine, dce, dcf = _cosines(edges, e, f)
+        c2, d2, away = self.c**2, self.d**2, self.h - cosine
+        g = self.gamma * (1.0 + c2 / d2 - c2 / (d2 + away**2))
+        dg = -2.0 * self.gamma * c2 * away / (d2 + away**2) ** 2
+        stretch = r[e] - r[f]
+        # exact zero when lambda3 is zero, whatever m is
+        grow = np.exp((self.lambda3 * stretch) ** self.m) if self.lambda3 else np.ones_like(stretch)
+        dgrow = self.m * self.lambda3**self.m * stretch ** (self.m - 1.0) * grow if self.lambda3 else 0.0 * stretch
+        zeta = np.bincount(e, taper[f] * g * grow, len(r))
+
+        x = (self.beta * zeta) ** self.n
+        order = (1.0 + x) ** (-0.5 / self.n)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            dorder = np.where(zeta > 0, -0.5 * (1.0 + x) ** (-0.5 / self.n - 1.0) * x / zeta, 0.0)
+        repulsion, attraction = self.A * np.exp(-self.lambda1 * r), -self.B * np.exp(-self.lambda2 * r)
+        bond = 0.5 * taper * (repulsion + order * attraction)
+        slope = 0.5 * dtaper * (repulsion + order * attraction)
+        slope -= 0.5 * taper * (self.lambda1 * repulsion + self.lambda2 * order * attraction)
+        inner = slope[:, None] * unit
+
+        weight = (0.5 * taper * attraction * dorder)[e]
+        along_e = (taper[f] * g * dgrow)[:, None] * unit[e] + (taper[f] * grow * dg)[:, None] * dce
+        along_f = (dtaper[f] * g * grow - taper[f] * g * dgrow)[:, None] * unit[f]
+        along_f = along_f + (taper[f] * grow * dg)[:, None] * dcf
+        _add_rows(inner, e, weight[:, None] * along_e)
+        _add_rows(inner, f, weight[:, None] * along_f)
+
+        gradient = np.zeros_like(everything.d)
+        gradient[inside] = inner
+        return np.bincount(edges.i, bond, len(edges.symbols)), gradient
