@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -218,27 +219,29 @@ class RunFolder:
 
     # -- reading ---------------------------------------------------------------------------------
 
-    def table(self, name: str, columns: Sequence[str] | None = None) -> pa.Table:
+    def table(self, name: str, columns: Sequence[str] | None = None, rows: int | None = None) -> pa.Table:
         """A table as far as it is on disk; of a run that was killed, the rows its checkpoint counts.
 
         Args:
             columns: only these.
+            rows: at most the first rows.
         """
-        stream = TableStream(self.path, name)
-        rows = None
-        if stream.parts() and self.has_checkpoint():
-            # series and flips of an unfinished run agree with one another only at a checkpoint
-            rows = self._read_checkpoint()[1]["rows"].get(name)
-        return stream.read(columns, rows)
+        return TableStream(self.path, name).read(columns, min(self.rows(name), rows or sys.maxsize))
 
-    def read(self, name: str, columns: Sequence[str] | None = None) -> dict[str, np.ndarray]:
+    def read(
+        self, name: str, columns: Sequence[str] | None = None, rows: int | None = None
+    ) -> dict[str, np.ndarray]:
         """As `table`, a numpy array by column name."""
-        table = self.table(name, columns)
+        table = self.table(name, columns, rows)
         return {key: table[key].to_numpy() for key in table.column_names}
 
     def rows(self, name: str) -> int:
-        """Rows of a table, those in memory included."""
-        return self._stream(name).rows
+        """Rows of a table that `table` gives."""
+        stream = TableStream(self.path, name)
+        if stream.parts() and self.has_checkpoint():
+            # series and flips of an unfinished run agree with one another only at a checkpoint
+            return self._read_checkpoint()[1]["rows"].get(name, 0)
+        return stream.flushed
 
     @property
     def system_toml(self) -> str:

@@ -188,7 +188,13 @@ class TableStream:
             columns: only these.
             rows: only the first rows.
         """
-        tables = list(self.batches(columns))
+        tables: list[pa.Table] = []
+        have = 0
+        for batch in self.batches(columns):
+            if rows is not None and have >= rows:
+                break
+            tables.append(batch)
+            have += batch.num_rows
         if not tables:
             fields = COLUMNS.get(self.name, {})
             names = fields if columns is None else columns
