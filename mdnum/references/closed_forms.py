@@ -8,18 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from itertools import combinations_with_replacement
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
-from mdnum.errors import InputError
+from mdnum.systems import pairs
+from mdnum.systems.schema import SystemSpec
 
 Form = Callable[[ndarray], tuple[ndarray, ndarray]]  # r -> u(r), u'(r)
-
-ONSET_FRACTION = 0.9
 
 
 @dataclass(frozen=True)
@@ -27,7 +24,7 @@ class PairForm:
     """The interaction of one pair of species.
 
     Attributes:
-        species: the two symbols, sorted.
+        species: the two symbols.
         kind: potential.
         constants: its constants by name, in the units of the system file.
         cutoff: cutoff kind.
@@ -70,59 +67,32 @@ class PairForm:
         return s * u, s * du + ds * u
 
 
-def pair_forms(spec: Any) -> dict[tuple[str, str], PairForm]:
-    """The interaction of every pair of species in a system file with a pair potential.
+def pair_forms(spec: SystemSpec, species: tuple[str, ...]) -> dict[tuple[str, str], PairForm]:
+    """The interaction of every two species, both orders.
 
     Args:
-        spec: `mdnum.systems.schema.SystemSpec`.
-    Returns: by sorted pair of symbols; a single entry ("*", "*") where the file has no pairs tables.
-    """
-    potential, cutoff = spec.potential, spec.cutoff
-    names = {name for table in (potential.pairs, cutoff.pairs) if table for name in table}
-    species = sorted({symbol for name in names for symbol in name.split("-")})
-    pairs = list(combinations_with_replacement(species, 2)) or [("*", "*")]
-    base = {key: getattr(potential, key) for key in _CONSTANTS[potential.kind]}
-    forms = {}
-    for pair in pairs:
-        own = _of_pair(potential.pairs, pair)
-        constants = {key: getattr(own, key) for key in base} if own is not None else base
-        if any(value is None for value in constants.values()):
-            continue  # a pair of species that the file gives no constants for does not occur in the structure
-        radius = _of_pair(cutoff.pairs, pair)
-        if radius is None:
-            radius = cutoff.radius if cutoff.radius is not None else cutoff.in_sigma * constants["sigma"]
-        whole = cutoff.radius if cutoff.radius is not None else cutoff.in_sigma
-        onset = getattr(cutoff, "onset", None)
-        fraction = onset / whole if onset is not None else ONSET_FRACTION
-        forms[pair] = PairForm(
-            pair,
-            potential.kind,
-            constants,
-            cutoff.kind,
-            float(radius),
-            float(radius * fraction if cutoff.kind in _SWITCH else radius),
-            cutoff.compare,
-        )
-    return forms
-
-
-def form_of(forms: Mapping[tuple[str, str], PairForm], a: str, b: str) -> PairForm:
-    """The form for two species.
-
+        spec: a system with a pair potential.
+        species: chemical symbols present.
     Raises:
-        InputError: none is given for them.
+        InputError: a pair of species has no constants or no radius.
     """
-    found = forms.get((min(a, b), max(a, b))) or forms.get(("*", "*"))
-    if found is None:
-        raise InputError(f"no constants for the pair {a}-{b}", where="potential")
-    return found
-
-
-def _of_pair(table: Mapping[str, Any] | None, pair: tuple[str, str]) -> Any:
-    for name, value in (table or {}).items():
-        if tuple(sorted(name.split("-"))) == pair:
-            return value
-    return None
+    if spec.cutoff is None:
+        raise TypeError(f"{spec.potential.kind} has no [cutoff]")
+    tables = pairs.pair_constants(spec, species)
+    radius, onset = pairs.cutoff_radii(spec, species)
+    return {
+        (a, b): PairForm(
+            (a, b),
+            spec.potential.kind,
+            {name: float(table[x, y]) for name, table in tables.items()},
+            spec.cutoff.kind,
+            float(radius[x, y]),
+            float(radius[x, y] if onset is None else onset[x, y]),
+            spec.cutoff.compare,
+        )
+        for x, a in enumerate(species)
+        for y, b in enumerate(species)
+    }
 
 
 def _lennard_jones(r: ndarray, sigma: float, epsilon: float) -> tuple[ndarray, ndarray]:
@@ -159,11 +129,6 @@ def _cosine(r: ndarray, onset: float, cut: float) -> tuple[ndarray, ndarray]:
     return 0.5 * (1.0 + np.cos(phase)), -0.5 * np.pi / (cut - onset) * np.sin(phase)
 
 
-_CONSTANTS = {
-    "lennard-jones": ("sigma", "epsilon"),
-    "morse": ("depth", "alpha", "r0"),
-    "soft-sphere": ("sigma", "epsilon", "alpha"),
-}
 _BARE: dict[str, Callable[..., tuple[ndarray, ndarray]]] = {
     "lennard-jones": _lennard_jones,
     "morse": _morse,

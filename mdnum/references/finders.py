@@ -10,10 +10,15 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
+from mdnum.errors import MdnumError
 from mdnum.references.oracle import widths
 
 Found = tuple[Int[ndarray, "pairs"], Int[ndarray, "pairs"], Float[ndarray, "pairs"]]
 Search = Callable[[ndarray, ndarray, ndarray, float], Found]
+
+
+class FinderError(MdnumError):
+    """A neighbor search raised instead of answering."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +33,7 @@ class Finder:
         images: whether a pair may be listed through several images (cells smaller than 2 r_cut).
         orthorhombic_only: refuses tilted cells.
         all_or_none: knows only "all directions periodic" and "none".
+        ours: mdnum's own or jax-md's: what a run stands on.
     """
 
     name: str
@@ -37,6 +43,7 @@ class Finder:
     images: bool = True
     orthorhombic_only: bool = False
     all_or_none: bool = False
+    ours: bool = False
 
     @property
     def version(self) -> str | None:
@@ -65,13 +72,22 @@ class Finder:
         pbc: Bool[ndarray, "3"],
         r_cut: float,
     ) -> Found:
-        """The pairs this search lists within r_cut, each once, with i <= j, sorted."""
-        i, j, distance = self.search(
-            np.ascontiguousarray(positions, dtype=np.float64),
-            np.ascontiguousarray(cell, dtype=np.float64),
-            np.asarray(pbc, dtype=bool),
-            float(r_cut),
-        )
+        """The pairs this search lists within r_cut, each once, with i <= j, sorted.
+
+        Raises:
+            FinderError: the library raised; what it said is in the message.
+        """
+        try:
+            i, j, distance = self.search(
+                np.ascontiguousarray(positions, dtype=np.float64),
+                np.ascontiguousarray(cell, dtype=np.float64),
+                np.asarray(pbc, dtype=bool),
+                float(r_cut),
+            )
+        except MdnumError:
+            raise
+        except Exception as error:  # another library's search may fail in any way; that is a result, not a crash
+            raise FinderError(f"{type(error).__name__}: {error}", where=self.name) from error
         order = np.lexsort((distance, j, i))
         return i[order], j[order], distance[order]
 

@@ -17,7 +17,7 @@ from ase.neighborlist import neighbor_list
 from ase.stress import full_3x3_to_voigt_6_stress
 from numpy import ndarray
 
-from mdnum.references.closed_forms import PairForm, form_of
+from mdnum.references.closed_forms import PairForm
 
 
 @dataclass(frozen=True)
@@ -100,9 +100,6 @@ class PairModel:
 
     def groups(self, edges: Edges) -> list[tuple[PairForm, ndarray]]:
         """The edges inside the cutoff, by the form that applies to them: (form, edge numbers)."""
-        if set(self.forms) == {("*", "*")}:
-            form = self.forms["*", "*"]
-            return [(form, np.flatnonzero(form.inside(edges.r)))]
         found = []
         present = sorted(set(edges.symbols.tolist()))
         first, second = edges.symbols[edges.i], edges.symbols[edges.j]
@@ -110,7 +107,7 @@ class PairModel:
             for b in present:
                 chosen = np.flatnonzero((first == a) & (second == b))
                 if len(chosen):
-                    form = form_of(self.forms, a, b)
+                    form = self.forms[a, b]
                     found.append((form, chosen[form.inside(edges.r[chosen])]))
         return found
 

@@ -1,0 +1,320 @@
+"""The ASE calculator that corresponds to a system, with the conversions between the two conventions.
+
+What differs between the codes, and what is done about it:
+
+| system file | ASE | conversion |
+|---|---|---|
+| lennard-jones, shifted | LennardJones(smooth=False) | none: ASE always shifts the energy to zero at rc |
+| lennard-jones, hard | LennardJones(smooth=False) | + u(r_cut) for every pair inside; same forces |
+| lennard-jones, switched | LennardJones(smooth=True, ro=onset) | none: the same cubic in r² |
+| lennard-jones, several species | one LennardJones has one sigma | sum over species by inclusion and exclusion |
+| morse, hard or shifted | MorsePotential | its own switch moved beyond the list; shifted: - u(r_cut) a pair |
+| morse, quintic | MorsePotential(rcut1, rcut2) | alpha = rho0 / r0; the switch is the same quintic in r |
+| eam | EAM(potential=file) | none |
+| tersoff | Tersoff | none: the same 14 constants |
+| all others | no ASE class | plain numpy on ASE's neighbor list (`independent.py`), and labeled so |
+
+ASE's LennardJones keeps a pair at r == rc (r² > rc² is dropped), its neighbor lists do not (r < rc). In the
+shifted and switched forms such a pair has no energy, so only its force can differ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from itertools import combinations_with_replacement
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from ase import Atoms
+from ase.calculators.calculator import Calculator, PropertyNotImplementedError, all_changes
+from ase.neighborlist import neighbor_list
+from numpy import ndarray
+
+from mdnum.references.closed_forms import PairForm, pair_forms
+from mdnum.references.independent import OnNeighborList, PairModel, StillingerWeberModel, TersoffModel
+from mdnum.systems import System
+
+_PROPERTIES = ["energy", "free_energy", "energies", "forces", "stress"]
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A calculator to compare with.
+
+    Attributes:
+        label: what it is, for people: "ASE LennardJones" or "plain numpy on ASE's neighbor list".
+        is_ase: whether the numbers come from a class of ASE.
+        conversion: what was done to make the conventions equal.
+        make: a fresh calculator.
+    """
+
+    label: str
+    is_ase: bool
+    conversion: str
+    make: Callable[[], Calculator]
+
+
+def reference(system: System) -> Reference:
+    """The best judge there is for a system: ASE where it has the class, else plain numpy.
+
+    Args:
+        system: `mdnum.systems.System`.
+    """
+    kind = system.spec.potential.kind
+    if kind == "eam":
+        return _eam(system)
+    if kind == "tersoff":
+        return _tersoff()
+    if kind == "stillinger-weber":
+        return independent(system)
+    species = system.species
+    forms = pair_forms(system.spec, species)
+    cutoff = system.spec.cutoff.kind
+    build = _ASE_PAIR.get((kind, cutoff))
+    if build is None:
+        return independent(system)
+    label, conversion = _WORDS[kind, cutoff]
+    if len(species) == 1:
+        form = forms[species[0], species[0]]
+        return Reference(label, True, conversion, lambda: build(form))
+    return Reference(
+        f"{label}, a sum over species",
+        True,
+        f"{conversion}; unlike pairs as all minus like (ASE's class has one set of constants)",
+        lambda: SpeciesSum([(build(forms[a, b]), a, b) for a, b in combinations_with_replacement(species, 2)]),
+    )
+
+
+def independent(system: System) -> Reference:
+    """A judge in plain numpy, for every kind but eam: a third opinion where ASE is the second.
+
+    Args:
+        system: `mdnum.systems.System`.
+    """
+    kind = system.spec.potential.kind
+    models: dict[str, Callable[[], Any]] = {"stillinger-weber": StillingerWeberModel, "tersoff": TersoffModel}
+    make_model = models.get(kind) or (lambda: PairModel(pair_forms(system.spec, system.species)))
+    return Reference(
+        "plain numpy on ASE's neighbor list",
+        False,
+        "none: the formulas of the system file, written a second time",
+        lambda: OnNeighborList(make_model()),
+    )
+
+
+class LennardJonesHard(Calculator):
+    """ASE's LennardJones with the energy shift taken out again: u(r_cut) for each pair inside.
+
+    Args:
+        form: constants, r_cut, and which pairs count as inside.
+    """
+
+    implemented_properties = _PROPERTIES
+    nolabel = True
+
+    def __init__(self, form: PairForm, **kwargs: Any):
+        super().__init__(**kwargs)
+        self.form = form
+        self.shifted = _lennard_jones_shifted(form)
+
+    def calculate(self, atoms=None, properties=None, system_changes=all_changes):
+        """Evaluate (see ase.calculators.calculator.Calculator)."""
+        super().calculate(atoms, properties or ["energy"], system_changes)
+        # get_property, not calculate: it is what tells ASE's class that the atoms have changed
+        results = _results(self.shifted, self.atoms)
+        i, distance = neighbor_list("id", self.atoms, self.form.r_cut * (1 + 1e-12))
+        inside = np.bincount(i[self.form.inside(distance)], minlength=len(self.atoms))
+        at_cut = float(self.form.bare(np.array([self.form.r_cut]))[0][0])
+        energies = results["energies"] + 0.5 * at_cut * inside
+        energy = results["energy"] + at_cut * (inside.sum() // 2)
+        self.results = {**results, "energy": energy, "free_energy": energy, "energies": energies}
+
+
+class MorseShifted(Calculator):
+    """ASE's MorsePotential without its switch, less u(r_cut) for each pair inside.
+
+    Args:
+        form: constants, r_cut, and which pairs count as inside.
+    """
+
+    implemented_properties = _PROPERTIES
+    nolabel = True
+
+    def __init__(self, form: PairForm, **kwargs: Any):
+        super().__init__(**kwargs)
+        self.form = form
+        self.hard = _morse_hard(form)
+
+    def calculate(self, atoms=None, properties=None, system_changes=all_changes):
+        """Evaluate (see ase.calculators.calculator.Calculator)."""
+        super().calculate(atoms, properties or ["energy"], system_changes)
+        results = _results(self.hard, self.atoms)
+        i, distance = neighbor_list("id", self.atoms, self.form.r_cut * (1 + 1e-12))
+        inside = np.bincount(i[self.form.inside(distance)], minlength=len(self.atoms))
+        at_cut = float(self.form.bare(np.array([self.form.r_cut]))[0][0])
+        energies = results["energies"] - 0.5 * at_cut * inside
+        energy = results["energy"] - at_cut * (inside.sum() // 2)
+        self.results = {**results, "energy": energy, "free_energy": energy, "energies": energies}
+
+
+class SpeciesSum(Calculator):
+    """A mixture from calculators that know one species: unlike pairs a-b are all minus a-a minus b-b.
+
+    Args:
+        parts: (calculator, species a, species b) for every pair of species present.
+    Error: the subtraction costs the digits by which the sum over like pairs exceeds that over unlike
+        pairs; about one for the mixtures shipped.
+    """
+
+    implemented_properties = _PROPERTIES
+    nolabel = True
+
+    def __init__(self, parts: Sequence[tuple[Calculator, str, str]], **kwargs: Any):
+        super().__init__(**kwargs)
+        self.parts = tuple(parts)
+
+    def calculate(self, atoms=None, properties=None, system_changes=all_changes):
+        """Evaluate (see ase.calculators.calculator.Calculator)."""
+        super().calculate(atoms, properties or ["energy"], system_changes)
+        symbols = np.array(self.atoms.get_chemical_symbols())
+        n = len(symbols)
+        total: dict[str, Any] = {"energy": 0.0, "energies": np.zeros(n), "forces": np.zeros((n, 3))}
+        if self.atoms.cell.rank == 3:
+            total["stress"] = np.zeros(6)
+        for calculator, a, b in self.parts:
+            groups = [((symbols == a), 1.0)] if a == b else [
+                ((symbols == a) | (symbols == b), 1.0),
+                ((symbols == a), -1.0),
+                ((symbols == b), -1.0),
+            ]
+            for chosen, sign in groups:
+                if not chosen.any():
+                    continue
+                calculator.reset()
+                results = _results(calculator, self.atoms[chosen])
+                total["energy"] += sign * results["energy"]
+                total["energies"][chosen] += sign * results["energies"]
+                total["forces"][chosen] += sign * results["forces"]
+                if "stress" in total:
+                    total["stress"] += sign * results["stress"]
+        self.results = {**total, "free_energy": total["energy"]}
+
+
+def _results(calculator: Calculator, atoms: Atoms) -> dict[str, Any]:
+    """Everything the calculator knows about atoms; the stress only where the cell has a volume."""
+    bare = Atoms(numbers=atoms.numbers, positions=atoms.positions, cell=atoms.cell, pbc=atoms.pbc)
+    found: dict[str, Any] = {}
+    for name in ("energy", "energies", "forces", *(["stress"] if atoms.cell.rank == 3 else [])):
+        value = calculator.get_property(name, bare)
+        found[name] = np.array(value) if name != "energy" else float(np.asarray(value))
+    return found
+
+
+def evaluate(calculator: Calculator, atoms: Atoms) -> dict[str, Any]:
+    """energy, forces, stress (3, 3; None without a volume) and energies (None where there are none) of atoms."""
+    bare = Atoms(numbers=atoms.numbers, positions=atoms.positions, cell=atoms.cell, pbc=atoms.pbc)
+    found: dict[str, Any] = {
+        "energy": float(np.asarray(calculator.get_property("energy", bare))),
+        "forces": np.array(calculator.get_property("forces", bare)),
+    }
+    if bare.cell.rank == 3:
+        xx, yy, zz, yz, xz, xy = np.array(calculator.get_property("stress", bare))
+        found["stress"] = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    else:
+        found["stress"] = None
+    try:
+        found["energies"] = np.array(calculator.get_property("energies", bare))
+    except PropertyNotImplementedError:
+        found["energies"] = None  # ASE's EAM has the total only
+    return found
+
+
+def _lennard_jones_shifted(form: PairForm) -> Calculator:
+    from ase.calculators.lj import LennardJones
+
+    return LennardJones(**form.constants, rc=form.r_cut, smooth=False)
+
+
+def _lennard_jones_switched(form: PairForm) -> Calculator:
+    from ase.calculators.lj import LennardJones
+
+    return LennardJones(**form.constants, rc=form.r_cut, ro=form.r_onset, smooth=True)
+
+
+def _inside_list(form: PairForm) -> Callable[..., Any]:
+    """A neighbor list for ASE's MorsePotential that lists what the system file calls inside, no more."""
+
+    def listed(quantities: str, atoms: Atoms, cutoff: float) -> tuple[ndarray, ...]:
+        i, j, d, D = neighbor_list("ijdD", atoms, form.r_cut * (1 + 1e-12))
+        keep = form.inside(d)
+        table = {"i": i[keep], "j": j[keep], "d": d[keep], "D": D[keep]}
+        return tuple(table[quantity] for quantity in quantities)
+
+    return listed
+
+
+def _morse(form: PairForm, begin: float, end: float) -> Calculator:
+    from ase.calculators.morse import MorsePotential
+
+    depth, alpha, r0 = (form.constants[key] for key in ("depth", "alpha", "r0"))
+    return MorsePotential(
+        epsilon=depth, rho0=alpha * r0, r0=r0, rcut1=begin / r0, rcut2=end / r0, neighbor_list=_inside_list(form)
+    )
+
+
+def _morse_hard(form: PairForm) -> Calculator:
+    return _morse(form, 2.0 * form.r_cut, 3.0 * form.r_cut)
+
+
+def _morse_quintic(form: PairForm) -> Calculator:
+    return _morse(form, form.r_onset, form.r_cut)
+
+
+_ASE_PAIR: dict[tuple[str, str], Callable[[PairForm], Calculator]] = {
+    ("lennard-jones", "hard"): LennardJonesHard,
+    ("lennard-jones", "shifted"): _lennard_jones_shifted,
+    ("lennard-jones", "switched"): _lennard_jones_switched,
+    ("morse", "hard"): _morse_hard,
+    ("morse", "shifted"): MorseShifted,
+    ("morse", "quintic"): _morse_quintic,
+}
+_WORDS = {
+    ("lennard-jones", "hard"): ("ASE LennardJones", "energy + u(r_cut) for each pair inside; forces as they are"),
+    ("lennard-jones", "shifted"): ("ASE LennardJones", "none"),
+    ("lennard-jones", "switched"): ("ASE LennardJones (smooth)", "none: ro is the onset"),
+    ("morse", "hard"): ("ASE MorsePotential", "its own switch moved beyond the pairs listed"),
+    ("morse", "shifted"): ("ASE MorsePotential", "its own switch moved away; energy - u(r_cut) for each pair inside"),
+    ("morse", "quintic"): ("ASE MorsePotential", "rho0 = alpha r0, rcut1 = onset / r0, rcut2 = r_cut / r0"),
+}
+
+
+def _tersoff() -> Reference:
+    from ase.calculators.tersoff import Tersoff, TersoffParameters
+
+    constants = TersoffParameters(**asdict(TersoffModel()))
+    return Reference("ASE Tersoff", True, "none", lambda: Tersoff({("Si", "Si", "Si"): constants}, skin=0.0))
+
+
+def _eam(system: System) -> Reference:
+    (file,) = system.tables
+    return Reference("ASE EAM", True, "none", lambda: _short_listed_eam(file))
+
+
+def _short_listed_eam(file: Path) -> Calculator:
+    """ASE's EAM with a list of the length it needs: its own reaches 2 (cutoff + skin) and takes minutes."""
+    from ase.calculators.eam import EAM
+    from ase.neighborlist import NeighborList
+
+    class ShortListed(EAM):
+        def update(self, atoms):
+            self.Nelements = len(self.elements)
+            self.index = np.array([self.elements.index(symbol) for symbol in atoms.get_chemical_symbols()])
+            self.pbc = atoms.get_pbc()
+            self.neighbors = NeighborList(
+                np.full(len(atoms), 0.5 * self.cutoff * (1 + 1e-12)), skin=0.0, self_interaction=False, bothways=True
+            )
+            self.neighbors.update(atoms)
+
+    return ShortListed(potential=str(file), form="alloy", skin=0.0)
