@@ -84,10 +84,6 @@ def main(arguments: list[str] | None = None) -> NoReturn:
         print_error(asked, as_json=as_json)
         sys.exit(EXIT_USAGE)
     except (KeyboardInterrupt, typer.Abort):
-        print_error(
-            MdnumError("stopped", remedy="A run folder continues with `mdnum run --resume FOLDER`"),
-            as_json=as_json,
-        )
         sys.exit(EXIT_STOPPED)
     except OSError as error:
         # a full disk, a folder without write permission: the person's to mend, not a bug to trace

@@ -31,6 +31,12 @@ SET_OPTION = typer.Option(
 )
 
 
+class Stopped(MdnumError):
+    """Somebody pressed control-C."""
+
+    exit_code = EXIT_STOPPED
+
+
 def parse_overrides(settings: Sequence[str] | None) -> dict[str, str]:
     """The `--set key=value` words as a mapping.
 

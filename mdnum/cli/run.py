@@ -49,18 +49,23 @@ def run(
 
     from mdnum.rollout import run as run_system
 
-    with ProgressBar() as progress:
-        result = run_system(
-            system,
-            out=out,
-            steps=steps,
-            save_every=save_every,
-            overrides=overrides,
-            resume=resume,
-            check=not no_check,
-            report=not no_report,
-            progress=progress,
-        )
+    try:
+        with ProgressBar() as progress:
+            result = run_system(
+                system,
+                out=out,
+                steps=steps,
+                save_every=save_every,
+                overrides=overrides,
+                resume=resume,
+                check=not no_check,
+                report=not no_report,
+                progress=progress,
+            )
+    except KeyboardInterrupt:
+        raise output.Stopped(
+            "stopped", remedy=f"Continue with `mdnum run --resume {resume or out}`"
+        ) from None
     summary = dict(result.summary)
     if as_json:
         output.print_json({"folder": result.folder, **summary})

@@ -1,0 +1,282 @@
+"""The command line parses, calls and prints: exit codes, one JSON document, one line an error."""
+
+from __future__ import annotations
+
+import io
+import json
+import subprocess
+import sys
+import types
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mdnum.rollout
+from mdnum.cli import main, output
+from mdnum.cli.progress import ProgressBar, describe
+from mdnum.cli.run import default_folder
+from mdnum.errors import InputError, NumericalError
+
+SUMMARY: dict[str, Any] = {
+    "system": "argon/crystal-108",
+    "atoms": 108,
+    "steps": 200,
+    "flips_entered": 1_234,
+    "flips_left": 1_230,
+    "rebuilds": 3,
+    "dangerous_builds": 0,
+    "lost_pairs": 0,
+    "ambiguous": 0,
+    "energy_drift": 1e-9,
+    "energy_budget_residual": 2e-12,
+    "energy_budget_closes": True,
+    "steps_per_second": np.float64(512.0),
+    "ase": {"energy_rel": 1e-16, "force_max": float("nan"), "stress_max": None, "ok": True},
+    "findings": [],
+    "verdict": "2,464 flips, none ambiguous.",
+    "status": "complete",
+}
+
+
+@dataclass
+class Recorder:
+    """A rollout that remembers how it was called and answers what it was told to."""
+
+    summary: dict[str, Any] = field(default_factory=lambda: dict(SUMMARY))
+    error: Exception | None = None
+    calls: list[tuple[Any, dict[str, Any]]] = field(default_factory=list)
+
+    def __call__(self, system: Any, **options: Any) -> Any:
+        self.calls.append((system, options))
+        if self.error is not None:
+            raise self.error
+        options["progress"](1, 200, {"phase": "run", "steps_per_second": 10.0, "flips": 1, "rebuilds": 0})
+        return types.SimpleNamespace(folder=options["out"], summary=self.summary)
+
+
+@pytest.fixture
+def rollout(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Recorder:
+    """`mdnum run` in an empty folder with the rollout replaced by a recorder."""
+    recorder = Recorder()
+    monkeypatch.setattr(mdnum.rollout, "run", recorder, raising=False)
+    monkeypatch.chdir(tmp_path)
+    return recorder
+
+
+def call(*arguments: str) -> int:
+    """The exit code of `mdnum ARGUMENTS`."""
+    with pytest.raises(SystemExit) as stopped:
+        main(list(arguments))
+    assert isinstance(stopped.value.code, int)
+    return stopped.value.code
+
+
+def test_run_passes_on_what_was_asked(rollout: Recorder):
+    code = call(
+        "run", "argon/crystal-108", "-o", "here", "--steps", "200", "--save-every", "5",
+        "--set", "cutoff.kind=switched", "--set", "dynamics.seed = 3", "--no-check", "--no-report",
+    )  # fmt: skip
+    assert code == 0
+    ((system, options),) = rollout.calls
+    progress = options.pop("progress")
+    assert isinstance(progress, ProgressBar)
+    assert system == "argon/crystal-108"
+    assert options == {
+        "out": Path("here"),
+        "steps": 200,
+        "save_every": 5,
+        "overrides": {"cutoff.kind": "switched", "dynamics.seed": "3"},
+        "resume": None,
+        "check": False,
+        "report": False,
+    }
+
+
+def test_run_prints_what_a_person_wants_to_know(rollout: Recorder, capsys: pytest.CaptureFixture[str]):
+    assert call("run", "argon/crystal-108") == 0
+    out, err = capsys.readouterr()
+    assert "2,464 flips, none ambiguous." in out
+    assert "1,234 entered, 1,230 left" in out
+    assert "closes" in out
+    assert "wrote runs/argon-crystal-108-1" in out
+    assert err == ""
+
+
+def test_run_as_json_is_one_document(rollout: Recorder, capsys: pytest.CaptureFixture[str]):
+    assert call("run", "argon/crystal-108", "--json") == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["flips_entered"] == 1_234
+    assert document["steps_per_second"] == 512.0
+    assert document["ase"]["force_max"] is None, "JSON has no NaN"
+    assert document["folder"] == "runs/argon-crystal-108-1"
+
+
+@pytest.mark.parametrize(
+    ("severity", "expected"), [("info", 0), ("warning", 1), ("error", 1)]
+)  # fmt: skip
+def test_findings_decide_the_exit_code(
+    rollout: Recorder, capsys: pytest.CaptureFixture[str], severity: str, expected: int
+):
+    rollout.summary["findings"] = [
+        {"code": "x", "severity": severity, "title": "A title", "text": "Seen.", "remedy": "Do this."}
+    ]
+    assert call("run", "argon/crystal-108") == expected
+    out = capsys.readouterr().out
+    assert f"{severity}: A title" in out
+    assert "Do this." in out
+
+
+def test_a_run_that_did_not_end_is_a_finding(rollout: Recorder):
+    rollout.summary["status"] = "stopped"
+    assert call("run", "argon/crystal-108") == 1
+
+
+def test_resume_needs_only_the_folder(rollout: Recorder):
+    assert call("run", "--resume", "runs/x-1") == 0
+    ((system, options),) = rollout.calls
+    assert system is None
+    assert options["out"] is None
+    assert options["resume"] == Path("runs/x-1")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["run"],
+        ["run", "x", "--set", "no-equals-sign"],
+        ["run", "x", "--set", "a=1", "--set", "a=2"],
+        ["run", "x", "--steps", "0"],
+        ["run", "x", "--steps", "many"],
+        ["run", "x", "--no-such-option"],
+        ["run", "--resume", "a", "-o", "b"],
+        ["run", "--resume", "a", "--set", "a=1"],
+        ["no-such-verb"],
+        ["check", "energy"],
+        ["report"],
+    ],
+)
+def test_mistakes_are_one_line_and_exit_2(
+    rollout: Recorder, capsys: pytest.CaptureFixture[str], arguments: list[str]
+):
+    assert call(*arguments) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("mdnum: ")
+    assert err.count("\n") == 1
+    assert rollout.calls == []
+
+    assert call(*arguments, "--json") == 2
+    out, _ = capsys.readouterr()
+    assert json.loads(out)["error"]["exit_code"] == 2
+
+
+@pytest.mark.parametrize(
+    ("error", "expected"),
+    [
+        (InputError("r_cut + skin is 9.5 Å", remedy="Shrink it", where="a.toml"), 2),
+        (NumericalError("potential energy is NaN", where="step 12"), 1),
+        (OSError(28, "No space left on device", "runs/x-1/series.parquet"), 2),
+        (KeyboardInterrupt(), 130),
+    ],
+)
+def test_errors_of_a_run_are_one_line(
+    rollout: Recorder, capsys: pytest.CaptureFixture[str], error: Exception, expected: int
+):
+    rollout.error = error
+    assert call("run", "x", "--json") == expected
+    out, err = capsys.readouterr()
+    assert err.startswith("mdnum: ")
+    assert err.count("\n") == 1
+    document = json.loads(out)["error"]
+    if isinstance(error, InputError):
+        assert document == {
+            "type": "InputError",
+            "message": "r_cut + skin is 9.5 Å",
+            "where": "a.toml",
+            "remedy": "Shrink it",
+            "exit_code": 2,
+        }
+    if isinstance(error, OSError):
+        assert "No space left" in err
+        assert "series.parquet" in err
+
+
+def test_a_bug_keeps_its_traceback(rollout: Recorder):
+    rollout.error = RuntimeError("a defect of mdnum")
+    with pytest.raises(RuntimeError, match="a defect"):
+        main(["run", "x"])
+
+
+def test_default_folders_count_up(tmp_path: Path):
+    assert default_folder("argon/liquid-864", tmp_path).name == "argon-liquid-864-1"
+    for name in ("argon-liquid-864-1", "argon-liquid-864-9", "argon-liquid-864-x", "argon-liquid-8"):
+        (tmp_path / name).mkdir()
+    assert default_folder("argon/liquid-864", tmp_path).name == "argon-liquid-864-10"
+    assert default_folder("some where/my liquid.toml", tmp_path).name == "my-liquid-1"
+
+
+def test_version_and_help(capsys: pytest.CaptureFixture[str]):
+    assert call("--version") == 0
+    assert capsys.readouterr().out.startswith("mdnum 0.")
+    assert call("--help") == 0
+    out = capsys.readouterr().out
+    assert all(verb in out for verb in ("run", "systems", "check", "report", "doctor"))
+    assert call() == 2
+    assert "Usage: mdnum" in capsys.readouterr().out
+
+
+def test_python_m_mdnum_is_mdnum():
+    done = subprocess.run([sys.executable, "-m", "mdnum", "run"], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2
+    assert done.stderr.startswith("mdnum: no system given")
+
+
+class _Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+INFO = {"phase": "run", "steps_per_second": 10.0, "flips": 1_500, "rebuilds": 2}
+
+
+def test_progress_appears_at_a_terminal_after_a_while():
+    stream = _Terminal()
+    with ProgressBar(stream, delay=0.05) as progress:
+        progress(100, 1_000, INFO)
+        assert not progress.shown
+        assert progress._timer is not None
+        progress._timer.join(20)
+        assert progress.shown
+        progress(200, 1_000, INFO)
+    assert stream.getvalue() != ""
+
+
+def test_progress_stays_away_from_pipes_and_short_runs():
+    pipe = io.StringIO()
+    with ProgressBar(pipe, delay=0.0) as progress:
+        progress(100, 1_000, INFO)
+        assert progress._timer is None
+    short = _Terminal()
+    with ProgressBar(short, delay=60.0) as progress:
+        progress(100, 1_000, INFO)
+    assert progress._timer is not None
+    progress._timer.join(20)
+    assert not progress._timer.is_alive()
+    assert pipe.getvalue() == short.getvalue() == ""
+
+
+def test_progress_line_has_rate_flips_rebuilds_and_eta():
+    line = describe(100, 1_000, INFO)
+    assert line == "100 of 1,000 steps  10 steps/s  1,500 flips  2 rebuilds  ETA 00:01:30"
+
+
+def test_plain_makes_json_of_what_a_run_holds():
+    document = {
+        "a": np.float64("inf"), "b": np.arange(3), "c": Path("x"), "d": (True, None), "e": np.bool_(True)
+    }  # fmt: skip
+    assert output.plain(document) == {"a": None, "b": [0, 1, 2], "c": "x", "d": [True, None], "e": True}
+    with pytest.raises(TypeError, match="object has no JSON form"):
+        output.plain(object())

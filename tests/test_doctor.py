@@ -1,0 +1,143 @@
+"""The doctor finds what it claims to find, and is content with this installation."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mdnum.doctor import Diagnosis, Row, arithmetic, crystal, diagnose, installation
+
+
+@pytest.fixture(scope="module")
+def diagnosis() -> Diagnosis:
+    return diagnose()
+
+
+def test_this_installation_is_safe(diagnosis: Diagnosis):
+    assert diagnosis.ok, [row for row in diagnosis.rows if row.status == "unsafe"]
+    names = {row.name for row in diagnosis.rows}
+    assert {"float64", "tilted crystal", "jit = eager = numpy", "second process", "devices"} <= names
+
+
+def test_it_answers_in_time(diagnosis: Diagnosis):
+    assert diagnosis.seconds < 20
+
+
+def test_every_unsafe_row_says_what_to_do_and_decides_the_verdict():
+    bad = Row("x", "unsafe", "seen", "do this")
+    assert not Diagnosis((Row("y", "ok", ""), bad), 1.0).ok
+    assert Diagnosis((Row("y", "ok", ""), Row("z", "info", "")), 1.0).ok
+    assert Diagnosis((bad,), 1.0).to_dict()["rows"][0]["remedy"] == "do this"
+
+
+def test_crystal_is_large_enough_and_honest():
+    cell, fractional, slots = crystal.tilted_crystal()
+    assert len(slots) > 16_384
+    assert fractional.shape == (500, 3)
+    # the smallest perpendicular width allows the minimum image
+    volume = abs(np.linalg.det(cell))
+    widths = [volume / np.linalg.norm(np.cross(cell[:, (k + 1) % 3], cell[:, (k + 2) % 3])) for k in range(3)]
+    assert min(widths) > 2 * (8.5125 + 0.4)
+    assert np.count_nonzero(cell) == 6
+
+
+def test_trap_sees_the_defect_of_jax_0_10_2(monkeypatch: pytest.MonkeyPatch):
+    """The defect put back by hand: under jit one coordinate of late rows is taken from another row."""
+    right = crystal.squared_distances
+
+    def wrong(cell, fractional, slots):
+        r2 = right(cell, fractional, slots)
+        if isinstance(cell, jax.core.Tracer):
+            r2 = r2.at[-2000:].set(jnp.roll(r2, 1)[-2000:])
+        return r2
+
+    assert crystal.trap().status == "ok"
+    monkeypatch.setattr(crystal, "squared_distances", wrong)
+    row = crystal.trap()
+    assert row.status == "unsafe"
+    assert row.remedy is not None
+    assert "!=0.10.2" in row.remedy
+
+
+def test_trap_calls_a_nan_unsafe(monkeypatch: pytest.MonkeyPatch):
+    right = crystal.squared_distances
+    monkeypatch.setattr(crystal, "squared_distances", lambda *a: right(*a).at[5].set(jnp.nan))
+    assert crystal.trap().status == "unsafe"
+
+
+def test_known_bad_versions_are_named(monkeypatch: pytest.MonkeyPatch):
+    assert installation.jax_version().status == "ok"
+    monkeypatch.setattr(jax, "__version__", "0.10.2")
+    row = installation.jax_version()
+    assert row.status == "unsafe"
+    assert "39103" in row.seen
+
+
+def _rows_under(code: str, **environment: str) -> str:
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=120,
+        env={**os.environ, **environment},
+    )
+    return done.stdout.strip().splitlines()[-1]
+
+
+def test_fast_math_is_unsafe():
+    """Asked of a real XLA, with the flag that allows it to reorder sums."""
+    code = "from mdnum.doctor import installation as i; print(i.flags().status)"
+    assert _rows_under(code, XLA_FLAGS="--xla_cpu_enable_fast_math=true") == "unsafe"
+    assert _rows_under(code, XLA_FLAGS="--xla_cpu_enable_fast_math=false") == "info"
+
+
+def test_contraction_is_computed_and_not_assumed():
+    """The same question has another answer on a processor without FMA."""
+    code = "from mdnum.doctor import arithmetic as a; print(a.contraction().status)"
+    assert _rows_under(code, XLA_FLAGS="--xla_cpu_max_isa=AVX") == "ok"
+
+
+def test_a_lost_float64_is_unsafe():
+    with jax.enable_x64(False):
+        row = arithmetic.float64()
+    assert row.status == "unsafe"
+    assert "float32" in row.seen
+    assert arithmetic.float64().status == "ok"
+
+
+def test_elementwise_sees_a_single_wrong_bit(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(np, "sqrt", lambda a: np.power(a, 0.5) * (1 + np.finfo(a.dtype).eps))
+    row = arithmetic.elementwise()
+    assert row.status == "unsafe"
+    assert "sqrt" in row.seen
+    assert "add" not in row.seen
+
+
+def test_another_process_with_other_bits_is_unsafe():
+    here = crystal.digest()
+    same = installation.Child.start(installation.DIGEST_CODE)
+    assert installation.second_process(same, here, 60).status == "ok"
+    other = installation.Child.start("print('0' * 64)")
+    assert installation.second_process(other, here, 60).status == "unsafe"
+    slow = installation.Child.start("import time; time.sleep(60)")
+    assert installation.second_process(slow, here, 0.5).status == "info"
+    broken = installation.Child.start("raise SystemExit(3)")
+    assert installation.second_process(broken, here, 60).status == "unsafe"
+
+
+def test_digest_depends_on_every_step():
+    assert crystal.digest(50) != crystal.digest(49)
+
+
+def test_a_missing_package_is_unsafe(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(installation, "PACKAGES", ("numpy", "no-such-package-at-all"))
+    (row,) = installation.versions()
+    assert row.status == "unsafe"
+    assert "no-such-package-at-all" in row.seen
