@@ -1,0 +1,109 @@
+"""What is recorded about a run is complete, plain, and changes when something that matters changes."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import types
+from pathlib import Path
+
+import ase.build
+import pytest
+
+import mdnum
+from mdnum import provenance
+
+
+def _system(path: Path | None = None) -> types.SimpleNamespace:
+    atoms = ase.build.bulk("Ar", "fcc", 5.26, cubic=True)
+    return types.SimpleNamespace(name="argon/cell", spec=None, path=path, atoms=atoms)
+
+
+def test_collect_is_json_and_names_what_decides_bits():
+    record = provenance.collect(_system())
+    assert json.loads(json.dumps(record)) == record
+    assert record["system"] == "argon/cell"
+    assert record["versions"]["mdnum"] == mdnum.__version__
+    assert record["versions"]["jax"]
+    assert record["jax_settings"]["jax_enable_x64"] is True
+    assert record["devices"][0]["platform"]
+    assert len(record["fingerprint"]) == 16
+
+
+def test_two_records_of_one_system_have_one_fingerprint(monkeypatch: pytest.MonkeyPatch):
+    first, second = provenance.collect(_system()), provenance.collect(_system())
+    assert first["fingerprint"] == second["fingerprint"]
+    assert first["hashes"] == second["hashes"]
+    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_max_isa=AVX")
+    other = provenance.collect(_system())
+    assert other["fingerprint"] != first["fingerprint"]
+    assert other["environment"]["XLA_FLAGS"] == "--xla_cpu_max_isa=AVX"
+
+
+def test_structure_hash_sees_a_last_bit_and_not_a_file_format(tmp_path: Path):
+    system = _system()
+    before = provenance.hashes(system)
+    assert before["file"] is None
+    system.atoms.positions[1, 2] *= 1 + 2**-52
+    after = provenance.hashes(system)
+    assert after["structure"] != before["structure"]
+
+
+def test_file_hash_is_that_of_its_bytes(tmp_path: Path):
+    path = tmp_path / "a.toml"
+    path.write_text("abc")
+    # FIPS 180-2, appendix B.1
+    expected = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+    assert provenance.hashes(_system(path))["file"] == expected
+
+
+def test_fingerprint_ignores_the_order_of_keys():
+    assert provenance.fingerprint({"a": 1, "b": 2}) == provenance.fingerprint({"b": 2, "a": 1})
+    assert provenance.fingerprint({"a": 1}) != provenance.fingerprint({"a": 2})
+
+
+@pytest.mark.parametrize(
+    ("text", "model", "flags"),
+    [
+        ("model name\t: X\nflags\t\t: fpu avx fma avx2\nmodel name\t: Y\n", "X", ["avx", "fma", "avx2"]),
+        ("Features\t: fp asimd sve\n", None, ["asimd", "sve"]),
+        ("nothing here\n", None, None),
+    ],
+)  # fmt: skip
+def test_cpu_is_read_from_either_kind_of_description(
+    tmp_path: Path, text: str, model: str | None, flags: list[str] | None
+):
+    cpuinfo = tmp_path / "cpuinfo"
+    cpuinfo.write_text(text)
+    found = provenance.cpu(cpuinfo)
+    assert found["flags"] == flags
+    assert found["model"]
+    if model:
+        assert found["model"] == model
+
+
+def test_commit_belongs_to_mdnum_and_says_when_files_changed(tmp_path: Path):
+    def git(*words: str) -> str:
+        identity = ["-c", "user.name=a", "-c", "user.email=a@b.invalid", "-c", "commit.gpgsign=false"]
+        done = subprocess.run(
+            ["git", "-C", str(tmp_path), *identity, *words], capture_output=True, text=True, check=True
+        )
+        return done.stdout.strip()
+
+    if shutil.which("git") is None:
+        assert provenance.commit(tmp_path) is None
+        return
+    git("init", "--quiet")
+    assert provenance.commit(tmp_path) is None
+    (tmp_path / "other.py").write_text("x = 1\n")
+    git("add", ".")
+    git("commit", "--quiet", "-m", "somebody else's repository")
+    (tmp_path / "provenance.py").write_text("x = 1\n")
+    assert provenance.commit(tmp_path) is None, "installed into a folder that git does not track"
+    git("add", ".")
+    git("commit", "--quiet", "-m", "mdnum's own")
+    head = git("rev-parse", "HEAD")
+    assert provenance.commit(tmp_path) == head
+    (tmp_path / "provenance.py").write_text("x = 2\n")
+    assert provenance.commit(tmp_path) == head + "+"
