@@ -1,0 +1,153 @@
+"""Constants and cutoff radii of every pair of species, as square arrays; and the longest interaction.
+
+A system file gives one set of constants, or one per pair of species; what computes wants arrays indexed by
+two species numbers. No mixing rule is applied: a structure with several species must list every pair, so
+that a forgotten cross term is an error and not a guess.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations_with_replacement
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from mdnum.errors import InputError
+from mdnum.systems import schema
+from mdnum.systems.schema import SystemSpec, pair_key
+
+_BUILT_IN_RADIUS = {
+    # longest interaction in Å: a·σ of Stillinger and Weber's silicon; R + D of Tersoff's T3 silicon
+    ("stillinger-weber", "Si"): 1.8 * 2.0951,
+    ("tersoff", "Si"): 3.0,
+}
+
+Table = Float64[np.ndarray, "species species"]
+
+
+def pair_constants(spec: SystemSpec, species: tuple[str, ...]) -> dict[str, Table]:
+    """Each constant of a pair potential for every pair of species.
+
+    Args:
+        spec: a system with a pair potential.
+        species: chemical symbols in the order of the rows.
+
+    Returns:
+        arrays (species, species), symmetric, in the file's units, by name: sigma and epsilon; depth, alpha
+        and r0; or sigma, epsilon and alpha.
+
+    Raises:
+        InputError: a pair of species has no constants.
+    """
+    potential = spec.potential
+    if not isinstance(potential, schema.PairPotential):
+        raise TypeError(f"{potential.kind} is not a pair potential")
+    given = {pair_key(*name.split("-")): row for name, row in (potential.pairs or {}).items()}
+    tables = {name: np.zeros((len(species), len(species))) for name in potential.constants}
+    missing = []
+    for a, b in combinations_with_replacement(range(len(species)), 2):
+        row = given.get(pair_key(species[a], species[b]))
+        if row is None and not (len(species) == 1 and getattr(potential, potential.constants[0]) is not None):
+            missing.append(f"{species[a]}-{species[b]}")
+            continue
+        for name, table in tables.items():
+            table[a, b] = table[b, a] = getattr(potential if row is None else row, name)
+    if missing:
+        known = ", ".join(potential.pairs) if potential.pairs else "one set for all"
+        raise InputError(
+            f"the structure holds {', '.join(species)}, but [potential] has no constants for "
+            f"{', '.join(missing)} (it has {known})",
+            remedy=f"Add [potential.pairs.{missing[0]}] and the like, or correct the structure's species",
+        )
+    return tables
+
+
+def cutoff_radii(spec: SystemSpec, species: tuple[str, ...]) -> tuple[Table, Table | None]:
+    """Cutoff radius and onset for every pair of species.
+
+    Returns:
+        radius and onset, arrays (species, species) in the file's units; onset is None for a cutoff without
+        one. Pairs with a radius of their own keep the ratio onset / radius.
+
+    Raises:
+        InputError: a pair of species has no radius.
+    """
+    cutoff = spec.cutoff
+    if cutoff is None:
+        raise TypeError(f"{spec.potential.kind} has no [cutoff]")
+    given = {pair_key(*name.split("-")): radius for name, radius in (cutoff.pairs or {}).items()}
+    shape = (len(species), len(species))
+    if cutoff.in_sigma is not None:
+        radius = cutoff.in_sigma * pair_constants(spec, species)["sigma"]
+    else:
+        radius = np.full(shape, np.nan if cutoff.radius is None else cutoff.radius)
+    for a, b in np.ndindex(shape):
+        radius[a, b] = given.get(pair_key(species[a], species[b]), radius[a, b])
+    if np.isnan(radius).any():
+        a, b = (int(k) for k in np.argwhere(np.isnan(radius))[0])
+        raise InputError(
+            f"[cutoff.pairs] has no radius for {species[a]}-{species[b]} (it has {', '.join(given)})",
+            remedy="Add it, or give a radius for every other pair as cutoff.radius",
+        )
+    if not isinstance(cutoff, schema.SwitchingCutoff):
+        return radius, None
+    if cutoff.onset is None:
+        return radius, schema.ONSET_FRACTION * radius
+    base = cutoff.radius if cutoff.radius is not None else cutoff.in_sigma
+    if base is None:
+        raise TypeError("an onset without a radius passes no schema")
+    # one radius for all: keep the onset as written instead of rounding it through the ratio
+    scaled = radius * (cutoff.onset / base)
+    return radius, np.where(radius == cutoff.radius, cutoff.onset, scaled) if cutoff.radius else scaled
+
+
+def longest_radius(spec: SystemSpec, species: tuple[str, ...], folder: Path) -> float:
+    """The distance beyond which no pair of atoms interacts directly (length).
+
+    Args:
+        spec: the system.
+        species: chemical symbols present.
+        folder: where a potential table is looked for.
+    """
+    potential = spec.potential
+    if isinstance(potential, schema.EmbeddedAtom):
+        return _setfl_header(folder / potential.file, species)
+    if isinstance(potential, schema.ManyBodyPotential):
+        unknown = [name for name in species if name != potential.parameters]
+        if unknown:
+            raise InputError(
+                f"{potential.kind} has constants for {potential.parameters}, but the structure holds "
+                f"{', '.join(unknown)}",
+                remedy="Correct the structure or the potential",
+            )
+        return _BUILT_IN_RADIUS[potential.kind, potential.parameters]
+    radius, _ = cutoff_radii(spec, species)
+    pair_constants(spec, species)
+    return float(radius.max())
+
+
+def _setfl_header(path: Path, species: tuple[str, ...]) -> float:
+    try:
+        with path.open(encoding="utf-8") as file:
+            lines = [next(file) for _ in range(5)]
+        elements = lines[3].split()[1:]
+        cutoff = float(lines[4].split()[4])
+    except FileNotFoundError:
+        raise InputError(
+            "no such potential table", where=str(path), remedy="Correct potential.file"
+        ) from None
+    except (OSError, UnicodeDecodeError, StopIteration, IndexError, ValueError) as error:
+        raise InputError(
+            f"not a setfl table ({type(error).__name__} in its five header lines)",
+            where=str(path),
+            remedy="An .eam.alloy file has three comment lines, the elements, then nrho drho nr dr cutoff",
+        ) from error
+    unknown = [name for name in species if name not in elements]
+    if unknown:
+        raise InputError(
+            f"the table has {', '.join(elements)}, but the structure holds {', '.join(unknown)}",
+            where=str(path),
+            remedy="Correct the structure or the potential",
+        )
+    return cutoff

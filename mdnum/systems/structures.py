@@ -1,0 +1,286 @@
+"""Structures: reading or building one, checking that it can be simulated, writing it without losing a bit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float64
+
+from mdnum.errors import InputError
+from mdnum.systems import schema
+from mdnum.systems.messages import nearest
+
+if TYPE_CHECKING:
+    from ase import Atoms
+
+_AXES = "xyz"
+
+_SMALLEST_DISTANCE = 0.3
+"""Closer than this (Å) is a mistake in any structure of metal units without a pair sigma."""
+
+_SMALLEST_IN_SIGMA = 0.4
+"""Lennard-Jones atoms closer than this many σ (240,000 ε) are a mistake and not a hot pair."""
+
+
+def make(structure: schema.FileStructure | schema.BuilderStructure, units: str, folder: Path) -> Atoms:
+    """The atoms a [structure] table describes, in float64, with nothing attached.
+
+    Args:
+        structure: the table.
+        units: "metal" or "lj"; in lj every mass is 1 unless given.
+        folder: where structure.file is looked for.
+
+    Returns:
+        atoms with positions, cell, pbc, masses where they differ from ASE's, momenta where the file has them.
+
+    Raises:
+        InputError: a missing or unreadable file, an unknown symbol, constraints.
+    """
+    from ase import Atoms
+
+    if isinstance(structure, schema.FileStructure):
+        source = _read(folder / structure.file, structure.index)
+    else:
+        source = _build(structure)
+    atoms = Atoms(
+        numbers=source.numbers,
+        positions=np.asarray(source.positions, dtype=np.float64),
+        cell=np.asarray(source.cell, dtype=np.float64),
+        pbc=source.pbc if structure.pbc is None else structure.pbc,
+    )
+    _set_masses(atoms, source, structure, units)
+    if structure.velocities == "file" and source.has("momenta"):
+        # momenta and not velocities: dividing by the mass once keeps what is written and read the same bits
+        atoms.set_momenta(np.asarray(source.get_momenta(), dtype=np.float64))
+    return atoms
+
+
+def _read(path: Path, index: int) -> Atoms:
+    import ase.io
+    from ase import Atoms
+
+    if not path.is_file():
+        raise InputError("no such structure file", where=str(path), remedy="Correct structure.file")
+    try:
+        found = ase.io.read(path, index=index)
+    except Exception as error:
+        # ase's readers raise whatever their parsing meets; every one of them means the same to the reader
+        detail = " ".join(str(error).split()) or "no more detail"
+        raise InputError(
+            f"cannot be read as a structure ({type(error).__name__}: {detail})",
+            where=str(path),
+            remedy="Check that `ase.io.read` opens it; extxyz is the safest format",
+        ) from error
+    if not isinstance(found, Atoms) or len(found) == 0:
+        raise InputError(
+            "holds no atoms", where=str(path), remedy="Correct structure.file or structure.index"
+        )
+    if found.constraints:
+        raise InputError(
+            "holds constraints (fixed atoms), which mdnum does not apply",
+            where=str(path),
+            remedy="Remove them from the structure",
+        )
+    return found
+
+
+def _build(structure: schema.BuilderStructure) -> Atoms:
+    from ase.build import bulk
+    from ase.data import atomic_numbers
+
+    if structure.symbol not in atomic_numbers:
+        near = nearest(structure.symbol, atomic_numbers)
+        raise InputError(
+            f"structure.symbol = {structure.symbol!r} is no chemical symbol",
+            remedy=f"Did you mean {near}?" if near else "Use one such as Ar",
+        )
+    atoms = bulk(structure.symbol, structure.builder, a=structure.lattice_constant, cubic=True)
+    atoms = atoms.repeat(structure.repeat)
+    xy, xz, yz = structure.tilt
+    if any(structure.tilt):
+        shear = np.array([[1.0, 0.0, 0.0], [xy, 1.0, 0.0], [xz, yz, 1.0]])
+        atoms.set_cell(np.asarray(atoms.cell) @ shear, scale_atoms=False)
+        atoms.positions = atoms.positions @ shear
+    if structure.rattle > 0:
+        atoms.rattle(structure.rattle, seed=structure.seed)
+    atoms.pbc = True
+    return atoms
+
+
+def _set_masses(
+    atoms: Atoms, source: Atoms, structure: schema.FileStructure | schema.BuilderStructure, units: str
+) -> None:
+    given = structure.masses or {}
+    present = sorted(set(atoms.get_chemical_symbols()))
+    unknown = [name for name in given if name not in present]
+    if unknown:
+        raise InputError(
+            f"structure.masses names {', '.join(unknown)}, but the structure holds {', '.join(present)}",
+            remedy="Correct the species in [structure.masses]",
+        )
+    if source.has("masses"):
+        masses = np.asarray(source.get_masses(), dtype=np.float64)
+    elif units == "lj":
+        masses = np.ones(len(atoms))
+    elif given:
+        masses = atoms.get_masses()
+    else:
+        return
+    for name, mass in given.items():
+        masses[atoms.symbols == name] = mass
+    if not (np.isfinite(masses).all() and (masses > 0).all()):
+        bad = int(np.argmin(np.where(np.isfinite(masses), masses, -1.0)))
+        raise InputError(
+            f"atom {bad} ({atoms.symbols[bad]}) has mass {masses[bad]:g}",
+            remedy="Correct the structure's masses column or give [structure.masses]",
+        )
+    atoms.set_masses(masses)
+
+
+def perpendicular_widths(
+    cell: Float64[np.ndarray, "3 3"], pbc: Sequence[bool] | np.ndarray
+) -> Float64[np.ndarray, " 3"]:
+    """Distance between opposite faces of the box along each cell vector (length); inf where it is free.
+
+    Half the smallest one is the longest distance for which the nearest image is the only one.
+    """
+    from ase.geometry import complete_cell
+
+    whole = complete_cell(cell)
+    reciprocal = np.linalg.inv(whole)
+    widths = 1.0 / np.linalg.norm(reciprocal, axis=0)
+    return np.where(np.asarray(pbc, dtype=bool), widths, np.inf)
+
+
+def check(atoms: Atoms, spec: schema.SystemSpec, r_cut: float, length: str) -> None:
+    """Refuse a structure that cannot be simulated.
+
+    Args:
+        atoms: the structure.
+        spec: the system it belongs to.
+        r_cut: longest interaction (length).
+        length: name of the unit of length, for messages.
+
+    Raises:
+        InputError: non-finite numbers, a missing cell vector, a box too small for r_cut + skin, overlaps.
+    """
+    _check_finite(atoms)
+    _check_cell(atoms)
+    _check_width(atoms, r_cut, spec.skin, length)
+    _check_overlap(atoms, _smallest_distance(spec), length)
+
+
+def _check_finite(atoms: Atoms) -> None:
+    names = ["positions", "momenta"] if atoms.has("momenta") else ["positions"]
+    for name in names:
+        bad = ~np.isfinite(atoms.arrays[name]).all(axis=1)
+        if bad.any():
+            first = int(np.argmax(bad))
+            values = ", ".join(f"{value:g}" for value in atoms.arrays[name][first])
+            count = int(bad.sum())
+            raise InputError(
+                f"atom {first} ({atoms.symbols[first]}) has {name} ({values})"
+                + (f", and {count - 1} more atoms are like it" if count > 1 else ""),
+                remedy="Every coordinate must be a finite number; write the structure again",
+            )
+
+
+def _check_cell(atoms: Atoms) -> None:
+    cell = np.asarray(atoms.cell)
+    if not np.isfinite(cell).all():
+        raise InputError("the cell holds a number that is not finite", remedy="Correct the structure's cell")
+    for axis in range(3):
+        if atoms.pbc[axis] and not cell[axis].any():
+            raise InputError(
+                f"periodic along {_AXES[axis]}, but the structure has no cell vector there",
+                remedy='Give the structure a cell (extxyz: Lattice="..."), or set structure.pbc = '
+                "[false, false, false]",
+            )
+    from ase.geometry import complete_cell
+
+    used = cell[cell.any(axis=1)]
+    lengths = np.prod(np.linalg.norm(used, axis=1))
+    if len(used) and abs(np.linalg.det(complete_cell(cell))) < 1e-9 * lengths:
+        raise InputError("the cell vectors lie in a plane", remedy="Correct the structure's cell")
+
+
+def _check_width(atoms: Atoms, r_cut: float, skin: float, length: str) -> None:
+    widths = perpendicular_widths(np.asarray(atoms.cell), atoms.pbc)
+    half = float(widths.min()) / 2
+    if r_cut + skin <= half:
+        return
+    axis = "abc"[int(np.argmin(widths))]
+    allowed = (
+        f"a skin up to {half - r_cut:.4g} {length}" if r_cut < half else f"a cutoff below {half:.4g} {length}"
+    )
+    raise InputError(
+        f"r_cut + skin = {r_cut:g} + {skin:g} = {r_cut + skin:.6g} {length}, but half the smallest "
+        f"perpendicular width of the box (along {axis}) is {half:.6g} {length}, and a longer pair has two images",
+        remedy=f"This box allows {allowed}; or repeat the structure",
+    )
+
+
+def _smallest_distance(spec: schema.SystemSpec) -> float:
+    potential = spec.potential
+    if isinstance(potential, schema.SoftSphere):
+        # soft spheres may overlap; only coinciding centers, where the force has no direction, are wrong
+        return 1e-9
+    if isinstance(potential, schema.LennardJones):
+        sigmas = [potential.sigma] if potential.sigma is not None else []
+        sigmas += [row.sigma for row in (potential.pairs or {}).values()]
+        return _SMALLEST_IN_SIGMA * min(sigmas)
+    return _SMALLEST_DISTANCE if spec.units == "metal" else 1e-3
+
+
+def _check_overlap(atoms: Atoms, smallest: float, length: str) -> None:
+    from vesin import NeighborList
+
+    if len(atoms) < 2:
+        return
+    finder = NeighborList(cutoff=smallest, full_list=False)
+    i, j, distance = finder.compute(
+        points=atoms.positions, box=np.asarray(atoms.cell), periodic=atoms.pbc, quantities="ijd"
+    )
+    if len(distance) == 0:
+        return
+    worst = int(np.argmin(distance))
+    a, b = sorted((int(i[worst]), int(j[worst])))
+    more = f" ({len(distance)} such pairs)" if len(distance) > 1 else ""
+    raise InputError(
+        f"atoms {a} ({atoms.symbols[a]}) and {b} ({atoms.symbols[b]}) are {distance[worst]:.4g} {length} "
+        f"apart, closer than {smallest:.4g} {length}{more}",
+        remedy="They overlap: correct the positions, the cell or the units of the structure",
+    )
+
+
+def to_extxyz(atoms: Atoms) -> str:
+    """Extended XYZ text that gives every float64 back bit for bit (ase's own writer keeps 8 decimals)."""
+    columns = ["species:S:1", "pos:R:3"]
+    if atoms.has("momenta"):
+        columns.append("momenta:R:3")
+    if atoms.has("masses"):
+        columns.append("masses:R:1")
+    comment = []
+    cell = np.asarray(atoms.cell)
+    if cell.any():
+        comment.append(f'Lattice="{_numbers(cell.ravel())}"')
+    comment.append(f"Properties={':'.join(columns)}")
+    comment.append(f'pbc="{" ".join("T" if flag else "F" for flag in atoms.pbc)}"')
+    arrays = [atoms.positions]
+    if atoms.has("momenta"):
+        arrays.append(atoms.get_momenta())
+    if atoms.has("masses"):
+        arrays.append(atoms.get_masses()[:, None])
+    rows = np.hstack(arrays)
+    lines = [str(len(atoms)), " ".join(comment)]
+    lines += [
+        f"{symbol} {_numbers(row)}" for symbol, row in zip(atoms.get_chemical_symbols(), rows, strict=True)
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _numbers(values: np.ndarray) -> str:
+    return " ".join(repr(float(value)) for value in values)
