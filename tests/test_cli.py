@@ -6,6 +6,7 @@ import io
 import json
 import subprocess
 import sys
+import tomllib
 import types
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -280,3 +281,123 @@ def test_plain_makes_json_of_what_a_run_holds():
     assert output.plain(document) == {"a": None, "b": [0, 1, 2], "c": "x", "d": [True, None], "e": True}
     with pytest.raises(TypeError, match="object has no JSON form"):
         output.plain(object())
+
+
+CRYSTAL = """
+about = "A crystal to try the command line on."
+units = "metal"
+[structure]
+builder = "fcc"
+symbol = "Ar"
+lattice_constant = 5.26
+repeat = [4, 4, 4]
+rattle = 0.05
+[potential]
+kind = "lennard-jones"
+sigma = 3.405
+epsilon = 0.0103235
+[cutoff]
+kind = "hard"
+radius = 8.5125
+[neighbors]
+skin = 1.0
+[dynamics]
+kind = "nve"
+timestep = 0.002
+temperature = 40.0
+steps = 100
+seed = 7
+"""
+
+
+@pytest.fixture
+def crystal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "crystal.toml"
+    path.write_text(CRYSTAL)
+    return path
+
+
+def test_systems_show_resolves_and_overrides(crystal: Path, capsys: pytest.CaptureFixture[str]):
+    assert call("systems", "show", "crystal.toml", "--set", "cutoff.kind=shifted") == 0
+    shown = tomllib.loads(capsys.readouterr().out)
+    assert shown["cutoff"]["kind"] == "shifted"
+    assert shown["precision"]["decision"] == "float64", "defaults are filled in"
+    assert call("systems", "show", "crystal.toml", "--set", "cutoff.kind=shifted", "--json") == 0
+    assert json.loads(capsys.readouterr().out) == shown
+
+
+def test_systems_check_says_fine_or_what_is_wrong(crystal: Path, capsys: pytest.CaptureFixture[str]):
+    assert call("systems", "check", "crystal.toml", "--json") == 0
+    assert json.loads(capsys.readouterr().out)["atoms"] == 256
+    assert call("systems", "check", "crystal.toml", "--set", "cutoff.radius=12") == 2
+    assert call("systems", "check", "crystal.toml", "--set", "cutoff.radus=8") == 2
+    err = capsys.readouterr().err
+    assert "radius" in err.splitlines()[-1], "the nearest known key"
+    assert call("systems", "check", "nowhere.toml") == 2
+
+
+def test_systems_list_and_copy_shipped_ones(crystal: Path, capsys: pytest.CaptureFixture[str]):
+    assert call("systems", "list", "--json") == 0
+    listed = json.loads(capsys.readouterr().out)["systems"]
+    assert "argon/liquid-864" in [row["name"] for row in listed]
+    assert all(row["atoms"] > 0 and row["about"] for row in listed)
+    assert call("systems", "list") == 0
+    assert "argon/liquid-864" in capsys.readouterr().out
+
+    assert call("systems", "copy", "argon/liquid-864", "mine") == 0
+    assert Path("mine/liquid-864.toml").is_file()
+    assert call("systems", "check", "mine/liquid-864.toml") == 0
+    assert call("systems", "copy", "argon/liquid-864", "mine") == 2, "nothing is overwritten"
+
+
+def test_check_prints_every_record_and_exits_by_agreement(
+    crystal: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    import mdnum.references.check as checks
+
+    @dataclass
+    class Report:
+        ok: bool
+        findings: tuple[dict[str, str], ...] = ()
+
+        def rows(self) -> list[dict[str, Any]]:
+            return [{"frame": "first", "energy": 1.25}, {"frame": "last", "energy": 2.5, "note": None}]
+
+        def to_dict(self) -> dict[str, Any]:
+            return {"rows": self.rows()}
+
+    asked = []
+    for ok in (True, False):
+        monkeypatch.setattr(checks, "check_energy", lambda system, ok=ok: asked.append(system) or Report(ok))
+        expected = 0 if ok else 1
+        assert call("check", "energy", "crystal.toml", "--set", "cutoff.kind=shifted") == expected
+        out = capsys.readouterr().out
+        assert all(word in out for word in ("first", "last", "1.25", "2.5"))
+        assert call("check", "energy", "crystal.toml", "--json") == expected
+        assert json.loads(capsys.readouterr().out)["ok"] is ok
+    assert asked[0].spec.cutoff.kind == "shifted"
+
+
+def test_few_records_with_many_parts_stand_side_by_side(capsys: pytest.CaptureFixture[str]):
+    output.print_records("t", [{f"part {n}": n for n in range(9)}])
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert ["part", "8", "8"] in lines
+
+
+def test_doctor_exits_by_its_verdict(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
+    import mdnum.doctor
+
+    for status, expected in (("ok", 0), ("info", 0), ("unsafe", 1)):
+        row = mdnum.doctor.Row("jax version", status, "seen", None if status == "ok" else "do this")
+        monkeypatch.setattr(mdnum.doctor, "diagnose", lambda row=row: mdnum.doctor.Diagnosis((row,), 0.5))
+        assert call("doctor") == expected
+        out = capsys.readouterr().out
+        assert ("UNSAFE" in out) is (expected == 1)
+        assert call("doctor", "--json") == expected
+        assert json.loads(capsys.readouterr().out)["rows"][0]["status"] == status
+
+
+def test_report_of_no_run_is_a_mistake(crystal: Path, capsys: pytest.CaptureFixture[str]):
+    assert call("report", "nowhere") == 2
+    assert capsys.readouterr().err.startswith("mdnum: ")

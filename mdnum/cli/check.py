@@ -47,11 +47,7 @@ def _check(function: str, title: str, name: str, settings: list[str] | None, as_
     if as_json:
         output.print_json({"ok": report.ok, **report.to_dict()})
     else:
-        rows = [dict(row) for row in report.rows()]
-        columns = list(dict.fromkeys(key for row in rows for key in row))
-        output.print_table(
-            f"{system.name}: {title}", columns, [[row.get(key) for key in columns] for row in rows]
-        )
+        output.print_records(f"{system.name}: {title}", report.rows())
         output.print_findings(report.findings)
         typer.echo("agrees" if report.ok else "does not agree")
     return output.exit_code(report.findings, ok=report.ok)

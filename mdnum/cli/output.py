@@ -22,6 +22,10 @@ EXIT_FINDINGS = 1
 EXIT_USAGE = 2
 EXIT_STOPPED = 130  # what a shell reports for a process ended by control-C
 
+_PIPE_WIDTH = 200
+# records that are easier to read side by side than as rows
+_FEW, _MANY = 3, 6
+
 # how a person should read a severity; the exit code is 1 for the last two
 _STYLE = {"info": "dim", "ok": "green", "warning": "yellow", "error": "bold red", "unsafe": "bold red"}
 
@@ -104,8 +108,10 @@ def console() -> Console:
     """rich's console on stdout, made when first needed because importing rich is slow."""
     from rich.console import Console
 
-    # no highlighting: a number is not more important for being a number
-    return Console(highlight=False, soft_wrap=not sys.stdout.isatty())
+    # no highlighting: a number is not more important for being a number; wide where nobody's window is
+    # known, because a table folded to 80 columns is hard to read in a log and harder to grep
+    width = None if sys.stdout.isatty() else _PIPE_WIDTH
+    return Console(highlight=False, width=width)
 
 
 def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
@@ -119,6 +125,17 @@ def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[Any]
     for row in rows:
         table.add_row(*(Text(show(cell), style=_STYLE.get(str(cell), "")) for cell in row))
     console().print(table)
+
+
+def print_records(title: str, records: Sequence[Mapping[str, Any]]) -> None:
+    """A table of records; on its side when there are few of them with many parts each."""
+    columns = list(dict.fromkeys(key for record in records for key in record))
+    rows = [[record.get(column) for column in columns] for record in records]
+    if len(rows) > _FEW or len(columns) <= _MANY:
+        print_table(title, columns, rows)
+    else:
+        head, *rest = zip(columns, *rows, strict=True)
+        print_table(title, [show(cell) for cell in head], rest)
 
 
 def show(cell: Any) -> str:
