@@ -1,4 +1,4 @@
-"""Answers that are right by construction, for any test to compare with: slow, short, nothing shared with mdnum."""
+"""Answers that are right by construction, for any test to compare with: slow, short, apart from mdnum."""
 
 from __future__ import annotations
 

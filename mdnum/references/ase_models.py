@@ -7,7 +7,7 @@ What differs between the codes, and what is done about it:
 | lennard-jones, shifted | LennardJones(smooth=False) | none: ASE always shifts the energy to zero at rc |
 | lennard-jones, hard | LennardJones(smooth=False) | + u(r_cut) for every pair inside; same forces |
 | lennard-jones, switched | LennardJones(smooth=True, ro=onset) | none: the same cubic in r² |
-| lennard-jones, several species | one LennardJones has one sigma | sum over species by inclusion and exclusion |
+| lennard-jones, several species | one LennardJones has one sigma | all minus like pairs |
 | morse, hard or shifted | MorsePotential | its own switch moved beyond the list; shifted: - u(r_cut) a pair |
 | morse, quintic | MorsePotential(rcut1, rcut2) | alpha = rho0 / r0; the switch is the same quintic in r |
 | eam | EAM(potential=file) | none |
@@ -24,16 +24,21 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from itertools import combinations_with_replacement
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from ase import Atoms
 from ase.calculators.calculator import Calculator, PropertyNotImplementedError, all_changes
-from ase.neighborlist import neighbor_list
 from numpy import ndarray
 
 from mdnum.references.closed_forms import PairForm, pair_forms
-from mdnum.references.independent import OnNeighborList, PairModel, StillingerWeberModel, TersoffModel
+from mdnum.references.independent import (
+    OnNeighborList,
+    PairModel,
+    StillingerWeberModel,
+    TersoffModel,
+    edges_of,
+)
 from mdnum.systems import System
 
 _PROPERTIES = ["energy", "free_energy", "energies", "forces", "stress"]
@@ -83,7 +88,9 @@ def reference(system: System) -> Reference:
         f"{label}, a sum over species",
         True,
         f"{conversion}; unlike pairs as all minus like (ASE's class has one set of constants)",
-        lambda: SpeciesSum([(build(forms[a, b]), a, b) for a, b in combinations_with_replacement(species, 2)]),
+        lambda: SpeciesSum(
+            [(build(forms[a, b]), a, b) for a, b in combinations_with_replacement(species, 2)]
+        ),
     )
 
 
@@ -122,10 +129,11 @@ class LennardJonesHard(Calculator):
     def calculate(self, atoms=None, properties=None, system_changes=all_changes):
         """Evaluate (see ase.calculators.calculator.Calculator)."""
         super().calculate(atoms, properties or ["energy"], system_changes)
+        atoms = cast(Atoms, self.atoms)
         # get_property, not calculate: it is what tells ASE's class that the atoms have changed
-        results = _results(self.shifted, self.atoms)
-        i, distance = neighbor_list("id", self.atoms, self.form.r_cut * (1 + 1e-12))
-        inside = np.bincount(i[self.form.inside(distance)], minlength=len(self.atoms))
+        results = _results(self.shifted, atoms)
+        edges = edges_of(atoms, self.form.r_cut)
+        inside = np.bincount(edges.i[self.form.inside(edges.r)], minlength=len(atoms))
         at_cut = float(self.form.bare(np.array([self.form.r_cut]))[0][0])
         energies = results["energies"] + 0.5 * at_cut * inside
         energy = results["energy"] + at_cut * (inside.sum() // 2)
@@ -150,9 +158,10 @@ class MorseShifted(Calculator):
     def calculate(self, atoms=None, properties=None, system_changes=all_changes):
         """Evaluate (see ase.calculators.calculator.Calculator)."""
         super().calculate(atoms, properties or ["energy"], system_changes)
-        results = _results(self.hard, self.atoms)
-        i, distance = neighbor_list("id", self.atoms, self.form.r_cut * (1 + 1e-12))
-        inside = np.bincount(i[self.form.inside(distance)], minlength=len(self.atoms))
+        atoms = cast(Atoms, self.atoms)
+        results = _results(self.hard, atoms)
+        edges = edges_of(atoms, self.form.r_cut)
+        inside = np.bincount(edges.i[self.form.inside(edges.r)], minlength=len(atoms))
         at_cut = float(self.form.bare(np.array([self.form.r_cut]))[0][0])
         energies = results["energies"] - 0.5 * at_cut * inside
         energy = results["energy"] - at_cut * (inside.sum() // 2)
@@ -178,22 +187,27 @@ class SpeciesSum(Calculator):
     def calculate(self, atoms=None, properties=None, system_changes=all_changes):
         """Evaluate (see ase.calculators.calculator.Calculator)."""
         super().calculate(atoms, properties or ["energy"], system_changes)
-        symbols = np.array(self.atoms.get_chemical_symbols())
+        atoms = cast(Atoms, self.atoms)
+        symbols = np.array(atoms.get_chemical_symbols())
         n = len(symbols)
         total: dict[str, Any] = {"energy": 0.0, "energies": np.zeros(n), "forces": np.zeros((n, 3))}
-        if self.atoms.cell.rank == 3:
+        if atoms.cell.rank == 3:
             total["stress"] = np.zeros(6)
         for calculator, a, b in self.parts:
-            groups = [((symbols == a), 1.0)] if a == b else [
-                ((symbols == a) | (symbols == b), 1.0),
-                ((symbols == a), -1.0),
-                ((symbols == b), -1.0),
-            ]
+            groups = (
+                [((symbols == a), 1.0)]
+                if a == b
+                else [
+                    ((symbols == a) | (symbols == b), 1.0),
+                    ((symbols == a), -1.0),
+                    ((symbols == b), -1.0),
+                ]
+            )
             for chosen, sign in groups:
                 if not chosen.any():
                     continue
                 calculator.reset()
-                results = _results(calculator, self.atoms[chosen])
+                results = _results(calculator, atoms[chosen])
                 total["energy"] += sign * results["energy"]
                 total["energies"][chosen] += sign * results["energies"]
                 total["forces"][chosen] += sign * results["forces"]
@@ -213,7 +227,7 @@ def _results(calculator: Calculator, atoms: Atoms) -> dict[str, Any]:
 
 
 def evaluate(calculator: Calculator, atoms: Atoms) -> dict[str, Any]:
-    """energy, forces, stress (3, 3; None without a volume) and energies (None where there are none) of atoms."""
+    """energy, forces, stress (3, 3) and energies of atoms; None for what there is not."""
     bare = Atoms(numbers=atoms.numbers, positions=atoms.positions, cell=atoms.cell, pbc=atoms.pbc)
     found: dict[str, Any] = {
         "energy": float(np.asarray(calculator.get_property("energy", bare))),
@@ -247,9 +261,9 @@ def _inside_list(form: PairForm) -> Callable[..., Any]:
     """A neighbor list for ASE's MorsePotential that lists what the system file calls inside, no more."""
 
     def listed(quantities: str, atoms: Atoms, cutoff: float) -> tuple[ndarray, ...]:
-        i, j, d, D = neighbor_list("ijdD", atoms, form.r_cut * (1 + 1e-12))
-        keep = form.inside(d)
-        table = {"i": i[keep], "j": j[keep], "d": d[keep], "D": D[keep]}
+        edges = edges_of(atoms, form.r_cut)
+        keep = form.inside(edges.r)
+        table = {"i": edges.i[keep], "j": edges.j[keep], "d": edges.r[keep], "D": edges.d[keep]}
         return tuple(table[quantity] for quantity in quantities)
 
     return listed
@@ -260,7 +274,12 @@ def _morse(form: PairForm, begin: float, end: float) -> Calculator:
 
     depth, alpha, r0 = (form.constants[key] for key in ("depth", "alpha", "r0"))
     return MorsePotential(
-        epsilon=depth, rho0=alpha * r0, r0=r0, rcut1=begin / r0, rcut2=end / r0, neighbor_list=_inside_list(form)
+        epsilon=depth,
+        rho0=alpha * r0,
+        r0=r0,
+        rcut1=begin / r0,
+        rcut2=end / r0,
+        neighbor_list=_inside_list(form),
     )
 
 
@@ -281,11 +300,17 @@ _ASE_PAIR: dict[tuple[str, str], Callable[[PairForm], Calculator]] = {
     ("morse", "quintic"): _morse_quintic,
 }
 _WORDS = {
-    ("lennard-jones", "hard"): ("ASE LennardJones", "energy + u(r_cut) for each pair inside; forces as they are"),
+    ("lennard-jones", "hard"): (
+        "ASE LennardJones",
+        "energy + u(r_cut) for each pair inside; forces as they are",
+    ),
     ("lennard-jones", "shifted"): ("ASE LennardJones", "none"),
     ("lennard-jones", "switched"): ("ASE LennardJones (smooth)", "none: ro is the onset"),
     ("morse", "hard"): ("ASE MorsePotential", "its own switch moved beyond the pairs listed"),
-    ("morse", "shifted"): ("ASE MorsePotential", "its own switch moved away; energy - u(r_cut) for each pair inside"),
+    ("morse", "shifted"): (
+        "ASE MorsePotential",
+        "its own switch moved away; energy - u(r_cut) for each pair inside",
+    ),
     ("morse", "quintic"): ("ASE MorsePotential", "rho0 = alpha r0, rcut1 = onset / r0, rcut2 = r_cut / r0"),
 }
 
@@ -313,7 +338,10 @@ def _short_listed_eam(file: Path) -> Calculator:
             self.index = np.array([self.elements.index(symbol) for symbol in atoms.get_chemical_symbols()])
             self.pbc = atoms.get_pbc()
             self.neighbors = NeighborList(
-                np.full(len(atoms), 0.5 * self.cutoff * (1 + 1e-12)), skin=0.0, self_interaction=False, bothways=True
+                np.full(len(atoms), 0.5 * self.cutoff * (1 + 1e-12)),
+                skin=0.0,
+                self_interaction=False,
+                bothways=True,
             )
             self.neighbors.update(atoms)
 

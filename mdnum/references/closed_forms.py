@@ -107,7 +107,9 @@ def _morse(r: ndarray, depth: float, alpha: float, r0: float) -> tuple[ndarray, 
 
 def _soft_sphere(r: ndarray, sigma: float, epsilon: float, alpha: float) -> tuple[ndarray, ndarray]:
     overlap = np.maximum(1.0 - r / sigma, 0.0)
-    return epsilon / alpha * overlap**alpha, -epsilon / sigma * np.where(overlap > 0, overlap ** (alpha - 1.0), 0.0)
+    return epsilon / alpha * overlap**alpha, -epsilon / sigma * np.where(
+        overlap > 0, overlap ** (alpha - 1.0), 0.0
+    )
 
 
 def _switched(r: ndarray, onset: float, cut: float) -> tuple[ndarray, ndarray]:

@@ -71,7 +71,8 @@ def effective_cutoff(
             last = middle
     ulps = first - _ordinal(r_cut)
     disagree = sum(
-        _counts_pair(finder, pair, r_cut, periodic) != exactly_inside(pair, np.zeros((3, 3)), 0, 1, (0, 0, 0), r_cut)
+        _counts_pair(finder, pair, r_cut, periodic)
+        != exactly_inside(pair, np.zeros((3, 3)), 0, 1, (0, 0, 0), r_cut)
         for pair in borderline_pairs(r_cut, oriented, seed)
     )
     comparison = {-1: "<", 0: "<="}.get(ulps, "rounded")
@@ -82,7 +83,7 @@ def effective_cutoff(
 
 
 def borderline_pairs(r_cut: float, count: int, seed: int) -> ndarray:
-    """Randomly oriented pairs of atoms within 3 ulps of r_cut: (count, 2, 3); the first atom is the origin."""
+    """Randomly oriented pairs within 3 ulps of r_cut: (count, 2, 3); the first atom is the origin."""
     rng = np.random.default_rng(seed)
     direction = rng.normal(size=(count, 3))
     direction /= np.linalg.norm(direction, axis=1)[:, None]

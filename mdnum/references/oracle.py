@@ -41,7 +41,12 @@ class PairSet:
     def select(self, mask: Bool[ndarray, "pairs"]) -> PairSet:
         """The pairs where mask is true."""
         return PairSet(
-            self.i[mask], self.j[mask], self.shift[mask], self.distance[mask], self.inside[mask], self.exact[mask]
+            self.i[mask],
+            self.j[mask],
+            self.shift[mask],
+            self.distance[mask],
+            self.inside[mask],
+            self.exact[mask],
         )
 
 
@@ -146,7 +151,9 @@ def all_pairs(
     reach = r_cut + bound if reach is None else max(reach, r_cut + bound)
 
     parts = [
-        part for shifts in _images(positions, cell, pbc, reach) for part in _within(positions, stored, shifts, reach)
+        part
+        for shifts in _images(positions, cell, pbc, reach)
+        for part in _within(positions, stored, shifts, reach)
     ]
     i, j, shift, distance = (np.concatenate([part[k] for part in parts]) for k in range(4))
     order = np.lexsort((shift[:, 2], shift[:, 1], shift[:, 0], j, i))

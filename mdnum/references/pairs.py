@@ -18,7 +18,13 @@ from mdnum.references.findings import finding, plain
 from mdnum.references.oracle import PairSet, all_pairs, rounding_bound
 from mdnum.systems import System, pairs
 
-AGREES, AT_THE_CUTOFF, DIFFERS, FAILED, NOT_ASKED = "agrees", "differs at the cutoff", "differs", "failed", "not asked"
+AGREES, AT_THE_CUTOFF, DIFFERS, FAILED, NOT_ASKED = (
+    "agrees",
+    "differs at the cutoff",
+    "differs",
+    "failed",
+    "not asked",
+)
 
 
 @dataclass(frozen=True)
@@ -119,20 +125,20 @@ def check_pairs(
         positions: instead of the system's own.
         effective: also bisect each search's effective cutoff.
     """
-    positions = system.atoms.get_positions() if positions is None else np.asarray(positions, dtype=float)
+    where: ndarray = system.atoms.get_positions() if positions is None else np.asarray(positions, dtype=float)
     cell, pbc = np.asarray(system.atoms.cell), np.asarray(system.atoms.pbc)
     compare = system.spec.cutoff.compare if system.spec.cutoff is not None else "r <"
     groups = _groups(system)
     truth = [
         _of_species(
-            all_pairs(positions, cell, pbc, radius, closed=compare.endswith("="), reach=radius * (1 + 1e-4)),
+            all_pairs(where, cell, pbc, radius, closed=compare.endswith("="), reach=radius * (1 + 1e-4)),
             chosen,
             system.species_index,
         )
         for radius, chosen in groups
     ]
     results = tuple(
-        _ask(finder, positions, cell, pbc, groups, truth, system.species_index, effective)
+        _ask(finder, where, cell, pbc, groups, truth, system.species_index, effective)
         for finder in (finders() if searches is None else searches)
     )
     ok = all(result.verdict in (AGREES, AT_THE_CUTOFF, NOT_ASKED) for result in results if result.ours)

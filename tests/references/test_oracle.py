@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections import Counter
 
 import numpy as np
+import oracles
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import oracles
 from mdnum.errors import InputError
 from mdnum.references.oracle import all_pairs, exactly_inside, rounding_bound, widths
 
@@ -35,7 +35,9 @@ def test_equals_the_explicit_images(seed, atoms, pbc, tilt, r_cut):
     assert _count(all_pairs(positions, cell, np.array(pbc), r_cut)) == expected
 
 
-@pytest.mark.parametrize("cell", [np.diag([7.0, 8.0, 9.0]), np.array([[7.0, 0, 0], [2.5, 8, 0], [-3, 1, 9.0]])])
+@pytest.mark.parametrize(
+    "cell", [np.diag([7.0, 8.0, 9.0]), np.array([[7.0, 0, 0], [2.5, 8, 0], [-3, 1, 9.0]])]
+)
 def test_large_box_needs_one_image(cell):
     rng = np.random.default_rng(3)
     positions = rng.uniform(-20, 20, (60, 3))

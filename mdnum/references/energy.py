@@ -1,0 +1,368 @@
+"""`mdnum check energy`: energy, forces and stress of mdnum against ASE, frame by frame."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from ase import Atoms
+
+from mdnum.references.ase_models import Reference, evaluate, independent, reference
+from mdnum.references.closed_forms import pair_forms
+from mdnum.references.findings import finding, plain
+from mdnum.references.independent import Edges, PairModel
+from mdnum.references.oracle import rounding_bound
+from mdnum.systems import System
+
+ENERGY_PAIR, FORCE, ENERGY_MANY_BODY = 1e-12, 1e-10, 1e-10
+"""What float64 must meet: relative energy of pair and of many-body potentials; forces over their scale."""
+
+ROUNDINGS = 10.0
+"""What narrower precision must meet: this many times the rounding expected of one typical number."""
+
+
+@dataclass(frozen=True)
+class FrameComparison:
+    """One frame, evaluated twice.
+
+    Attributes:
+        frame: which.
+        energy, energy_reference: total energies (eV or ε).
+        energy_rel: their difference over the energy (or sum |pair energies| / 1000).
+        force_max: largest difference of a force component.
+        force_scale: largest force on an atom or along a pair, which a perfect crystal has too.
+        force_rel: force_max / force_scale.
+        stress_max: largest difference of a stress component (energy / length³); None without a volume.
+        stress_rel: over the largest stress that a single kind of term could have.
+        energy_expected, force_expected: differences that rounding in the system's precision lets expect.
+        energy_third, force_third: relative energy and largest force component of mdnum against a third
+            evaluation, in plain numpy; None where there is none.
+        ambiguous: pairs within rounding of a cutoff, about which the two may rightly differ.
+        ok: within tolerance.
+    """
+
+    frame: str
+    energy: float
+    energy_reference: float
+    energy_rel: float
+    force_max: float
+    force_scale: float
+    force_rel: float
+    stress_max: float | None
+    stress_rel: float | None
+    energy_expected: float
+    force_expected: float
+    energy_third: float | None
+    force_third: float | None
+    ambiguous: int
+    ok: bool
+
+    @property
+    def energy_roundings(self) -> float:
+        """Energy difference in units of the expected rounding."""
+        return abs(self.energy - self.energy_reference) / self.energy_expected
+
+    @property
+    def force_roundings(self) -> float:
+        """Largest force difference in units of the expected rounding."""
+        return self.force_max / self.force_expected
+
+
+@dataclass(frozen=True)
+class EnergyReport:
+    """Energies, forces and stresses against a reference.
+
+    Attributes:
+        system: name.
+        reference: what it was compared with; says so when it is not ASE.
+        is_ase: whether the reference is a class of ASE.
+        conversion: what was done to make the conventions equal.
+        precision: "float64", or the narrowest type in use.
+        frames: one comparison per frame.
+        findings: what to look at.
+        ok: every frame within tolerance.
+    """
+
+    system: str
+    reference: str
+    is_ase: bool
+    conversion: str
+    precision: str
+    frames: tuple[FrameComparison, ...]
+    findings: tuple[dict[str, str], ...]
+    ok: bool
+
+    @property
+    def worst(self) -> dict[str, Any]:
+        """The worst of all frames, in the names of summary.json's `ase`."""
+        stress = [frame.stress_max for frame in self.frames if frame.stress_max is not None]
+        return {
+            "reference": self.reference,
+            "energy_rel": max(frame.energy_rel for frame in self.frames),
+            "force_max": max(frame.force_max for frame in self.frames),
+            "stress_max": max(stress) if stress else None,
+            "force_scale": max(frame.force_scale for frame in self.frames),
+            "ok": self.ok,
+        }
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {**plain(self), "worst": plain(self.worst)}
+
+    def rows(self) -> list[dict[str, Any]]:
+        """A row per frame."""
+        narrow = self.precision != "float64"
+        return [
+            {
+                "frame": frame.frame,
+                "reference": self.reference,
+                "energy": frame.energy,
+                "energy, relative": frame.energy_rel,
+                "force, largest": frame.force_max,
+                "force, relative": frame.force_rel,
+                "stress, largest": frame.stress_max,
+                **(
+                    {"energy, roundings": frame.energy_roundings, "force, roundings": frame.force_roundings}
+                    if narrow
+                    else {}
+                ),
+                "against numpy": frame.energy_third,
+                "ambiguous pairs": frame.ambiguous,
+                "agrees": frame.ok,
+            }
+            for frame in self.frames
+        ]
+
+
+def check_energy(
+    subject: Any,
+    frames: Mapping[str, Atoms] | Sequence[Atoms] | None = None,
+    *,
+    judge: Reference | None = None,
+) -> EnergyReport:
+    """Compare energies, forces and stresses with ASE (or, where ASE has no class, with plain numpy).
+
+    Args:
+        subject: a `System`, or a `Simulation` built from one.
+        frames: positions and cells to compare at, by name or in order; default the initial frame.
+        judge: instead of the reference chosen by `ase_models.reference`.
+    Raises:
+        InputError: the system cannot be built.
+    """
+    simulation = built(subject)
+    system: System = simulation.system
+    judge = reference(system) if judge is None else judge
+    third = independent(system) if judge.is_ase and system.spec.potential.kind != "eam" else None
+    named = _named(frames, system)
+    calculator, other = judge.make(), third.make() if third else None
+    compared = tuple(
+        _compare(name, atoms, simulation, system, calculator, other) for name, atoms in named.items()
+    )
+    precision = narrowest(system)
+    return EnergyReport(
+        system.name,
+        judge.label,
+        judge.is_ase,
+        judge.conversion,
+        precision,
+        compared,
+        tuple(_findings(compared, judge, precision)),
+        all(frame.ok for frame in compared),
+    )
+
+
+def built(subject: Any) -> Any:
+    """A Simulation, from one or from a System."""
+    if isinstance(subject, System):
+        from mdnum.systems import build
+
+        return build(subject)
+    return subject
+
+
+def narrowest(system: System) -> str:
+    """The narrowest float type among the roles that energies and forces depend on."""
+    precision = system.spec.precision
+    roles = (precision.state, precision.force, precision.accumulate)
+    return "float32" if "float32" in roles else "float64"
+
+
+def _named(frames: Mapping[str, Atoms] | Sequence[Atoms] | None, system: System) -> dict[str, Atoms]:
+    if frames is None:
+        return {"initial": system.atoms}
+    if isinstance(frames, Mapping):
+        return dict(frames)
+    return {f"frame {number}": atoms for number, atoms in enumerate(frames)}
+
+
+def _compare(
+    name: str, atoms: Atoms, simulation: Any, system: System, calculator: Any, other: Any
+) -> FrameComparison:
+    positions = atoms.get_positions()
+    if system.spec.precision.state == "float32":
+        positions = positions.astype(np.float32).astype(np.float64)  # both are to see what the state can hold
+    mine = simulation.evaluate(positions, np.asarray(atoms.cell))
+    stored = Atoms(numbers=atoms.numbers, positions=positions, cell=atoms.cell, pbc=system.atoms.pbc)
+    theirs = evaluate(calculator, stored)
+    third = evaluate(other, stored) if other is not None else None
+
+    scale = _Scales.of(system, simulation, stored, mine, theirs)
+    energy, energy_reference = float(mine.energy), theirs["energy"]
+    energy_rel = _over(abs(energy - energy_reference), max(abs(energy_reference), 1e-3 * scale.energy))
+    force_max = float(np.abs(np.asarray(mine.forces) - theirs["forces"]).max(initial=0.0))
+    stress_max = stress_rel = None
+    if theirs["stress"] is not None:
+        stress_max = float(np.abs(np.asarray(mine.stress) - theirs["stress"]).max())
+        stress_rel = _over(stress_max, scale.stress)
+    force_rel = _over(force_max, scale.force)
+    if narrowest(system) == "float64":
+        tolerance = ENERGY_PAIR if system.spec.cutoff is not None else ENERGY_MANY_BODY
+        ok = energy_rel <= tolerance and force_rel <= FORCE and (stress_rel is None or stress_rel <= FORCE)
+    else:
+        ok = (
+            abs(energy - energy_reference) <= ROUNDINGS * scale.energy_expected
+            and force_max <= ROUNDINGS * scale.force_expected
+        )
+    return FrameComparison(
+        name,
+        energy,
+        energy_reference,
+        energy_rel,
+        force_max,
+        scale.force,
+        force_rel,
+        stress_max,
+        stress_rel,
+        scale.energy_expected,
+        scale.force_expected,
+        _over(abs(energy - third["energy"]), max(abs(third["energy"]), 1e-3 * scale.energy))
+        if third
+        else None,
+        float(np.abs(np.asarray(mine.forces) - third["forces"]).max(initial=0.0)) if third else None,
+        scale.ambiguous,
+        ok,
+    )
+
+
+def _over(difference: float, scale: float) -> float:
+    """difference / scale, where equal is 0 whatever the scale."""
+    return 0.0 if difference == 0.0 else float(difference / scale) if scale > 0.0 else float("inf")
+
+
+@dataclass(frozen=True)
+class _Scales:
+    """What differences are measured against.
+
+    energy: sum of |energies|; force: largest force on an atom or along a pair; stress: virial without
+    cancellation over the volume; *_expected: what rounding lets expect.
+    """
+
+    energy: float
+    force: float
+    stress: float
+    energy_expected: float
+    force_expected: float
+    ambiguous: int
+
+    @classmethod
+    def of(
+        cls, system: System, simulation: Any, atoms: Atoms, mine: Any, theirs: Mapping[str, Any]
+    ) -> _Scales:
+        """Scales of a frame; pair by pair where there are pairs, else from the totals."""
+        unit = 2.0**-24 if narrowest(system) == "float32" else 2.0**-53
+        largest_force = float(np.abs(theirs["forces"]).max(initial=0.0))
+        volume = atoms.get_volume() if atoms.cell.rank == 3 else float("inf")
+        positions, cell = atoms.get_positions(), np.asarray(atoms.cell)
+        # a displacement is a difference of coordinates of this size, each rounded once or twice
+        shift = rounding_bound(positions, cell, 0.0, unit_roundoff=unit) / 8.0
+        i, j, r = (np.asarray(array) for array in (mine.i, mine.j, mine.distance))
+        if system.spec.cutoff is None:
+            energies = np.abs(np.asarray(mine.energies)).sum()
+            force = max(largest_force, _over(energies / max(len(atoms), 1), float(r.min(initial=np.inf))))
+            stress = force * float(r.sum()) / volume
+            # many-body terms are steep: a bond's stiffness is about force scale per tenth of its length
+            stiff = 10.0 * force / max(float(r.mean()) if len(r) else 1.0, 1e-300)
+            return cls(
+                energies,
+                force,
+                stress,
+                4.0 * unit * energies + shift * largest_force * np.sqrt(len(atoms)),
+                8.0 * unit * force + 4.0 * shift * stiff,
+                0,
+            )
+        model = PairModel(pair_forms(system.spec, system.species))
+        edges = Edges(np.array(atoms.get_chemical_symbols()), i, j, np.zeros((len(i), 3)), r)
+        energies, forces, stiffness, ambiguous = np.zeros(len(i)), np.zeros(len(i)), np.zeros(len(i)), 0
+        bound = rounding_bound(positions, cell, float(system.r_cut), unit_roundoff=unit)
+        for form, rows in model.groups(edges):
+            u, du = form(r[rows])
+            step = 1e-4 * form.r_cut
+            energies[rows], forces[rows] = np.abs(u), np.abs(du)
+            stiffness[rows] = np.abs(form(r[rows] + step)[1] - form(r[rows] - step)[1]) / (2 * step)
+            ambiguous += int((np.abs(r[rows] - form.r_cut) <= bound).sum())
+        per_atom = np.zeros(len(atoms))
+        np.add.at(per_atom, i, (stiffness * shift) ** 2 + (12.0 * unit * forces) ** 2)
+        np.add.at(per_atom, j, (stiffness * shift) ** 2 + (12.0 * unit * forces) ** 2)
+        summed = np.zeros(len(atoms))
+        np.add.at(summed, i, energies)
+        # rounding of the terms adds at random, rounding of the running sums with their size
+        energy_expected = np.sqrt(
+            ((forces * shift) ** 2).sum() + ((12.0 * unit * energies) ** 2).sum() + (unit * summed.sum()) ** 2
+        )
+        force = max(largest_force, float(forces.max(initial=0.0)))
+        return cls(
+            float(energies.sum()),
+            force,
+            float((forces * r).sum()) / volume,
+            float(energy_expected),
+            float(np.sqrt(per_atom.max(initial=0.0))) + 4.0 * unit * force,
+            ambiguous,
+        )
+
+
+def _findings(frames: Sequence[FrameComparison], judge: Reference, precision: str) -> list[dict[str, str]]:
+    found = []
+    wrong = [frame for frame in frames if not frame.ok]
+    if wrong:
+        worst = max(wrong, key=lambda frame: frame.force_rel)
+        third = ""
+        if worst.energy_third is not None:
+            third = " A third evaluation, in plain numpy, differs from mdnum by "
+            third += f"{worst.energy_third:.1e} in energy and {worst.force_third:.1e} in force."
+        found.append(
+            finding(
+                "ase-disagrees",
+                "error",
+                f"energies or forces differ from {judge.label}",
+                f"At the {worst.frame} frame the energy is {worst.energy:.12g} against "
+                f"{worst.energy_reference:.12g} (relative {worst.energy_rel:.1e}) and a force component "
+                f"differs by {worst.force_max:.1e} of {worst.force_scale:.1e}.{third}",
+                "Find the cause first; `mdnum check pairs` tells whether it is the list"
+                if not worst.ambiguous
+                else f"{worst.ambiguous} pairs lie within rounding of the cutoff: compare without them",
+            )
+        )
+    if not judge.is_ase:
+        found.append(
+            finding(
+                "not-ase",
+                "info",
+                "ASE has no class for this potential and cutoff",
+                "The comparison is with the same formulas in plain numpy on ASE's neighbor list.",
+            )
+        )
+    if precision != "float64":
+        worst_energy = max(frame.energy_roundings for frame in frames)
+        worst_force = max(frame.force_roundings for frame in frames)
+        found.append(
+            finding(
+                "narrow-precision",
+                "info",
+                f"compared in units of {precision} rounding",
+                f"Energy {worst_energy:.2g} and forces {worst_force:.2g} times the rounding to be expected; "
+                f"{ROUNDINGS:g} times is taken as agreement.",
+            )
+        )
+    return found
