@@ -1,0 +1,173 @@
+"""The box: lattice vectors, periodicity per axis, wrapping and the minimum image, on the host and in jit.
+
+Both sides do the same operations in the same order. Lattice vectors are subtracted as n * L with
+n in {-1, 0, 1} for wrapped positions; those products are exact, so a fused multiply-add gives the same
+bits as separate rounding, and numpy reproduces what jit computed.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from mdnum.errors import InputError
+
+
+class Cell(eqx.Module):
+    """A parallelepiped box. Usable on the host (numpy leaves) and in jit (jax leaves).
+
+    Attributes:
+        matrix: lattice vectors as rows, length, shape (3, 3); a free axis may hold a zero vector.
+        inverse: columns give fractional coordinates of the periodic axes; 0 for a free axis, shape (3, 3).
+        pbc: periodicity per axis.
+        orthorhombic: lattice vectors lie along x, y and z.
+    """
+
+    matrix: Float[np.ndarray | jax.Array, "3 3"]
+    inverse: Float[np.ndarray | jax.Array, "3 3"]
+    pbc: tuple[bool, bool, bool] = eqx.field(static=True)
+    orthorhombic: bool = eqx.field(static=True)
+
+    @classmethod
+    def create(cls, matrix, pbc=True) -> Cell:
+        """A cell from lattice vectors.
+
+        Args:
+            matrix: lattice vectors as rows, shape (3, 3), or three edge lengths.
+            pbc: one flag or one per axis.
+
+        Raises:
+            InputError: a periodic axis without a lattice vector, or vectors that span no volume.
+        """
+        matrix = np.asarray(matrix, np.float64)
+        if matrix.shape == (3,):
+            matrix = np.diag(matrix)
+        flags = np.broadcast_to(np.asarray(pbc, bool), (3,))
+        norms = np.linalg.norm(matrix, axis=1)
+        if not np.all(np.isfinite(matrix)):
+            raise InputError("the cell has entries that are not finite numbers")
+        if np.any(flags & (norms == 0)):
+            axis = "abc"[int(np.argmax(flags & (norms == 0)))]
+            raise InputError(
+                f"axis {axis} is periodic but its lattice vector is zero",
+                remedy="Give the structure a cell or set structure.pbc = false for that axis",
+            )
+        full = _completed(matrix)
+        if abs(np.linalg.det(full)) < 1e-12 * np.prod(np.linalg.norm(full, axis=1)):
+            raise InputError("the lattice vectors span no volume")
+        inverse = np.linalg.inv(full)
+        inverse[:, ~flags] = 0.0
+        diagonal = bool(np.all(full == np.diag(np.diag(full))))
+        return cls(matrix.copy(), inverse, tuple(bool(f) for f in flags), diagonal)
+
+    @property
+    def widths(self) -> Float[np.ndarray, "3"]:
+        """Perpendicular widths of the periodic axes, length; infinity for a free axis."""
+        with np.errstate(divide="ignore"):
+            widths = 1.0 / np.linalg.norm(np.asarray(self.inverse), axis=0)
+        return widths
+
+    @property
+    def volume(self) -> float:
+        """Volume, length cubed; NaN unless all axes are periodic."""
+        return float(abs(np.linalg.det(np.asarray(self.matrix)))) if all(self.pbc) else float("nan")
+
+    def astype(self, dtype) -> Cell:
+        """The cell with jax leaves of the given dtype."""
+        return Cell(
+            jnp.asarray(self.matrix, dtype), jnp.asarray(self.inverse, dtype), self.pbc, self.orthorhombic
+        )
+
+    def _images(self, x, y, z, rounding):
+        """Lattice coordinates of a vector, rounded: how many lattice vectors to subtract per axis."""
+        m = self.inverse
+        if self.orthorhombic:
+            return rounding(x * m[0, 0]), rounding(y * m[1, 1]), rounding(z * m[2, 2])
+        return tuple(rounding(x * m[0, k] + y * m[1, k] + z * m[2, k]) for k in range(3))
+
+    def _subtract(self, x, y, z, n):
+        a = self.matrix
+        if self.orthorhombic:
+            return x - n[0] * a[0, 0], y - n[1] * a[1, 1], z - n[2] * a[2, 2]
+        for k in range(3):
+            if self.pbc[k]:
+                x, y, z = x - n[k] * a[k, 0], y - n[k] * a[k, 1], z - n[k] * a[k, 2]
+        return x, y, z
+
+    def minimum_image(self, x, y, z):
+        """Components of a displacement reduced to its nearest image.
+
+        Right for every vector whose nearest image is shorter than half the smallest perpendicular width;
+        the caller refuses cutoffs beyond that.
+        """
+        if not any(self.pbc):
+            return x, y, z
+        rounding = np.rint if isinstance(x, np.ndarray) else jnp.round
+        return self._subtract(x, y, z, self._images(x, y, z, rounding))
+
+    def wrap(self, x, y, z):
+        """Components brought into the box, and the integer lattice coordinates that were taken off."""
+        if not any(self.pbc):
+            zero = np.zeros_like(x) if isinstance(x, np.ndarray) else jnp.zeros_like(x)
+            return (x, y, z), (zero, zero, zero)
+        floor = np.floor if isinstance(x, np.ndarray) else jnp.floor
+        n = self._images(x, y, z, floor)
+        return self._subtract(x, y, z, n), n
+
+
+def wrap_positions(
+    cell: Cell, positions: Float[np.ndarray, "atoms 3"]
+) -> tuple[Float[np.ndarray, "atoms 3"], Int[np.ndarray, "atoms 3"]]:
+    """Positions in the box, and the images they were in; however far outside they start.
+
+    Error: the first pass subtracts up to n lattice vectors at once, rounding n*L; the second brings in what
+    that rounding left outside. A coordinate may still equal L after adding L to a tiny negative number.
+    """
+    wrapped = np.array(positions, np.float64, copy=True)
+    images = np.zeros(wrapped.shape, np.int64)
+    for _ in range(2):
+        components, n = cell.wrap(*(np.ascontiguousarray(c) for c in wrapped.T))
+        wrapped = np.stack(components, axis=1)
+        images += np.stack(n, axis=1).astype(np.int64)
+    return wrapped, images
+
+
+def displacement(
+    cell: Cell, start: Float[np.ndarray, "... 3"], end: Float[np.ndarray, "... 3"], dtype=np.float64
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Components of the nearest image of end - start, with the bits that the force loop computes in dtype."""
+    host = Cell(np.asarray(cell.matrix, dtype), np.asarray(cell.inverse, dtype), cell.pbc, cell.orthorhombic)
+    start, end = np.asarray(start, dtype), np.asarray(end, dtype)
+    return host.minimum_image(*(end[..., k] - start[..., k] for k in range(3)))
+
+
+def strain_loss(reference: Cell, now: Cell, r_list: float) -> float:
+    """How much shorter a listed distance can have become by deforming the box alone, length.
+
+    A pair just outside the list moves with the box; the deformation F takes a vector of length r_list to
+    at least sigma_min(F) * r_list. Added to twice the largest displacement relative to the box it must stay
+    within the skin.
+
+    Source: kUPS issue 263, `2 max|u| + r_list max(0, 1 - sigma_min(F)) <= r_list - r_cut`.
+    """
+    a, b = _completed(np.asarray(reference.matrix)), _completed(np.asarray(now.matrix))
+    smallest = np.linalg.svd(np.linalg.solve(a, b), compute_uv=False)[-1]
+    return float(r_list * max(0.0, 1.0 - smallest))
+
+
+def _completed(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+    """Lattice vectors with each zero row replaced by a unit vector that is orthogonal to the others."""
+    full = np.array(matrix, np.float64, copy=True)
+    missing: Bool[np.ndarray, "3"] = np.linalg.norm(full, axis=1) == 0
+    if missing.all():
+        return np.eye(3)
+    for k in np.flatnonzero(missing):
+        others = full[np.linalg.norm(full, axis=1) > 0]
+        # a null vector of the vectors that are there: the last right singular vector
+        full[k] = np.linalg.svd(others)[2][len(others)]
+    if missing.any() and np.linalg.det(full) < 0:
+        full[np.flatnonzero(missing)[0]] *= -1
+    return full

@@ -1,0 +1,189 @@
+"""The pair decision: which pairs are inside the cutoff, by the system's own convention.
+
+The quantity and its threshold live here alone; the force loop, the list check and the host that writes
+the ledger all compute them through this file, with the same bits.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int, UInt8
+
+from mdnum.errors import InputError
+from mdnum.events import Threshold
+from mdnum.md.cell import Cell
+from mdnum.md.verlet import SLOTS
+from mdnum.precision import distance_bound, squared_distance_bound
+from mdnum.precision.exact import squared_norm
+
+CONVENTIONS = ("r2 <", "r2 <=", "r <", "r <=")
+
+
+@dataclass(frozen=True)
+class PairDecider:
+    """Whether a pair is inside: `r2 < r_cut²` or one of its three relatives.
+
+    Attributes:
+        r_cut: cutoff of each pair type, length.
+        compare: quantity and comparison, one of "r2 <", "r2 <=", "r <", "r <=".
+        dtype: the dtype in which the quantity is computed and compared.
+        extent: largest coordinate difference per axis, length; sets the rounding bound.
+    """
+
+    r_cut: tuple[float, ...]
+    compare: str = "r2 <"
+    dtype: str = "float64"
+    extent: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self):
+        if self.compare not in CONVENTIONS:
+            raise InputError(
+                f"unknown convention {self.compare!r}; known are {', '.join(map(repr, CONVENTIONS))}",
+                where="cutoff.compare",
+            )
+
+    @property
+    def space(self) -> str:
+        """The quantity that is compared: "r" or "r2"."""
+        return self.compare.split()[0]
+
+    @property
+    def thresholds(self) -> tuple[Threshold, ...]:
+        """One threshold per pair type, in the dtype and space that the program compares in."""
+        scalar = np.dtype(self.dtype).type
+        comparison = self.compare.split()[1]
+        values = [scalar(r) * scalar(r) if self.space == "r2" else scalar(r) for r in self.r_cut]
+        return tuple(Threshold(float(value), comparison, self.space) for value in values)
+
+    @property
+    def bounds(self) -> tuple[float, ...]:
+        """Rounding bound of the quantity near each threshold (error analysis: precision.bounds)."""
+        bound = squared_distance_bound if self.space == "r2" else distance_bound
+        return tuple(float(bound(r, self.extent, np.dtype(self.dtype))) for r in self.r_cut)
+
+    def values(self) -> jax.Array:
+        """Threshold values as an array of the decision's dtype, shape (types,)."""
+        return jnp.asarray([t.value for t in self.thresholds], np.dtype(self.dtype))
+
+    def quantity(self, dx: jax.Array, dy: jax.Array, dz: jax.Array, zero: jax.Array) -> jax.Array:
+        """The compared quantity inside jit; bit for bit what `host_quantity` gives."""
+        r2 = squared_norm(dx, dy, dz, zero)
+        return jnp.sqrt(r2) if self.space == "r" else r2
+
+    def host_quantity(self, dx, dy, dz) -> Float[np.ndarray, "..."]:
+        """The compared quantity on the host, from displacement components of the decision's dtype."""
+        r2 = dx * dx + dy * dy + dz * dz
+        return np.sqrt(r2) if self.space == "r" else r2
+
+    def inside(self, quantity: jax.Array, value: jax.Array) -> jax.Array:
+        """The decision: quantity against threshold value(s), as the convention has it."""
+        return quantity <= value if self.compare.endswith("<=") else quantity < value
+
+
+class Tables(eqx.Module):
+    """A pair table on the device.
+
+    Attributes:
+        index: neighbor of each slot and atom in sorted labels, padded with the number of atoms,
+            shape (slots/8, 8, atoms).
+        types: pair type of each slot (None where there is only one), same shape.
+        order: sorted atom k is atom order[k], shape (atoms,).
+    """
+
+    index: Int[Array, "words 8 atoms"]
+    types: UInt8[Array, "words 8 atoms"] | None
+    order: Int[Array, "atoms"]
+
+
+class Decisions(NamedTuple):
+    """What a pass over a list decided.
+
+    Attributes:
+        bits: decisions, eight slots to a byte, shape (slots/8, atoms).
+        nearest: smallest |margin| of any listed pair, in the quantity's space.
+        ambiguous: listed pairs (each counted once) whose |margin| is within the rounding bound.
+    """
+
+    bits: UInt8[Array, "words atoms"]
+    nearest: Float[Array, ""]
+    ambiguous: Int[Array, ""]
+
+
+class SlotJudge:
+    """Decides one slot of every atom at a time, inside jit, and keeps the tally.
+
+    Args:
+        decider: the convention.
+        cell: the box.
+        zero: integer zero that XLA must not know.
+        positions: sorted, wrapped, shape (3, atoms).
+    """
+
+    def __init__(self, decider: PairDecider, cell: Cell, zero: jax.Array, positions: Float[Array, "3 atoms"]):
+        dtype = np.dtype(decider.dtype)
+        self.decider, self.zero = decider, zero
+        self.cell = cell.astype(dtype)
+        self.components = tuple(positions.astype(dtype))
+        self.atoms = positions.shape[1]
+        self.value = decider.values()
+        self.bound = jnp.asarray(decider.bounds, dtype)
+
+    def start(self) -> tuple[jax.Array, jax.Array]:
+        """An empty tally: nearest margin and number of ambiguous pairs, per atom."""
+        return jnp.full(self.atoms, jnp.inf, self.value.dtype), jnp.zeros(self.atoms, jnp.int32)
+
+    def slot(self, j, types):
+        """Displacement, quantity and decision of the neighbors j (types: their pair types, or None)."""
+        d = displacements(self.components, self.cell, j)
+        quantity = self.decider.quantity(*d, self.zero)
+        threshold = self.value[0] if types is None else self.value[types]
+        return d, quantity, self.decider.inside(quantity, threshold) & (j < self.atoms), threshold
+
+    def tally(self, tally, bits, k, j, types, quantity, inside, threshold):
+        """Bits and tally with slot k of a block added."""
+        nearest, ambiguous = tally
+        bits = bits | (inside.astype(jnp.uint8) << jnp.uint8(k))
+        margin = jnp.abs(threshold - quantity)
+        real = j < self.atoms
+        close = margin <= (self.bound[0] if types is None else self.bound[types])
+        return bits, (
+            jnp.minimum(nearest, jnp.where(real, margin, jnp.inf)),
+            ambiguous + (close & real).astype(jnp.int32),
+        )
+
+    @staticmethod
+    def finish(tally, bits) -> Decisions:
+        """The pass's decisions; every pair was met from both ends."""
+        nearest, ambiguous = tally
+        return Decisions(bits, jnp.min(nearest, initial=jnp.inf).astype(jnp.float64), jnp.sum(ambiguous) // 2)
+
+
+def displacements(components, cell: Cell, j):
+    """Nearest images of x_j - x_i, per component; indices of padding are clamped into range by XLA."""
+    return cell.minimum_image(*(c.at[j].get(mode="promise_in_bounds") - c for c in components))
+
+
+def decide_table(
+    decider: PairDecider, cell: Cell, zero: jax.Array, positions: Float[Array, "3 atoms"], tables: Tables
+) -> Decisions:
+    """The decisions of a whole list at given positions, without forces."""
+    judge = SlotJudge(decider, cell, zero, positions)
+
+    def block(tally, listed):
+        index, types = listed
+        bits = jnp.zeros(judge.atoms, jnp.uint8)
+        for k in range(SLOTS):
+            t = None if types is None else types[k]
+            _, quantity, inside, threshold = judge.slot(index[k], t)
+            bits, tally = judge.tally(tally, bits, k, index[k], t, quantity, inside, threshold)
+        return tally, bits
+
+    tally, bits = lax.scan(block, judge.start(), (tables.index, tables.types))
+    return judge.finish(tally, bits)

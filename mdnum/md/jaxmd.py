@@ -1,0 +1,441 @@
+"""The one door to jax-md: displacement, neighbor lists, pair search and relaxation, with its traps held off.
+
+jax-md 0.2.29 has defects that pass without an error (float32 thresholds, pairs dropped outside the box,
+inverted flags). They are worked around here and nowhere else; tests/md/test_jaxmd_traps.py asserts that
+each defect is still there, so that a work-around can be dropped the day it is not.
+
+jax_md takes seconds to import, so it is imported inside the functions that need it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+import mdnum.precision  # noqa: F401  (switches float64 on before the first array exists)
+from mdnum.errors import CapacityError, InputError, NumericalError
+
+if TYPE_CHECKING:
+    from jax_md.partition import NeighborList
+
+Format = Literal["dense", "sparse", "ordered-sparse"]
+Displacement = Callable[..., Array]
+
+# jax-md keeps the box of a list in float32, so its cells can come out 6e-8 too small and lose pairs that
+# span one; searching a little further and filtering in float64 makes the result exact
+_SEARCH_MARGIN = 1e-6
+# FIRE adds 1e-6 to |F|² and so stops mixing below forces of 1e-3; forces and masses scaled by a power of
+# two give the same motion with that floor at 1e-9
+_FIRE_SCALE = 2.0**20
+
+
+def scalar(value: float) -> Float[Array, ""]:
+    """A number in the only form that jax-md keeps in float64.
+
+    jax_md.util.maybe_downcast turns Python floats, numpy floats and numpy arrays into float32 even under
+    x64; only a jax float64 array survives. Use this for every sigma, epsilon, r_onset and r_cutoff.
+    """
+    return jnp.asarray(value, jnp.float64)
+
+
+def complete(cell: Float[np.ndarray, "3 3"], pbc: Bool[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """The cell with every non-periodic vector replaced by a unit vector perpendicular to the others.
+
+    Args:
+        cell: lattice vectors as rows, length; rows of non-periodic axes may be anything.
+        pbc: which axes are periodic.
+    """
+    from ase.geometry import complete_cell
+
+    rows = np.where(np.asarray(pbc, bool)[:, None], np.asarray(cell, np.float64), 0.0)
+    return np.asarray(complete_cell(rows), np.float64)
+
+
+def widths(cell: Float[np.ndarray, "3 3"], pbc: Bool[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    """Perpendicular widths of the cell along each axis, infinite where it is not periodic.
+
+    Raises:
+        InputError: the periodic vectors do not span a volume.
+    """
+    full = complete(cell, pbc)
+    volume = abs(np.linalg.det(full))
+    if not np.isfinite(volume) or volume < 1e-12 * np.prod(np.linalg.norm(full, axis=1)):
+        raise InputError(
+            "the periodic cell vectors are linearly dependent", remedy="give three independent vectors"
+        )
+    return np.where(np.asarray(pbc, bool), 1.0 / np.linalg.norm(np.linalg.inv(full), axis=0), np.inf)
+
+
+def _dual(cell: Float[Array, "3 3"], periodic: tuple[int, ...]) -> Float[Array, "3 axes"]:
+    """Columns that turn a vector into its fractional coordinates along the periodic axes alone.
+
+    The pseudo-inverse of the periodic rows: a tilted non-periodic row must not leak into the image choice.
+    """
+    if len(periodic) == 3:
+        a, b, c = cell
+        dual = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=1)
+        return dual / jnp.sum(a * dual[:, 0])
+    rows = cell[jnp.asarray(periodic)]
+    return rows.T @ jnp.linalg.inv(rows @ rows.T)
+
+
+def displacement(cell: Float[Array, "3 3"], pbc: tuple[bool, bool, bool] = (True, True, True)) -> Displacement:
+    """Minimum-image displacement in real coordinates, in the form every jax-md energy function takes.
+
+    The image is chosen by rounding fractional coordinates and subtracted as whole lattice vectors, so a
+    pair that needs no image keeps the exact difference of its coordinates, positions may leave the box, and
+    derivatives with respect to the cell (stress by strain) are those of the chosen image.
+
+    Args:
+        cell: lattice vectors as rows, length; orthorhombic or triclinic.
+        pbc: which axes are periodic; the others are free and their rows are ignored.
+
+    Returns:
+        `fn(Ra, Rb, cell=None, perturbation=None) -> Ra - Rb`, (3,) arrays. `cell=` replaces the cell of the
+        call, also under jit and grad; `perturbation=` is jax-md's linear map of the result. Other keywords
+        are ignored, because jax-md hands every function all of them.
+
+    Error:
+        the minimum image is the nearest one only below half the smallest perpendicular width; builders here
+        refuse a longer list. jax-md's own spaces ignore the question (no flag).
+    """
+    periodic = tuple(axis for axis in range(3) if pbc[axis])
+    base = jnp.asarray(cell)
+
+    def fn(Ra: Array, Rb: Array, cell: Array | None = None, perturbation: Array | None = None, **_: Any) -> Array:
+        if Ra.shape != (3,) or Rb.shape != (3,):
+            # jax-md probes with one and two dimensions and moves on at a ValueError
+            raise ValueError(f"displacement of two points in 3 dimensions; got {Ra.shape} and {Rb.shape}")
+        vector = Ra - Rb
+        if periodic:
+            lattice = jnp.asarray(base if cell is None else cell, vector.dtype)
+            dual = jax.lax.stop_gradient(_dual(lattice, periodic))
+            held = jax.lax.stop_gradient(vector)
+            for column, axis in enumerate(periodic):
+                # sums are written out: a dot of three numbers may run in reduced precision on an accelerator
+                along = held[0] * dual[0, column] + held[1] * dual[1, column] + held[2] * dual[2, column]
+                vector = vector - jnp.round(along) * lattice[axis]
+        if perturbation is not None:
+            vector = jnp.sum(perturbation * vector[None, :], axis=1)
+        return vector
+
+    return fn
+
+
+def neighbor_vectors(
+    positions: Float[Array, "atoms 3"],
+    idx: Int[Array, "atoms slots"],
+    cell: Float[Array, "3 3"],
+    pbc: tuple[bool, bool, bool],
+) -> Float[Array, "atoms slots 3"]:
+    """Minimum-image vectors from each atom to its listed neighbors; padded slots hold some finite vector."""
+    toward = displacement(cell, pbc)
+    others = positions[jnp.where(idx < positions.shape[0], idx, 0)]
+    return jax.vmap(lambda here, there: jax.vmap(lambda point: toward(point, here))(there))(positions, others)
+
+
+def _refuse_update(*_: Any, **__: Any) -> NeighborList:
+    raise InputError(
+        "this neighbor list was built outside jax-md and cannot update itself",
+        remedy="build a new one with mdnum.md.jaxmd.as_neighbor_list",
+    )
+
+
+def as_neighbor_list(
+    idx_dense: Int[Array, "atoms slots"] | np.ndarray,
+    reference_position: Float[Array, "atoms 3"] | np.ndarray,
+    format: Format = "dense",
+    *,
+    capacity: int | None = None,
+) -> NeighborList:
+    """jax-md's NeighborList around a list that somebody else built, so that any jax-md energy runs on it.
+
+    Works inside jit as well, where padding stays where it is; host arrays are packed to the front, as
+    jax-md does it.
+
+    Args:
+        idx_dense: neighbors of each atom, both directions, padded with the number of atoms. Entries that
+            name the atom itself become padding: jax-md's EAM would count them as density at r = 0.
+        reference_position: positions at which the list was built, length.
+        format: dense (atoms, slots); sparse (2, capacity), both directions; ordered-sparse, each pair once.
+        capacity: slots of a sparse list; as many as the dense one has if not given.
+
+    Raises:
+        CapacityError: a sparse list would not fit its capacity (host arrays only).
+    """
+    from jax_md import partition
+
+    formats = {
+        "dense": partition.Dense,
+        "sparse": partition.Sparse,
+        "ordered-sparse": partition.OrderedSparse,
+    }
+    if format not in formats:
+        raise InputError(f"unknown neighbor list format {format!r}; known are {', '.join(formats)}")
+    on_host = isinstance(idx_dense, np.ndarray)
+    xp: Any = np if on_host else jnp
+    atoms, slots = idx_dense.shape
+    own = xp.arange(atoms, dtype=np.int32)[:, None]
+    idx = xp.where((idx_dense == own) | (idx_dense >= atoms), atoms, idx_dense).astype(np.int32)
+    if format != "dense":
+        receiver = idx.reshape(-1)
+        sender = xp.broadcast_to(own, idx.shape).reshape(-1)
+        real = receiver < atoms
+        if format == "ordered-sparse":
+            real = real & (receiver < sender)
+        idx = xp.stack([xp.where(real, receiver, atoms), xp.where(real, sender, atoms)]).astype(np.int32)
+        if on_host:
+            room = atoms * slots if capacity is None else capacity
+            count = int(real.sum())
+            if count > room:
+                raise CapacityError(
+                    f"{count} neighbors in a list with {room} slots", remedy="give the list a larger capacity"
+                )
+            packed = np.full((2, room), atoms, np.int32)
+            packed[:, :count] = idx[:, real]
+            idx = packed
+        elif capacity is not None and capacity < atoms * slots:
+            raise InputError("a list built inside jit cannot be packed", remedy="leave capacity out")
+    return partition.NeighborList(
+        idx=jnp.asarray(idx),
+        reference_position=jnp.asarray(reference_position),
+        error=partition.PartitionError(jnp.zeros((), jnp.uint8)),
+        cell_list_capacity=None,
+        max_occupancy=idx.shape[-1],
+        format=formats[format],
+        cell_size=None,
+        cell_list_fn=_refuse_update,  # type: ignore[arg-type]
+        update_fn=_refuse_update,  # type: ignore[arg-type]
+    )
+
+
+class PairSearch:
+    """jax-md's own neighbor search for one cell, called again and again with new positions.
+
+    It is handed fractional coordinates folded into [0, 1) and the perpendicular widths as its box: a
+    position outside the box silently drops pairs in jax-md, and its triangular-box path flags good boxes as
+    malformed. Overflow is read after every search, outside jit, and answered with a larger list.
+
+    Args:
+        cell: lattice vectors as rows, length.
+        pbc: which axes are periodic.
+        r_list: search radius, length (cutoff plus skin).
+        capacity_multiplier: room left in each row, as a factor.
+
+    Raises:
+        InputError: r_list is over half the smallest perpendicular width, where one image is not enough.
+    """
+
+    def __init__(
+        self,
+        cell: Float[np.ndarray, "3 3"],
+        pbc: tuple[bool, bool, bool],
+        r_list: float,
+        *,
+        capacity_multiplier: float = 1.25,
+    ):
+        narrowest = float(np.min(widths(cell, np.asarray(pbc))))
+        if not 0 < r_list <= narrowest / 2:
+            raise InputError(
+                f"a neighbor list of radius {r_list:g} in a cell {narrowest:g} wide; "
+                f"expected a radius above 0 and up to {narrowest / 2:g}",
+                remedy="repeat the cell, or lower the cutoff or the skin",
+            )
+        self.cell = complete(cell, np.asarray(pbc))
+        self.pbc = np.asarray(pbc, bool)
+        self.r_list = float(r_list)
+        self.capacity_multiplier = capacity_multiplier
+        self._list: NeighborList | None = None
+        self._low = np.zeros(3)
+        self._span = np.ones(3)
+        self._update = jax.jit(lambda folded, previous: previous.update(folded))
+
+    def _frame(self, fractional: np.ndarray) -> None:
+        """A frame [0, 1) around the atoms along free axes, with room to move."""
+        low, high = fractional.min(axis=0), fractional.max(axis=0)
+        self._low = np.where(self.pbc, 0.0, low - self.r_list)
+        self._span = np.where(self.pbc, 1.0, high - low + 2 * self.r_list)
+
+    def _fold(self, fractional: np.ndarray) -> np.ndarray:
+        folded = (fractional - self._low) / self._span
+        wrapped = folded - np.floor(folded)
+        # -1e-17 folds to exactly 1.0, which is outside
+        return np.where(self.pbc, np.where(wrapped >= 1.0, 0.0, wrapped), folded)
+
+    def _allocate(self, folded: np.ndarray) -> NeighborList:
+        from jax_md import partition
+
+        rows = jnp.asarray(self.cell * self._span[:, None])
+        wraps = jnp.asarray(self.pbc)
+
+        def metric(Ra: Array, Rb: Array, **_: Any) -> Array:
+            if Ra.shape != (3,):
+                raise ValueError("three dimensions")
+            delta = Ra - Rb
+            delta = delta - jnp.where(wraps, jnp.round(delta), 0.0)
+            return delta[0] * rows[0] + delta[1] * rows[1] + delta[2] * rows[2]
+
+        boxes = 1.0 / np.linalg.norm(np.linalg.inv(np.asarray(rows)), axis=0)
+        functions = partition.neighbor_list(
+            metric,
+            jnp.asarray(boxes),
+            scalar(self.r_list * (1 + _SEARCH_MARGIN)),  # type: ignore[arg-type]
+            dr_threshold=0.0,
+            capacity_multiplier=self.capacity_multiplier,
+            fractional_coordinates=True,
+            format=partition.Dense,
+        )
+        return functions.allocate(jnp.asarray(folded))
+
+    def __call__(self, positions: Float[np.ndarray, "atoms 3"]) -> Int[np.ndarray, "atoms slots"]:
+        """Neighbors within r_list of each atom: rows sorted, padded with the number of atoms.
+
+        Raises:
+            NumericalError: a position is not finite.
+            CapacityError: jax-md reports an overflow even in a list allocated for these positions.
+        """
+        positions = np.asarray(positions, np.float64)
+        if not np.isfinite(positions).all():
+            atom = int(np.argwhere(~np.isfinite(positions).all(axis=1))[0, 0])
+            raise NumericalError(f"the position of atom {atom} is not finite")
+        atoms = len(positions)
+        if atoms < 2:
+            return np.full((atoms, 1), atoms, np.int32)
+        fractional = positions @ np.linalg.inv(self.cell)
+        folded = self._fold(fractional)
+        found = None
+        if self._list is not None and (folded >= 0).all() and (folded < 1).all():
+            found = self._update(jnp.asarray(folded), self._list)
+        if found is None or bool(found.did_buffer_overflow):
+            self._frame(fractional)
+            folded = self._fold(fractional)
+            found = self._allocate(folded)
+            if bool(found.did_buffer_overflow):
+                raise CapacityError("jax-md's list overflows right after its allocation")
+            self._list = found
+        idx = np.asarray(found.idx)
+        vectors = positions[np.minimum(idx, atoms - 1)] - positions[:, None, :]
+        images = np.where(self.pbc, np.round(vectors @ np.linalg.inv(self.cell)), 0.0)
+        vectors -= images @ self.cell
+        near = (idx < atoms) & (np.sum(vectors**2, axis=-1) < self.r_list**2)
+        return np.sort(np.where(near, idx, atoms).astype(np.int32), axis=1)
+
+
+def dense_pairs(
+    positions: Float[np.ndarray, "atoms 3"],
+    cell: Float[np.ndarray, "3 3"],
+    pbc: tuple[bool, bool, bool],
+    r_list: float,
+    *,
+    capacity_multiplier: float = 1.25,
+) -> Int[np.ndarray, "atoms slots"]:
+    """Neighbors within r_list found by jax-md, once; see PairSearch for repeated searches."""
+    return PairSearch(cell, pbc, r_list, capacity_multiplier=capacity_multiplier)(positions)
+
+
+@dataclass(frozen=True)
+class Relaxed:
+    """Where a relaxation ended.
+
+    Attributes:
+        positions: (atoms, 3), length; not folded back into the cell.
+        steps: FIRE steps taken.
+        force_max: largest force on an atom at the end, force.
+        converged: whether force_max is within the tolerance asked for.
+    """
+
+    positions: np.ndarray
+    steps: int
+    force_max: float
+    converged: bool
+
+
+def relax(
+    energy_or_force_fn: Callable[..., Array],
+    positions: Float[np.ndarray, "atoms 3"],
+    *,
+    neighbors: Callable[[np.ndarray], Any] | None = None,
+    skin: float | None = None,
+    mass: float | np.ndarray = 1.0,
+    max_steps: int = 5_000,
+    force_tolerance: float = 1e-6,
+    dt_start: float = 0.1,
+    dt_max: float = 0.4,
+) -> Relaxed:
+    """Go downhill to the nearest minimum with jax-md's FIRE.
+
+    Args:
+        energy_or_force_fn: `fn(positions)`, or `fn(positions, neighbor=...)` where neighbors is given;
+            returns an energy (scalar) or forces (atoms, 3).
+        positions: start, length.
+        neighbors: builds a list from positions on the host, with the skin included.
+        skin: length; the list is rebuilt once an atom has moved half of it. Needed with neighbors.
+        mass: per atom or one for all; only the path depends on it.
+        max_steps: FIRE steps at most.
+        force_tolerance: stop when no atom feels more than this, force.
+        dt_start, dt_max: first and largest time step, internal time.
+
+    Raises:
+        InputError: neighbors without a positive skin.
+        NumericalError: forces are not finite.
+
+    Source: Bitzek et al., Phys. Rev. Lett. 97, 170201 (2006), as coded in jax_md.minimize.fire_descent.
+    """
+    from jax_md import minimize
+
+    if neighbors is not None and not (skin is not None and skin > 0):
+        raise InputError("a relaxation over a neighbor list needs a skin above 0", remedy="give skin=")
+
+    def scaled(points: Array, **kwargs: Any) -> Array:
+        return energy_or_force_fn(points, **kwargs) * _FIRE_SCALE
+
+    init, apply = minimize.fire_descent(scaled, lambda R, dR, **_: R + dR, dt_start=dt_start, dt_max=dt_max)
+
+    def largest(state: Any) -> Array:
+        return jnp.sqrt(jnp.max(jnp.sum(state.force**2, axis=-1))) / _FIRE_SCALE
+
+    @jax.jit
+    def start(points: Array, masses: Array, kwargs: dict[str, Any]) -> Any:
+        # FIRE stores its time step as float16 (the smallest type that "fits" 0.1) and would step in it
+        state = init(points, mass=masses, **kwargs)
+        return state.set(dt=jnp.asarray(dt_start, points.dtype), alpha=jnp.asarray(0.1, points.dtype))
+
+    @jax.jit
+    def epoch(state: Any, steps: Array, reference: Array, kwargs: dict[str, Any]) -> tuple[Any, Array]:
+        def going(carry: tuple[Any, Array]) -> Array:
+            now, done = carry
+            moved = jnp.max(jnp.sum((now.position - reference) ** 2, axis=-1))
+            fresh = True if skin is None else moved <= (0.5 * skin) ** 2
+            return (done < max_steps) & (largest(now) > force_tolerance) & fresh
+
+        def step(carry: tuple[Any, Array]) -> tuple[Any, Array]:
+            return apply(carry[0], **kwargs), carry[1] + 1
+
+        return jax.lax.while_loop(going, step, (state, steps))
+
+    points = jnp.asarray(positions, jnp.float64)
+    masses = jnp.broadcast_to(jnp.asarray(mass, jnp.float64) * _FIRE_SCALE, (len(points),))
+    kwargs = {} if neighbors is None else {"neighbor": neighbors(np.asarray(points))}
+    state = start(points, masses, kwargs)
+    steps = jnp.zeros((), jnp.int32)
+    while True:
+        reference, before = state.position, int(steps)
+        state, steps = epoch(state, steps, reference, kwargs)
+        if neighbors is not None and int(steps) > before:
+            kwargs = {"neighbor": neighbors(np.asarray(state.position))}
+            # the step that used the skin up saw the old list; its force is taken again on the new one
+            state = state.set(force=start(state.position, masses, kwargs).force)
+        force_max = float(largest(state))
+        if not np.isfinite(force_max):
+            raise NumericalError("forces are not finite during the relaxation", where=f"step {int(steps)}")
+        if force_max <= force_tolerance or int(steps) >= max_steps:
+            break
+        if int(steps) == before:
+            raise NumericalError("the relaxation makes no progress", where=f"step {before}")
+    return Relaxed(np.asarray(state.position), int(steps), force_max, force_max <= force_tolerance)

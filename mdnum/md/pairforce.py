@@ -1,0 +1,161 @@
+"""The fast path: pair forces by gathers over a full list, block of slots after block of slots.
+
+Every pair is evaluated from both ends, so no result is scattered: each atom sums its own neighbors in a
+fixed order. A block of eight slots is one fused kernel over all atoms and leaves one byte of decisions per
+atom; temporaries never exceed a few arrays of one number per atom, which stay in the cache.
+
+Measured on two cores, N = 4,000 and 32,000: 0.8 and 6.5 ms a call in float64, decisions included; the same
+expression over the whole (slots, atoms) array takes 1.6 and 65 ms.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from mdnum.md.cell import Cell
+from mdnum.md.decide import Decisions, PairDecider, SlotJudge, Tables, decide_table, displacements
+from mdnum.md.potentials import CutPotential
+from mdnum.md.verlet import SLOTS
+from mdnum.precision import PrecisionPolicy
+from mdnum.precision.exact import zero_bits
+from mdnum.precision.reductions import Reduction, Sequential
+
+
+class Forces(NamedTuple):
+    """What one evaluation gives.
+
+    Attributes:
+        force: energy/length, shape (3, atoms).
+        energy: energy of each atom, half of its pairs' (or, where a potential has no such division, the
+            total on the first atom), shape (atoms,).
+        virial: sum over pairs of r_ij · F_ij, energy.
+        decisions: None where they were not asked for.
+    """
+
+    force: Float[Array, "3 atoms"]
+    energy: Float[Array, "atoms"]
+    virial: Float[Array, ""]
+    decisions: Decisions | None
+
+
+class PairForce(eqx.Module):
+    """Forces and decisions of a cut pair potential.
+
+    Attributes:
+        model: the potential with its cutoff.
+        cell: the box.
+        zero: an integer zero that XLA must not know (see precision.exact).
+        decider: the pair decision.
+        policy: dtype by role.
+        reduction: order of the sum over neighbors.
+    """
+
+    model: CutPotential
+    cell: Cell
+    zero: Int[Array, ""]
+    decider: PairDecider = eqx.field(static=True)
+    policy: PrecisionPolicy = eqx.field(static=True)
+    reduction: Reduction = eqx.field(static=True, default=Sequential())
+
+    @classmethod
+    def create(cls, model: CutPotential, cell: Cell, decider: PairDecider, policy, reduction) -> PairForce:
+        """Parameters and box in the dtypes of the policy."""
+        return cls(
+            model.astype(policy.dtype("force")),
+            cell.astype(np.float64),
+            zero_bits(policy.dtype("decision")),
+            decider,
+            policy,
+            reduction,
+        )
+
+    def decide(self, positions: Float[Array, "3 atoms"], tables: Tables) -> Decisions:
+        """The decisions of a list at given positions, without forces."""
+        return decide_table(self.decider, self.cell, self.zero, positions, tables)
+
+    def __call__(self, positions: Float[Array, "3 atoms"], tables: Tables, *, decisions: bool) -> Forces:
+        """Forces at sorted, wrapped positions.
+
+        Args:
+            positions: shape (3, atoms), length, in the order of the tables.
+            tables: the list.
+            decisions: whether to return them too; forces have the same bits either way.
+        """
+        judge = SlotJudge(self.decider, self.cell, self.zero, positions)
+        force_dtype, accumulate = self.policy.dtype("force"), self.policy.dtype("accumulate")
+        same = self.policy.dtype("decision") == force_dtype
+        cell = self.cell.astype(force_dtype)
+        components = tuple(positions.astype(force_dtype))
+        at = self.model.at_cutoff()
+
+        def block(carry, listed):
+            totals, tally = carry
+            index, types = listed
+            bits = jnp.zeros(judge.atoms, jnp.uint8)
+            terms = []
+            for k in range(SLOTS):
+                t = None if types is None else types[k]
+                d, quantity, inside, threshold = judge.slot(index[k], t)
+                if decisions:
+                    bits, tally = judge.tally(tally, bits, k, index[k], t, quantity, inside, threshold)
+                d = d if same else displacements(components, cell, index[k])
+                if same and self.decider.space == "r2":
+                    r2 = quantity
+                else:
+                    r2 = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
+                # the argument is masked, not only the result: a padded slot may be at distance zero
+                r2 = jnp.where(inside, r2, jnp.ones((), force_dtype))
+                energy, slope = self.model.evaluate(r2, t, at)
+                energy, slope = jnp.where(inside, energy, 0), jnp.where(inside, slope, 0)
+                pull = slope + slope
+                term = (*(pull * c for c in d), energy, pull * r2)
+                terms.append([q.astype(accumulate) for q in term])
+            summed = [self.reduction.within(total, list(q)) for total, *q in zip(totals, *terms, strict=True)]
+            totals = tuple(total for total, _ in summed)
+            return (totals, tally), (bits if decisions else None, tuple(later for _, later in summed))
+
+        start = ((jnp.zeros(judge.atoms, accumulate),) * 5, judge.start())
+        (totals, tally), (bits, later) = lax.scan(block, start, (tables.index, tables.types))
+        fx, fy, fz, energy, virial = (
+            self.reduction.finish(total, blocks) for total, blocks in zip(totals, later, strict=True)
+        )
+        half = jnp.asarray(0.5, accumulate)
+        return Forces(
+            jnp.stack([fx, fy, fz]),
+            half * energy,
+            -jnp.sum(half * virial, dtype=jnp.float64),
+            judge.finish(tally, bits) if decisions else None,
+        )
+
+    def virial_tensor(self, positions: Float[Array, "3 atoms"], tables: Tables) -> Float[Array, "3 3"]:
+        """Sum over pairs of r_ij ⊗ F_ij, energy; minus the derivative of the energy by strain."""
+        judge = SlotJudge(self.decider, self.cell, self.zero, positions)
+        force_dtype = self.policy.dtype("force")
+        cell = self.cell.astype(force_dtype)
+        components = tuple(positions.astype(force_dtype))
+        at = self.model.at_cutoff()
+
+        def block(totals, listed):
+            index, types = listed
+            for k in range(SLOTS):
+                t = None if types is None else types[k]
+                _, _, inside, _ = judge.slot(index[k], t)
+                d = displacements(components, cell, index[k])
+                r2 = jnp.where(inside, d[0] * d[0] + d[1] * d[1] + d[2] * d[2], jnp.ones((), force_dtype))
+                slope = jnp.where(inside, self.model.evaluate(r2, t, at)[1], 0)
+                products = [slope * d[a] * d[b] for a, b in _VOIGT]
+                totals = tuple(total + q for total, q in zip(totals, products, strict=True))
+            return totals, None
+
+        totals, _ = lax.scan(block, (jnp.zeros(judge.atoms, force_dtype),) * 6, (tables.index, tables.types))
+        xx, yy, zz, yz, xz, xy = (-jnp.sum(total, dtype=jnp.float64) for total in totals)
+        return jnp.stack([jnp.stack([xx, xy, xz]), jnp.stack([xy, yy, yz]), jnp.stack([xz, yz, zz])])
+
+
+_VOIGT = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))

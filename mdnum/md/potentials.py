@@ -1,0 +1,142 @@
+"""Pair potentials in closed form: energy and slope as functions of r²."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from mdnum.md.cutoffs import AtCutoff, Cutoff
+
+
+class PairPotential(eqx.Module):
+    """A bare pair potential; every array leaf is a parameter with one entry per pair type."""
+
+    name: ClassVar[str]
+
+    @abstractmethod
+    def evaluate(self, r2: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        """Energy u and du/d(r²) at squared distances, parameters broadcast against r2."""
+
+    def of(self, types: Int[Array, "..."] | None) -> PairPotential:
+        """The parameters of given pair types; types None means that there is only one."""
+        return jax.tree.map(lambda leaf: leaf[0] if types is None else leaf[types], self)
+
+
+class LennardJones(PairPotential):
+    """4 epsilon ((sigma/r)^12 - (sigma/r)^6).
+
+    Attributes:
+        sigma: length, shape (types,).
+        epsilon: energy, shape (types,).
+    """
+
+    name = "lennard-jones"
+    sigma: Float[Array, "types"]
+    epsilon: Float[Array, "types"]
+
+    def evaluate(self, r2):
+        inverse = 1 / r2
+        s2 = self.sigma * self.sigma * inverse
+        s6 = s2 * s2 * s2
+        return 4 * self.epsilon * (s6 * (s6 - 1)), -12 * self.epsilon * (s6 * (s6 + s6 - 1)) * inverse
+
+
+class Morse(PairPotential):
+    """depth (exp(-2 alpha (r - r0)) - 2 exp(-alpha (r - r0))).
+
+    Attributes:
+        depth: energy; alpha: 1/length; r0: length; each of shape (types,).
+    """
+
+    name = "morse"
+    depth: Float[Array, "types"]
+    alpha: Float[Array, "types"]
+    r0: Float[Array, "types"]
+
+    def evaluate(self, r2):
+        r = jnp.sqrt(r2)
+        e = jnp.exp(-self.alpha * (r - self.r0))
+        return self.depth * (e * (e - 2)), -self.depth * self.alpha * (e * (e - 1)) / r
+
+
+class SoftSphere(PairPotential):
+    """epsilon/alpha (1 - r/sigma)^alpha inside sigma, zero outside.
+
+    Attributes:
+        sigma: length; epsilon: energy; alpha: exponent above 1; each of shape (types,).
+    """
+
+    name = "soft-sphere"
+    sigma: Float[Array, "types"]
+    epsilon: Float[Array, "types"]
+    alpha: Float[Array, "types"]
+
+    def evaluate(self, r2):
+        r = jnp.sqrt(r2)
+        overlap = jnp.maximum(1 - r / self.sigma, 0)
+        # a zero overlap is kept away from the power, whose derivatives are not finite there
+        touching = overlap > 0
+        power = jnp.where(touching, jnp.where(touching, overlap, 1) ** (self.alpha - 1), 0)
+        return (
+            self.epsilon / self.alpha * power * overlap,
+            -self.epsilon / self.sigma * power / (r + r),
+        )
+
+
+class CutPotential(eqx.Module):
+    """A pair potential with its cutoff: what the force loop evaluates.
+
+    Attributes:
+        potential: bare potential, parameters per pair type.
+        cutoff: how it ends.
+        r_cut: cutoff per pair type, length, shape (types,).
+        r_onset: onset of switching per pair type (equal to r_cut where there is none), shape (types,).
+    """
+
+    potential: PairPotential
+    cutoff: Cutoff
+    r_cut: Float[Array, "types"]
+    r_onset: Float[Array, "types"]
+
+    @property
+    def pair_types(self) -> int:
+        """How many kinds of pairs there are."""
+        return self.r_cut.shape[0]
+
+    def at_cutoff(self) -> AtCutoff:
+        """The bare potential at r_cut, per pair type."""
+        energy, w = self.potential.evaluate(self.r_cut * self.r_cut)
+        return AtCutoff(self.r_cut, self.r_onset, energy, 2 * self.r_cut * w)
+
+    def evaluate(self, r2, types, at: AtCutoff):
+        """Energy and denergy/d(r²) of pairs inside the cutoff.
+
+        Args:
+            r2: squared distances.
+            types: pair type of each pair, or None where there is only one.
+            at: `at_cutoff()`, made once outside the loop.
+        """
+        u, w = self.potential.of(types).evaluate(r2)
+        here = AtCutoff(*(leaf[0] if types is None else leaf[types] for leaf in at))
+        return self.cutoff.cut(r2, u, w, here)
+
+    def jumps(self) -> tuple[Float[np.ndarray, "types"], Float[np.ndarray, "types"]]:
+        """Energy jump and radial force jump of a pair that enters, per pair type."""
+        at = self.at_cutoff()
+        return np.asarray(self.cutoff.energy_jump(at)), np.asarray(self.cutoff.force_jump(at))
+
+    def astype(self, dtype) -> CutPotential:
+        """Parameters as jax arrays of the given dtype."""
+        return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), self)
+
+
+def pair_type(first, second, species: int):
+    """Index of an unordered pair of species, counted along the rows of the upper triangle."""
+    low, high = np.minimum(first, second), np.maximum(first, second)
+    return low * species - low * (low - 1) // 2 + (high - low)

@@ -1,0 +1,214 @@
+"""Verlet skin lists: when they are rebuilt, how they are built, and what they hold."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from mdnum.errors import CapacityError, InputError
+from mdnum.md.cell import Cell, displacement, strain_loss
+from mdnum.md.cells import neighbor_table
+
+# decisions leave the force loop eight to a byte, so lists have a multiple of eight slots
+SLOTS = 8
+
+
+@dataclass(frozen=True)
+class RebuildRule:
+    """When a list is rebuilt, in the words of LAMMPS's neigh_modify.
+
+    Attributes:
+        skin: r_list - r_cut, length.
+        every: a list may be rebuilt only at multiples of this many steps after its build.
+        delay: and not before this many steps.
+        check: rebuild only where an atom has moved by more than skin/2 (else blindly, whenever allowed).
+    """
+
+    skin: float
+    every: int = 1
+    delay: int = 0
+    check: bool = True
+
+    @property
+    def first_allowed(self) -> int:
+        """Age at which a list can first be rebuilt; a build there is `dangerous` in LAMMPS's sense,
+        because an earlier one may have been due."""
+        return max(self.every, self.delay)
+
+    @property
+    def safe(self) -> bool:
+        """Whether a list is never used once its skin is spent."""
+        return self.check and self.every == 1 and self.delay <= 1
+
+
+@dataclass(frozen=True)
+class PairTable:
+    """The pairs of one list, both directions, as the force loop reads them.
+
+    Attributes:
+        index: neighbor of each slot and atom, in sorted labels, padded with the number of atoms,
+            shape (slots, atoms).
+        order: sorted atom k is atom order[k].
+        r_list: list radius, length.
+        occupancy: largest number of neighbors of an atom.
+        build_seconds: time the search took.
+    """
+
+    index: Int[np.ndarray, "slots atoms"]
+    order: Int[np.ndarray, "atoms"]
+    r_list: float
+    occupancy: int
+    build_seconds: float
+
+    @property
+    def slots(self) -> int:
+        """Room per atom."""
+        return self.index.shape[0]
+
+    @property
+    def pairs(self) -> int:
+        """Number of listed pairs, each counted once."""
+        return int(np.count_nonzero(self.index < self.index.shape[1])) // 2
+
+    def unsorted(self) -> Int[np.ndarray, "atoms slots"]:
+        """Neighbors in the user's labels, one row per atom, padded with the number of atoms."""
+        atoms = self.index.shape[1]
+        labels = np.append(self.order, atoms).astype(np.int32)
+        out = np.empty((atoms, self.slots), np.int32)
+        out[self.order] = labels[self.index].T
+        return out
+
+
+class ListBuilder(Protocol):
+    """A neighbor search that fills a pair table."""
+
+    name: str
+
+    def build(
+        self, positions: Float[np.ndarray, "atoms 3"], cell: Cell, r_list: float, slots: int
+    ) -> tuple[Int[np.ndarray, "slots atoms"], Int[np.ndarray, "atoms"], int]:
+        """Index table in sorted labels, order, and the largest neighbor count (above slots: incomplete)."""
+        ...
+
+
+@dataclass(frozen=True)
+class HostBuilder:
+    """mdnum's own cell list, compiled by numba, on the host."""
+
+    name: str = "host"
+
+    def build(self, positions, cell, r_list, slots):
+        return neighbor_table(positions, cell, r_list, slots)
+
+
+@dataclass(frozen=True)
+class JaxMdBuilder:
+    """jax-md's partition.neighbor_list, through the adaptor that keeps its traps shut."""
+
+    name: str = "jax-md"
+
+    def build(self, positions, cell, r_list, slots):
+        from mdnum.md import jaxmd
+
+        rows = np.asarray(jaxmd.dense_pairs(positions, cell.matrix, cell.pbc, r_list))
+        atoms = len(positions)
+        occupancy = int((rows < atoms).sum(1).max(initial=0))
+        table = np.full((slots, atoms), atoms, np.int32)
+        # jax-md pads at the end of a row; its order is kept, it is the order of the sum
+        kept = min(slots, rows.shape[1])
+        if occupancy <= slots:
+            table[:kept] = rows[:, :kept].T
+        return table, np.arange(atoms), occupancy
+
+
+BUILDERS: dict[str, ListBuilder] = {"host": HostBuilder(), "jax-md": JaxMdBuilder()}
+
+
+def check_radius(cell: Cell, r_cut: float, skin: float) -> None:
+    """Refuse a list radius that the minimum image cannot serve.
+
+    Raises:
+        InputError: r_cut + skin exceeds half the smallest perpendicular width of the box.
+    """
+    half = float(np.min(cell.widths)) / 2
+    if r_cut + skin > half:
+        wanted = f"r_cut + skin = {r_cut + skin:g} exceeds half the smallest perpendicular box width {half:g}"
+        if r_cut < half:
+            remedy = f"Use a skin of at most {half - r_cut:.4g}, or a larger box"
+        else:
+            remedy = f"Repeat the box (r_cut alone needs a width of {2 * r_cut:g}) or use a smaller cutoff"
+        raise InputError(wanted, remedy=remedy, where="neighbors.skin")
+
+
+@dataclass
+class VerletList:
+    """A list that grows its capacity when it must and remembers where it was built.
+
+    Attributes:
+        builder: the neighbor search.
+        rule: when to rebuild.
+        r_cut: largest interaction radius, length.
+        slack: room kept beyond the largest occupancy seen, so that a denser moment does not recompile.
+        guard: added to the list radius to cover the rounding of displacements in a narrow state, length.
+        slots: room per atom; 0 lets the density decide.
+    """
+
+    builder: ListBuilder
+    rule: RebuildRule
+    r_cut: float
+    slack: float = 1.1
+    guard: float = 0.0
+    slots: int = field(default=0)
+
+    def build(self, positions: Float[np.ndarray, "atoms 3"], cell: Cell) -> PairTable:
+        """The pairs within r_cut + skin of wrapped positions; capacity grows until they fit.
+
+        Raises:
+            CapacityError: an atom would have every other atom as a neighbor and more.
+        """
+        r_list = self.r_cut + self.rule.skin
+        atoms = len(positions)
+        if not self.slots:
+            self.slots = self._guess(atoms, cell, r_list)
+        begin = time.perf_counter()
+        while True:
+            index, order, most = self.builder.build(positions, cell, r_list + self.guard, self.slots)
+            if most <= self.slots:
+                return PairTable(index, order, r_list, most, time.perf_counter() - begin)
+            if most >= atoms and atoms > 1:
+                raise CapacityError(f"an atom has {most} neighbors among {atoms} atoms")
+            self.slots = self._rounded(most * self.slack)
+
+    def _guess(self, atoms: int, cell: Cell, r_list: float) -> int:
+        volume = cell.volume
+        if not np.isfinite(volume):
+            return SLOTS
+        # a guess that is too small costs one more search, one that is too large costs every step
+        mean = atoms / volume * 4.0 / 3.0 * np.pi * r_list**3
+        return self._rounded(min(mean, atoms))
+
+    @staticmethod
+    def _rounded(slots: float) -> int:
+        return max(SLOTS, int(np.ceil(slots / SLOTS)) * SLOTS)
+
+    def consumed(self, positions, cell: Cell, reference, reference_cell: Cell) -> float:
+        """Share of the skin that motion and box strain have used since the build; above 1 is too late.
+
+        Args:
+            positions, cell: now; reference, reference_cell: at the build. Wrapped positions, length.
+        """
+        moved = displacement(cell, _carried(reference, reference_cell, cell), positions)
+        largest = float(np.sqrt(np.max(sum(c * c for c in moved), initial=0.0)))
+        loss = strain_loss(reference_cell, cell, self.r_cut + self.rule.skin)
+        return (2 * largest + loss) / self.rule.skin if self.rule.skin > 0 else np.inf
+
+
+def _carried(positions, old: Cell, new: Cell):
+    """Where positions would be if they had only moved with the box."""
+    if np.array_equal(old.matrix, new.matrix):
+        return positions
+    return np.asarray(positions) @ np.asarray(old.inverse) @ np.asarray(new.matrix)

@@ -1,0 +1,39 @@
+"""Floats as integers: unit roundoff, ulp distance and neighbors."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float, Int
+
+_SIGNED = {np.dtype(np.float64): np.int64, np.dtype(np.float32): np.int32, np.dtype(np.float16): np.int16}
+
+
+def unit_roundoff(dtype) -> float:
+    """Half the spacing of the floats at 1: the largest relative error of one rounding (Higham 2002, 2.1)."""
+    return float(np.finfo(dtype).eps) / 2
+
+
+def ordinal(x: Float[np.ndarray, "..."]) -> Int[np.ndarray, "..."]:
+    """Position of x among all floats of its dtype, as a signed integer; -0 and +0 share 0.
+
+    Adjacent finite floats have adjacent ordinals, so differences count ulps. NaN has no meaningful ordinal.
+    """
+    x = np.asarray(x)
+    integer = _SIGNED[x.dtype]
+    bits = x.view(integer).astype(np.int64)
+    lowest = np.int64(np.iinfo(integer).min)
+    return np.where(bits < 0, lowest - bits, bits)
+
+
+def ulp_distance(a, b, dtype=np.float64) -> Int[np.ndarray, "..."]:
+    """How many floats of dtype lie from a to b, with sign (b above a is positive)."""
+    return ordinal(np.asarray(b, dtype)) - ordinal(np.asarray(a, dtype))
+
+
+def neighbor(x, ulps: int, dtype=np.float64):
+    """The float that lies the given number of ulps above x (below, where negative)."""
+    x = np.asarray(x, dtype)
+    integer = _SIGNED[x.dtype]
+    place = ordinal(x) + ulps
+    lowest = np.int64(np.iinfo(integer).min)
+    return np.where(place < 0, lowest - place, place).astype(integer).view(x.dtype)[()]

@@ -1,0 +1,248 @@
+"""Epoch after epoch: the host's side of a rollout.
+
+The engine builds lists, starts jitted epochs and hands out what they recorded. While the device computes
+an epoch, the caller works on the record of the one before: that is why a segment is yielded only after
+its successor has been started.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from mdnum.md.cell import wrap_positions
+from mdnum.md.verlet import PairTable, VerletList
+from mdnum.rollout.epoch import Program, Record, State, empty_record, run_epoch
+from mdnum.systems.build import Simulation
+
+# bytes that the rows of one epoch's record may take, and the most rows; both bound memory, not accuracy
+_RECORD_BYTES = 48 * 2**20
+_MOST_ROWS = 128
+
+
+@dataclass(frozen=True)
+class Segment:
+    """What one stretch of steps with one list left behind, on the host.
+
+    Attributes:
+        first: step of the first row.
+        rows: number of rows.
+        record: one row per step (host arrays; valid until the next segment but one is asked for).
+        before: decisions of this list at the step before `first`, shape (words, atoms).
+        table: the list.
+        epoch: number of the list's life.
+        built: step at which the list was built.
+        opens: whether this is the first segment of its epoch.
+        closes: why the epoch ended with it: "displacement", "interval", "end", "blow-up" or None.
+        state: where the rollout goes on.
+        reference: wrapped positions at which the list was built, shape (atoms, 3).
+    """
+
+    first: int
+    rows: int
+    record: Record
+    before: UInt8[np.ndarray, "words atoms"] | None
+    table: PairTable
+    epoch: int
+    built: int
+    opens: bool
+    closes: str | None
+    state: State
+    reference: Float[np.ndarray, "atoms 3"]
+
+    @property
+    def last(self) -> int:
+        """Step of the last row."""
+        return self.first + self.rows - 1
+
+    def rows_of(self, name: str) -> np.ndarray:
+        """The filled rows of a column of the record."""
+        return np.asarray(getattr(self.record, name))[: self.rows]
+
+    def unsorted(self, name: str, row: int) -> np.ndarray:
+        """A row of a per-atom column in the user's order of atoms, shape (atoms, 3)."""
+        sorted_row = np.asarray(getattr(self.record, name))[row]
+        out = np.empty((sorted_row.shape[1], 3), sorted_row.dtype)
+        out[self.table.order] = sorted_row.T
+        return out
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where an engine begins: the start of a rollout, or a checkpoint of one.
+
+    Attributes:
+        state: the state to go on from.
+        reference: wrapped positions at which the list in use was built, shape (atoms, 3).
+        built: step at which it was built.
+        epoch: number of its life.
+        slots: its capacity; 0 lets the density decide.
+    """
+
+    state: State
+    reference: Float[np.ndarray, "atoms 3"]
+    built: int = 0
+    epoch: int = 0
+    slots: int = 0
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """Plain arrays for a checkpoint."""
+        arrays = {f"state_{name}": np.asarray(value) for name, value in self.state._asdict().items()}
+        numbers = {"built": self.built, "epoch": self.epoch, "slots": self.slots}
+        return arrays | {"reference": self.reference} | {k: np.asarray(v) for k, v in numbers.items()}
+
+    @classmethod
+    def from_arrays(cls, arrays) -> Start:
+        """The inverse of `to_arrays`, bit for bit."""
+        state = State(*(jnp.asarray(arrays[f"state_{name}"]) for name in State._fields))
+        return cls(
+            state,
+            np.asarray(arrays["reference"]),
+            int(arrays["built"]),
+            int(arrays["epoch"]),
+            int(arrays["slots"]),
+        )
+
+
+def first_state(simulation: Simulation) -> Start:
+    """The start of a rollout: positions wrapped, velocities as the system has them."""
+    dtype = simulation.policy.dtype("state")
+    wrapped, images = wrap_positions(simulation.cell, simulation.positions)
+    wrapped = wrapped.astype(dtype)
+    x = jnp.asarray(wrapped.T)
+    state = State(
+        jnp.zeros((), jnp.int64),
+        x,
+        jnp.asarray(simulation.velocities.T, dtype),
+        jnp.asarray(images.T, jnp.int32),
+        x,
+        jnp.zeros((), jnp.float64),
+    )
+    return Start(state, np.asarray(wrapped, np.float64))
+
+
+class Engine:
+    """Runs a simulation from a start to a last step.
+
+    Args:
+        simulation: the system as objects.
+        last: last step to evaluate.
+        start: where to begin; default the system's own start.
+        record: whether decisions and positions leave the loop. Energies do in any case, and trajectories
+            have the same bits either way.
+    """
+
+    def __init__(self, simulation: Simulation, last: int, *, start: Start | None = None, record: bool = True):
+        self.simulation = simulation
+        self.last = last
+        self.record = record
+        self.start = start or first_state(simulation)
+        self.verlet: VerletList = simulation.verlet_list()
+        self.verlet.slots = self.start.slots
+        rule = simulation.rule
+        self.program = Program(
+            simulation.force,
+            simulation.integrator,
+            simulation.cell.astype(np.float64),
+            jnp.asarray(simulation.masses),
+            jnp.asarray(rule.skin / 2, jnp.float64),
+            rule.every,
+            rule.delay,
+            rule.check,
+            record,
+        )
+        self._records: list[Record | None] = [None, None]
+
+    def _room(self, words: int) -> int:
+        """Rows of a record: a power of two within the memory allowed."""
+        per_row = self.simulation.atoms * (2 * 24 + 12 + words) if self.record else 64
+        rows = max(2, min(_MOST_ROWS, _RECORD_BYTES // per_row))
+        # no list is expected to live longer than the run
+        return min(1 << (rows.bit_length() - 1), 1 << max(1, int(self.last + 1).bit_length()))
+
+    def _take(self, turn: int, words: int) -> Record:
+        """The record buffer whose turn it is; it is donated to the epoch that fills it."""
+        rows, held = self._room(words), self._records[turn]
+        self._records[turn] = None
+        if held is not None and held.bits.shape[:2] == (rows, words):
+            return held
+        dtype = self.simulation.policy.dtype("state")
+        return empty_record(rows, words, self.simulation.atoms, dtype, self.record)
+
+    def segments(self) -> Iterator[Segment]:
+        """Stretches of steps in order; the last one has `closes` set to "end" or "blow-up"."""
+        start, cell = self.start, self.simulation.cell
+        state, reference, built, epoch = start.state, start.reference, start.built, start.epoch
+        table = self.verlet.build(reference, cell)
+        tables = self.simulation.tables(table)
+        home = jnp.asarray(reference.T, self.simulation.policy.dtype("state"))
+        first, opens, turn = int(state.step), int(state.step) == built, 0
+        waiting: Segment | None = None
+        while True:
+            words = table.slots // 8
+            outcome, record = run_epoch(
+                self.program,
+                tables,
+                state,
+                home,
+                jnp.asarray(built, jnp.int64),
+                jnp.asarray(self.last, jnp.int64),
+                self._take(turn, words),
+            )
+            if waiting is not None:
+                # the device is at work: the caller may read the record before this one
+                yield waiting
+                self._records[1 - turn] = waiting.record
+            rows = int(outcome.rows)
+            closes = self._closes(outcome, first + rows)
+            waiting = Segment(
+                first,
+                rows,
+                record,
+                None if outcome.before is None else np.asarray(outcome.before.bits),
+                table,
+                epoch,
+                built,
+                opens,
+                closes,
+                outcome.state,
+                reference,
+            )
+            state, first, turn, opens = outcome.state, first + rows, 1 - turn, False
+            if closes in ("end", "blow-up"):
+                yield waiting
+                return
+            if closes:
+                reference = np.asarray(state.x, np.float64).T.copy()
+                home, built, epoch, opens = state.x, first, epoch + 1, True
+                table = self.verlet.build(reference, cell)
+                tables = self.simulation.tables(table)
+
+    def _closes(self, outcome, next_step: int) -> str | None:
+        if not bool(outcome.finite):
+            return "blow-up"
+        if next_step > self.last:
+            return "end"
+        if bool(outcome.rebuild):
+            return "displacement" if self.simulation.rule.check else "interval"
+        return None
+
+
+def resume_point(segment: Segment) -> Start:
+    """Where a rollout goes on after a segment: with its list, or with a new one where its list is used up."""
+    state = segment.state
+    if segment.closes in ("displacement", "interval"):
+        reference = np.asarray(state.x, np.float64).T.copy()
+        return Start(state, reference, segment.last + 1, segment.epoch + 1, segment.table.slots)
+    return Start(state, segment.reference, segment.built, segment.epoch, segment.table.slots)
+
+
+def unwrapped(
+    cell_matrix: Float[np.ndarray, "3 3"], x: Float[np.ndarray, "atoms 3"], images: Int[np.ndarray, "atoms 3"]
+):
+    """Positions as if the box had no faces: wrapped positions plus the lattice vectors taken off."""
+    return x + images @ np.asarray(cell_matrix)

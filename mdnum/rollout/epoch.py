@@ -1,0 +1,236 @@
+"""The life of one Verlet list: a jitted loop that advances with fixed pairs and records as it goes.
+
+The loop ends when the skin is used up, the record is full, the last step is done, or a number is not
+finite. The host then rebuilds the list and starts the next epoch.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int, UInt8
+
+from mdnum.md.cell import Cell
+from mdnum.md.decide import Decisions, Tables
+from mdnum.md.integrators import Integrator
+from mdnum.md.pairforce import Forces
+
+
+class Program(eqx.Module):
+    """Everything about a rollout that stays the same from epoch to epoch.
+
+    Attributes:
+        force: PairForce or ManyBodyForce: forces and decisions over a list.
+        integrator: between force evaluations.
+        cell: the box, float64.
+        masses: shape (atoms,), in the user's order.
+        half_skin: half the skin, length.
+        every, delay: when the list may be rebuilt (RebuildRule).
+        check: whether a rebuild needs an atom to have moved by half the skin.
+        record: whether decisions and positions leave the loop.
+    """
+
+    force: eqx.Module
+    integrator: Integrator
+    cell: Cell
+    masses: Float[Array, "atoms"]
+    half_skin: Float[Array, ""]
+    every: int = eqx.field(static=True)
+    delay: int = eqx.field(static=True)
+    check: bool = eqx.field(static=True)
+    record: bool = eqx.field(static=True)
+
+
+class State(NamedTuple):
+    """Where a rollout stands between two force evaluations, in the user's order of atoms.
+
+    Attributes:
+        step: the step whose forces come next.
+        x: wrapped positions at that step, shape (3, atoms).
+        v: velocities after the first half kick (at step 0: the initial velocities), shape (3, atoms).
+        images: lattice vectors taken off by wrapping so far, shape (3, atoms).
+        x_before: positions of the step before, shape (3, atoms).
+        heat: energy taken up from the thermostat so far.
+    """
+
+    step: Int[Array, ""]
+    x: Float[Array, "3 atoms"]
+    v: Float[Array, "3 atoms"]
+    images: Int[Array, "3 atoms"]
+    x_before: Float[Array, "3 atoms"]
+    heat: Float[Array, ""]
+
+
+class Record(NamedTuple):
+    """One row per step of an epoch, atoms in the order of its tables.
+
+    Attributes:
+        x, v: positions and full-step velocities, shape (rows, 3, atoms).
+        images: shape (rows, 3, atoms), int32.
+        bits: decisions, shape (rows, words, atoms).
+        potential, kinetic, virial, heat: energies, shape (rows,).
+        nearest: smallest |margin|; ambiguous: pairs within the rounding bound; moved: largest displacement
+            since the list was built; each of shape (rows,).
+    """
+
+    x: Float[Array, "rows 3 atoms"]
+    v: Float[Array, "rows 3 atoms"]
+    images: Int[Array, "rows 3 atoms"]
+    bits: UInt8[Array, "rows words atoms"]
+    potential: Float[Array, "rows"]
+    kinetic: Float[Array, "rows"]
+    virial: Float[Array, "rows"]
+    heat: Float[Array, "rows"]
+    nearest: Float[Array, "rows"]
+    ambiguous: Int[Array, "rows"]
+    moved: Float[Array, "rows"]
+
+
+class Outcome(NamedTuple):
+    """How an epoch's loop ended.
+
+    Attributes:
+        state: where to go on.
+        rows: how many rows were recorded.
+        rebuild: the list must be rebuilt before the next forces.
+        finite: every number so far was.
+        before: decisions of the list at the step before its first, for the count check and the first flips.
+    """
+
+    state: State
+    rows: Int[Array, ""]
+    rebuild: Bool[Array, ""]
+    finite: Bool[Array, ""]
+    before: Decisions | None
+
+
+def empty_record(rows: int, words: int, atoms: int, dtype, record: bool) -> Record:
+    """Room for the rows of an epoch; without recording only the per-step numbers have room."""
+    shape = (rows, 3, atoms) if record else (rows, 3, 0)
+    numbers = [jnp.zeros(rows, jnp.float64) for _ in range(4)]
+    return Record(
+        jnp.zeros(shape, dtype),
+        jnp.zeros(shape, dtype),
+        jnp.zeros(shape, jnp.int32),
+        jnp.zeros((rows, words, atoms if record else 0), jnp.uint8),
+        *numbers,
+        jnp.zeros(rows, jnp.float64),
+        jnp.zeros(rows, jnp.int32),
+        jnp.zeros(rows, jnp.float64),
+    )
+
+
+def _write(record: Record, row, **values) -> Record:
+    """Write one row of the named columns."""
+    return record._replace(
+        **{
+            name: lax.dynamic_update_index_in_dim(
+                getattr(record, name), jnp.asarray(value, getattr(record, name).dtype), row, 0
+            )
+            for name, value in values.items()
+        }
+    )
+
+
+# the record is donated: two of them take turns, and no epoch pays for clearing one
+@partial(jax.jit, donate_argnames=("record",))
+def run_epoch(
+    program: Program,
+    tables: Tables,
+    state: State,
+    reference: Float[Array, "3 atoms"],
+    built: Int[Array, ""],
+    last: Int[Array, ""],
+    record: Record,
+) -> tuple[Outcome, Record]:
+    """Advance with one list until it is used up, the record is full or the last step is done.
+
+    Args:
+        program: what stays the same.
+        tables: the list.
+        state: where the rollout stands, user's order.
+        reference: wrapped positions at which the list was built, user's order.
+        built: step at which the list was built.
+        last: last step to evaluate.
+        record: rows to fill; donated.
+    """
+    order = tables.order
+    dtype = state.x.dtype
+    x, v, images = state.x[:, order], state.v[:, order], state.images[:, order]
+    home = reference[:, order]
+    masses = program.masses[order]
+    cell = program.cell.astype(dtype)
+    half_step = (0.5 * program.integrator.timestep).astype(dtype)
+    mass_row = masses.astype(dtype)
+
+    before = None
+    if program.record:
+        before = program.force.decide(state.x_before[:, order], tables)  # type: ignore[attr-defined]
+
+    def moved(x):
+        d = cell.minimum_image(*(x - home))
+        return jnp.sqrt(jnp.max(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])).astype(jnp.float64)
+
+    def body(carry):
+        step, x, v, images, _, heat, row, _, _, largest, record = carry
+        made: Forces = program.force(x, tables, decisions=program.record)  # type: ignore[operator]
+        acceleration = made.force.astype(dtype) / mass_row
+        # the first step of all starts from full-step velocities
+        second_half = jnp.where(step == 0, jnp.zeros((), dtype), half_step)
+        v = v + second_half * acceleration
+        potential = jnp.sum(made.energy, dtype=jnp.float64)
+        speed2 = jnp.sum(jnp.square(v.astype(jnp.float64)), axis=0)
+        kinetic = 0.5 * jnp.sum(masses * speed2)
+        values = {
+            "potential": potential,
+            "kinetic": kinetic,
+            "virial": made.virial,
+            "heat": heat,
+            "moved": largest,
+        }
+        if program.record:
+            d = made.decisions
+            assert d is not None
+            values |= {"x": x, "v": v, "images": images, "bits": d.bits}
+            values |= {"nearest": d.nearest, "ambiguous": d.ambiguous}
+        record = _write(record, row, **values)
+        finite = jnp.isfinite(potential) & jnp.isfinite(kinetic)
+        after, v, taken = program.integrator.drift(x, v + half_step * acceleration, masses, step, order)
+        wrapped, n = cell.wrap(*after)
+        after, images = jnp.stack(wrapped), images + jnp.stack(n).astype(jnp.int32)
+        step = step + 1
+        largest = moved(after)
+        age = step - built
+        allowed = (age >= program.delay) & (age % program.every == 0)
+        due = allowed & (largest > program.half_skin) if program.check else allowed
+        return step, after, v, images, x, heat + taken, row + 1, due, finite, largest, record
+
+    def go_on(carry):
+        step, _, _, _, _, _, row, due, finite, _, _ = carry
+        return (step <= last) & (row < record.potential.shape[0]) & ~due & finite
+
+    carry = (
+        state.step,
+        x,
+        v,
+        images,
+        state.x_before[:, order],
+        state.heat,
+        jnp.zeros((), jnp.int64),
+        jnp.zeros((), bool),
+        jnp.ones((), bool),
+        moved(x),
+        record,
+    )
+    step, x, v, images, x_before, heat, rows, due, finite, _, record = lax.while_loop(go_on, body, carry)
+
+    def unsorted(a):
+        return jnp.zeros_like(a).at[:, order].set(a)
+
+    end = State(step, unsorted(x), unsorted(v), unsorted(images), unsorted(x_before), heat)
+    return Outcome(end, rows, due, finite, before), record

@@ -1,0 +1,142 @@
+"""The life of Verlet lists: epochs, dangerous builds, and the audit that finds pairs a list has lost."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from mdnum.rollout.engine import Segment
+from mdnum.rollout.flips import decided_pairs, true_pairs
+from mdnum.systems.build import Simulation
+
+
+@dataclass
+class Epoch:
+    """One list in use: what has been seen of it so far."""
+
+    epoch: int
+    start: int
+    pairs_listed: int
+    capacity: int
+    occupancy: int
+    build_ms: float
+    length: int = 0
+    displacement: float = 0.0
+    lost: set[int] = field(default_factory=set)
+    lost_pair_steps: int = 0
+    first_lost_step: int = -1
+
+    @classmethod
+    def of(cls, segment: Segment) -> Epoch:
+        """The epoch that a segment belongs to, before its first row."""
+        table = segment.table
+        return cls(
+            segment.epoch, segment.built, table.pairs, table.slots, table.occupancy, 1e3 * table.build_seconds
+        )
+
+    def to_dict(self) -> dict:
+        """Plain values, for a checkpoint."""
+        return {**self.__dict__, "lost": sorted(self.lost)}
+
+    @classmethod
+    def from_dict(cls, values: dict) -> Epoch:
+        """The inverse of `to_dict`."""
+        return cls(**{**values, "lost": set(values["lost"])})
+
+
+@dataclass
+class ListHealth:
+    """Follows the lists of a run and counts what went wrong.
+
+    A list can only lose a pair once two atoms together have used up the skin. With a safe rebuild rule that
+    never happens; where it does, every such step is audited against a fresh search.
+
+    Attributes:
+        simulation: the system as objects.
+        lost: keys of all pairs lost at any step so far.
+        lost_pair_steps: pairs missing, summed over steps.
+        first_lost_step: -1 while nothing was lost.
+        rebuilds: lists built after the first.
+        dangerous: rebuilds at the first step they were allowed at, in LAMMPS's meaning.
+        mismatches: rebuilds at which the old list and the new one disagreed on how many pairs are inside.
+    """
+
+    simulation: Simulation
+    current: Epoch | None = None
+    lost: set[int] = field(default_factory=set)
+    lost_pair_steps: int = 0
+    first_lost_step: int = -1
+    rebuilds: int = 0
+    dangerous: int = 0
+    mismatches: int = 0
+
+    def check_count(self, segment: Segment, inside_before: int, count_before: int | None) -> None:
+        """Compare a new list's count of pairs at the step before it with what the old list counted there."""
+        if segment.opens and count_before is not None and segment.first > 0 and inside_before != count_before:
+            self.mismatches += 1
+
+    def take(self, segment: Segment) -> dict[str, np.ndarray] | None:
+        """Account for a segment; returns the row of its epoch where it ends one."""
+        if self.current is None or self.current.epoch != segment.epoch:
+            self.current = Epoch.of(segment)
+        epoch = self.current
+        moved = segment.rows_of("moved")
+        epoch.length += segment.rows
+        epoch.displacement = max(epoch.displacement, float(np.max(moved, initial=0.0)))
+        self._audit(segment, moved, epoch)
+        return self._close(segment, epoch) if segment.closes else None
+
+    def _audit(self, segment: Segment, moved, epoch: Epoch) -> None:
+        skin = self.simulation.rule.skin
+        for row in np.flatnonzero(2 * moved > skin):
+            positions = segment.unsorted("x", row).astype(np.float64)
+            if not np.all(np.isfinite(positions)):
+                continue
+            true = true_pairs(self.simulation, positions)
+            missing = np.setdiff1d(true, decided_pairs(self.simulation, segment, row), assume_unique=True)
+            if not len(missing):
+                continue
+            step = segment.first + int(row)
+            for tally in (epoch, self):
+                tally.lost_pair_steps += len(missing)
+                tally.lost |= set(missing.tolist())
+                tally.first_lost_step = step if tally.first_lost_step < 0 else tally.first_lost_step
+
+    def _close(self, segment: Segment, epoch: Epoch) -> dict[str, np.ndarray]:
+        rule = self.simulation.rule
+        rebuilt = segment.closes in ("displacement", "interval")
+        dangerous = segment.closes == "displacement" and epoch.length == rule.first_allowed
+        self.rebuilds += rebuilt
+        self.dangerous += dangerous
+        consumed = 2 * epoch.displacement / rule.skin if rule.skin > 0 else np.inf
+        values = {
+            "epoch": epoch.epoch,
+            "start": epoch.start,
+            "length": epoch.length,
+            "displacement": epoch.displacement,
+            "skin_consumed": consumed,
+            "pairs_listed": epoch.pairs_listed,
+            "capacity": epoch.capacity,
+            "occupancy": epoch.occupancy,
+            "reason": segment.closes,
+            "dangerous": dangerous,
+            "lost_pairs": len(epoch.lost),
+            "lost_pair_steps": epoch.lost_pair_steps,
+            "first_lost_step": epoch.first_lost_step,
+            "build_ms": epoch.build_ms,
+        }
+        return {name: np.array([value]) for name, value in values.items()}
+
+    def to_dict(self) -> dict:
+        """Plain values, for a checkpoint."""
+        values = {k: v for k, v in self.__dict__.items() if k not in ("simulation", "current", "lost")}
+        current = None if self.current is None else self.current.to_dict()
+        return {**values, "lost": sorted(self.lost), "current": current}
+
+    @classmethod
+    def from_dict(cls, simulation: Simulation, values: dict) -> ListHealth:
+        """The inverse of `to_dict`."""
+        current = None if values["current"] is None else Epoch.from_dict(values["current"])
+        rest = {k: v for k, v in values.items() if k not in ("lost", "current")}
+        return cls(simulation, current=current, lost=set(values["lost"]), **rest)

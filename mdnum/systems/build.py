@@ -1,0 +1,357 @@
+"""From a system to something that runs: the one place where the words of a file become objects."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from mdnum.errors import InputError
+from mdnum.md.cell import Cell, wrap_positions
+from mdnum.md.cutoffs import BY_NAME as CUTOFFS
+from mdnum.md.decide import PairDecider, Tables
+from mdnum.md.integrators import Integrator, Langevin, VelocityVerlet
+from mdnum.md.manyforce import ManyBodyForce
+from mdnum.md.pairforce import PairForce
+from mdnum.md.potentials import CutPotential, LennardJones, Morse, PairPotential, SoftSphere, pair_type
+from mdnum.md.verlet import BUILDERS, SLOTS, PairTable, RebuildRule, VerletList, check_radius
+from mdnum.precision import PrecisionPolicy, unit_roundoff
+from mdnum.precision.reductions import BY_NAME as REDUCTIONS
+from mdnum.systems import pairs, schema
+from mdnum.systems.load import System, load
+from mdnum.units import Units
+
+_POTENTIALS: Mapping[str, type[PairPotential]] = {
+    "lennard-jones": LennardJones,
+    "morse": Morse,
+    "soft-sphere": SoftSphere,
+}
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Energies and forces of one configuration.
+
+    Attributes:
+        energy: total energy.
+        forces: shape (atoms, 3), energy/length.
+        stress: dE/dstrain / volume (ASE's sign), shape (3, 3), energy/length³; NaN unless fully periodic.
+        energies: per atom, shape (atoms,), pair terms split evenly; NaN for many-body potentials.
+        i, j: pairs inside the (longest) cutoff, i < j.
+        distance: of those pairs, length.
+    """
+
+    energy: float
+    forces: Float[np.ndarray, "atoms 3"]
+    stress: Float[np.ndarray, "3 3"]
+    energies: Float[np.ndarray, "atoms"]
+    i: Int[np.ndarray, "pairs"]
+    j: Int[np.ndarray, "pairs"]
+    distance: Float[np.ndarray, "pairs"]
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """A system as objects: what the rollout, the references and the calculator work with.
+
+    Attributes:
+        system: where it came from.
+        cell: the box.
+        positions: shape (atoms, 3), length, as the structure has them (not wrapped).
+        velocities: shape (atoms, 3), length per internal time.
+        masses: shape (atoms,).
+        species: index into system.species, shape (atoms,).
+        model: CutPotential, or a many-body potential.
+        decider: the pair decision.
+        rule: when lists are rebuilt.
+        builder: name of the list builder.
+        policy: dtype by role.
+        reduction: order of the force sum.
+        integrator: the dynamics.
+    """
+
+    system: System
+    cell: Cell
+    positions: Float[np.ndarray, "atoms 3"]
+    velocities: Float[np.ndarray, "atoms 3"]
+    masses: Float[np.ndarray, "atoms"]
+    species: Int[np.ndarray, "atoms"]
+    model: Any
+    decider: PairDecider
+    rule: RebuildRule
+    builder: str
+    policy: PrecisionPolicy
+    reduction: Any
+    integrator: Integrator
+
+    @property
+    def units(self) -> Units:
+        """The unit system of the file."""
+        return self.system.units
+
+    @property
+    def atoms(self) -> int:
+        """Number of atoms."""
+        return len(self.masses)
+
+    @property
+    def pairwise(self) -> bool:
+        """Whether the fast pair path serves it (else the general path does)."""
+        return isinstance(self.model, CutPotential)
+
+    @property
+    def pbc(self) -> tuple[bool, bool, bool]:
+        """Periodicity per axis."""
+        return self.cell.pbc
+
+    @property
+    def potential(self) -> Any:
+        """The bare pair potential, or the many-body potential."""
+        return self.model.potential if self.pairwise else self.model
+
+    @property
+    def cutoff(self) -> Any:
+        """The cutoff of a pair potential; None where the potential carries its own."""
+        return self.model.cutoff if self.pairwise else None
+
+    @property
+    def r_cut(self) -> float:
+        """The longest interaction radius, length."""
+        return max(self.decider.r_cut)
+
+    @cached_property
+    def force(self) -> PairForce | ManyBodyForce:
+        """Forces and decisions over a list, for use in jit."""
+        if self.pairwise:
+            return PairForce.create(self.model, self.cell, self.decider, self.policy, self.reduction)
+        return ManyBodyForce.create(self.model, self.cell, self.decider, self.policy)
+
+    @property
+    def pair_types(self) -> int:
+        """How many kinds of pairs there are."""
+        return len(self.decider.r_cut)
+
+    def type_of(self, i, j) -> Int[np.ndarray, "..."]:
+        """Pair type of atoms i and j."""
+        if self.pair_types == 1:
+            return np.zeros(np.broadcast(i, j).shape, np.int64)
+        return pair_type(self.species[i], self.species[j], len(self.system.species))
+
+    def jumps(self) -> tuple[Float[np.ndarray, "types"], Float[np.ndarray, "types"]]:
+        """Energy and radial force that a pair brings when it enters, per pair type."""
+        if self.pairwise:
+            return self.model.jumps()
+        return np.array([float(self.model.energy_jump)]), np.array([float(self.model.force_jump)])
+
+    def verlet_list(self) -> VerletList:
+        """A new Verlet list for this system."""
+        return VerletList(BUILDERS[self.builder], self.rule, self.r_cut, guard=self._guard)
+
+    @property
+    def _guard(self) -> float:
+        """Room for rounding of the displacements that are compared with the skin, length."""
+        coarsest = max(unit_roundoff(self.policy.dtype(role)) for role in ("state", "decision"))
+        return 16 * coarsest * float(np.linalg.norm(self.decider.extent))
+
+    def tables(self, table: PairTable) -> Tables:
+        """A pair table on the device, with pair types."""
+        atoms = table.index.shape[1]
+        shape = (-1, SLOTS, atoms)
+        types = None
+        if self.pair_types > 1:
+            # padding borrows the last atom's species; its decision is no whatever its type
+            species = self.species[np.append(table.order, table.order[-1])]
+            kinds = pair_type(species[table.index], species[:atoms], len(self.system.species))
+            types = jnp.asarray(kinds.astype(np.uint8).reshape(shape))
+        return Tables(jnp.asarray(table.index.reshape(shape)), types, jnp.asarray(table.order))
+
+    def with_cutoff(self, kind: str) -> Simulation:
+        """The same system with another treatment of its cutoff (its radius and pairs stay the same)."""
+        return replace(self, model=eqx.tree_at(lambda m: m.cutoff, self.model, CUTOFFS[kind]))
+
+    def with_cell(self, cell: Cell) -> Simulation:
+        """The same system in another box."""
+        check_radius(cell, self.r_cut, 0.0)
+        return replace(self, cell=cell, decider=replace(self.decider, extent=_extent(cell, self.positions)))
+
+    def evaluate(
+        self,
+        positions: Float[np.ndarray, "atoms 3"] | None = None,
+        cell: Float[np.ndarray, "3 3"] | None = None,
+    ) -> Evaluation:
+        """Energy, forces, stress and pairs of one configuration, with a list of its own.
+
+        Args:
+            positions: length; default the structure's.
+            cell: lattice vectors as rows; default the system's.
+
+        Raises:
+            InputError: the cutoff exceeds half the smallest perpendicular width.
+        """
+        here = self if cell is None else self.with_cell(Cell.create(cell, self.pbc))
+        at = np.asarray(self.positions if positions is None else positions, np.float64)
+        wrapped, _ = wrap_positions(here.cell, at)
+        table = VerletList(BUILDERS[here.builder], replace(here.rule, skin=0.0), here.r_cut).build(
+            wrapped, here.cell
+        )
+        tables = here.tables(table)
+        x = jnp.asarray(wrapped[table.order].T, here.policy.dtype("state"))
+        result, virial = _evaluate(here.force, x, tables)
+        forces = np.empty((here.atoms, 3))
+        forces[table.order] = np.asarray(result.force, np.float64).T
+        energies = np.full(here.atoms, np.nan)
+        if here.pairwise:
+            energies[table.order] = np.asarray(result.energy, np.float64)
+        i, j, distance = here.inside(wrapped, table, np.asarray(result.decisions.bits))
+        return Evaluation(
+            float(jnp.sum(result.energy, dtype=jnp.float64)),
+            forces,
+            -np.asarray(virial) / here.cell.volume,
+            energies,
+            i,
+            j,
+            distance,
+        )
+
+    def inside(self, wrapped, table: PairTable, bits) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Pairs i < j whose decision is yes, sorted, with their distances."""
+        from mdnum.events import set_bits
+        from mdnum.md.cell import displacement
+
+        slots, columns = set_bits(bits)
+        i, j = table.order[columns], table.order[table.index[slots, columns]]
+        keep = i < j
+        i, j = i[keep], j[keep]
+        order = np.lexsort((j, i))
+        i, j = i[order], j[order]
+        dx, dy, dz = displacement(self.cell, wrapped[i], wrapped[j])
+        return i, j, np.sqrt(dx * dx + dy * dy + dz * dz)
+
+
+@eqx.filter_jit
+def _evaluate(force: PairForce | ManyBodyForce, x, tables: Tables):
+    """Forces with decisions, and the virial tensor sum r_ij ⊗ F_ij."""
+    result = force(x, tables, decisions=True)
+    return result, force.virial_tensor(x, tables)
+
+
+def _extent(cell: Cell, positions) -> tuple[float, float, float]:
+    """Largest coordinate difference per axis between wrapped positions."""
+    matrix = np.asarray(cell.matrix)
+    span = np.ptp(positions, axis=0) if len(positions) else np.zeros(3)
+    box = np.abs(matrix).sum(axis=0)
+    periodic = np.array([any(cell.pbc[k] and matrix[k, c] != 0 for k in range(3)) for c in range(3)])
+    return tuple(float(e) for e in np.where(periodic, box, 2 * span + 1.0))  # type: ignore[return-value]
+
+
+def _per_type(table: Float[np.ndarray, "species species"]) -> Float[np.ndarray, "types"]:
+    """The upper triangle of a symmetric table, row by row: one entry per pair type."""
+    return np.asarray(table, np.float64)[np.triu_indices(len(table))]
+
+
+def _pair_model(system: System) -> CutPotential:
+    spec, species = system.spec, system.species
+    assert spec.cutoff is not None
+    constants = {name: jnp.asarray(_per_type(t)) for name, t in pairs.pair_constants(spec, species).items()}
+    radius, onset = pairs.cutoff_radii(spec, species)
+    r_cut = jnp.asarray(_per_type(radius))
+    return CutPotential(
+        _POTENTIALS[spec.potential.kind](**constants),
+        CUTOFFS[spec.cutoff.kind],
+        r_cut,
+        r_cut if onset is None else jnp.asarray(_per_type(onset)),
+    )
+
+
+def _many_body_model(system: System):
+    from mdnum.md import manybody
+
+    potential = system.spec.potential
+    if isinstance(potential, schema.EmbeddedAtom):
+        return manybody.embedded_atom(system.folder / potential.file, system.atoms.get_chemical_symbols())
+    if isinstance(potential, schema.Tersoff):
+        return manybody.tersoff(potential.parameters)
+    assert isinstance(potential, schema.StillingerWeber)
+    return manybody.stillinger_weber(potential.parameters)
+
+
+def _velocities(system: System) -> Float[np.ndarray, "atoms 3"]:
+    """The structure's velocities, or Maxwell-Boltzmann at the temperature asked for."""
+    dynamics, atoms = system.spec.dynamics, system.atoms
+    masses = atoms.get_masses()
+    velocities = system.velocities
+    if velocities is None:
+        kT = system.units.k_B * dynamics.temperature
+        noise = np.random.default_rng(dynamics.seed).standard_normal((len(masses), 3))
+        velocities = noise * np.sqrt(kT / masses)[:, None]
+    if dynamics.remove_drift and len(masses) > 1:
+        velocities = velocities - masses @ velocities / masses.sum()
+    return np.asarray(velocities, np.float64)
+
+
+def build(system: System | str, overrides: Mapping[str, Any] | None = None) -> Simulation:
+    """The objects of a system.
+
+    Args:
+        system: a loaded system, or a name or path to load.
+        overrides: as for `load`, where a name or path is given.
+
+    Raises:
+        InputError: the cutoff and skin do not fit the box, or the file cannot be run.
+    """
+    if not isinstance(system, System):
+        system = load(system, overrides)
+    spec, units = system.spec, system.units
+    cell = Cell.create(np.asarray(system.atoms.cell), system.atoms.pbc)
+    precision = spec.precision
+    policy = PrecisionPolicy(precision.state, precision.force, precision.decision, precision.accumulate)
+    extent = _extent(cell, system.atoms.positions)
+    if spec.cutoff is not None:
+        model = _pair_model(system)
+        radii = tuple(float(r) for r in np.asarray(model.r_cut))
+        decider = PairDecider(radii, spec.cutoff.compare, precision.decision, extent)
+    else:
+        if policy != PrecisionPolicy():
+            raise InputError(
+                "many-body potentials are evaluated in float64 only",
+                where="precision",
+                remedy="Remove the [precision] table",
+            )
+        model = _many_body_model(system)
+        decider = PairDecider((float(model.r_cut),), "r <", "float64", extent)
+    check_radius(cell, max(decider.r_cut), spec.skin)
+    rebuild = spec.neighbors.rebuild
+    builder = spec.neighbors.builder
+    timestep = jnp.asarray(spec.dynamics.timestep * units.time_factor, jnp.float64)
+    if isinstance(spec.dynamics, schema.Langevin):
+        integrator: Integrator = Langevin(
+            timestep,
+            jnp.asarray(spec.dynamics.friction / units.time_factor, jnp.float64),
+            jnp.asarray(units.k_B * spec.dynamics.temperature, jnp.float64),
+            jax.random.key(spec.dynamics.seed),
+        )
+    else:
+        integrator = VelocityVerlet(timestep)
+    return Simulation(
+        system,
+        cell,
+        np.asarray(system.atoms.positions, np.float64),
+        _velocities(system),
+        np.asarray(system.atoms.get_masses(), np.float64),
+        system.species_index,
+        model,
+        decider,
+        RebuildRule(spec.skin, rebuild.every, rebuild.delay, rebuild.check),
+        # a search on the host wins on a CPU; on an accelerator the positions would have to travel
+        ("host" if jax.default_backend() == "cpu" else "jax-md") if builder == "auto" else builder,
+        policy,
+        REDUCTIONS[precision.reduction],
+        integrator,
+    )
