@@ -14,10 +14,19 @@ import jax
 import jaxtyping
 import pytest
 
-# Annotations are checked when a function is called. Only the numerical packages: the command line and
-# the report import slow packages lazily, so their annotations name what is not imported yet.
-_CHECKED = ["mdnum.precision", "mdnum.events", "mdnum.md", "mdnum.dynamics"]
-jaxtyping.install_import_hook(_CHECKED, "beartype.beartype")
+# Annotations are checked when a function is called. Not those of the command line and the report: they
+# import slow packages lazily, so their annotations name what is not imported yet.
+_CHECKED = [
+    "mdnum.precision",
+    "mdnum.events",
+    "mdnum.md",
+    "mdnum.dynamics",
+    "mdnum.store",
+    "mdnum.systems",
+    "mdnum.rollout",
+    "mdnum.doctor",
+]
+jaxtyping.install_import_hook(_CHECKED, "typing_rules.check")
 
 # compiling takes seconds and happens in the first example
 hypothesis.settings.register_profile(

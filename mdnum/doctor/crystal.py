@@ -137,7 +137,7 @@ def digest(steps: int = 50) -> str:
 
     @jax.jit
     def roll(x: jax.Array) -> tuple[jax.Array, jax.Array]:
-        def advance(_: int, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        def advance(_: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
             x, v = state
             half = v + 0.5 * step * force(x)
             x = x + step * half
