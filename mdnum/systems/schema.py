@@ -139,7 +139,7 @@ class MorsePair(Table):
 class SoftSpherePair(Table):
     sigma: Length
     epsilon: Energy
-    alpha: float = Field(2.0, ge=1, description="exponent")
+    alpha: float = Field(2.0, gt=1, description="exponent")
 
 
 class _PairPotential(Table):
@@ -188,7 +188,7 @@ class SoftSphere(_PairPotential):
     kind: Literal["soft-sphere"]
     sigma: Length | None = Field(None, description="diameter (Å or σ)")
     epsilon: Energy | None = Field(None, description="energy scale (eV or ε)")
-    alpha: Annotated[float, Field(ge=1)] = Field(2.0, description="exponent; 2 is harmonic, 2.5 Hertzian")
+    alpha: Annotated[float, Field(gt=1)] = Field(2.0, description="exponent; 2 is harmonic, 2.5 Hertzian")
     pairs: dict[str, SoftSpherePair] | None = Field(
         None, description='constants of each pair of species, such as "Ni-P"'
     )

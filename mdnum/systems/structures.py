@@ -218,7 +218,7 @@ def _check_width(atoms: Atoms, r_cut: float, skin: float, length: str) -> None:
     )
     raise InputError(
         f"r_cut + skin = {r_cut:g} + {skin:g} = {r_cut + skin:.6g} {length}, but half the smallest "
-        f"perpendicular width of the box (along {axis}) is {half:.6g} {length}, and a longer pair has two images",
+        f"perpendicular width of the box (along {axis}) is {half:.6g} {length}, where a pair gets two images",
         remedy=f"This box allows {allowed}; or repeat the structure",
     )
 

@@ -1,0 +1,309 @@
+"""Each mistake a person makes in a system file or structure becomes one line that says what, where and how."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ase import Atoms
+from ase.build import bulk
+from ase.constraints import FixAtoms
+from ase.io import write
+
+from mdnum.errors import InputError
+from mdnum.systems import load
+from mdnum.systems.structures import to_extxyz
+
+GOOD = """\
+about = "argon"
+units = "metal"
+
+[structure]
+file = "argon.extxyz"
+
+[potential]
+kind = "lennard-jones"
+sigma = 3.405
+epsilon = 0.0103235
+
+[cutoff]
+kind = "hard"
+radius = 8.0
+
+[neighbors]
+skin = 0.5
+
+[dynamics]
+kind = "nve"
+timestep = 0.002
+steps = 10
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "argon.extxyz").write_text(to_extxyz(bulk("Ar", a=5.4, cubic=True).repeat(4)))
+    (tmp_path / "system.toml").write_text(GOOD)
+    return tmp_path
+
+
+def refusal(folder: Path, overrides: dict[str, str] | None = None) -> str:
+    with pytest.raises(InputError) as caught:
+        load(folder / "system.toml", overrides)
+    line = str(caught.value)
+    assert "\n" not in line
+    assert caught.value.exit_code == 2
+    return line
+
+
+def edit(folder: Path, old: str, new: str) -> None:
+    text = (folder / "system.toml").read_text()
+    assert old in text
+    (folder / "system.toml").write_text(text.replace(old, new))
+
+
+def test_the_unedited_file_loads(folder: Path):
+    assert len(load(folder / "system.toml").atoms) == 256
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "words"),
+    [
+        ("radius = 8.0", "radius = 8.0.1", 14, ["not TOML", "radius = 8.0.1"]),
+        ("[cutoff]", "[cutoff", 12, ["not TOML"]),
+        ("radius = 8.0", "radus = 8.0", 14, ["unknown key 'radus'", "[cutoff]", "Did you mean radius?"]),
+        ("skin = 0.5", "skinn = 0.5", 17, ["unknown key 'skinn'", "Did you mean skin?"]),
+        ("[neighbors]", "[neighbours]", 16, ["unknown key 'neighbours'", "Did you mean neighbors?"]),
+        ("radius = 8.0", "radius = 8.0\nonset = 7.0", 15, ["unknown key 'onset'", "Known keys are", "compare"]),
+        ('units = "metal"', 'units = "real"', 2, ['units = "real"', '"metal" or "lj"']),
+        ('units = "metal"', "", None, ["key 'units' missing", "metal: Å"]),
+        ("sigma = 3.405", "sigma = -3.405", 9, ["potential.sigma = -3.405", "above 0", "Å or σ"]),
+        ("radius = 8.0", "radius = 0.0", 14, ["cutoff.radius = 0.0", "above 0"]),
+        ("skin = 0.5", "skin = -0.5", 17, ["neighbors.skin = -0.5", "at least 0"]),
+        ("skin = 0.5", 'skin = "0.5"', 17, ['neighbors.skin = "0.5"', "expected a number", "quotes"]),
+        ("steps = 10", "steps = 10.5", 22, ["dynamics.steps = 10.5", "a whole number"]),
+        ("skin = 0.5", "skin = nan", 17, ["neighbors.skin = nan", "finite"]),
+        (
+            'kind = "lennard-jones"',
+            'kind = "lenard-jones"',
+            8,
+            ["unknown potential kind 'lenard-jones'", "Did you mean lennard-jones?", "tersoff", "eam"],
+        ),
+        ('kind = "hard"', 'kind = "truncated"', 13, ["unknown cutoff kind 'truncated'", "hard, shifted"]),
+        ('kind = "nve"', "", 19, ["'kind' missing in [dynamics]", "nve, langevin"]),
+        ('kind = "nve"', 'kind = "langevin"', 19, ["key 'temperature' missing in [dynamics]", "1 more problem"]),
+        ("radius = 8.0", "", 12, ["[cutoff]", "radius missing", "in_sigma"]),
+        ("radius = 8.0", "radius = 8.0\nin_sigma = 2.5", 12, ["both given"]),
+        ("radius = 8.0", 'radius = 8.0\ncompare = "<"', 15, ['cutoff.compare = "<"', '"r2 <"']),
+        ("epsilon = 0.0103235", "", 7, ["[potential]", "epsilon missing"]),
+        ('[cutoff]\nkind = "hard"\nradius = 8.0', "", None, ["[cutoff] missing", "lennard-jones needs one"]),
+        ('kind = "lennard-jones"\nsigma = 3.405\nepsilon = 0.0103235', 'kind = "tersoff"', 10, ["[cutoff]"]),
+        ('[structure]\nfile = "argon.extxyz"', "", None, ["table [structure] missing"]),
+        ('file = "argon.extxyz"', 'flie = "argon.extxyz"', 5, ["unknown key 'flie'", "Did you mean file?"]),
+        ('file = "argon.extxyz"', 'file = "gone.extxyz"', None, ["gone.extxyz: no such structure file"]),
+        ("[neighbors]", "[neighbors]\nrebuild = 5", 17, ["neighbors.rebuild = 5", "a table"]),
+    ],
+)
+def test_a_mistake_in_the_file(folder: Path, old: str, new: str, line: int | None, words: list[str]):
+    edit(folder, old, new)
+    said = refusal(folder)
+    for word in words:
+        assert word in said
+    if line is not None:
+        assert f"system.toml:{line}: " in said
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "words"),
+    [
+        ("cutoff.radus", "8", ["--set cutoff.radus", "Did you mean radius?"]),
+        ("cutof.radius", "8", ["Did you mean cutoff?"]),
+        ("cutoff.kind", "swiched", ["--set cutoff.kind", "Did you mean switched?"]),
+        ("neighbors.skin", "wide", ["--set neighbors.skin", '"wide"', "expected a number"]),
+        ("about.me", "x", ["about is a value and not a table"]),
+        ("cutoff..radius", "8", ["--set", "is not a key"]),
+        ("dynamics.kind", "langevin", ["key 'temperature' missing"]),
+        ("potential.kind", "morse", ["depth", "missing"]),
+        ("precision.force", "float16", ["--set precision.force", '"float64" or "float32"']),
+    ],
+)
+def test_a_mistake_on_the_command_line(folder: Path, key: str, value: str, words: list[str]):
+    said = refusal(folder, {key: value})
+    for word in words:
+        assert word in said
+
+
+def test_a_missing_system_file_and_an_unknown_name(tmp_path: Path):
+    with pytest.raises(InputError, match=r"gone\.toml: no such system file"):
+        load(tmp_path / "gone.toml")
+    with pytest.raises(InputError, match=r"no system called 'argon/liquid-846'.*Did you mean argon/liquid-864\?"):
+        load("argon/liquid-846")
+    with pytest.raises(InputError, match=r"Did you mean argon/liquid-864\?"):
+        load("liquid-864")
+
+
+def test_a_system_file_that_is_not_text(tmp_path: Path):
+    (tmp_path / "system.toml").write_bytes(b"\xff\xfe\x00units")
+    with pytest.raises(InputError, match="UTF-8"):
+        load(tmp_path / "system.toml")
+
+
+def test_an_unreadable_structure(folder: Path):
+    (folder / "argon.extxyz").write_text("three\nnot a structure\n")
+    said = refusal(folder)
+    assert "argon.extxyz: cannot be read as a structure" in said
+    (folder / "argon.extxyz").write_text("")
+    assert "argon.extxyz" in refusal(folder)
+
+
+def test_a_truncated_structure(folder: Path):
+    text = (folder / "argon.extxyz").read_text()
+    (folder / "argon.extxyz").write_text(text[: len(text) // 2])
+    assert "cannot be read as a structure" in refusal(folder)
+
+
+def change(folder: Path, atoms: Atoms) -> None:
+    (folder / "argon.extxyz").write_text(to_extxyz(atoms))
+
+
+def test_positions_that_are_not_numbers_name_the_atom(folder: Path):
+    atoms = load(folder / "system.toml").atoms
+    atoms.positions[17, 1] = np.nan
+    change(folder, atoms)
+    assert "atom 17 (Ar) has positions" in refusal(folder)
+    atoms.positions[40, 0] = np.inf
+    change(folder, atoms)
+    assert "1 more atoms are like it" in refusal(folder)
+
+
+def test_momenta_that_are_not_numbers_name_the_atom(folder: Path):
+    atoms = load(folder / "system.toml").atoms
+    momenta = np.zeros((len(atoms), 3))
+    momenta[3, 2] = np.nan
+    atoms.set_momenta(momenta)
+    change(folder, atoms)
+    assert "atom 3 (Ar) has momenta" in refusal(folder)
+
+
+def test_overlapping_atoms_are_named_with_their_distance(folder: Path):
+    atoms = load(folder / "system.toml").atoms
+    atoms.positions[100] = atoms.positions[7] + [0.25, 0.0, 0.0]
+    change(folder, atoms)
+    said = refusal(folder)
+    assert "atoms 7 (Ar) and 100 (Ar) are 0.25 Å apart" in said
+    assert "closer than 1.362 Å" in said
+
+
+def test_an_overlap_across_the_boundary(folder: Path):
+    atoms = load(folder / "system.toml").atoms
+    atoms.positions[0] = [0.05, 1.0, 1.0]
+    atoms.positions[9] = [atoms.cell[0, 0] - 0.05, 1.0, 1.0]
+    change(folder, atoms)
+    assert "atoms 0 (Ar) and 9 (Ar) are 0.1 Å apart" in refusal(folder)
+
+
+def test_a_box_too_small_says_what_would_fit(folder: Path):
+    said = refusal(folder, {"neighbors.skin": "3.0"})
+    assert "8 + 3 = 11 Å" in said
+    assert "10.8 Å" in said
+    assert "a skin up to 2.8 Å" in said
+    assert "a cutoff below 10.8 Å" in refusal(folder, {"cutoff.radius": "12"})
+    load(folder / "system.toml", {"neighbors.skin": "2.7999"})
+
+
+def test_the_width_of_a_sheared_box_is_measured_across(folder: Path):
+    atoms = load(folder / "system.toml").atoms
+    cell = np.array(atoms.cell)
+    # as long as before along every vector's axis, but leaning so far that its faces are close
+    cell[1, 0] = 0.9 * cell[0, 0]
+    atoms.set_cell(cell)
+    change(folder, atoms)
+    assert "half the smallest perpendicular width of the box (along a) is 8.02" in refusal(folder)
+
+
+def test_free_boundaries_have_no_width(folder: Path):
+    system = load(folder / "system.toml", {"structure.pbc": "[false, false, false]", "cutoff.radius": "50"})
+    assert not system.atoms.pbc.any()
+
+
+def test_periodic_without_a_cell(folder: Path):
+    change(folder, Atoms("Ar2", positions=[[0, 0, 0], [4, 0, 0]]))
+    assert not load(folder / "system.toml").atoms.pbc.any()
+    said = refusal(folder, {"structure.pbc": "[true, false, false]"})
+    assert "periodic along x, but the structure has no cell vector there" in said
+
+
+def test_cell_vectors_in_a_plane(folder: Path):
+    atoms = load(folder / "system.toml").atoms
+    cell = np.array(atoms.cell)
+    cell[2] = cell[0] + cell[1]
+    atoms.set_cell(cell)
+    change(folder, atoms)
+    assert "the cell vectors lie in a plane" in refusal(folder)
+
+
+def test_unknown_species(folder: Path):
+    atoms = load(folder / "system.toml").atoms
+    atoms.symbols[5] = "Kr"
+    change(folder, atoms)
+    said = refusal(folder)
+    assert "the structure holds Ar, Kr" in said
+    assert "no constants for Ar-Ar, Ar-Kr, Kr-Kr" in said
+    with_pairs = """[potential]
+kind = "lennard-jones"
+pairs.Ar-Ar = { sigma = 3.4, epsilon = 0.01 }
+pairs.Kr-Ar = { sigma = 3.5, epsilon = 0.01 }
+"""
+    edit(folder, '[potential]\nkind = "lennard-jones"\nsigma = 3.405\nepsilon = 0.0103235\n', with_pairs)
+    assert "no constants for Kr-Kr (it has Ar-Ar, Kr-Ar)" in refusal(folder)
+
+
+def test_silicon_constants_for_argon(folder: Path):
+    edit(folder, '[cutoff]\nkind = "hard"\nradius = 8.0\n', "")
+    edit(folder, 'kind = "lennard-jones"\nsigma = 3.405\nepsilon = 0.0103235', 'kind = "stillinger-weber"')
+    assert "constants for Si, but the structure holds Ar" in refusal(folder)
+
+
+def test_pair_names_that_are_not_pairs(folder: Path):
+    edit(folder, "epsilon = 0.0103235", "epsilon = 0.01\npairs.ArKr = { sigma = 1.0, epsilon = 1.0 }")
+    assert "'ArKr' is not two species joined by a hyphen" in refusal(folder)
+    edit(folder, "pairs.ArKr =", "pairs.Ar-Kr = { sigma = 1.0, epsilon = 1.0 }\npairs.Kr-Ar =")
+    assert "are the same pair" in refusal(folder)
+    edit(folder, "pairs.Kr-Ar = { sigma", "pairs.Kr-Kr = { sgima")
+    said = refusal(folder)
+    assert "unknown key 'sgima' in [potential.pairs.Kr-Kr]" in said
+    assert "Did you mean sigma?" in said
+
+
+def test_masses_of_absent_species(folder: Path):
+    edit(folder, 'file = "argon.extxyz"', 'file = "argon.extxyz"\nmasses = { Kr = 80.0 }')
+    assert "structure.masses names Kr" in refusal(folder)
+
+
+def test_constraints_are_not_silently_dropped(folder: Path):
+    atoms = load(folder / "system.toml").atoms
+    atoms.set_constraint(FixAtoms([0]))
+    write(folder / "fixed.extxyz", atoms, columns=["symbols", "positions", "move_mask"])
+    edit(folder, "argon.extxyz", "fixed.extxyz")
+    assert "constraints" in refusal(folder)
+
+
+def test_a_builder_with_a_wrong_symbol(folder: Path):
+    edit(folder, 'file = "argon.extxyz"', 'builder = "fcc"\nsymbol = "Argon"\nlattice_constant = 5.4')
+    said = refusal(folder)
+    assert "'Argon' is no chemical symbol" in said
+
+
+def test_a_table_that_is_not_setfl(folder: Path):
+    edit(folder, '[cutoff]\nkind = "hard"\nradius = 8.0\n', "")
+    edit(
+        folder,
+        'kind = "lennard-jones"\nsigma = 3.405\nepsilon = 0.0103235',
+        'kind = "eam"\nfile = "ar.eam.alloy"',
+    )
+    assert "ar.eam.alloy: no such potential table" in refusal(folder)
+    (folder / "ar.eam.alloy").write_text("one\ntwo\n")
+    assert "not a setfl table" in refusal(folder)
+    (folder / "ar.eam.alloy").write_text("a\nb\nc\n1 Cu\n100 0.1 100 0.05 5.0\n")
+    assert "the table has Cu, but the structure holds Ar" in refusal(folder)
