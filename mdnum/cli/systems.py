@@ -24,7 +24,8 @@ def list_systems(as_json: bool = output.JSON_OPTION) -> int:
     if as_json:
         output.print_json({"systems": rows})
     else:
-        output.print_table("", ("name", "atoms", "about"), [tuple(row.values()) for row in rows])
+        lines = [(row["name"], row["atoms"], row["about"].partition(". ")[0]) for row in rows]
+        output.print_table("", ("name", "atoms", "about"), lines)
     return output.EXIT_FINE
 
 

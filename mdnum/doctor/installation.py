@@ -160,14 +160,14 @@ class Child:
         return lines[-1], ""
 
 
-# the import of mdnum's own adaptor, because nothing else may import jax_md
 IMPORTS_CODE = """
-import time
-start = time.perf_counter()
-import jax
-middle = time.perf_counter()
-import mdnum.md.jaxmd
-print(f"jax {middle - start:.1f} s, jax_md and its adaptor {time.perf_counter() - middle:.1f} s")
+import importlib, time
+seconds = []
+for name in ("jax", "jax_md", "mdnum.md.jaxmd"):
+    start = time.perf_counter()
+    importlib.import_module(name)
+    seconds.append(time.perf_counter() - start)
+print("jax {:.1f} s, jax_md {:.1f} s, mdnum's adaptor {:.1f} s".format(*seconds))
 """
 DIGEST_CODE = "from mdnum.doctor.crystal import digest; print(digest())"
 
