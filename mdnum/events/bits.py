@@ -10,16 +10,15 @@ import numba
 import numpy as np
 from jaxtyping import Int, UInt8
 
+_POPULATION = np.array([int(byte).bit_count() for byte in range(256)], np.int64)
+
 
 @numba.njit(cache=True, nogil=True)
 def _count_changed(before, now):
     total = 0
     for w in range(now.shape[0]):
         for c in range(now.shape[1]):
-            changed = before[w, c] ^ now[w, c]
-            while changed:
-                changed &= changed - 1
-                total += 1
+            total += _POPULATION[before[w, c] ^ now[w, c]]
     return total
 
 
@@ -68,8 +67,5 @@ def count_set(packed) -> int:
     """How many decisions of packed bytes (any number of columns) are yes."""
     total = 0
     for value in packed.ravel():
-        bits = value
-        while bits:
-            bits &= bits - 1
-            total += 1
+        total += _POPULATION[value]
     return total

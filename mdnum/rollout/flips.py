@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -44,8 +44,8 @@ class PairRecorder:
         decision was made with.
 
         Raises:
-            MdnumError: a flip was recorded from one end only, or a margin contradicts its decision; neither can
-                happen unless the compiled program and the host disagree about arithmetic.
+            MdnumError: a flip was recorded from one end only, or a margin contradicts its decision: the
+                compiled program and the host would disagree about arithmetic.
         """
         bits = segment.rows_of("bits")
         before = segment.before
@@ -139,9 +139,7 @@ def decided_pairs(simulation: Simulation, segment: Segment, row: int) -> Int[np.
 
 
 def true_pairs(simulation: Simulation, wrapped: Float[np.ndarray, "atoms 3"]) -> Int[np.ndarray, "pairs"]:
-    """Keys of all pairs inside, from a search that knows nothing of the list in use; same convention and bits."""
-    from dataclasses import replace
-
+    """Keys of all pairs inside, from a fresh search; same convention and bits as the program's."""
     decider = simulation.decider
     verlet = replace(simulation.verlet_list(), rule=replace(simulation.rule, skin=0.0), slots=0)
     table = verlet.build(np.asarray(wrapped, np.float64), simulation.cell)

@@ -1,0 +1,336 @@
+"""A rollout into a run folder: record, check the record, and survive a kill."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from ase import Atoms
+
+from mdnum import provenance
+from mdnum.errors import FolderError, InputError, NumericalError
+from mdnum.rollout.budget import EnergyBudget
+from mdnum.rollout.engine import Engine, Segment, Start, resume_point
+from mdnum.rollout.flips import PairRecorder, flip_columns
+from mdnum.rollout.health import ListHealth
+from mdnum.rollout.series import series_columns
+from mdnum.rollout.summary import Tally, closest_pair, summarize
+from mdnum.store import RunFolder
+from mdnum.systems.build import Simulation, build
+from mdnum.systems.load import System, load
+
+Progress = Callable[[int, int, dict[str, Any]], None]
+
+# the budget is checked this often; each check evaluates the whole system once more
+_BUDGET_CHECKS = 20
+_LOG_LINES = 50
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What a run left behind.
+
+    Attributes:
+        folder: the run folder.
+        summary: the content of summary.json.
+        simulation: the system as objects.
+        frames: first and last positions, shape (atoms, 3) each, wrapped, length.
+    """
+
+    folder: Path
+    summary: dict[str, Any]
+    simulation: Simulation
+    frames: tuple[np.ndarray, np.ndarray]
+
+
+@dataclass
+class _Progress:
+    """What has been done so far; all of it goes into a checkpoint."""
+
+    tally: Tally
+    health: ListHealth
+    budget: EnergyBudget
+    pairs: int | None = None
+    first: np.ndarray | None = None
+    last: np.ndarray | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        return {
+            "tally": self.tally.to_dict(),
+            "health": self.health.to_dict(),
+            "budget": self.budget.to_dict(),
+            "pairs": self.pairs,
+        }
+
+
+@dataclass
+class Rollout:
+    """One run on its way into its folder.
+
+    Attributes:
+        simulation: the system as objects.
+        folder: where it goes.
+        steps: last step.
+        save_every: a trajectory frame every so many steps; 0 for none.
+        progress: called with step, steps and a dictionary of figures.
+        began: time.perf_counter() at the start, for the time to the first step.
+    """
+
+    simulation: Simulation
+    folder: RunFolder
+    steps: int
+    save_every: int
+    progress: Progress | None = None
+    began: float = field(default_factory=time.perf_counter)
+
+    def __post_init__(self):
+        self.recorder = PairRecorder(self.simulation)
+        self.done = _Progress(Tally(), ListHealth(self.simulation), EnergyBudget(self.simulation))
+        self.start: Start | None = None
+        self._earlier_seconds = 0.0
+
+    def restore(self, saved: Mapping[str, Any]) -> None:
+        """Continue from a checkpoint's state instead of from the beginning."""
+        self.start = Start.from_arrays(saved)
+        done = saved["done"]
+        self.done = _Progress(
+            Tally.from_dict(done["tally"]),
+            ListHealth.from_dict(self.simulation, done["health"]),
+            EnergyBudget.from_dict(self.simulation, done["budget"]),
+            done["pairs"],
+            np.asarray(saved["first"]),
+            np.asarray(saved["last"]),
+        )
+        self._earlier_seconds = self.done.tally.seconds
+
+    def run(self) -> dict[str, Any]:
+        """Run to the last step and write everything but the report; returns the summary.
+
+        Raises:
+            NumericalError: a number stopped being finite; everything up to the step before it is kept.
+            FolderError: the folder cannot be written.
+        """
+        engine = Engine(self.simulation, self.steps, start=self.start)
+        interval = max(1, self.steps // _BUDGET_CHECKS)
+        blown: Segment | None = None
+        self._say("compile", 0 if self.start is None else int(self.start.state.step))
+        loop_began: float | None = None
+        counted = 0
+        for segment in engine.segments():
+            if segment.closes == "blow-up":
+                blown = segment
+            kept = _finite_rows(segment)
+            if kept.rows:
+                self._take(kept, interval)
+            now = time.perf_counter()
+            if loop_began is None:
+                # the first segment holds the compilation; the rate is that of the steps after it
+                self.done.tally.start_up_seconds = self.done.tally.start_up_seconds or now - self.began
+                loop_began = now
+            else:
+                counted += segment.rows
+            self.done.tally.seconds = self._earlier_seconds + now - self.began
+            if loop_began < now:
+                self.done.tally.steps_per_second = counted / (now - loop_began)
+            self._say("run", segment.last)
+            if blown is None:
+                self._checkpoint(segment, force=segment.closes == "end")
+        status = "complete" if blown is None else "failed"
+        summary = summarize(self.simulation, self.folder, self.done, self.steps, status)
+        if blown is not None:
+            return self._fail(blown, summary)
+        self.folder.finalize()
+        summary = summarize(self.simulation, self.folder, self.done, self.steps, status)
+        self.folder.write_summary(summary)
+        return summary
+
+    def _take(self, segment: Segment, interval: int) -> None:
+        done = self.done
+        before = self.recorder.inside(segment.before)
+        done.health.check_count(segment, before, done.pairs)
+        pairs = self.recorder.counts(segment)
+        ledger = self.recorder.flips(segment)
+        self.folder.append("series", series_columns(self.simulation, segment, pairs, ledger))
+        if len(ledger):
+            self.folder.append("flips", flip_columns(ledger))
+        row = done.health.take(segment)
+        if row is not None:
+            self.folder.append("epochs", row)
+        done.tally.take(segment, pairs, ledger)
+        done.pairs = int(pairs[-1])
+        if done.first is None:
+            done.first = segment.unsorted("x", 0)
+        done.last = segment.unsorted("x", segment.rows - 1)
+        self._save_frames(segment)
+        self._close_budget(segment, ledger, interval)
+        self._log(segment)
+
+    def _close_budget(self, segment: Segment, ledger, interval: int) -> None:
+        budget = self.done.budget
+        potential = segment.rows_of("potential")
+        if budget.start is None:
+            budget.check(segment.first, segment.unsorted("x", 0), float(potential[0]))
+        budget.jumps += float(np.sum(ledger.jump))
+        due = segment.first // interval != (segment.last + 1) // interval or segment.closes == "end"
+        if due:
+            budget.check(segment.last, segment.unsorted("x", segment.rows - 1), float(potential[-1]))
+
+    def _save_frames(self, segment: Segment) -> None:
+        if not self.save_every:
+            return
+        for row in range(segment.rows):
+            step = segment.first + row
+            if step % self.save_every == 0:
+                self.folder.append_frame(self._frame(segment, row, step))
+
+    def _frame(self, segment: Segment, row: int, step: int) -> Atoms:
+        atoms: Atoms = self.simulation.system.atoms.copy()
+        atoms.set_positions(segment.unsorted("x", row).astype(np.float64))
+        atoms.set_velocities(segment.unsorted("v", row).astype(np.float64))
+        atoms.set_array("images", segment.unsorted("images", row))
+        atoms.info["step"] = step
+        atoms.info["time"] = step * self.simulation.system.spec.dynamics.timestep
+        return atoms
+
+    def _checkpoint(self, segment: Segment, *, force: bool) -> None:
+        if force or self.folder.checkpoint_due():
+            self.folder.checkpoint(self._to_dict(segment), force=True)
+
+    def _to_dict(self, segment: Segment) -> dict[str, Any]:
+        """Everything that a resumed run needs to go on after a segment as if nothing had happened."""
+        return {
+            **resume_point(segment).to_arrays(),
+            "first": self.done.first,
+            "last": self.done.last,
+            "done": self.done.to_dict(),
+            "steps": self.steps,
+            "save_every": self.save_every,
+        }
+
+    def _log(self, segment: Segment) -> None:
+        every = max(1, self.steps // _LOG_LINES)
+        header = (
+            "    step       time      potential        kinetic          total  temperature     pairs  flips"
+        )
+        for row in range(segment.rows):
+            step = segment.first + row
+            if step == 0:
+                self.folder.log(header)
+            if step % every == 0 or step == self.steps:
+                self.folder.log(self.done.tally.line(self.simulation, segment, row))
+
+    def _say(self, phase: str, step: int) -> None:
+        if self.progress is None:
+            return
+        tally = self.done.tally
+        info = {
+            "phase": phase,
+            "steps_per_second": tally.steps_per_second,
+            "flips": tally.entered + tally.left,
+            "rebuilds": self.done.health.rebuilds,
+        }
+        self.progress(step, self.steps, info)
+
+    def _fail(self, blown: Segment, summary: dict[str, Any]) -> dict[str, Any]:
+        step = blown.last
+        row = blown.rows - 1
+        positions = blown.unsorted("x", row).astype(np.float64)
+        if not np.all(np.isfinite(positions)):
+            positions = np.asarray(self.done.last, np.float64)
+        where = closest_pair(self.simulation, positions)
+        self.folder.checkpoint(self._to_dict(blown), force=True)
+        self.folder.finalize()
+        message = f"the energy or a velocity stopped being a finite number at step {step}{where}"
+        summary["error"] = message
+        summary["verdict"] = f"Stopped: {message}."
+        self.folder.write_summary(summary)
+        raise NumericalError(
+            message,
+            where=self.simulation.system.name,
+            remedy=f"Everything up to step {step - 1} is in {self.folder.path}. "
+            "Use a shorter dynamics.timestep, relax the structure or lower the temperature",
+        )
+
+
+def _finite_rows(segment: Segment) -> Segment:
+    """The segment without the last row where that is the one that is not finite."""
+    return replace(segment, rows=segment.rows - 1) if segment.closes == "blow-up" else segment
+
+
+def run(
+    system: System | str | Path | None,
+    *,
+    out: str | Path | None = None,
+    steps: int | None = None,
+    save_every: int | None = None,
+    overrides: Mapping[str, Any] | None = None,
+    resume: str | Path | None = None,
+    progress: Progress | None = None,
+) -> RunResult:
+    """Simulate a system and record every flip into a run folder.
+
+    Args:
+        system: a loaded system, a shipped name or the path of a system file; None when resuming.
+        out: the new run folder; default runs/<name>-<n>.
+        steps: last step; default the system's.
+        save_every: a trajectory frame every so many steps; default the system's.
+        overrides: dotted keys to values, as for `mdnum.systems.load`.
+        resume: continue the run in this folder; bit for bit what it would have been without the stop.
+        progress: called now and then with step, steps and a dictionary of figures.
+
+    Raises:
+        InputError: the system cannot be run. FolderError: the folder cannot be used.
+        NumericalError: the run blew up; what came before is in the folder.
+    """
+    began = time.perf_counter()
+    if resume is not None:
+        rollout = _resumed(Path(resume), steps, progress, began)
+    elif system is None:
+        raise InputError("no system given", remedy="Name a system, or a folder to resume")
+    else:
+        loaded = system if isinstance(system, System) else load(system, overrides)
+        rollout = _fresh(loaded, out, steps, save_every, progress, began)
+    try:
+        summary = rollout.run()
+    except BaseException:
+        rollout.folder.close()
+        raise
+    done = rollout.done
+    assert done.first is not None and done.last is not None
+    frames = (np.asarray(done.first, np.float64), np.asarray(done.last, np.float64))
+    return RunResult(rollout.folder.path, summary, rollout.simulation, frames)
+
+
+def _fresh(system: System, out, steps, save_every, progress, began) -> Rollout:
+    simulation = build(system)
+    last = system.spec.dynamics.steps if steps is None else steps
+    every = system.spec.record.save_every if save_every is None else save_every
+    if last < 0 or every < 0:
+        raise InputError("steps and save_every must not be negative")
+    folder = RunFolder.create(Path(out) if out is not None else _free_folder(system.name))
+    system.write(folder.path)
+    folder.write_provenance(provenance.collect(system))
+    return Rollout(simulation, folder, last, every, progress, began)
+
+
+def _resumed(path: Path, steps: int | None, progress, began) -> Rollout:
+    folder = RunFolder.open(path)
+    saved = folder.resume()
+    if steps is not None and steps < int(np.asarray(saved["state_step"])) - 1:
+        raise FolderError(f"has run past step {steps} already", where=str(path))
+    simulation = build(load(path / "system.toml"))
+    last = int(saved["steps"]) if steps is None else steps
+    rollout = Rollout(simulation, folder, last, int(saved["save_every"]), progress, began)
+    rollout.restore(saved)
+    return rollout
+
+
+def _free_folder(name: str) -> Path:
+    number = 1
+    while (path := Path("runs") / f"{name.replace('/', '-')}-{number}").exists():
+        number += 1
+    return path

@@ -1,0 +1,143 @@
+"""Running totals of a rollout, and the summary they end in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from mdnum.events import Ledger
+from mdnum.md.cell import displacement, wrap_positions
+from mdnum.rollout.engine import Segment
+from mdnum.rollout.series import degrees_of_freedom
+from mdnum.store import RunFolder
+from mdnum.systems.build import Simulation
+
+
+@dataclass
+class Tally:
+    """Totals over the rows seen so far."""
+
+    step: int = -1
+    entered: int = 0
+    left: int = 0
+    ambiguous: int = 0
+    ambiguous_flips: int = 0
+    pairs_first: int = 0
+    pairs_last: int = 0
+    start_up_seconds: float = 0.0
+    seconds: float = 0.0
+    steps_per_second: float = 0.0
+
+    def take(self, segment: Segment, pairs: np.ndarray, ledger: Ledger) -> None:
+        """Add a segment."""
+        if self.step < 0:
+            self.pairs_first = int(pairs[0])
+        self.step = segment.last
+        self.pairs_last = int(pairs[-1])
+        self.entered += int(ledger.entered.sum())
+        self.left += int((~ledger.entered).sum())
+        self.ambiguous += int(segment.rows_of("ambiguous").sum())
+        self.ambiguous_flips += int(ledger.ambiguous.sum())
+
+    def line(self, simulation: Simulation, segment: Segment, row: int) -> str:
+        """A line of log.txt."""
+        potential, kinetic = segment.rows_of("potential")[row], segment.rows_of("kinetic")[row]
+        temperature = 2 * kinetic / (degrees_of_freedom(simulation) * simulation.units.k_B)
+        step = segment.first + row
+        time = step * simulation.system.spec.dynamics.timestep
+        return (
+            f"{step:8d} {time:10.4f} {potential:14.6f} {kinetic:14.6f} {potential + kinetic:14.6f} "
+            f"{temperature:12.4f} {self.pairs_last:9d} {self.entered + self.left:6d}"
+        )
+
+    def to_dict(self) -> dict:
+        """Plain values, for a checkpoint."""
+        return dict(self.__dict__)
+
+    @classmethod
+    def from_dict(cls, values: dict) -> Tally:
+        """The inverse of `to_dict`."""
+        return cls(**values)
+
+
+def summarize(
+    simulation: Simulation, folder: RunFolder, done: Any, steps: int, status: str
+) -> dict[str, Any]:
+    """The content of summary.json, without the references' and the report's part."""
+    tally, health, budget = done.tally, done.health, done.budget
+    energy_jump, force_jump = simulation.jumps()
+    timestep = simulation.system.spec.dynamics.timestep
+    cutoff = simulation.cutoff
+    return {
+        "system": simulation.system.name,
+        "about": simulation.system.spec.about,
+        "status": status,
+        "units": simulation.units.name,
+        "atoms": simulation.atoms,
+        "steps": tally.step,
+        "steps_asked": steps,
+        "time": tally.step * timestep,
+        "dynamics": simulation.integrator.name,
+        "flips_entered": tally.entered,
+        "flips_left": tally.left,
+        "pairs_first": tally.pairs_first,
+        "pairs_last": tally.pairs_last,
+        "algebra_residual": tally.pairs_last - tally.pairs_first - tally.entered + tally.left,
+        "rebuilds": health.rebuilds,
+        "dangerous_builds": health.dangerous,
+        "count_mismatches": health.mismatches,
+        "lost_pairs": len(health.lost),
+        "lost_pair_steps": health.lost_pair_steps,
+        "first_lost_step": health.first_lost_step,
+        "ambiguous": tally.ambiguous,
+        "ambiguous_flips": tally.ambiguous_flips,
+        "energy_drift": drift(folder, simulation.atoms),
+        "energy_budget_residual": budget.residual,
+        "energy_budget_tolerance": budget.tolerance,
+        "energy_budget_checks": budget.checks,
+        "energy_budget_closes": budget.closes,
+        "steps_per_second": tally.steps_per_second,
+        "start_up_seconds": tally.start_up_seconds,
+        "wall_seconds": tally.seconds,
+        "cutoff": {
+            "kind": cutoff.name if cutoff is not None else simulation.model.name,
+            "radius": simulation.r_cut,
+            "skin": simulation.rule.skin,
+            "compare": simulation.decider.compare,
+            "energy_jump": float(energy_jump[np.argmax(np.abs(energy_jump))]),
+            "force_jump": float(force_jump[np.argmax(np.abs(force_jump))]),
+            "smoothness": cutoff.smoothness if cutoff is not None else simulation.model.smoothness,
+            "bound": float(max(simulation.decider.bounds)),
+        },
+        "ase": None,
+        "findings": [],
+        "verdict": "",
+    }
+
+
+def drift(folder: RunFolder, atoms: int) -> float | None:
+    """Slope of the conserved energy per atom, by least squares; None for fewer than three rows."""
+    rows = folder.read("series", ["time", "conserved"])
+    if len(rows["time"]) < 3:
+        return None
+    return float(np.polyfit(rows["time"], rows["conserved"] - rows["conserved"][0], 1)[0] / atoms)
+
+
+def closest_pair(simulation: Simulation, positions: Float[np.ndarray, "atoms 3"]) -> str:
+    """Words that name the two atoms closest to one another, to follow a sentence about a blow-up."""
+    if simulation.atoms < 2 or not np.all(np.isfinite(positions)):
+        return ""
+    wrapped, _ = wrap_positions(simulation.cell, positions)
+    table = simulation.verlet_list().build(wrapped, simulation.cell)
+    slot, column = np.nonzero(table.index < simulation.atoms)
+    if not len(slot):
+        return ""
+    i, j = table.order[column], table.order[table.index[slot, column]]
+    d = displacement(simulation.cell, wrapped[i], wrapped[j])
+    distance = np.sqrt(sum(c * c for c in d))
+    k = int(np.argmin(distance))
+    low, high = sorted((int(i[k]), int(j[k])))
+    return f"; the closest pair is {low}-{high} at {distance[k]:.4g} {simulation.units.length}"
