@@ -1,0 +1,269 @@
+"""The report's figures, each drawn once for a page and once for a phone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+
+from mdnum.report import analysis
+from mdnum.report.run import Run
+from mdnum.report.svg import BAD, FIRST, GRID, INK, MUTED, SECOND, THIRD, style
+from mdnum.report.words import MINUS, power
+
+#: Points a line is thinned to; longer ones become an envelope of smallest and largest values.
+POINTS = 600
+
+
+def energy(run: Run, figure: Figure) -> None:
+    """The change of the energy beside the ledger's jumps, and what is left between the two."""
+    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+    time, budget, unit = run.series["time"], run.budget, run.units.energy
+    if np.any(run.series["energy_jump"]):
+        # one upon the other where the budget closes: a broad pale line, and a thin one that runs in it
+        _line(above, time, budget["change"], FIRST, "E(t) − E(0)", width=4, alpha=0.4)
+        _line(above, time, budget["jumps"], SECOND, "sum of the ledger’s jumps", width=0.9, band=False)
+        _label(below, f"difference ({unit})")
+    else:
+        _line(above, time, budget["change"], FIRST, "E(t) − E(0); no flip changes the energy")
+        _label(below, f"residual ({unit})")
+    _label(above, f"energy ({unit})")
+    _legend(above)
+    below.axhline(0, color=MUTED, lw=0.6)
+    _line(below, time, budget["residual"], THIRD)
+    below.set_xlabel(f"time ({run.units.time})")
+
+
+def flips(run: Run, figure: Figure) -> None:
+    """Pairs that enter and leave at each step, and pairs inside."""
+    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+    series = run.series
+    # no decision came before the first step, so it has no flips
+    time = series["time"][1:]
+    for values, color, label, sign in (
+        (series["entered"][1:], FIRST, "entered", 1),
+        (series["left"][1:], SECOND, "left", -1),
+    ):
+        if not len(values):
+            continue
+        low, middle, high, at = _envelope(time, values.astype(float), 240)
+        above.fill_between(at, sign * low, sign * high, color=color, alpha=0.3, lw=0, step="mid")
+        above.step(at, sign * middle, color=color, lw=1.1, where="mid", label=label)
+    above.axhline(0, color=MUTED, lw=0.6)
+    above.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{abs(value):g}"))
+    above.yaxis.set_major_locator(MaxNLocator(5, integer=True))
+    _label(above, "flips per step")
+    _legend(above)
+    _line(below, series["time"], series["pairs"].astype(float), THIRD)
+    _label(below, "pairs inside")
+    below.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
+    below.set_xlabel(f"time ({run.units.time})")
+
+
+def margins(run: Run, figure: Figure) -> None:
+    """How far from their threshold decisions were at a flip, in units of the rounding bound."""
+    axes = figure.subplots()
+    ratio = analysis.margins_in_bounds(run.flips)
+    ratio = ratio[np.isfinite(ratio)]
+    top = np.ceil(np.log10(max(ratio.max(initial=10.0), 10.0)))
+    edges = np.arange(-1, top + 0.25, 0.25)
+    counts, _ = np.histogram(np.log10(np.maximum(ratio, 0.1001)), edges)
+    axes.stairs(counts, edges, color=FIRST, fill=True, alpha=0.35)
+    axes.stairs(counts, edges, color=FIRST, lw=1.1, label="flips")
+    expected = analysis.expected_ambiguous(run.flips)
+    if expected > 0:
+        # a density that is even near zero puts counts in proportion to the width of a bin
+        width = 10.0 ** edges[1:] - 10.0 ** edges[:-1]
+        shown = (expected * width >= 0.5) & (expected * width <= 2 * counts.max())
+        centers = (edges[1:] + edges[:-1]) / 2
+        axes.plot(
+            centers[shown], expected * width[shown], color=MUTED, lw=1.1, ls="--", label="spread evenly"
+        )
+    axes.axvspan(-1, 0, color=BAD, alpha=0.16, lw=0)
+    axes.axvline(0, color=BAD, lw=1.0)
+    axes.set_yscale("log")
+    axes.set_ylim(0.5, 3 * max(counts.max(initial=1), 1))
+    axes.set_xlim(-1, top)
+    axes.annotate(
+        "ambiguous", (-0.5, 0.985), xycoords=axes.get_xaxis_transform(), color=BAD, rotation=90,
+        va="top", ha="center", fontsize=8,
+    )  # fmt: skip
+    axes.xaxis.set_major_locator(MaxNLocator(8, integer=True))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: power(round(value))))
+    _log_ticks(axes)
+    _label(axes, "flips per quarter decade")
+    axes.set_xlabel("|margin| / rounding bound")
+    _legend(axes)
+
+
+def residence(run: Run, figure: Figure) -> None:
+    """How long a pair keeps a decision between two flips."""
+    axes = figure.subplots()
+    lengths = analysis.stays(run.flips)
+    longest = max(lengths.inside.max(initial=10), lengths.outside.max(initial=10))
+    edges = np.unique(np.round(np.geomspace(1, longest + 1, 36)))
+    for values, color, label in ((lengths.inside, FIRST, "inside"), (lengths.outside, SECOND, "outside")):
+        counts, _ = np.histogram(values, edges)
+        # per step of width: bins of a few steps would otherwise look fuller than they are
+        axes.stairs(
+            counts / np.diff(edges), edges, color=color, lw=1.3, label=f"stays {label}", baseline=None
+        )
+    axes.set_xscale("log")
+    axes.set_yscale("log", nonpositive="mask")
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
+    _log_ticks(axes)
+    _label(axes, "stays per step of length")
+    axes.set_xlabel("steps between two flips of a pair")
+    _legend(axes)
+
+
+def lists(run: Run, figure: Figure) -> None:
+    """What each neighbor list used up of its skin, and how long it lived."""
+    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+    epochs, step = run.epochs, run.epochs["start"].astype(float)
+    skin, length = epochs["skin_consumed"], epochs["length"].astype(float)
+    bad = epochs["dangerous"].astype(bool) | (epochs["lost_pairs"] > 0)
+    above.axhline(1, color=BAD, lw=1.0, label="skin used up")
+    for axes, values in ((above, skin), (below, length)):
+        if len(values) > POINTS:
+            low, middle, high, at = _envelope(step, values)
+            axes.fill_between(at, low, high, color=FIRST, alpha=0.3, lw=0)
+            axes.plot(at, middle, color=FIRST, lw=1.1)
+        else:
+            axes.plot(step, values, ".", color=FIRST, ms=4, mew=0)
+        worst = np.flatnonzero(bad)
+        worst = worst[np.argsort(-values[worst])][:POINTS]
+        if len(worst):
+            axes.plot(
+                step[worst], values[worst], "o", color=BAD, ms=3.5, mew=0, label="dangerous, or pairs lost"
+            )
+    above.set_ylim(0, max(1.18, 1.08 * float(np.max(skin, initial=0))))
+    below.set_ylim(0, 1.15 * float(np.max(length, initial=1)))
+    below.yaxis.set_major_locator(MaxNLocator(4, integer=True))
+    _legend(above)
+    _label(above, "skin consumed")
+    _label(below, "steps per list")
+    below.set_xlabel("step at which the list was built")
+    below.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
+
+
+#: Figures by file name: what draws it, and its height in inches on a page.
+FIGURES: Mapping[str, tuple[Callable[[Run, Figure], None], float]] = MappingProxyType(
+    {
+        "energy": (energy, 3.9),
+        "flips": (flips, 3.7),
+        "margins": (margins, 2.9),
+        "residence": (residence, 2.7),
+        "lists": (lists, 3.5),
+    }
+)
+
+PAGE_WIDTH, PHONE_WIDTH = 7.6, 3.7
+
+
+def draw(name: str, run: Run, width: float = PAGE_WIDTH) -> Figure:
+    """One of `FIGURES`.
+
+    Args:
+        width: inches; a phone's is drawn a little lower, its labels as large.
+    """
+    function, height = FIGURES[name]
+    with style():
+        figure = Figure(
+            figsize=(width, height if width == PAGE_WIDTH else 0.85 * height), layout="constrained"
+        )
+        figure.get_layout_engine().set(h_pad=0.05, w_pad=0.02, hspace=0.04)  # type: ignore[union-attr]
+        function(run, figure)
+        figure.align_ylabels()
+        for axes in figure.axes:
+            axes.grid(True, color=GRID, lw=0.6)
+            axes.set_axisbelow(True)
+            for side in ("top", "right", "left"):
+                axes.spines[side].set_visible(False)
+            axes.tick_params(length=0)
+            if width != PAGE_WIDTH and axes.get_xscale() == "linear":
+                axes.xaxis.set_major_locator(MaxNLocator(5, integer=name == "margins"))
+    return figure
+
+
+def _envelope(
+    at: Float[np.ndarray, "points"], values: Float[np.ndarray, "points"], most: int = POINTS
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """(smallest, mean, largest, position) in at most so many equal groups; a group of one is its value."""
+    if len(values) <= most:
+        return values, values, values, at
+    starts = np.unique(np.linspace(0, len(values), most, endpoint=False).astype(int))
+    sizes = np.diff(np.append(starts, len(values)))
+    return (
+        np.minimum.reduceat(values, starts),
+        np.add.reduceat(values, starts) / sizes,
+        np.maximum.reduceat(values, starts),
+        np.add.reduceat(at, starts) / sizes,
+    )
+
+
+def _line(
+    axes: Axes,
+    at: np.ndarray,
+    values: np.ndarray,
+    color: str,
+    label: str = "",
+    width: float = 1.2,
+    alpha: float = 1.0,
+    band: bool = True,
+) -> None:
+    low, middle, high, position = _envelope(at, values)
+    if band and len(values) > POINTS:
+        axes.fill_between(position, low, high, color=color, alpha=0.3, lw=0)
+    axes.plot(position, middle, color=color, lw=width, alpha=alpha, label=label or None)
+    axes.yaxis.set_major_formatter(_Engineering())
+    axes.yaxis.set_major_locator(MaxNLocator(5))
+
+
+class _Engineering(FuncFormatter):
+    """Plain numbers, with one power of ten for the axis written into its topmost label's place."""
+
+    def __init__(self) -> None:
+        super().__init__(lambda value, _: f"{value:g}")
+        self.exponent = 0
+
+    def set_locs(self, locs: list[float]) -> None:
+        super().set_locs(locs)
+        largest = max((abs(loc) for loc in locs), default=0.0)
+        exponent = int(np.floor(np.log10(largest))) if largest > 0 else 0
+        self.exponent = exponent if exponent < -2 or exponent > 4 else 0
+
+    def __call__(self, x: float, pos: int | None = None) -> str:
+        scaled = round(x / 10.0**self.exponent, 6)
+        return f"{scaled:g}".replace("-", MINUS)
+
+    def get_offset(self) -> str:
+        return f"× {power(self.exponent)}" if self.exponent else ""
+
+
+def _log_ticks(axes: Axes) -> None:
+    axes.yaxis.set_major_locator(LogLocator(numticks=6))
+    axes.yaxis.set_major_formatter(
+        FuncFormatter(lambda value, _: f"{value:g}" if 0.1 < value < 999 else power(round(np.log10(value))))
+    )
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_minor_formatter(NullFormatter())
+    axes.minorticks_off()
+
+
+def _label(axes: Axes, text: str) -> None:
+    axes.set_ylabel(text, color=INK)
+
+
+def _legend(axes: Axes) -> None:
+    handles, labels = axes.get_legend_handles_labels()
+    if handles:
+        axes.legend(
+            handles, labels, loc="lower left", bbox_to_anchor=(0, 1.0), ncols=len(handles), frameon=False,
+            handlelength=1.3, columnspacing=1.4, borderaxespad=0.1, fontsize=8.5,
+        )  # fmt: skip

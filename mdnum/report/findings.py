@@ -1,0 +1,152 @@
+"""A verdict in words on a run, with the findings and the evidence it rests on; from the folder alone."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from mdnum.report import analysis
+from mdnum.report.rules import CHATTER_STEPS, CODES, RULES, Finding, jump, residual, total
+from mdnum.report.run import Run, load
+from mdnum.report.words import listed, many, number
+from mdnum.store import RunFolder
+
+_ORDER = ("error", "warning", "info")
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What to think of a run.
+
+    Attributes:
+        tone: the worst severity; "good" if there is neither error nor warning.
+        headline: the verdict in one sentence.
+        evidence: what it rests on, a sentence each.
+        findings: errors first.
+    """
+
+    tone: Literal["good", "warning", "error"]
+    headline: str
+    evidence: tuple[str, ...]
+    findings: tuple[Finding, ...]
+
+    @property
+    def text(self) -> str:
+        """Headline and evidence."""
+        return " ".join((self.headline, *self.evidence))
+
+
+def judge(run: Run) -> Verdict:
+    """All findings of a run, and the verdict.
+
+    Findings that others left in summary.json (a check, say) are kept; those of `rules` are decided anew.
+    """
+    found = [finding for rule in RULES for finding in rule(run)]
+    found += [_restore(kept) for kept in run.summary.get("findings") or () if kept.get("code") not in CODES]
+    findings = tuple(sorted(found, key=lambda finding: _ORDER.index(finding.severity)))
+    errors = [finding.title for finding in findings if finding.severity == "error"]
+    warnings = [finding.title for finding in findings if finding.severity == "warning"]
+    if errors:
+        headline = f"Do not rely on this run: {listed(errors)}."
+    elif warnings:
+        headline = (
+            f"The record is complete; look at {many(len(warnings), 'point')} first: {listed(warnings)}."
+        )
+    elif run.summary.get("status") == "complete":
+        headline = "The record is complete and nothing needs attention."
+    else:
+        headline = "As far as it went, the record is complete and nothing needs attention."
+    tone = "error" if errors else "warning" if warnings else "good"
+    return Verdict(tone, headline, tuple(_evidence(run)), findings)
+
+
+def record(folder: RunFolder | str | Path) -> Verdict:
+    """Judges a run and writes findings and verdict into its summary.json."""
+    folder = folder if isinstance(folder, RunFolder) else RunFolder.open(folder)
+    run = load(folder)
+    verdict = judge(run)
+    store(folder, run, verdict)
+    return verdict
+
+
+def store(folder: RunFolder, run: Run, verdict: Verdict) -> None:
+    """Writes findings and verdict into summary.json, beside what is there."""
+    findings = [dataclasses.asdict(finding) for finding in verdict.findings]
+    folder.write_summary({**run.summary, "findings": findings, "verdict": verdict.text})
+
+
+def sharpness(run: Run) -> tuple[float, float] | None:
+    """(energy of one flip, largest step of the budget's residual): how plainly a missing flip would show.
+
+    Returns:
+        None where flips cost no energy or no step was made.
+    """
+    if not jump(run) or run.steps < 1:
+        return None
+    return abs(jump(run)), float(np.max(np.abs(np.diff(run.budget["residual"]))))
+
+
+def summarize(run: Run) -> dict[str, Any]:
+    """Numbers on flips that the report shows beside its figures."""
+    flips = run.flips
+    lengths = analysis.stays(flips)
+    ratio = analysis.margins_in_bounds(flips)
+    finite = ratio[np.isfinite(ratio)]
+    loaded = len(flips["step"])
+    undone = lengths.undone_within(CHATTER_STEPS)
+    return {
+        "total": run.flips_total,
+        "loaded": loaded,
+        "per_step": run.flips_total / run.steps if run.steps else 0.0,
+        "undone": undone,
+        "undone_share": undone / loaded if loaded else 0.0,
+        "inside_median": float(np.median(lengths.inside)) if len(lengths.inside) else None,
+        "outside_median": float(np.median(lengths.outside)) if len(lengths.outside) else None,
+        "pairs": len(analysis.busiest_pairs(flips).i),
+        "ratio_min": float(finite.min()) if len(finite) else None,
+        "ratio_median": float(np.median(finite)) if len(finite) else None,
+        "expected_ambiguous": analysis.expected_ambiguous(flips),
+    }
+
+
+def _evidence(run: Run) -> Iterator[str]:
+    if analysis.algebra_holds(run.series).all():
+        flips = run.flips_total
+        subject = (
+            f"All {many(flips, 'flip')} are accounted for"
+            if flips > 1
+            else "The one flip is accounted for"
+            if flips
+            else "No pair flipped"
+        )
+        yield (
+            f"{subject}: pairs inside = pairs at the start + entered − left at every one of "
+            f"{many(len(run.series['step']), 'step')}."
+        )
+    lives = len(run.epochs["epoch"])
+    if lives and not total(run, "lost_pairs"):
+        within = "the one life" if lives == 1 else f"the {many(lives, 'life', 'lives')}"
+        yield f"No pair was lost in {within} of the neighbor list."
+    if run.summary.get("energy_budget_closes"):
+        yield (
+            "The energy budget closes: E(t) − E(0) and the sum of the ledger’s jumps differ by at most "
+            f"{number(residual(run), 2)} {run.units.energy}."
+        )
+    ase = run.summary.get("ase") or {}
+    if ase.get("ok") and ase.get("energy_rel") is not None:
+        yield (
+            f"Energies agree with ASE to {number(ase['energy_rel'], 2)} (relative), forces to "
+            f"{number(ase.get('force_max'), 2)} {run.units.energy}/{run.units.length}."
+        )
+
+
+def _restore(kept: dict[str, Any]) -> Finding:
+    values = {field.name: str(kept.get(field.name) or "") for field in dataclasses.fields(Finding)}
+    if values["severity"] not in _ORDER:
+        values["severity"] = "info"
+    return Finding(**values)  # type: ignore[arg-type]

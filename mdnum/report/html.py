@@ -1,0 +1,280 @@
+"""report.html: one file that reads without mdnum, without a network, on paper and on a phone."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jinja2 import Environment, StrictUndefined
+from markupsafe import Markup
+
+from mdnum.report import analysis, figures, findings, svg
+from mdnum.report.findings import Verdict
+from mdnum.report.rules import CHATTER_STEPS, residual
+from mdnum.report.run import FLIPS_LOADED, Run, load
+from mdnum.report.words import count, many, number, percent, plain
+from mdnum.store import RunFolder
+from mdnum.store.atomic import disk_errors, write_text
+
+#: Rows of the flip table that the page carries.
+TABLE_ROWS = 5_000
+_STATIC_ROWS = 20
+_BUSIEST = 10
+
+
+def write_report(folder: RunFolder | str | Path) -> Path:
+    """Writes report.html and figures/*.svg, and puts findings and verdict into summary.json.
+
+    Everything is read from the folder; a run that was killed is reported up to its last checkpoint.
+
+    Returns:
+        the path of report.html.
+
+    Raises:
+        FolderError: no run in the folder, or it cannot be written.
+    """
+    folder = folder if isinstance(folder, RunFolder) else RunFolder.open(folder)
+    run = load(folder)
+    verdict = findings.judge(run)
+    findings.store(folder, run, verdict)
+    with disk_errors(folder.path / "figures"):
+        (folder.path / "figures").mkdir(exist_ok=True)
+    pictures = {}
+    for name, title in _titles(run).items():
+        page = figures.draw(name, run)
+        write_text(folder.path / "figures" / f"{name}.svg", svg.standalone(page, name))
+        phone = figures.draw(name, run, figures.PHONE_WIDTH)
+        pictures[name] = Markup(
+            f'<div class="wide">{svg.inline(page, name, title)}</div>'
+            f'<div class="narrow">{svg.inline(phone, name + "-phone", title)}</div>'
+        )
+    path = folder.path / "report.html"
+    write_text(path, render(run, verdict, pictures))
+    return path
+
+
+def render(run: Run, verdict: Verdict, pictures: Mapping[str, str]) -> str:
+    """The page's text.
+
+    Args:
+        pictures: markup by the names of `figures.FIGURES`; one that is missing is left out.
+    """
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    environment.filters |= {"number": number, "count": count, "percent": percent, "plain": plain}
+    environment.globals |= {"many": many}
+    here = files("mdnum.report")
+    template = environment.from_string((here / "report.html.j2").read_text(encoding="utf-8"))
+    rows = _table_rows(run)
+    return template.render(
+        run=run,
+        verdict=verdict,
+        pictures=pictures,
+        units=run.units,
+        summary=run.summary,
+        style=Markup((here / "report.css").read_text(encoding="utf-8")),
+        script=Markup((here / "report.js").read_text(encoding="utf-8")),
+        light=svg.LIGHT,
+        dark=svg.DARK,
+        font=Markup(svg.FONT),
+        key_figures=list(_key_figures(run)),
+        what=list(_what_was_run(run)),
+        flips=findings.summarize(run),
+        sharpness=findings.sharpness(run),
+        chatter_steps=CHATTER_STEPS,
+        busiest=_busiest(run),
+        lists=_lists(run),
+        ase=list(_ase(run)),
+        rows=rows,
+        rows_json=Markup(_script_safe(rows)),
+        static_rows=_STATIC_ROWS,
+        flips_loaded=FLIPS_LOADED,
+        provenance=list(_flat(run.provenance)),
+    )
+
+
+def _titles(run: Run) -> dict[str, str]:
+    titles = {"energy": "Energy and its budget against time", "flips": "Flips per step against time"}
+    if len(run.flips["step"]):
+        titles["margins"] = "Histogram of margins in units of the rounding bound"
+    if len(analysis.stays(run.flips).all) > 1:
+        titles["residence"] = "Histogram of the steps between two flips of a pair"
+    if len(run.epochs["epoch"]):
+        titles["lists"] = "Skin consumed and steps per neighbor list"
+    return titles
+
+
+def _key_figures(run: Run) -> Iterator[tuple[str, str, str]]:
+    """(label, value, small print) of the strip below the verdict."""
+    summary = run.summary
+    entered, left = (int(run.series[name].sum(dtype=np.int64)) for name in ("entered", "left"))
+    atoms = summary.get("atoms")
+    rate = (
+        f"{number(run.flips_total / run.steps / atoms, 2)} per atom and step" if atoms and run.steps else ""
+    )
+    yield "Flips", count(entered + left), rate or f"{count(entered)} in, {count(left)} out"
+    lost = int(run.epochs["lost_pairs"].sum())
+    yield "Lost pairs", count(lost), f"in {many(len(run.epochs['epoch']), 'list')}"
+    ambiguous = int(run.series["ambiguous"].sum(dtype=np.int64))
+    yield "Ambiguous", count(ambiguous), "decisions within rounding"
+    closes = summary.get("energy_budget_closes")
+    words = "" if closes is None else "; budget closes" if closes else "; budget is open"
+    yield "Budget residual", number(residual(run), 2), run.units.energy + words
+    energy = (summary.get("ase") or {}).get("energy_rel")
+    yield "Against ASE", number(energy, 2), "not compared" if energy is None else "relative energy difference"
+    speed = summary.get("steps_per_second")
+    yield "Speed", number(speed), "steps per second"
+
+
+def _what_was_run(run: Run) -> Iterator[tuple[str, str]]:
+    """(what, words) for the table of the run; what the system file leaves out is left out."""
+    units, system, summary = run.units, run.system, run.summary
+    if system.get("about"):
+        yield "System", str(system["about"])
+    atoms = summary.get("atoms")
+    time = run.series["time"]
+    yield (
+        "Size",
+        ", ".join(
+            part
+            for part in (
+                many(atoms, "atom") if atoms else "",
+                many(run.steps, "step"),
+                f"{plain(float(time[-1] - time[0]))} {units.time}",
+            )
+            if part
+        ),
+    )
+    if potential := system.get("potential"):
+        yield "Potential", _words(potential)
+    if cutoff := system.get("cutoff"):
+        yield "Cutoff", _words(cutoff, {"radius": units.length, "onset": units.length})
+    jumps = run.cutoff
+    if jumps.get("energy_jump") is not None:
+        force = jumps.get("force_jump")
+        yield (
+            "At the cutoff",
+            f"energy jump {number(jumps['energy_jump'])} {units.energy}, force jump {number(force)} "
+            f"{units.energy}/{units.length}",
+        )
+    if neighbors := system.get("neighbors"):
+        yield "Neighbor lists", _words(neighbors, {"skin": units.length})
+    if dynamics := system.get("dynamics"):
+        yield "Dynamics", _words(dynamics, {"timestep": units.time, "temperature": units.temperature})
+    mean = float(np.mean(run.series["temperature"]))
+    yield "Temperature", f"{number(mean, 4)} {units.temperature} (mean over the run)"
+    if precision := system.get("precision"):
+        yield "Precision", _words(precision)
+
+
+def _words(table: Mapping[str, Any], units: Mapping[str, str] | None = None) -> str:
+    parts = []
+    for key, value in table.items():
+        if isinstance(value, Mapping):
+            inner = (f"{name} ({_words(item)})" if isinstance(item, Mapping) else f"{name} {item}"
+                     for name, item in value.items())  # fmt: skip
+            parts.append(f"{key}: {'; '.join(inner)}")
+        elif key == "kind":
+            parts.insert(0, str(value))
+        elif value is not None:
+            unit = (units or {}).get(key)
+            shown = str(value).lower() if isinstance(value, bool) else str(value)
+            parts.append(f"{key.replace('_', ' ')} {shown}{f' {unit}' if unit else ''}")
+    return ", ".join(parts)
+
+
+def _busiest(run: Run) -> list[dict[str, Any]]:
+    pairs = analysis.busiest_pairs(run.flips, _BUSIEST)
+    total = run.steps or 1
+    return [
+        {"pair": f"{i}–{j}", "flips": int(n), "every": total / n}
+        for i, j, n in zip(pairs.i.tolist(), pairs.j.tolist(), pairs.flips.tolist(), strict=True)
+    ]
+
+
+def _lists(run: Run) -> dict[str, Any] | None:
+    epochs = run.epochs
+    if not len(epochs["epoch"]):
+        return None
+    # the last list was cut off by the end of the run: its length says nothing
+    whole = epochs["reason"] != "end"
+    length = epochs["length"][whole] if whole.any() else epochs["length"]
+    skin = epochs["skin_consumed"]
+    reasons, counts = np.unique(epochs["reason"].astype(str), return_counts=True)
+    return {
+        "count": len(skin),
+        "length_median": float(np.median(length)),
+        "length_min": int(length.min()),
+        "length_max": int(length.max()),
+        "skin_median": float(np.median(skin)),
+        "skin_max": float(skin.max()),
+        "pairs_listed": float(np.mean(epochs["pairs_listed"])),
+        "occupancy": float(np.max(epochs["occupancy"] / np.maximum(epochs["capacity"], 1))),
+        "capacities": len(np.unique(epochs["capacity"])),
+        "dangerous": int(epochs["dangerous"].sum()),
+        "lost_pairs": int(epochs["lost_pairs"].sum()),
+        "lost_pair_steps": int(epochs["lost_pair_steps"].sum()),
+        "build_ms": float(np.median(epochs["build_ms"])),
+        "reasons": ", ".join(f"{reason} {count(int(n))}" for reason, n in zip(reasons, counts, strict=True)),
+    }
+
+
+def _ase(run: Run) -> Iterator[tuple[str, str, str]]:
+    """(quantity, difference, scale) against ASE; nothing where it was not compared."""
+    ase, units = run.summary.get("ase") or {}, run.units
+    if ase.get("energy_rel") is not None:
+        yield "energy", number(ase["energy_rel"]), "relative"
+    if ase.get("force_max") is not None:
+        scale = ase.get("force_scale")
+        share = f"; {number(ase['force_max'] / scale, 2)} of the force scale" if scale else ""
+        yield "forces", number(ase["force_max"]), f"{units.energy}/{units.length}, largest component{share}"
+    if ase.get("stress_max") is not None:
+        yield "stress", number(ase["stress_max"]), f"{units.energy}/{units.length}³, largest component"
+
+
+def _table_rows(run: Run) -> list[list[Any]]:
+    """The flips nearest to the threshold, in the order of steps: step, i, j, entered, and numbers."""
+    flips = run.flips
+    chosen = np.sort(analysis.closest(flips, TABLE_ROWS))
+    ratio = analysis.margins_in_bounds(flips)[chosen]
+    columns = [flips[name][chosen].tolist() for name in ("step", "i", "j")]
+    columns.append(flips["entered"][chosen].astype(int).tolist())
+    for name, digits in (("distance", 9), ("margin", 4), ("radial_speed", 4), ("energy_jump", 4)):
+        columns.append([_short(value, digits) for value in flips[name][chosen].tolist()])
+    columns.append([_short(value, 3) for value in ratio.tolist()])
+    return [list(row) for row in zip(*columns, strict=True)]
+
+
+def _short(value: float, digits: int) -> float | None:
+    return float(f"{value:.{digits}g}") if np.isfinite(value) else None
+
+
+def _flat(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+    for key, item in value.items():
+        name = f"{prefix}{key}".replace("_", " ")
+        if isinstance(item, Mapping):
+            scalars = {inner: text for inner, text in item.items() if not isinstance(text, Mapping | list)}
+            if scalars:
+                yield name, ", ".join(f"{inner} {_text(text)}" for inner, text in scalars.items())
+            yield from _flat({key: inner for key, inner in item.items() if key not in scalars}, f"{name} ")
+        elif isinstance(item, list):
+            texts = [_words(part) if isinstance(part, Mapping) else _text(part) for part in item]
+            yield name, ", ".join(texts) or "none"
+        else:
+            yield name, _text(item)
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return "none"
+    return {True: "on", False: "off"}[value] if isinstance(value, bool) else str(value) or "none"
+
+
+def _script_safe(value: Any) -> str:
+    # "</script>" inside a string would end the element it stands in
+    return json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")

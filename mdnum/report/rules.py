@@ -1,0 +1,290 @@
+"""One rule per thing that can be wrong with a run, or that one should know about it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from mdnum.report import analysis
+from mdnum.report.run import Run
+from mdnum.report.words import count, many, number, percent
+
+Severity = Literal["info", "warning", "error"]
+
+#: A flip taken back within so many steps is chatter.
+CHATTER_STEPS = 10
+#: Share of flips that must be chatter before it is worth a warning; free flight through the cutoff gives
+#: a few percent at usual time steps.
+CHATTER_SHARE = 0.15
+#: Drift over the run, per atom and in units of k_B T, from which on it is worth a warning.
+DRIFT_SHARE = 0.01
+
+_GRADIENT = (
+    "A gradient taken through the rollout differentiates the branch that ran and misses what each flip "
+    "adds, an error that a shorter time step does not shrink."
+)
+_RECORDER = "A flip was not recorded: the ledger cannot be used. Please report it."
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing a person should know about a run.
+
+    Attributes:
+        code: stable name, for scripts.
+        severity: error: do not use the numbers; warning: look before you do; info: good to know.
+        title: one line, without a capital or a full stop.
+        text: what was seen, with its numbers.
+        remedy: what to do, empty if nothing.
+    """
+
+    code: str
+    severity: Severity
+    title: str
+    text: str
+    remedy: str = ""
+
+
+Rule = Callable[[Run], Iterator[Finding]]
+
+
+def _status(run: Run) -> Iterator[Finding]:
+    status = run.summary.get("status")
+    planned = (run.system.get("dynamics") or {}).get("steps")
+    of = f" of {count(planned)}" if planned and planned > run.steps else ""
+    if status == "failed":
+        title = f"the run failed at step {_step(run, -1)}{of}"
+        text = run.summary.get("message") or "It stopped at the first number that was not finite."
+        remedy = "Shorten dynamics.timestep, or relax the structure first."
+        yield Finding("RUN_FAILED", "error", title, str(text), remedy)
+    elif status != "complete":
+        title = f"the run ended early, after {many(run.steps, 'step')}{of}"
+        text = "It was stopped or killed; what is here is complete up to its last checkpoint."
+        yield Finding("NOT_FINISHED", "info", title, text, "Continue with mdnum run --resume.")
+
+
+def _lost_pairs(run: Run) -> Iterator[Finding]:
+    lost = total(run, "lost_pairs")
+    if not lost:
+        return
+    firsts = run.epochs["first_lost_step"]
+    firsts = firsts[firsts >= 0]
+    since = f", from step {count(int(firsts.min()))} on" if len(firsts) else ""
+    neighbors = run.system.get("neighbors") or {}
+    if neighbors.get("check") is False:
+        remedy = (
+            f"Set neighbors.check = true (the list is rebuilt blindly every {neighbors.get('every', 1)} "
+            "steps), or raise neighbors.skin."
+        )
+    else:
+        remedy = "Raise neighbors.skin, or shorten dynamics.timestep."
+    text = (
+        f"{many(lost, 'pair')} inside the cutoff {'was' if lost == 1 else 'were'} missing from the list in "
+        f"use, for {many(total(run, 'lost_pair_steps'), 'pair-step')}. Their forces are missing, and so are "
+        "their flips."
+    )
+    yield Finding("LOST_PAIRS", "error", f"the neighbor list lost {many(lost, 'pair')}{since}", text, remedy)
+
+
+def _dangerous_builds(run: Run) -> Iterator[Finding]:
+    dangerous = total(run, "dangerous_builds", "dangerous")
+    if not dangerous:
+        return
+    worst = float(np.max(run.epochs["skin_consumed"], initial=0.0))
+    audit = (
+        "Pairs were lost."
+        if total(run, "lost_pairs")
+        else "The audit at each rebuild found no lost pair, so these forces are right."
+    )
+    text = (
+        f"{count(dangerous)} of {count(len(run.epochs['epoch']))} lists may have been in use for too long "
+        f"(LAMMPS’s meaning of the word); at worst {percent(worst)} of the skin was consumed. {audit}"
+    )
+    remedy = "Rebuild earlier (neighbors.every, neighbors.delay) or raise neighbors.skin."
+    yield Finding("DANGEROUS_BUILDS", "warning", many(dangerous, "dangerous build"), text, remedy)
+
+
+def _algebra(run: Run) -> Iterator[Finding]:
+    wrong = np.flatnonzero(~analysis.algebra_holds(run.series))
+    if len(wrong):
+        title = f"pairs and flips disagree from step {_step(run, wrong[0])} on"
+        text = f"Pairs inside are not pairs at the start + entered − left at {many(len(wrong), 'step')}."
+        yield Finding("EVENT_ALGEBRA", "error", title, text, _RECORDER)
+
+
+def _ledger(run: Run) -> Iterator[Finding]:
+    title = "the table of flips is not complete"
+    counted = int(run.series["entered"].sum(dtype=np.int64) + run.series["left"].sum(dtype=np.int64))
+    if counted != run.flips_total:
+        text = f"The steps count {many(counted, 'flip')}; the table has {count(run.flips_total)}."
+        yield Finding("LEDGER_INCOMPLETE", "error", title, text, "Run again in a new folder.")
+        return
+    if len(run.flips["step"]) == run.flips_total:
+        wrong = np.flatnonzero(~analysis.flips_match_series(run.series, run.flips))
+        if len(wrong):
+            where = _step(run, wrong[0])
+            text = f"Steps and table count different flips at {many(len(wrong), 'step')}, first at {where}."
+            yield Finding("LEDGER_INCOMPLETE", "error", title, text, "Run again in a new folder.")
+            return
+    if not analysis.alternates(run.flips):
+        text = "A pair enters or leaves twice in a row; between the two there was a flip the other way."
+        yield Finding("LEDGER_INCOMPLETE", "error", title, text, _RECORDER)
+
+
+def _budget(run: Run) -> Iterator[Finding]:
+    if run.summary.get("energy_budget_closes") is not False:
+        return
+    energy = run.units.energy
+    text = f"E(t) − E(0) and the sum of the ledger’s energy jumps part by {number(residual(run))} {energy}."
+    moves = np.abs(np.diff(run.budget["residual"]))
+    if len(moves):
+        worst = int(np.argmax(moves))
+        text += (
+            f" They part most, by {number(float(moves[worst]))} {energy}, at step {_step(run, worst + 1)}."
+        )
+    if jump(run):
+        text += f" One flip is {number(abs(jump(run)))} {energy}."
+    remedy = (
+        "Either a flip is missing, or the time step is too long to conserve energy: halve "
+        "dynamics.timestep and compare."
+    )
+    yield Finding("BUDGET_OPEN", "error", "the energy budget does not close", text, remedy)
+
+
+def _tie(run: Run) -> Iterator[Finding]:
+    margin = abs(float(run.series["min_margin"][0]))
+    if margin and not run.series["ambiguous"][0]:
+        return
+    text = (
+        f"At step 0 the closest pair is {number(margin)} from the threshold, within rounding. Whether it "
+        "counts is a convention (cutoff.compare), and other codes have others."
+    )
+    remedy = "Move cutoff.radius between two neighbor shells."
+    yield Finding("TIE_AT_CUTOFF", "warning", "pairs start exactly at the cutoff", text, remedy)
+
+
+def _ambiguous(run: Run) -> Iterator[Finding]:
+    ambiguous = run.summary.get("ambiguous") or int(run.series["ambiguous"].sum(dtype=np.int64))
+    if not ambiguous:
+        return
+    text = (
+        f"{many(ambiguous, 'decision')} came out as {'it' if ambiguous == 1 else 'they'} did by rounding: "
+        "another order of summation, compiler or machine may decide otherwise, and follow another trajectory "
+        f"from there. Atoms that cross the cutoff freely would give "
+        f"{number(analysis.expected_ambiguous(run.flips), 2)}."
+    )
+    remedy = "Move cutoff.radius between two neighbor shells."
+    title = f"{many(ambiguous, 'decision')} within rounding of the cutoff"
+    yield Finding("AMBIGUOUS_DECISIONS", "warning", title, text, remedy)
+
+
+def _chatter(run: Run) -> Iterator[Finding]:
+    flips = len(run.flips["step"])
+    undone = analysis.stays(run.flips).undone_within(CHATTER_STEPS)
+    # a handful of flips says nothing about the cutoff
+    if flips < 20 or undone < CHATTER_SHARE * flips:
+        return
+    smooth = not jump(run) and not run.cutoff.get("force_jump")
+    busiest = analysis.busiest_pairs(run.flips, 1)
+    text = (
+        f"{count(undone)} of {many(flips, 'flip')} are taken back by the same pair within {CHATTER_STEPS} "
+        f"steps; pair {busiest.i[0]}–{busiest.j[0]} alone flips {count(int(busiest.flips[0]))} times. Atoms "
+        "rest at the cutoff, as a crystal’s shell does."
+    )
+    if smooth:
+        text += " The cutoff is smooth, so that this costs nothing."
+    remedy = "Move cutoff.radius between two neighbor shells" + (
+        "." if smooth else ", or use a switched cutoff."
+    )
+    title = f"{percent(undone / flips)} of the flips are chatter"
+    yield Finding("CHATTER", "info" if smooth else "warning", title, text, remedy)
+
+
+def _cutoff(run: Run) -> Iterator[Finding]:
+    kind, force = run.cutoff.get("kind"), float(run.cutoff.get("force_jump") or 0.0)
+    if not kind or not (jump(run) or force):
+        return
+    energy = run.units.energy
+    force_text = f"{number(abs(force))} {energy}/{run.units.length}"
+    if jump(run):
+        text = (
+            f"The {kind} cutoff ends where the pair energy is {number(jump(run))} {energy} and the force "
+            f"{force_text}: each flip changes the total energy by that much. {_GRADIENT}"
+        )
+        remedy = 'For conserved energy or for gradients use cutoff.kind = "switched" or "quintic".'
+        yield Finding("HARD_CUTOFF", "info", "every flip kicks the energy", text, remedy)
+        return
+    text = f"The {kind} cutoff ends at zero energy, but the force jumps there by {force_text}."
+    if kind == "shifted":
+        text += " Forces, trajectory and flips are bit for bit those of a hard cutoff."
+    remedy = 'For gradients use cutoff.kind = "switched" or "quintic".'
+    yield Finding("FORCE_JUMP", "info", "every flip kicks the force", f"{text} {_GRADIENT}", remedy)
+
+
+def _drift(run: Run) -> Iterator[Finding]:
+    drift, atoms = run.summary.get("energy_drift"), run.summary.get("atoms")
+    thermal = run.units.k_B * float(np.mean(run.series["temperature"]))
+    time = float(run.series["time"][-1] - run.series["time"][0])
+    if drift is None or not atoms or not thermal > 0 or abs(drift) * time < DRIFT_SHARE * thermal:
+        return
+    units, moved = run.units, abs(drift) * time
+    share = min(1.0, abs(float(run.budget["jumps"][-1])) / (moved * atoms))
+    text = (
+        f"{number(drift, signed=True)} {units.energy} per atom and {units.time} make {number(moved)} "
+        f"{units.energy} per atom in {number(time)} {units.time}. "
+        + (f"The flips account for {percent(share)} of it." if share else "No flip changes the energy here.")
+    )
+    remedy = "Use a cutoff that ends smoothly." if share > 0.5 else "Shorten dynamics.timestep."
+    title = f"the energy drifts by {percent(moved / thermal)} of k_B T over the run"
+    yield Finding("DRIFT", "warning", title, text, remedy)
+
+
+def _ase(run: Run) -> Iterator[Finding]:
+    ase = run.summary.get("ase") or {}
+    if ase.get("ok") is False:
+        scale = ase.get("force_scale")
+        text = (
+            f"Relative energy difference {number(ase.get('energy_rel'))}, largest force difference "
+            f"{number(ase.get('force_max'))} {run.units.energy}/{run.units.length}"
+            + (f" at a force scale of {number(scale)}." if scale else ".")
+        )
+        remedy = "Look at mdnum check energy for this system, and at mdnum doctor for this installation."
+        yield Finding("ASE_DISAGREES", "error", "energies or forces disagree with ASE", text, remedy)
+    elif ase.get("ok") is None:
+        text = str(ase.get("note") or "The comparison was switched off, or ASE has no such potential.")
+        yield Finding("ASE_NOT_COMPARED", "info", "not compared with ASE", text, "Run mdnum check energy.")
+
+
+#: Rules in the order in which their findings are told, and the codes they decide anew each time.
+RULES: tuple[Rule, ...] = (
+    _status, _lost_pairs, _algebra, _ledger, _budget, _ase, _dangerous_builds, _tie, _ambiguous, _chatter,
+    _drift, _cutoff,
+)  # fmt: skip
+CODES = frozenset({
+    "RUN_FAILED", "NOT_FINISHED", "LOST_PAIRS", "DANGEROUS_BUILDS", "EVENT_ALGEBRA", "LEDGER_INCOMPLETE",
+    "BUDGET_OPEN", "TIE_AT_CUTOFF", "AMBIGUOUS_DECISIONS", "CHATTER", "HARD_CUTOFF", "FORCE_JUMP", "DRIFT",
+    "ASE_DISAGREES", "ASE_NOT_COMPARED",
+})  # fmt: skip
+
+
+def residual(run: Run) -> float:
+    """Largest |E(t) - E(0) - sum of jumps|, as the run stated it or else from the series."""
+    stated = run.summary.get("energy_budget_residual")
+    return float(np.max(np.abs(run.budget["residual"]))) if stated is None else abs(float(stated))
+
+
+def jump(run: Run) -> float:
+    """Energy of a pair at the cutoff, 0 where it ends at zero."""
+    return float(run.cutoff.get("energy_jump") or 0.0)
+
+
+def total(run: Run, key: str, column: str | None = None) -> int:
+    """A count from the summary, or from the epochs where a killed run has no summary."""
+    return int(run.summary.get(key) or run.epochs[column or key].sum())
+
+
+def _step(run: Run, row: int) -> str:
+    return count(int(run.series["step"][row]))

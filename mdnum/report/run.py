@@ -1,0 +1,102 @@
+"""What a report reads: a run folder, loaded once."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mdnum import units
+from mdnum.errors import FolderError
+from mdnum.store import RunFolder
+from mdnum.units import Units
+
+#: Flips that are loaded; the counts per step come from the series and cover all of them.
+FLIPS_LOADED = 10_000_000
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run folder's content on the host.
+
+    Attributes:
+        summary, system, provenance: as written.
+        series, epochs: arrays by column name.
+        flips: as series; the first `FLIPS_LOADED` of them.
+        flips_total: all flips in the table.
+    """
+
+    path: Path
+    summary: Mapping[str, Any]
+    system: Mapping[str, Any]
+    system_toml: str
+    provenance: Mapping[str, Any]
+    series: Mapping[str, np.ndarray]
+    epochs: Mapping[str, np.ndarray]
+    flips: Mapping[str, np.ndarray]
+    flips_total: int
+
+    @property
+    def name(self) -> str:
+        """The system's name."""
+        return str(self.summary.get("system") or self.path.name)
+
+    @property
+    def steps(self) -> int:
+        """Steps made."""
+        return max(0, len(self.series["step"]) - 1)
+
+    @cached_property
+    def units(self) -> Units:
+        """The unit system of all numbers in the folder."""
+        return units.get(str(self.summary.get("units") or self.system.get("units") or "lj"))
+
+    @property
+    def cutoff(self) -> Mapping[str, Any]:
+        """Kind, radius, comparison, jumps; empty where there is none."""
+        return self.summary.get("cutoff") or {}
+
+    @property
+    def conservative(self) -> bool:
+        """Whether the total energy should stay what it was."""
+        return (self.system.get("dynamics") or {}).get("kind", "nve") == "nve"
+
+    @cached_property
+    def budget(self) -> dict[str, np.ndarray]:
+        """Energy against time: its change, the ledger's jumps summed, and what is left between the two."""
+        conserved = self.series["conserved"]
+        change = conserved - conserved[0] if len(conserved) else conserved
+        jumps = np.cumsum(self.series["energy_jump"])
+        return {"change": change, "jumps": jumps, "residual": change - jumps}
+
+
+def load(folder: RunFolder | str | Path) -> Run:
+    """Loads a run folder, finished or not.
+
+    Raises:
+        FolderError: it holds no run, or no step of one.
+    """
+    if not isinstance(folder, RunFolder):
+        folder = RunFolder.open(folder)
+    series = folder.read("series")
+    if not len(series["step"]):
+        raise FolderError(
+            "holds no step of a run", remedy="Resume the run, or run again", where=str(folder.path)
+        )
+    toml = folder.system_toml
+    return Run(
+        path=folder.path,
+        summary=folder.summary,
+        system=tomllib.loads(toml),
+        system_toml=toml,
+        provenance=folder.provenance,
+        series=series,
+        epochs=folder.read("epochs"),
+        flips=folder.read("flips", rows=FLIPS_LOADED),
+        flips_total=folder.rows("flips"),
+    )

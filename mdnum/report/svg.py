@@ -1,0 +1,112 @@
+"""matplotlib figures as SVG that follows the page: its font, its colors, light and dark."""
+
+from __future__ import annotations
+
+import io
+import re
+from contextlib import AbstractContextManager
+
+import matplotlib as mpl
+from matplotlib.figure import Figure
+
+# colors that stand for a role; no figure uses them otherwise, so they can be replaced in the finished file
+INK, MUTED, GRID, FIRST, SECOND, THIRD, BAD = (f"#0102{index:02x}" for index in range(1, 8))
+_ROLES = {
+    INK: "ink",
+    MUTED: "muted",
+    GRID: "grid",
+    FIRST: "first",
+    SECOND: "second",
+    THIRD: "third",
+    BAD: "bad",
+}
+
+LIGHT = {
+    "ink": "#1c2430", "muted": "#66707e", "grid": "#e3e6ea", "first": "#2563a8", "second": "#c2661a",
+    "third": "#2c7a63", "bad": "#b3261e",
+}  # fmt: skip
+DARK = {
+    "ink": "#e4e7ec", "muted": "#98a2b0", "grid": "#2b323c", "first": "#74a9e8", "second": "#e79a58",
+    "third": "#63bda1", "bad": "#f07b72",
+}  # fmt: skip
+FONT = 'system-ui, -apple-system, "Segoe UI", Roboto, "Liberation Sans", "Helvetica Neue", Arial, sans-serif'
+
+
+def style() -> AbstractContextManager[None]:
+    """The settings under which figures are drawn, whatever the user's matplotlibrc says."""
+    return mpl.rc_context(
+        {
+            **mpl.rcParamsDefault,
+            "backend": mpl.get_backend(),
+            "font.family": "DejaVu Sans",
+            "font.size": 9,
+            "axes.labelsize": 9,
+            "axes.edgecolor": MUTED,
+            "axes.linewidth": 0.7,
+            "axes.labelcolor": INK,
+            "text.color": INK,
+            "xtick.color": MUTED,
+            "ytick.color": MUTED,
+            "xtick.labelcolor": INK,
+            "ytick.labelcolor": INK,
+            "xtick.labelsize": 8.5,
+            "ytick.labelsize": 8.5,
+            "axes.unicode_minus": True,
+            "axes.formatter.useoffset": False,
+            "figure.facecolor": "none",
+            "axes.facecolor": "none",
+            "savefig.facecolor": "none",
+            "path.simplify_threshold": 0.3,
+            "svg.fonttype": "none",
+        }
+    )
+
+
+def inline(figure: Figure, name: str, title: str) -> str:
+    """An <svg> element for an HTML page that defines the colors as custom properties.
+
+    Args:
+        name: makes the element's ids unique on the page.
+        title: what a screen reader says.
+    """
+    text = _svg(figure, name)
+    text = re.sub(r'<svg [^>]*?viewBox="([^"]+)"[^>]*>', r'<svg viewBox="\1" role="img">', text, count=1)
+    return text.replace('role="img">', f'role="img" aria-label="{title}">', 1)
+
+
+def standalone(figure: Figure, name: str) -> str:
+    """A whole SVG file, which carries both sets of colors and follows the viewer's preference."""
+    text = _svg(figure, name)
+    rules = (
+        f"svg {{ {_properties(LIGHT)} }} "
+        f"@media (prefers-color-scheme: dark) {{ svg {{ {_properties(DARK)} }} }} "
+        f"text {{ font-family: {FONT}; }}"
+    )
+    return re.sub(r"(<svg [^>]*>)", rf"\1<style>{rules}</style>", text, count=1)
+
+
+def _properties(colors: dict[str, str]) -> str:
+    return " ".join(f"--{role}: {color};" for role, color in colors.items())
+
+
+def _svg(figure: Figure, name: str) -> str:
+    sink = io.StringIO()
+    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
+        figure.savefig(sink, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
+    text = sink.getvalue()
+    text = text[text.index("<svg ") :]
+    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    text = re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)
+    for color, role in _ROLES.items():
+        text = text.replace(color, f"var(--{role})")
+    # the page's own font instead of the one it was measured with
+    text = text.replace("font-family: 'DejaVu Sans'; ", "")
+    text = re.sub(r' transform="rotate\(-0 [^)]*\)"', "", text)
+    referenced = set(re.findall(r"#([\w.-]+)", text))
+    text = re.sub(r' id="([^"]+)"', lambda found: found[0] if found[1] in referenced else "", text)
+    text = re.sub(r'id="([^"]+)"', rf'id="{name}-\1"', text)
+    text = re.sub(r'href="#([^"]+)"', rf'href="#{name}-\1"', text)
+    text = re.sub(r"url\(#([^)]+)\)", rf"url(#{name}-\1)", text)
+    # a hundredth of a point is finer than any screen; what stands between the tags are the labels
+    text = re.sub(r"<[^>]+>", lambda tag: re.sub(r"(\d+\.\d{2})\d+", r"\1", tag[0]), text)
+    return re.sub(r"\n\s*\n*", "\n", text)

@@ -1,0 +1,66 @@
+"""Numbers as people read them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+MINUS = "\N{MINUS SIGN}"
+
+
+def power(exponent: int) -> str:
+    """10ⁿ."""
+    return "10" + str(exponent).translate(_RAISED)
+
+
+def number(value: float | None, digits: int = 3, signed: bool = False) -> str:
+    """A number with so many significant digits; a power of ten where it is far from 1; "–" for none."""
+    if value is None or math.isnan(value):
+        return "–"
+    if math.isinf(value):
+        return f"{MINUS if value < 0 else ''}∞"
+    if value == 0:
+        return "0"
+    sign = MINUS if value < 0 else "+" if signed else ""
+    mantissa, exponent = f"{abs(value):.{digits - 1}e}".split("e")
+    scale = int(exponent)
+    if -4 < scale < 6:
+        # whole numbers are told in full: 123,456 rather than 123,000
+        rounded = float(f"{mantissa}e{exponent}") if scale < digits else abs(value)
+        return sign + f"{rounded:,.{max(0, digits - 1 - scale)}f}"
+    # no-break spaces: a number is one word
+    return f"{sign}{mantissa}\N{NO-BREAK SPACE}×\N{NO-BREAK SPACE}{power(scale)}"
+
+
+def count(value: float | None) -> str:
+    """A whole number with its thousands set apart; "–" for none."""
+    return "–" if value is None else f"{int(value):,}".replace("-", MINUS)
+
+
+def plain(value: float | None, digits: int = 4) -> str:
+    """As `number`, without zeros that only fill up the digits: for what was chosen rather than measured."""
+    text = number(value, digits)
+    return text.rstrip("0").rstrip(".") if "." in text and "×" not in text else text
+
+
+def many(value: float | None, noun: str, plural: str | None = None) -> str:
+    """1 pair, 2 pairs, no pairs."""
+    plural = plural or noun + "s"
+    if not value:
+        return f"no {plural}"
+    return f"{count(value)} {noun if value == 1 else plural}"
+
+
+def percent(share: float) -> str:
+    """A share in percent, without a false 0 % or 100 %."""
+    if 0 < share < 0.001:
+        return "under 0.1 %"
+    if 0.999 < share < 1:
+        return "over 99.9 %"
+    return f"{100 * share:.1f} %" if 0 < share < 0.1 else f"{100 * share:.0f} %"
+
+
+def listed(items: Sequence[str]) -> str:
+    """a, b and c."""
+    return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}"
