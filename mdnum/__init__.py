@@ -23,7 +23,7 @@ _HOMES = {
     "build": "mdnum.systems:build",
     "diagnose": "mdnum.doctor:diagnose",
     "load": "mdnum.systems:load",
-    "run": "mdnum.rollout:run",
+    "run": "mdnum.workflow:run",
     "systems": "mdnum.systems",
 }
 
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from mdnum.errors import MdnumError as MdnumError
     from mdnum.errors import NumericalError as NumericalError
     from mdnum.references import MdnumCalculator as MdnumCalculator
-    from mdnum.rollout import run as run
+    from mdnum.workflow import run as run
     from mdnum.systems import build as build
     from mdnum.systems import load as load
 

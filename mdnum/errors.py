@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 
 class MdnumError(Exception):
     """Base of every error that mdnum raises on purpose.
@@ -41,6 +43,21 @@ class LostPairsError(MdnumError):
 
 
 class NumericalError(MdnumError):
-    """A number that must be finite is not."""
+    """A number that must be finite is not.
+
+    Args:
+        folder: the run folder that holds everything up to that number.
+    """
 
     exit_code = 1
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        remedy: str | None = None,
+        where: str | None = None,
+        folder: Path | None = None,
+    ):
+        super().__init__(message, remedy=remedy, where=where)
+        self.folder = folder

@@ -47,7 +47,7 @@ def run(
     if resume is None:
         out = default_folder(str(system)) if out is None else out
 
-    from mdnum.rollout import run as run_system
+    from mdnum.workflow import run as run_system
 
     try:
         with ProgressBar() as progress:

@@ -13,12 +13,13 @@ from ase import Atoms
 
 from mdnum import provenance
 from mdnum.errors import FolderError, InputError, NumericalError
+from mdnum.events import Ledger
 from mdnum.rollout.budget import EnergyBudget
 from mdnum.rollout.engine import Engine, Segment, Start, resume_point
 from mdnum.rollout.flips import PairRecorder, flip_columns
 from mdnum.rollout.health import ListHealth
 from mdnum.rollout.series import series_columns
-from mdnum.rollout.summary import Tally, closest_pair, summarize
+from mdnum.rollout.summary import Tally, closest_pair, log_line, summarize
 from mdnum.store import RunFolder
 from mdnum.systems.build import Simulation, build
 from mdnum.systems.load import System, load
@@ -167,9 +168,9 @@ class Rollout:
         done.last = segment.unsorted("x", segment.rows - 1)
         self._save_frames(segment)
         self._close_budget(segment, ledger, interval)
-        self._log(segment)
+        self._log(segment, pairs, ledger)
 
-    def _close_budget(self, segment: Segment, ledger, interval: int) -> None:
+    def _close_budget(self, segment: Segment, ledger: Ledger, interval: int) -> None:
         budget = self.done.budget
         potential = segment.rows_of("potential")
         if budget.start is None:
@@ -211,7 +212,9 @@ class Rollout:
             "save_every": self.save_every,
         }
 
-    def _log(self, segment: Segment) -> None:
+    def _log(self, segment: Segment, pairs: np.ndarray, ledger: Ledger) -> None:
+        so_far = np.cumsum(np.bincount(ledger.step - segment.first, minlength=segment.rows))
+        flips = self.done.tally.entered + self.done.tally.left - len(ledger)
         every = max(1, self.steps // _LOG_LINES)
         header = (
             "    step       time      potential        kinetic          total  temperature     pairs  flips"
@@ -221,7 +224,9 @@ class Rollout:
             if step == 0:
                 self.folder.log(header)
             if step % every == 0 or step == self.steps:
-                self.folder.log(self.done.tally.line(self.simulation, segment, row))
+                self.folder.log(
+                    log_line(self.simulation, segment, row, int(pairs[row]), flips + int(so_far[row]))
+                )
 
     def _say(self, phase: str, step: int) -> None:
         if self.progress is None:
@@ -253,6 +258,7 @@ class Rollout:
             where=self.simulation.system.name,
             remedy=f"Everything up to step {step - 1} is in {self.folder.path}. "
             "Use a shorter dynamics.timestep, relax the structure or lower the temperature",
+            folder=self.folder.path,
         )
 
 

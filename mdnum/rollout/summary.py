@@ -42,17 +42,6 @@ class Tally:
         self.ambiguous += int(segment.rows_of("ambiguous").sum())
         self.ambiguous_flips += int(ledger.ambiguous.sum())
 
-    def line(self, simulation: Simulation, segment: Segment, row: int) -> str:
-        """A line of log.txt."""
-        potential, kinetic = segment.rows_of("potential")[row], segment.rows_of("kinetic")[row]
-        temperature = 2 * kinetic / (degrees_of_freedom(simulation) * simulation.units.k_B)
-        step = segment.first + row
-        time = step * simulation.system.spec.dynamics.timestep
-        return (
-            f"{step:8d} {time:10.4f} {potential:14.6f} {kinetic:14.6f} {potential + kinetic:14.6f} "
-            f"{temperature:12.4f} {self.pairs_last:9d} {self.entered + self.left:6d}"
-        )
-
     def to_dict(self) -> dict:
         """Plain values, for a checkpoint."""
         return dict(self.__dict__)
@@ -61,6 +50,18 @@ class Tally:
     def from_dict(cls, values: dict) -> Tally:
         """The inverse of `to_dict`."""
         return cls(**values)
+
+
+def log_line(simulation: Simulation, segment: Segment, row: int, pairs: int, flips: int) -> str:
+    """A line of log.txt: a row of a segment with the pairs inside and the flips up to there."""
+    potential, kinetic = segment.rows_of("potential")[row], segment.rows_of("kinetic")[row]
+    temperature = 2 * kinetic / (degrees_of_freedom(simulation) * simulation.units.k_B)
+    step = segment.first + row
+    time = step * simulation.system.spec.dynamics.timestep
+    return (
+        f"{step:8d} {time:10.4f} {potential:14.6f} {kinetic:14.6f} {potential + kinetic:14.6f} "
+        f"{temperature:12.4f} {pairs:9d} {flips:6d}"
+    )
 
 
 def summarize(
