@@ -13,6 +13,7 @@ import hypothesis
 import jax
 import jaxtyping
 import pytest
+import typing_rules
 
 # Annotations are checked when a function is called. Not those of the command line and the report: they
 # import slow packages lazily, so their annotations name what is not imported yet.
@@ -26,6 +27,7 @@ _CHECKED = [
     "mdnum.rollout",
     "mdnum.doctor",
 ]
+typing_rules.keep_numba_whole()
 jaxtyping.install_import_hook(_CHECKED, "typing_rules.check")
 
 # compiling takes seconds and happens in the first example

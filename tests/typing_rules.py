@@ -2,7 +2,43 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+import numba
 from beartype import BeartypeConf, beartype
+from beartype.roar import BeartypeDecorHintPep3119Exception
 
 # an int where a float is expected is fine (PEP 484's numeric tower)
-check = beartype(conf=BeartypeConf(is_pep484_tower=True))
+_beartype = beartype(conf=BeartypeConf(is_pep484_tower=True))
+
+
+def check(function: Callable[..., Any]) -> Callable[..., Any]:
+    """function with its annotations checked at each call.
+
+    A function that takes a protocol which is not runtime-checkable is left as it is: such a protocol can
+    only be checked by a static checker, and pyright does.
+    """
+    try:
+        return _beartype(function)
+    except BeartypeDecorHintPep3119Exception:
+        return function
+
+
+def keep_numba_whole() -> None:
+    """Let numba compile a function rather than the checking wrapper that the import hook puts around it.
+
+    To be called before mdnum is imported: the hook decorates every function below its other decorators.
+    """
+    njit = numba.njit
+
+    @functools.wraps(njit)
+    def unwrapping(*arguments: Any, **options: Any) -> Any:
+        if len(arguments) == 1 and callable(arguments[0]):
+            return njit(inspect.unwrap(arguments[0]), **options)
+        compiler = njit(*arguments, **options)
+        return lambda function: compiler(inspect.unwrap(function))
+
+    numba.njit = unwrapping

@@ -17,12 +17,12 @@ def diagnose(budget: float = 18.0) -> Diagnosis:
 
     Args:
         budget: seconds after which the tests in other processes are given up; those in this process
-            take about five.
+            take about six.
 
     Returns:
         A row per test. `Diagnosis.ok` is false when one is unsafe.
     """
-    from mdnum.doctor import arithmetic, crystal, installation
+    from mdnum.doctor import arithmetic, crystal, installation, own
 
     start = time.perf_counter()
     digest = installation.Child.start(installation.DIGEST_CODE)
@@ -44,6 +44,7 @@ def diagnose(budget: float = 18.0) -> Diagnosis:
         arithmetic.constant_division(),
         arithmetic.subnormals(),
         installation.numba_works(),
+        own.forces(),
         installation.second_process(digest, crystal.digest(), left()),
         installation.imports(imports, left()),
         *installation.versions(),
