@@ -8,7 +8,7 @@ from mdnum.errors import InputError
 
 # CODATA 2014 as ase.units uses it, written out so that reading a system file need not import ase.
 # tests/test_units.py holds them to ase.units.
-_PICOSECOND = 98.22694788464062
+_PICOSECOND = 98.22694788464064
 _GPA_PER_EV_PER_A3 = 160.21766208
 _BOLTZMANN_EV_PER_K = 8.617330337217213e-05
 

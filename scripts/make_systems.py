@@ -96,7 +96,7 @@ def equilibrate(
         if not ((x - listed) ** 2).sum(axis=1).max() < skin**2 / 4:
             found = finder.compute(points=x, box=cell, periodic=pbc, quantities="ij")
             pairs, listed = [index.astype(np.int64) for index in found], x.copy()
-        return lj_forces(x, *pairs, cell, inverse, pbc, kind, sigma, epsilon, r_cut)
+        return lj_forces(x, pairs[0], pairs[1], cell, inverse, pbc, kind, sigma, epsilon, r_cut)
 
     pairs: list[np.ndarray] = []
     f = force()
@@ -122,7 +122,7 @@ def equilibrate(
 def argon(atoms: Atoms, schedule: list[tuple[float, int]], seed: int) -> Atoms:
     """Equilibrate Lennard-Jones argon in metal units, cutoff 2.5 σ, steps of 5 fs."""
     one = np.ones((1, 1))
-    atoms.set_masses(np.full(len(atoms), ARGON_MASS))
+    atoms.set_array("masses", np.full(len(atoms), ARGON_MASS))
     return equilibrate(
         atoms,
         schedule,
@@ -168,7 +168,7 @@ def reduced(
     atoms: Atoms, schedule: list[tuple[float, int]], seed: int, sigma: np.ndarray, epsilon: np.ndarray
 ) -> Atoms:
     """Equilibrate a Lennard-Jones system in reduced units, cutoff 2.5 σ of each pair where the box allows."""
-    atoms.set_masses(np.ones(len(atoms)))
+    atoms.set_array("masses", np.ones(len(atoms)))
     half = min(atoms.cell.lengths()) / 2
     return equilibrate(
         atoms,
@@ -204,7 +204,7 @@ def at_cutoff() -> Atoms:
     """Two atoms that part at relative speed 1 in a box periodic along x, and so meet again."""
     atoms = Atoms("Ar2", positions=[[3.5, 4.0, 4.0], [5.5, 4.0, 4.0]], cell=[9.0, 8.0, 8.0])
     atoms.pbc = (True, False, False)
-    atoms.set_masses([1.0, 1.0])
+    atoms.set_array("masses", np.array([1.0, 1.0]))
     atoms.set_velocities([[-0.8, 0.0, 0.0], [0.8, 0.0, 0.0]])
     return atoms
 
@@ -212,7 +212,7 @@ def at_cutoff() -> Atoms:
 def leaving_well() -> Atoms:
     """Relative coordinate 1.8, relative speed 1, reduced mass 1."""
     atoms = Atoms("Ar2", positions=[[-0.9, 0.0, 0.0], [0.9, 0.0, 0.0]])
-    atoms.set_masses([2.0, 2.0])
+    atoms.set_array("masses", np.array([2.0, 2.0]))
     atoms.set_velocities([[-0.5, 0.0, 0.0], [0.5, 0.0, 0.0]])
     return atoms
 
@@ -235,7 +235,12 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(STRUCTURES)}")
-    names = parser.parse_args().names or list(STRUCTURES)
+    parser.add_argument("--schema", action="store_true", help="write schema.json only")
+    arguments = parser.parse_args()
+    names = [] if arguments.schema else arguments.names or list(STRUCTURES)
+    unknown = [name for name in names if name not in STRUCTURES]
+    if unknown:
+        parser.error(f"no structure called {', '.join(unknown)}; there are {', '.join(STRUCTURES)}")
     for name in names:
         atoms = STRUCTURES[name]()
         path = ROOT / f"{name}.extxyz"

@@ -255,16 +255,31 @@ def _override(data: dict[str, Any], key: toml.Key, value: Any) -> None:
     table[key[-1]] = value
 
 
+_RIVALS: dict[toml.Key, tuple[str, ...]] = {
+    # what the command line says replaces the file's other way of saying it
+    ("cutoff", "radius"): ("in_sigma", "pairs"),
+    ("cutoff", "in_sigma"): ("radius", "pairs"),
+    ("structure", "file"): ("builder",),
+    ("structure", "builder"): ("file",),
+}
+
+
 def _drop_foreign_keys(data: dict[str, Any], values: Mapping[toml.Key, Any]) -> None:
-    """After `--set X.kind=...`, the keys of the file that only the old kind had."""
+    """Keys of the file that an override makes meaningless: of another kind, or a rival of its key."""
     for key in values:
-        if len(key) == 2 and key[1] == "kind" and key[0] in messages.TAGGED:
-            table = data[key[0]]
-            known = messages.known_keys((key[0],), data)
-            every = messages.keys_of_any_kind(key[0])
-            for foreign in [name for name in table if name in every and name not in known]:
-                if not any(given[:2] == (key[0], foreign) for given in values):
-                    del table[foreign]
+        table = data.get(key[0])
+        if not isinstance(table, dict):
+            continue
+        foreign = set(_RIVALS.get(key, ()))
+        if {"radius", "in_sigma"} & foreign & set(table):
+            # the onset was in the unit of the radius that goes
+            foreign.add("onset")
+        if key[0] in messages.TAGGED and key[1:] in (("kind",), ("file",), ("builder",)):
+            rest = {**data, key[0]: {name: value for name, value in table.items() if name not in foreign}}
+            foreign |= messages.keys_of_any_kind(key[0]) - set(messages.known_keys(key[:1], rest))
+        for name in foreign & set(table):
+            if not any(given[:2] == (key[0], name) for given in values):
+                del table[name]
 
 
 def _draw_again(data: dict[str, Any], values: Mapping[toml.Key, Any]) -> None:

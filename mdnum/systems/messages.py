@@ -56,12 +56,15 @@ def explain(
     details.sort(key=lambda detail: detail["type"] != "extra_forbidden")
     detail = details[0]
     key = _key(detail["loc"], data)
+    if detail["type"] == "union_tag_invalid":
+        key = (*key, "kind")
     if detail["type"] == "value_error" and not key and "[cutoff]" in detail["msg"]:
         key = ("cutoff",)
     message, remedy = _sentence(detail, key, data)
     if len(details) > 1:
         others = len(details) - 1
-        remedy += f" ({others} more {'problem' if others == 1 else 'problems'} after this one.)"
+        remedy += "" if remedy.endswith((".", "?")) else "."
+        remedy = f"{remedy} {others} more {'problem follows' if others == 1 else 'problems follow'}"
     return InputError(message, remedy=remedy, where=place(key, text, where, overridden))
 
 
@@ -70,7 +73,11 @@ def place(key: Key, text: str, where: str | Path, overridden: Iterable[Key] = ()
     if any(key[: len(given)] == given for given in overridden):
         return f"--set {'.'.join(key)}"
     number = line_of(text, key) if key else None
-    return f"{where}:{number}" if number else str(where)
+    if number:
+        return f"{where}:{number}"
+    # a whole table that only overrides mention
+    given = next((given for given in overridden if key and given[: len(key)] == key), None)
+    return f"--set {'.'.join(given)}" if given else str(where)
 
 
 def _key(loc: tuple[int | str, ...], data: Mapping[str, Any]) -> Key:
@@ -84,19 +91,20 @@ def _key(loc: tuple[int | str, ...], data: Mapping[str, Any]) -> Key:
 def _sentence(detail: Mapping[str, Any], key: Key, data: Mapping[str, Any]) -> tuple[str, str]:
     kind = str(detail["type"])
     name = ".".join(key)
+    last = key[-1] if key else ""
     seen = detail["input"]
     context = detail.get("ctx", {})
     if kind == "extra_forbidden":
         known = known_keys(key[:-1], data)
-        near = nearest(key[-1], known)
+        near = nearest(last, known)
         table = f"[{'.'.join(key[:-1])}]" if len(key) > 1 else "a system file"
         remedy = f"Did you mean {near}?" if near else f"Known keys are {', '.join(known)}."
-        return f"unknown key {key[-1]!r} in {table}", remedy
+        return f"unknown key {last!r} in {table}", remedy
     if kind == "missing":
         owner = f"[{'.'.join(key[:-1])}]" if len(key) > 1 else "the system file"
         if not _is_scalar(key, data):
             return f"table [{name}] missing", f"Add a [{name}] table."
-        return f"key {key[-1]!r} missing in {owner}", f"Add `{key[-1]} = ...`{_meaning(key, data)}."
+        return f"key {last!r} missing in {owner}", f"Add `{last} = ...`" + _meaning(key, data, " ({})")
     if kind == "union_tag_not_found":
         kinds = _kinds(key[0])
         return f"key 'kind' missing in [{name}]", f"Known kinds are {', '.join(kinds)}."
@@ -105,27 +113,34 @@ def _sentence(detail: Mapping[str, Any], key: Key, data: Mapping[str, Any]) -> t
         given = str(context.get("tag"))
         near = nearest(given, kinds)
         remedy = f"Did you mean {near}? " if near else ""
-        return f"unknown {name} kind {given!r}", f"{remedy}Known kinds are {', '.join(kinds)}."
+        return f"unknown {key[0]} kind {given!r}", f"{remedy}Known kinds are {', '.join(kinds)}."
     if kind == "literal_error":
         options = str(context["expected"]).replace("'", '"')
-        near = nearest(
-            str(seen), [option.strip('" ') for option in options.replace(" or ", ", ").split(", ")]
-        )
-        remedy = f"Did you mean {near}? " if near else ""
-        return f"{name} = {_show(seen)}", f"{remedy}Expected {options}."
+        return f"{name} = {_show(seen)}; expected {options}", _meaning(key, data, f"{last}: {{}}")
     if kind in ("greater_than", "greater_than_equal"):
         bound = f"above {context['gt']:g}" if kind == "greater_than" else f"at least {context['ge']:g}"
-        return f"{name} = {_show(seen)}; expected a number {bound}", f"Correct it{_meaning(key, data)}."
+        return f"{name} = {_show(seen)}; expected a number {bound}", _meaning(key, data, f"{last}: {{}}")
     if kind in ("too_short", "too_long", "missing_positional_only_argument"):
         return f"{name} = {_show(seen)}; expected three values", "Give one for each of x, y and z."
     if kind == "value_error":
-        prefix = f"[{name}]: " if name else ""
-        return prefix + str(detail["msg"]).removeprefix("Value error, "), ""
+        said = str(detail["msg"]).removeprefix("Value error, ")
+        return said if "[" in said else f"[{name}]: {said}", ""
     expected = _EXPECTED.get(kind)
     if expected:
-        hint = " Leave out the quotes" if isinstance(seen, str) and "number" in expected else ""
-        return f"{name} = {_show(seen)}; expected {expected}", hint.strip() or f"Correct {name}."
+        quoted = isinstance(seen, str) and "number" in expected and _is_number(seen)
+        return (
+            f"{name} = {_show(seen)}; expected {expected}",
+            "Leave out the quotes" if quoted else f"Correct {name}",
+        )
     return f"{name} = {_show(seen)}: {detail['msg']}", f"Correct {name}."
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _show(value: Any) -> str:
@@ -176,7 +191,7 @@ def _models_in(annotation: Any) -> Iterable[type[BaseModel]]:
 def known_keys(key: Key, data: Mapping[str, Any]) -> list[str]:
     """Keys that the table at key may hold, given the kinds the data names."""
     model = _model(key, data)
-    return list(model.model_fields) if model else []
+    return sorted(model.model_fields, key=lambda name: name != "kind") if model else []
 
 
 def keys_of_any_kind(table: str) -> set[str]:
@@ -200,7 +215,7 @@ def _is_scalar(key: Key, data: Mapping[str, Any]) -> bool:
     return field is None or not list(_models_in(field.rebuild_annotation()))
 
 
-def _meaning(key: Key, data: Mapping[str, Any]) -> str:
+def _meaning(key: Key, data: Mapping[str, Any], form: str) -> str:
     model = _model(key[:-1], data)
     field = model.model_fields.get(key[-1]) if model else None
-    return f" ({key[-1]}: {field.description})" if field is not None and field.description else ""
+    return form.format(field.description) if field is not None and field.description else ""

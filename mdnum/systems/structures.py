@@ -137,7 +137,7 @@ def _set_masses(
             f"atom {bad} ({atoms.symbols[bad]}) has mass {masses[bad]:g}",
             remedy="Correct the structure's masses column or give [structure.masses]",
         )
-    atoms.set_masses(masses)
+    atoms.set_array("masses", masses, float, ())
 
 
 def perpendicular_widths(

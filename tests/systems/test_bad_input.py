@@ -1,4 +1,4 @@
-"""Each mistake a person makes in a system file or structure becomes one line that says what, where and how."""
+"""Each mistake in a system file or structure becomes one line that says what, where and what to do."""
 
 from __future__ import annotations
 
@@ -75,7 +75,12 @@ def test_the_unedited_file_loads(folder: Path):
         ("radius = 8.0", "radus = 8.0", 14, ["unknown key 'radus'", "[cutoff]", "Did you mean radius?"]),
         ("skin = 0.5", "skinn = 0.5", 17, ["unknown key 'skinn'", "Did you mean skin?"]),
         ("[neighbors]", "[neighbours]", 16, ["unknown key 'neighbours'", "Did you mean neighbors?"]),
-        ("radius = 8.0", "radius = 8.0\nonset = 7.0", 15, ["unknown key 'onset'", "Known keys are", "compare"]),
+        (
+            "radius = 8.0",
+            "radius = 8.0\nonset = 7.0",
+            15,
+            ["unknown key 'onset'", "Known keys are", "compare"],
+        ),
         ('units = "metal"', 'units = "real"', 2, ['units = "real"', '"metal" or "lj"']),
         ('units = "metal"', "", None, ["key 'units' missing", "metal: Å"]),
         ("sigma = 3.405", "sigma = -3.405", 9, ["potential.sigma = -3.405", "above 0", "Å or σ"]),
@@ -92,7 +97,12 @@ def test_the_unedited_file_loads(folder: Path):
         ),
         ('kind = "hard"', 'kind = "truncated"', 13, ["unknown cutoff kind 'truncated'", "hard, shifted"]),
         ('kind = "nve"', "", 19, ["'kind' missing in [dynamics]", "nve, langevin"]),
-        ('kind = "nve"', 'kind = "langevin"', 19, ["key 'temperature' missing in [dynamics]", "1 more problem"]),
+        (
+            'kind = "nve"',
+            'kind = "langevin"',
+            19,
+            ["key 'temperature' missing in [dynamics]", "1 more problem follows"],
+        ),
         ("radius = 8.0", "", 12, ["[cutoff]", "radius missing", "in_sigma"]),
         ("radius = 8.0", "radius = 8.0\nin_sigma = 2.5", 12, ["both given"]),
         ("radius = 8.0", 'radius = 8.0\ncompare = "<"', 15, ['cutoff.compare = "<"', '"r2 <"']),
@@ -118,7 +128,7 @@ def test_a_mistake_in_the_file(folder: Path, old: str, new: str, line: int | Non
     ("key", "value", "words"),
     [
         ("cutoff.radus", "8", ["--set cutoff.radus", "Did you mean radius?"]),
-        ("cutof.radius", "8", ["Did you mean cutoff?"]),
+        ("cutof.radius", "8", ["--set cutof.radius: ", "Did you mean cutoff?"]),
         ("cutoff.kind", "swiched", ["--set cutoff.kind", "Did you mean switched?"]),
         ("neighbors.skin", "wide", ["--set neighbors.skin", '"wide"', "expected a number"]),
         ("about.me", "x", ["about is a value and not a table"]),
@@ -137,7 +147,9 @@ def test_a_mistake_on_the_command_line(folder: Path, key: str, value: str, words
 def test_a_missing_system_file_and_an_unknown_name(tmp_path: Path):
     with pytest.raises(InputError, match=r"gone\.toml: no such system file"):
         load(tmp_path / "gone.toml")
-    with pytest.raises(InputError, match=r"no system called 'argon/liquid-846'.*Did you mean argon/liquid-864\?"):
+    with pytest.raises(
+        InputError, match=r"no system called 'argon/liquid-846'.*Did you mean argon/liquid-864\?"
+    ):
         load("argon/liquid-846")
     with pytest.raises(InputError, match=r"Did you mean argon/liquid-864\?"):
         load("liquid-864")

@@ -1,0 +1,238 @@
+"""Loading: names and paths, overrides, species tables, and systems that are written and read again."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ase.build import bulk
+from ase.io import read
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from mdnum import systems
+from mdnum.errors import InputError
+from mdnum.systems import System, load, pairs, structures
+
+ARGON = "argon/liquid-864"
+MIXTURE = "binary/kob-andersen-1000"
+
+
+def same_bits(a: System, b: System) -> bool:
+    return (
+        a.spec.potential.kind == b.spec.potential.kind
+        and a.atoms.get_chemical_symbols() == b.atoms.get_chemical_symbols()
+        and np.array_equal(a.atoms.positions, b.atoms.positions)
+        and np.array_equal(np.asarray(a.atoms.cell), np.asarray(b.atoms.cell))
+        and np.array_equal(a.atoms.pbc, b.atoms.pbc)
+        and np.array_equal(a.atoms.get_masses(), b.atoms.get_masses())
+        and (a.velocities is None) == (b.velocities is None)
+        and (a.velocities is None or np.array_equal(a.velocities, b.velocities))
+    )
+
+
+def test_a_name_and_a_path_mean_the_same():
+    by_name = load(ARGON)
+    by_path = load(systems.shipped_folder() / f"{ARGON}.toml")
+    assert by_name.name == ARGON
+    assert by_path.name == "liquid-864"
+    assert same_bits(by_name, by_path)
+
+
+def test_the_species_of_a_mixture():
+    system = load(MIXTURE)
+    assert system.species == ("Ni", "P")
+    assert np.bincount(system.species_index).tolist() == [800, 200]
+    assert np.array_equal(system.species_index == 1, system.atoms.symbols == "P")
+
+
+def test_tables_of_a_mixture():
+    system = load(MIXTURE)
+    tables = pairs.pair_constants(system.spec, system.species)
+    assert tables["sigma"].tolist() == [[1.0, 0.8], [0.8, 0.88]]
+    assert tables["epsilon"].tolist() == [[1.0, 1.5], [1.5, 0.5]]
+    radius, onset = pairs.cutoff_radii(system.spec, system.species)
+    assert np.allclose(radius, 2.5 * tables["sigma"], rtol=1e-15)
+    assert onset is None
+    assert system.r_cut == 2.5
+
+
+def test_a_radius_of_a_single_pair_and_its_onset():
+    system = load(MIXTURE, {"cutoff.kind": "switched", "cutoff.onset": "2.0", "cutoff.pairs.P-Ni": "1.9"})
+    radius, onset = pairs.cutoff_radii(system.spec, system.species)
+    assert np.allclose(radius, [[2.5, 1.9], [1.9, 2.2]], rtol=1e-15)
+    assert onset is not None
+    assert np.allclose(onset, 0.8 * radius, rtol=1e-15)
+
+
+def test_a_single_onset_is_kept_to_the_bit():
+    system = load(ARGON, {"cutoff.kind": "quintic", "cutoff.onset": "7.1"})
+    radius, onset = pairs.cutoff_radii(system.spec, system.species)
+    assert onset is not None
+    assert onset.tolist() == [[7.1]]
+    assert radius.tolist() == [[8.5125]]
+
+
+def test_an_onset_is_nine_tenths_of_the_radius_by_default():
+    system = load(ARGON, {"cutoff.kind": "switched"})
+    assert system.spec.cutoff.onset == 0.9 * 8.5125
+    assert "onset = " in system.to_toml()
+
+
+def test_a_pair_without_a_radius_is_named():
+    with pytest.raises(InputError, match="no radius for Ni-Ni"):
+        load(MIXTURE, {"cutoff": {"kind": "hard", "pairs": {"Ni-P": 2.0}}})
+
+
+def test_overrides_are_read_as_toml():
+    system = load(ARGON, {"neighbors.skin": "0.5", "dynamics.steps": "1_000", "cutoff.compare": "r <="})
+    assert (system.spec.skin, system.spec.dynamics.steps) == (0.5, 1000)
+    assert system.spec.cutoff.compare == "r <="
+    assert load(ARGON, {"neighbors.skin": 0.5, "neighbors.rebuild.check": False}).spec.skin == 0.5
+
+
+def test_another_kind_drops_the_keys_it_does_not_have():
+    switched = load(ARGON, {"cutoff.kind": "switched", "cutoff.onset": "7.0"})
+    assert switched.spec.cutoff.onset == 7.0
+    constant = {"potential.depth": "0.01", "potential.alpha": "1.7", "potential.r0": "3.8"}
+    morse = load(ARGON, {"potential.kind": "morse", **constant})
+    assert not hasattr(morse.spec.potential, "sigma")
+    nve = load("argon/langevin-500", {"dynamics.kind": "nve"})
+    assert not hasattr(nve.spec.dynamics, "friction")
+
+
+def test_a_radius_replaces_multiples_of_sigma():
+    system = load(MIXTURE, {"cutoff.radius": "2.0"})
+    assert system.spec.cutoff.in_sigma is None
+    assert system.r_cut == 2.0
+
+
+def test_a_temperature_asked_for_is_not_ignored():
+    stored = load(ARGON)
+    assert stored.velocities is not None
+    assert load(ARGON, {"dynamics.steps": "10"}).velocities is not None
+    assert load(ARGON, {"dynamics.temperature": "200"}).velocities is None
+    assert load(ARGON, {"dynamics.seed": "8"}).velocities is None
+    kept = load(ARGON, {"dynamics.seed": "8", "structure.velocities": "file"})
+    assert kept.velocities is not None
+    assert load("argon/langevin-500", {"dynamics.seed": "8"}).velocities is not None, (
+        "there it seeds the noise"
+    )
+
+
+@pytest.mark.parametrize(
+    "name", [ARGON, MIXTURE, "pair/leaving-well", "pair/at-cutoff", "silicon/tersoff-512"]
+)
+def test_a_written_system_is_the_same_system(name: str, tmp_path: Path):
+    system = load(name)
+    path = system.write(tmp_path / "run")
+    again = load(path.parent)
+    assert again.name == name
+    assert same_bits(system, again)
+    assert again.to_toml() == system.to_toml() == path.read_text(encoding="utf-8")
+    ignored = {"structure", "name"}
+    assert again.spec.model_dump(exclude=ignored) == system.spec.model_dump(exclude=ignored)
+
+
+def test_overrides_are_part_of_what_is_written(tmp_path: Path):
+    changed = load(ARGON, {"cutoff.kind": "switched", "neighbors.skin": "0.7", "dynamics.temperature": "50"})
+    again = load(changed.write(tmp_path))
+    assert again.spec.cutoff == changed.spec.cutoff
+    assert again.spec.skin == 0.7
+    assert again.velocities is None
+    assert tomllib.loads(changed.to_toml())["structure"]["velocities"] == "drawn"
+
+
+def test_a_system_with_a_table_takes_it_along(tmp_path: Path):
+    source = tmp_path / "source"
+    source.mkdir()
+    (source / "cu.eam.alloy").write_text("a\nb\nc\n1 Cu\n100 0.1 100 0.05 5.0\n")
+    (source / "cu.toml").write_text(
+        'units = "metal"\n[structure]\nbuilder = "fcc"\nsymbol = "Cu"\nlattice_constant = 3.6\n'
+        "repeat = [4, 4, 4]\n"
+        '[potential]\nkind = "eam"\nfile = "cu.eam.alloy"\n[dynamics]\nkind = "nve"\ntimestep = 0.001\n'
+    )
+    system = load(source / "cu.toml")
+    assert system.r_cut == 5.0
+    again = load(system.write(tmp_path / "run"))
+    assert (tmp_path / "run" / "cu.eam.alloy").is_file()
+    assert again.r_cut == 5.0
+    copied = systems.copy(source / "cu.toml", tmp_path / "copy")
+    assert load(copied).r_cut == 5.0
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    arrays(np.float64, (3, 3), elements=st.floats(-1e3, 1e3)),
+    arrays(np.float64, (3, 3), elements=st.floats(-1e-3, 1e-3)),
+)
+def test_extxyz_keeps_every_bit(
+    tmp_path_factory: pytest.TempPathFactory, positions: np.ndarray, momenta: np.ndarray
+):
+    atoms = bulk("Ar", a=np.pi).repeat((3, 1, 1))
+    atoms.positions = positions
+    atoms.set_momenta(momenta)
+    atoms.set_masses([1 / 3, np.e, 40.0])
+    atoms.pbc = (True, False, True)
+    path = tmp_path_factory.mktemp("extxyz") / "atoms.extxyz"
+    path.write_text(structures.to_extxyz(atoms))
+    again = read(path)
+    for name in ("positions", "momenta", "masses"):
+        assert np.array_equal(again.arrays[name], atoms.arrays[name])
+    assert np.array_equal(np.asarray(again.cell), np.asarray(atoms.cell))
+    assert np.array_equal(again.pbc, atoms.pbc)
+
+
+def test_masses(tmp_path: Path):
+    assert set(load("argon/crystal-108").atoms.get_masses()) == {1.0}, "reduced units"
+    assert set(load("pair/leaving-well").atoms.get_masses()) == {2.0}, "as given"
+    assert set(load("silicon/tersoff-512").atoms.get_masses()) == {28.085}, "ase's"
+    heavy = load("silicon/tersoff-512", {"structure.masses.Si": "30.0"})
+    assert set(load(heavy.write(tmp_path)).atoms.get_masses()) == {30.0}
+
+
+def test_a_builder_with_tilt_shears_cell_and_atoms_alike():
+    plain = load("silicon/tersoff-512", {"structure.rattle": "0.0"})
+    tilted = load("silicon/tersoff-512", {"structure.rattle": "0.0", "structure.tilt": "[0.1, -0.05, 0.2]"})
+    cell = np.asarray(tilted.atoms.cell)
+    edge = plain.atoms.cell[0, 0]
+    assert np.allclose(cell, [[edge, 0, 0], [0.1 * edge, edge, 0], [-0.05 * edge, 0.2 * edge, edge]])
+    assert np.allclose(
+        tilted.atoms.get_scaled_positions(wrap=False), plain.atoms.get_scaled_positions(wrap=False)
+    )
+
+
+def test_perpendicular_widths():
+    assert structures.perpendicular_widths(np.diag([3.0, 4.0, 5.0]), [True, True, True]).tolist() == [3, 4, 5]
+    widths = structures.perpendicular_widths(np.diag([3.0, 4.0, 0.0]), [True, False, False])
+    assert widths.tolist() == [3.0, np.inf, np.inf]
+    sheared = np.array([[1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    assert np.allclose(structures.perpendicular_widths(sheared, [True] * 3), [np.sqrt(0.5), 1.0, 1.0])
+
+
+def test_copy_gives_a_system_that_loads_and_overwrites_nothing(tmp_path: Path):
+    copied = systems.copy(ARGON, tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "liquid-864.extxyz",
+        "liquid-864.toml",
+        "schema.json",
+    ]
+    assert same_bits(load(copied), load(ARGON))
+    assert copied.read_text(encoding="utf-8").startswith("#:schema schema.json")
+    with pytest.raises(InputError, match="is there already"):
+        systems.copy(ARGON, tmp_path)
+    systems.copy("argon/crystal-108", tmp_path)
+
+
+def test_a_hundred_thousand_atoms_are_checked(tmp_path: Path):
+    text = (systems.shipped_folder() / f"{ARGON}.toml").read_text(encoding="utf-8")
+    structure = (
+        'builder = "fcc"\nsymbol = "Ar"\nlattice_constant = 5.3\nrepeat = [30, 30, 30]\nrattle = 0.1\n'
+    )
+    (tmp_path / "large.toml").write_text(
+        text.replace('file = "liquid-864.extxyz"', structure), encoding="utf-8"
+    )
+    assert len(load(tmp_path / "large.toml").atoms) == 108_000

@@ -1,0 +1,145 @@
+"""The shipped systems: all there, each what its name and description promise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from ase.neighborlist import neighbor_list
+
+from mdnum import systems
+from mdnum.systems import load
+from mdnum.systems.structures import perpendicular_widths
+
+ATOMS = {
+    "argon/crystal-108": 108,
+    "argon/crystal-500": 500,
+    "argon/langevin-500": 500,
+    "argon/liquid-864": 864,
+    "argon/tilted-500": 500,
+    "binary/kob-andersen-1000": 1000,
+    "copper/eam-500": 500,
+    "pair/at-cutoff": 2,
+    "pair/leaving-well": 2,
+    "silicon/stillinger-weber-512": 512,
+    "silicon/tersoff-512": 512,
+}
+
+
+def test_all_are_listed():
+    assert systems.names() == list(ATOMS)
+
+
+@pytest.mark.parametrize("name", list(ATOMS))
+def test_each_loads_and_fits_its_box(name: str):
+    system = load(name)
+    assert len(system.atoms) == ATOMS[name]
+    assert system.name == name
+    assert len(system.spec.about) > 40
+    assert system.spec.dynamics.steps >= 1000
+    widths = perpendicular_widths(np.asarray(system.atoms.cell), system.atoms.pbc)
+    assert system.r_cut + system.spec.skin <= widths.min() / 2
+
+
+@pytest.mark.parametrize("name", list(ATOMS))
+def test_stored_velocities_have_the_temperature_of_the_file(name: str):
+    system = load(name)
+    temperature = system.spec.dynamics.temperature
+    if system.velocities is None or temperature == 0:
+        # drawn from the seed at the start of a run, or a pair with speeds of its own
+        assert system.velocities is None or len(system.atoms) == 2
+        return
+    masses = system.atoms.get_masses()
+    kinetic = (masses[:, None] * system.velocities**2).sum()
+    assert np.abs(masses @ system.velocities).max() < 1e-10 * np.sqrt(kinetic)
+    assert kinetic / (3 * (len(masses) - 1) * system.units.k_B) == pytest.approx(temperature, rel=1e-10)
+
+
+def coordination(name: str, low: float, high: float) -> float:
+    """Neighbors per atom between two distances."""
+    system = load(name)
+    d = neighbor_list("d", system.atoms, high)
+    return float((d >= low).sum()) / len(system.atoms)
+
+
+@pytest.mark.parametrize(
+    ("name", "shell", "neighbors", "width"),
+    [
+        ("argon/crystal-500", 5, 24, 0.4),
+        ("argon/crystal-108", 2, 6, 0.15),
+    ],
+)
+def test_a_shell_of_the_crystal_sits_at_its_cutoff(name: str, shell: int, neighbors: int, width: float):
+    system = load(name)
+    r = system.r_cut
+    assert coordination(name, r - width, r + width) == pytest.approx(neighbors, abs=0.5)
+    lattice_constant = (4 / (len(system.atoms) / system.atoms.get_volume())) ** (1 / 3)
+    assert r == pytest.approx(lattice_constant * np.sqrt(shell / 2), rel=1e-14)
+    # thermal motion puts some of the shell on either side
+    inside = coordination(name, r - width, r)
+    assert 0.2 * neighbors < inside < 0.8 * neighbors
+
+
+def test_the_tilted_box_has_no_right_angle():
+    angles = load("argon/tilted-500").atoms.cell.angles()
+    assert np.abs(angles - 90).min() > 2
+
+
+@pytest.mark.parametrize("name", ["argon/liquid-864", "argon/langevin-500", "binary/kob-andersen-1000"])
+def test_liquids_are_liquid(name: str):
+    # a crystal's structure factor at its lattice vectors is of the order of the number of atoms
+    atoms = load(name).atoms
+    scaled = atoms.get_scaled_positions()
+    largest = 0.0
+    for h in np.ndindex(21, 21, 21):
+        if any(h):
+            largest = max(largest, abs(np.exp(2j * np.pi * scaled @ np.array(h)).sum()) ** 2 / len(atoms))
+    assert largest < 0.1 * len(atoms)
+
+
+def test_rahmans_density():
+    atoms = load("argon/liquid-864").atoms
+    # 1.374 g/cm³, in amu and Å: the number Rahman gives for the box of 10.229 sigma
+    assert atoms.get_masses().sum() * 1.66053907 / atoms.get_volume() == pytest.approx(1.374, rel=0.02)
+
+
+def test_the_pair_crosses_its_cutoff_back_and_forth():
+    # between crossings the two atoms feel only one another: integrate the relative coordinate
+    system = load("pair/at-cutoff")
+    spec, r_cut = system.spec, system.r_cut
+    h = spec.dynamics.timestep
+    box = system.atoms.cell[0, 0]
+    x = system.atoms.positions[1, 0] - system.atoms.positions[0, 0]
+    v = system.velocities[1, 0] - system.velocities[0, 0]
+
+    def acceleration(x: float) -> float:
+        d = x - box * np.round(x / box)
+        return 2 * np.sign(d) * 24 * (2 * abs(d) ** -13 - abs(d) ** -7) if abs(d) < r_cut else 0.0
+
+    inside = [abs(x) < r_cut]
+    a = acceleration(x)
+    for _ in range(spec.dynamics.steps):
+        v += 0.5 * h * a
+        x += h * v
+        a = acceleration(x)
+        v += 0.5 * h * a
+        inside.append(abs(x - box * np.round(x / box)) < r_cut)
+    flips = np.flatnonzero(np.diff(np.array(inside, dtype=int)))
+    assert len(flips) >= 6
+
+
+def test_the_particle_leaves_its_well_with_the_slope_of_the_description():
+    system = load("pair/leaving-well")
+    masses = system.atoms.get_masses()
+    reduced = masses.prod() / masses.sum()
+    r0 = system.atoms.get_distance(0, 1)
+    v0 = float(np.linalg.norm(system.velocities[1] - system.velocities[0]))
+    assert (reduced, v0) == (1.0, 1.0)
+
+    def energy(r: float) -> float:
+        return 4 * (r**-12 - r**-6)
+
+    slope = 4 * (6 * r0**-7 - 12 * r0**-13)
+    speed = np.sqrt(v0**2 + 2 * (energy(r0) - energy(system.r_cut)))
+    assert r0 < system.r_cut
+    assert slope / speed == pytest.approx(0.411400, abs=1e-6)
+    assert speed * system.spec.dynamics.steps * system.spec.dynamics.timestep > system.r_cut - r0
