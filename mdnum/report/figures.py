@@ -128,14 +128,14 @@ def lists(run: Run, figure: Figure) -> None:
     epochs, step = run.epochs, run.epochs["start"].astype(float)
     skin, length = epochs["skin_consumed"], epochs["length"].astype(float)
     bad = epochs["dangerous"].astype(bool) | (epochs["lost_pairs"] > 0)
-    above.axhline(1, color=BAD, lw=1.0, label="skin used up")
+    above.axhline(1, color=BAD, lw=0.9, ls=(0, (4, 3)), zorder=1.5, label="skin used up")
     for axes, values in ((above, skin), (below, length)):
         if len(values) > POINTS:
             low, middle, high, at = _envelope(step, values)
             axes.fill_between(at, low, high, color=FIRST, alpha=0.3, lw=0)
             axes.plot(at, middle, color=FIRST, lw=1.1)
         else:
-            axes.plot(step, values, ".", color=FIRST, ms=4, mew=0)
+            axes.plot(step, values, "o", color=FIRST, ms=2.6, mew=0)
         worst = np.flatnonzero(bad)
         worst = worst[np.argsort(-values[worst])][:POINTS]
         if len(worst):

@@ -133,10 +133,15 @@ def _evidence(run: Run) -> Iterator[str]:
         within = "the one life" if lives == 1 else f"the {many(lives, 'life', 'lives')}"
         yield f"No pair was lost in {within} of the neighbor list."
     if run.summary.get("energy_budget_closes"):
-        yield (
-            "The energy budget closes: E(t) − E(0) and the sum of the ledger’s jumps differ by at most "
-            f"{number(residual(run), 2)} {run.units.energy}."
+        checks = run.summary.get("energy_budget_checks")
+        where = f" at {many(checks, 'step')}" if checks else ""
+        off = f"to {number(residual(run), 2)} {run.units.energy}" if residual(run) else "exactly"
+        what = (
+            "less the ledger’s jumps, the energy is that of the same positions without jumps"
+            if jump(run)
+            else "the energy is that of the same positions, evaluated anew"
         )
+        yield f"The energy budget closes: {what}, {off}{where}."
     ase = run.summary.get("ase") or {}
     if ase.get("ok") and ase.get("energy_rel") is not None:
         yield (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator, Mapping
 from importlib.resources import files
 from pathlib import Path
@@ -165,7 +166,9 @@ def _what_was_run(run: Run) -> Iterator[tuple[str, str]]:
     if neighbors := system.get("neighbors"):
         yield "Neighbor lists", _words(neighbors, {"skin": units.length})
     if dynamics := system.get("dynamics"):
-        yield "Dynamics", _words(dynamics, {"timestep": units.time, "temperature": units.temperature})
+        # how many steps were made is said above; the file says how many were planned
+        made = {key: value for key, value in dynamics.items() if key != "steps"}
+        yield "Dynamics", _words(made, {"timestep": units.time, "temperature": units.temperature})
     mean = float(np.mean(run.series["temperature"]))
     yield "Temperature", f"{number(mean, 4)} {units.temperature} (mean over the run)"
     if precision := system.get("precision"):
@@ -176,16 +179,21 @@ def _words(table: Mapping[str, Any], units: Mapping[str, str] | None = None) -> 
     parts = []
     for key, value in table.items():
         if isinstance(value, Mapping):
-            inner = (f"{name} ({_words(item)})" if isinstance(item, Mapping) else f"{name} {item}"
-                     for name, item in value.items())  # fmt: skip
+            inner = (
+                f"{name} ({_words(item)})" if isinstance(item, Mapping) else f"{name} {_value(item)}"
+                for name, item in value.items()
+            )
             parts.append(f"{key}: {'; '.join(inner)}")
         elif key == "kind":
             parts.insert(0, str(value))
         elif value is not None:
             unit = (units or {}).get(key)
-            shown = str(value).lower() if isinstance(value, bool) else str(value)
-            parts.append(f"{key.replace('_', ' ')} {shown}{f' {unit}' if unit else ''}")
+            parts.append(f"{key.replace('_', ' ')} {_value(value)}{f' {unit}' if unit else ''}")
     return ", ".join(parts)
+
+
+def _value(value: Any) -> str:
+    return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def _busiest(run: Run) -> list[dict[str, Any]]:
@@ -272,7 +280,11 @@ def _flat(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str
 def _text(value: Any) -> str:
     if value is None:
         return "none"
-    return {True: "on", False: "off"}[value] if isinstance(value, bool) else str(value) or "none"
+    text = ("on" if value else "off") if isinstance(value, bool) else str(value)
+    if re.fullmatch(r"[0-9a-f]{32,}\+?", text):
+        # enough of a hash to tell two apart; provenance.json has the whole
+        text = text[:12] + "…"
+    return text or "none"
 
 
 def _script_safe(value: Any) -> str:

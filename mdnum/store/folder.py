@@ -23,8 +23,10 @@ from mdnum.store.tables import COLUMNS, TableStream
 if TYPE_CHECKING:
     from ase import Atoms
 
-_FILES = ("system.toml", "provenance.json", "summary.json", "log.txt", "checkpoint.npz", "trajectory.traj",
-          "report.html", *(f"{name}.parquet" for name in COLUMNS))  # fmt: skip
+_FILES = (
+    "system.toml", "structure.extxyz", "provenance.json", "summary.json", "log.txt", "checkpoint.npz",
+    "trajectory.traj", "report.html", *(f"{name}.parquet" for name in COLUMNS),
+)  # fmt: skip
 _LOCK = ".lock"
 
 

@@ -55,7 +55,7 @@ def test_a_good_run(good):
 def test_every_planted_defect_is_found(good):
     flips = {name: np.delete(values, 40) for name, values in good.flips.items()}
     planted = {
-        "RUN_FAILED": summary(good, status="failed", message="a force is NaN"),
+        "RUN_FAILED": summary(good, status="failed", error="a force is NaN"),
         "NOT_FINISHED": summary(good, status=None),
         "LOST_PAIRS": epochs(good, lost_pairs=3, lost_pair_steps=11, first_lost_step=25),
         "DANGEROUS_BUILDS": epochs(good, dangerous=True),
@@ -64,7 +64,8 @@ def test_every_planted_defect_is_found(good):
         "BUDGET_OPEN": summary(good, energy_budget_closes=False),
         "TIE_AT_CUTOFF": series(good, 0, min_margin=0.0),
         "AMBIGUOUS_DECISIONS": summary(good, ambiguous=2),
-        "DRIFT": summary(good, energy_drift=-0.01),
+        "DRIFT": {"series": {**good.series, "conserved": good.series["conserved"] + 5 * good.series["time"]}},
+        "LISTS_DISAGREE": summary(good, count_mismatches=2),
         "ASE_DISAGREES": summary(good, ase={"ok": False, "energy_rel": 1e-3, "force_max": 0.1}),
         "ASE_NOT_COMPARED": summary(good, ase=None),
         "FORCE_JUMP": summary(good, cutoff={"kind": "shifted", "energy_jump": 0.0, "force_jump": 1e-4}),
@@ -79,7 +80,7 @@ def test_every_planted_defect_is_found(good):
 def test_lost_pairs_are_told_with_numbers_and_a_remedy(good):
     run = dataclasses.replace(
         good,
-        system={**good.system, "neighbors": {"check": False, "every": 20}},
+        system={**good.system, "neighbors": {"rebuild": {"check": False, "every": 20}}},
         **epochs(good, lost_pairs=3, lost_pair_steps=1108, first_lost_step=25),
     )
     verdict = findings.judge(run)
