@@ -12,18 +12,19 @@ if TYPE_CHECKING:
     from mdnum.references.calculator import MdnumCalculator
     from mdnum.references.check import check_dynamics, check_energy, check_pairs
     from mdnum.references.effective import effective_cutoff
-    from mdnum.references.finders import Finder, finders
+    from mdnum.references.finders import Finder
     from mdnum.references.oracle import all_pairs
+    from mdnum.references.own import all_finders
 
 __all__ = [
     "Finder",
     "MdnumCalculator",
+    "all_finders",
     "all_pairs",
     "check_dynamics",
     "check_energy",
     "check_pairs",
     "effective_cutoff",
-    "finders",
 ]
 
 _WHERE = {
@@ -34,7 +35,7 @@ _WHERE = {
     "check_energy": "check",
     "check_pairs": "check",
     "effective_cutoff": "effective",
-    "finders": "finders",
+    "all_finders": "own",
 }
 
 

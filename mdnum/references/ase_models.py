@@ -76,7 +76,7 @@ def reference(system: System) -> Reference:
         return independent(system)
     species = system.species
     forms = pair_forms(system.spec, species)
-    cutoff = system.spec.cutoff.kind
+    cutoff = forms[species[0], species[0]].cutoff
     build = _ASE_PAIR.get((kind, cutoff))
     if build is None:
         return independent(system)
@@ -233,7 +233,7 @@ def evaluate(calculator: Calculator, atoms: Atoms) -> dict[str, Any]:
         "energy": float(np.asarray(calculator.get_property("energy", bare))),
         "forces": np.array(calculator.get_property("forces", bare)),
     }
-    if bare.cell.rank == 3:
+    if bare.cell.rank == 3 and bare.pbc.all():  # ASE gives one for a molecule in a box, of the box's volume
         xx, yy, zz, yz, xz, xy = np.array(calculator.get_property("stress", bare))
         found["stress"] = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     else:

@@ -16,8 +16,8 @@ from mdnum import systems
 from mdnum.errors import InputError
 from mdnum.systems import System, SystemSpec
 
-# a change of any of these is another program: other parameters per atom, another box
-_REBUILD = {"numbers", "pbc", "cell"}
+# a change of either is another program; positions and cell are arguments of it
+_REBUILD = {"numbers", "pbc"}
 
 
 class MdnumCalculator(Calculator):
@@ -89,17 +89,20 @@ class MdnumCalculator(Calculator):
         if self._simulation is None or _REBUILD & set(system_changes):
             # only what the forces depend on: constraints and the like stay with ASE
             bare = Atoms(numbers=atoms.numbers, positions=atoms.positions, cell=atoms.cell, pbc=atoms.pbc)
-            bare.set_masses(atoms.get_masses())
-            self._simulation = systems.build(replace(self._template, atoms=bare))
+            # no list outlives a call, so a skin would only ask for a wider box
+            neighbors = self._template.spec.neighbors.model_copy(update={"skin": 0.0})
+            spec = self._template.spec.model_copy(update={"neighbors": neighbors})
+            self._simulation = systems.build(replace(self._template, spec=spec, atoms=bare))
         evaluation = self._simulation.evaluate(atoms.get_positions(), np.asarray(atoms.cell))
         energy = float(evaluation.energy)
         self.results = {
             "energy": energy,
             "free_energy": energy,  # no electrons, no entropy: the same number
-            "energies": np.array(evaluation.energies),
             "forces": np.array(evaluation.forces),
         }
-        if atoms.cell.rank == 3:
+        if np.isfinite(evaluation.energies).all():  # a many-body potential need not split by atom
+            self.results["energies"] = np.array(evaluation.energies)
+        if atoms.cell.rank == 3 and atoms.pbc.all():
             self.results["stress"] = full_3x3_to_voigt_6_stress(np.asarray(evaluation.stress))
 
 

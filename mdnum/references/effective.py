@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -42,7 +43,7 @@ class EffectiveCutoff:
 
 
 def effective_cutoff(
-    finder: Finder, r_cut: float, *, periodic: bool = True, oriented: int = 100, seed: int = 0
+    finder: Finder, r_cut: float, *, periodic: bool = True, oriented: int | None = None, seed: int = 0
 ) -> EffectiveCutoff:
     """Bisect two-atom configurations to the last double that finder counts as inside r_cut.
 
@@ -54,15 +55,17 @@ def effective_cutoff(
         finder: the search.
         r_cut: the cutoff to ask for.
         periodic: in a periodic box, as in a simulation; else free atoms.
-        oriented: how many randomly oriented pairs to place within 3 ulps of r_cut.
+        oriented: how many randomly oriented pairs to place within 3 ulps of r_cut; default what the
+            search can afford.
         seed: of the orientations.
-    Error: none for the bisection, which walks over doubles; it assumes that a search which counts a
-        distance counts the smaller ones (checked at both ends).
+    Error: none, doubles are walked over one by one in the end; it assumes that a search which counts a
+        distance counts the smaller ones (checked at relative distances of 1e-5).
     """
+    oriented = finder.affords if oriented is None else oriented
     low, high = r_cut * (1 - 1e-5), r_cut * (1 + 1e-5)
     if not _counts(finder, low, r_cut, periodic) or _counts(finder, high, r_cut, periodic):
         return EffectiveCutoff(finder.name, r_cut, float("nan"), 0, "not a cutoff", 0, 0)
-    first, last = _ordinal(low), _ordinal(high)
+    first, last = _bracket(lambda place: _counts(finder, _double(place), r_cut, periodic), _ordinal(r_cut))
     while last - first > 1:
         middle = (first + last) // 2
         if _counts(finder, _double(middle), r_cut, periodic):
@@ -89,6 +92,21 @@ def borderline_pairs(r_cut: float, count: int, seed: int) -> ndarray:
     direction /= np.linalg.norm(direction, axis=1)[:, None]
     length = r_cut + rng.uniform(-_NEARBY, _NEARBY, size=(count, 1)) * np.spacing(r_cut)
     return np.stack([np.zeros((count, 3)), length * direction], axis=1)
+
+
+def _bracket(counts: Callable[[int], bool], start: int) -> tuple[int, int]:
+    """Two places among the doubles, the first counted and the second not, by doubling steps away from start.
+
+    Most searches stop within an ulp of what they were asked for, so this ends after two or three calls.
+    """
+    step = 1
+    if counts(start):
+        while counts(start + step):
+            step *= 2
+        return start + step // 2, start + step
+    while not counts(start - step):
+        step *= 2
+    return start - step, start - step // 2
 
 
 def _counts(finder: Finder, distance: float, r_cut: float, periodic: bool) -> bool:

@@ -34,6 +34,7 @@ class Finder:
         orthorhombic_only: refuses tilted cells.
         all_or_none: knows only "all directions periodic" and "none".
         ours: mdnum's own or jax-md's: what a run stands on.
+        affords: how many tiny searches it is asked for beyond the needed ones; each costs jax-md 0.3 s.
     """
 
     name: str
@@ -44,6 +45,7 @@ class Finder:
     orthorhombic_only: bool = False
     all_or_none: bool = False
     ours: bool = False
+    affords: int = 100
 
     @property
     def version(self) -> str | None:
@@ -227,8 +229,3 @@ PEERS: tuple[Finder, ...] = (
     Finder("scipy cKDTree", "scipy", _scipy, images=False, orthorhombic_only=True),
 )
 """The searches that have nothing to do with mdnum."""
-
-
-def finders() -> tuple[Finder, ...]:
-    """Every search there is an adapter for, installed or not."""
-    return PEERS

@@ -13,9 +13,10 @@ from numpy import ndarray
 
 from mdnum.errors import MdnumError
 from mdnum.references.effective import EffectiveCutoff, effective_cutoff
-from mdnum.references.finders import Finder, finders
+from mdnum.references.finders import Finder
 from mdnum.references.findings import finding, plain
 from mdnum.references.oracle import PairSet, all_pairs, rounding_bound
+from mdnum.references.own import all_finders
 from mdnum.systems import System, pairs
 
 AGREES, AT_THE_CUTOFF, DIFFERS, FAILED, NOT_ASKED = (
@@ -139,7 +140,7 @@ def check_pairs(
     ]
     results = tuple(
         _ask(finder, where, cell, pbc, groups, truth, system.species_index, effective)
-        for finder in (finders() if searches is None else searches)
+        for finder in (all_finders(system) if searches is None else searches)
     )
     ok = all(result.verdict in (AGREES, AT_THE_CUTOFF, NOT_ASKED) for result in results if result.ours)
     return PairsReport(
