@@ -72,8 +72,9 @@ class Cell(eqx.Module):
 
     @property
     def volume(self) -> float:
-        """Volume, length cubed; NaN unless all axes are periodic."""
-        return float(abs(np.linalg.det(np.asarray(self.matrix)))) if all(self.pbc) else float("nan")
+        """Volume of the three lattice vectors, length cubed; NaN where one is missing (ASE's convention)."""
+        volume = float(abs(np.linalg.det(np.asarray(self.matrix))))
+        return volume if volume > 0 else float("nan")
 
     def astype(self, dtype) -> Cell:
         """The cell with jax leaves of the given dtype."""

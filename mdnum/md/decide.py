@@ -19,6 +19,7 @@ from jaxtyping import Array, Float, Int, UInt8
 from mdnum.errors import InputError
 from mdnum.events import Threshold
 from mdnum.md.cell import Cell
+from mdnum.md.potentials import of_type
 from mdnum.md.verlet import SLOTS
 from mdnum.precision import distance_bound, squared_distance_bound
 from mdnum.precision.exact import squared_norm
@@ -143,7 +144,7 @@ class SlotJudge:
         """Displacement, quantity and decision of the neighbors j (types: their pair types, or None)."""
         d = displacements(self.components, self.cell, j)
         quantity = self.decider.quantity(*d, self.zero)
-        threshold = self.value[0] if types is None else self.value[types]
+        threshold = of_type(self.value, types)
         return d, quantity, self.decider.inside(quantity, threshold) & (j < self.atoms), threshold
 
     def tally(self, tally, bits, k, j, types, quantity, inside, threshold):
@@ -152,7 +153,7 @@ class SlotJudge:
         bits = bits | (inside.astype(jnp.uint8) << jnp.uint8(k))
         margin = jnp.abs(threshold - quantity)
         real = j < self.atoms
-        close = margin <= (self.bound[0] if types is None else self.bound[types])
+        close = margin <= of_type(self.bound, types)
         return bits, (
             jnp.minimum(nearest, jnp.where(real, margin, jnp.inf)),
             ambiguous + (close & real).astype(jnp.int32),

@@ -10,22 +10,42 @@ jax_md takes seconds to import, so it is imported inside the functions that need
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 import mdnum.precision  # noqa: F401  (switches float64 on before the first array exists)
 from mdnum.errors import CapacityError, InputError, NumericalError
+from mdnum.md.displacement import Displacement, complete, displacement, widths
 
 if TYPE_CHECKING:
     from jax_md.partition import NeighborList
+else:
+    # annotations are looked at when the tests run, and must not cost the import
+    NeighborList = Any
+
+__all__ = [
+    "Displacement",
+    "Format",
+    "NeighborList",
+    "PairSearch",
+    "Relaxed",
+    "as_neighbor_list",
+    "dense_pairs",
+    "displacement",
+    "relax",
+    "scalar",
+    "standard_promotion",
+    "upstream",
+]
 
 Format = Literal["dense", "sparse", "ordered-sparse"]
-Displacement = Callable[..., Array]
 
 # jax-md keeps the box of a list in float32, so its cells can come out 6e-8 too small and lose pairs that
 # span one; searching a little further and filtering in float64 makes the result exact
@@ -35,6 +55,21 @@ _SEARCH_MARGIN = 1e-6
 _FIRE_SCALE = 2.0**20
 
 
+def standard_promotion() -> AbstractContextManager[None]:
+    """The dtype rules that jax-md's code needs: it mixes widths everywhere, even while it is imported."""
+    return jax.numpy_dtype_promotion("standard")
+
+
+def upstream() -> ModuleType:
+    """The package jax_md, imported when first asked for; takes seconds."""
+    with standard_promotion():
+        import jax_md
+        import jax_md.energy
+        import jax_md.minimize
+        import jax_md.partition
+    return jax_md
+
+
 def scalar(value: float) -> Float[Array, ""]:
     """A number in the only form that jax-md keeps in float64.
 
@@ -42,102 +77,6 @@ def scalar(value: float) -> Float[Array, ""]:
     x64; only a jax float64 array survives. Use this for every sigma, epsilon, r_onset and r_cutoff.
     """
     return jnp.asarray(value, jnp.float64)
-
-
-def complete(cell: Float[np.ndarray, "3 3"], pbc: Bool[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """The cell with every non-periodic vector replaced by a unit vector perpendicular to the others.
-
-    Args:
-        cell: lattice vectors as rows, length; rows of non-periodic axes may be anything.
-        pbc: which axes are periodic.
-    """
-    from ase.geometry import complete_cell
-
-    rows = np.where(np.asarray(pbc, bool)[:, None], np.asarray(cell, np.float64), 0.0)
-    return np.asarray(complete_cell(rows), np.float64)
-
-
-def widths(cell: Float[np.ndarray, "3 3"], pbc: Bool[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-    """Perpendicular widths of the cell along each axis, infinite where it is not periodic.
-
-    Raises:
-        InputError: the periodic vectors do not span a volume.
-    """
-    full = complete(cell, pbc)
-    volume = abs(np.linalg.det(full))
-    if not np.isfinite(volume) or volume < 1e-12 * np.prod(np.linalg.norm(full, axis=1)):
-        raise InputError(
-            "the periodic cell vectors are linearly dependent", remedy="give three independent vectors"
-        )
-    return np.where(np.asarray(pbc, bool), 1.0 / np.linalg.norm(np.linalg.inv(full), axis=0), np.inf)
-
-
-def _dual(cell: Float[Array, "3 3"], periodic: tuple[int, ...]) -> Float[Array, "3 axes"]:
-    """Columns that turn a vector into its fractional coordinates along the periodic axes alone.
-
-    The pseudo-inverse of the periodic rows: a tilted non-periodic row must not leak into the image choice.
-    """
-    if len(periodic) == 3:
-        a, b, c = cell
-        dual = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=1)
-        return dual / jnp.sum(a * dual[:, 0])
-    rows = cell[jnp.asarray(periodic)]
-    return rows.T @ jnp.linalg.inv(rows @ rows.T)
-
-
-def displacement(cell: Float[Array, "3 3"], pbc: tuple[bool, bool, bool] = (True, True, True)) -> Displacement:
-    """Minimum-image displacement in real coordinates, in the form every jax-md energy function takes.
-
-    The image is chosen by rounding fractional coordinates and subtracted as whole lattice vectors, so a
-    pair that needs no image keeps the exact difference of its coordinates, positions may leave the box, and
-    derivatives with respect to the cell (stress by strain) are those of the chosen image.
-
-    Args:
-        cell: lattice vectors as rows, length; orthorhombic or triclinic.
-        pbc: which axes are periodic; the others are free and their rows are ignored.
-
-    Returns:
-        `fn(Ra, Rb, cell=None, perturbation=None) -> Ra - Rb`, (3,) arrays. `cell=` replaces the cell of the
-        call, also under jit and grad; `perturbation=` is jax-md's linear map of the result. Other keywords
-        are ignored, because jax-md hands every function all of them.
-
-    Error:
-        the minimum image is the nearest one only below half the smallest perpendicular width; builders here
-        refuse a longer list. jax-md's own spaces ignore the question (no flag).
-    """
-    periodic = tuple(axis for axis in range(3) if pbc[axis])
-    base = jnp.asarray(cell)
-
-    def fn(Ra: Array, Rb: Array, cell: Array | None = None, perturbation: Array | None = None, **_: Any) -> Array:
-        if Ra.shape != (3,) or Rb.shape != (3,):
-            # jax-md probes with one and two dimensions and moves on at a ValueError
-            raise ValueError(f"displacement of two points in 3 dimensions; got {Ra.shape} and {Rb.shape}")
-        vector = Ra - Rb
-        if periodic:
-            lattice = jnp.asarray(base if cell is None else cell, vector.dtype)
-            dual = jax.lax.stop_gradient(_dual(lattice, periodic))
-            held = jax.lax.stop_gradient(vector)
-            for column, axis in enumerate(periodic):
-                # sums are written out: a dot of three numbers may run in reduced precision on an accelerator
-                along = held[0] * dual[0, column] + held[1] * dual[1, column] + held[2] * dual[2, column]
-                vector = vector - jnp.round(along) * lattice[axis]
-        if perturbation is not None:
-            vector = jnp.sum(perturbation * vector[None, :], axis=1)
-        return vector
-
-    return fn
-
-
-def neighbor_vectors(
-    positions: Float[Array, "atoms 3"],
-    idx: Int[Array, "atoms slots"],
-    cell: Float[Array, "3 3"],
-    pbc: tuple[bool, bool, bool],
-) -> Float[Array, "atoms slots 3"]:
-    """Minimum-image vectors from each atom to its listed neighbors; padded slots hold some finite vector."""
-    toward = displacement(cell, pbc)
-    others = positions[jnp.where(idx < positions.shape[0], idx, 0)]
-    return jax.vmap(lambda here, there: jax.vmap(lambda point: toward(point, here))(there))(positions, others)
 
 
 def _refuse_update(*_: Any, **__: Any) -> NeighborList:
@@ -169,8 +108,7 @@ def as_neighbor_list(
     Raises:
         CapacityError: a sparse list would not fit its capacity (host arrays only).
     """
-    from jax_md import partition
-
+    partition = upstream().partition
     formats = {
         "dense": partition.Dense,
         "sparse": partition.Sparse,
@@ -269,8 +207,7 @@ class PairSearch:
         return np.where(self.pbc, np.where(wrapped >= 1.0, 0.0, wrapped), folded)
 
     def _allocate(self, folded: np.ndarray) -> NeighborList:
-        from jax_md import partition
-
+        partition = upstream().partition
         rows = jnp.asarray(self.cell * self._span[:, None])
         wraps = jnp.asarray(self.pbc)
 
@@ -311,11 +248,13 @@ class PairSearch:
         folded = self._fold(fractional)
         found = None
         if self._list is not None and (folded >= 0).all() and (folded < 1).all():
-            found = self._update(jnp.asarray(folded), self._list)
+            with standard_promotion():
+                found = self._update(jnp.asarray(folded), self._list)
         if found is None or bool(found.did_buffer_overflow):
             self._frame(fractional)
             folded = self._fold(fractional)
-            found = self._allocate(folded)
+            with standard_promotion():
+                found = self._allocate(folded)
             if bool(found.did_buffer_overflow):
                 raise CapacityError("jax-md's list overflows right after its allocation")
             self._list = found
@@ -387,8 +326,7 @@ def relax(
 
     Source: Bitzek et al., Phys. Rev. Lett. 97, 170201 (2006), as coded in jax_md.minimize.fire_descent.
     """
-    from jax_md import minimize
-
+    minimize = upstream().minimize
     if neighbors is not None and not (skin is not None and skin > 0):
         raise InputError("a relaxation over a neighbor list needs a skin above 0", remedy="give skin=")
 
@@ -436,6 +374,4 @@ def relax(
             raise NumericalError("forces are not finite during the relaxation", where=f"step {int(steps)}")
         if force_max <= force_tolerance or int(steps) >= max_steps:
             break
-        if int(steps) == before:
-            raise NumericalError("the relaxation makes no progress", where=f"step {before}")
     return Relaxed(np.asarray(state.position), int(steps), force_max, force_max <= force_tolerance)

@@ -14,6 +14,11 @@ from jaxtyping import Array, Float, Int
 from mdnum.md.cutoffs import AtCutoff, Cutoff
 
 
+def of_type(leaf: Float[Array, "types"], types: Int[Array, "..."] | None) -> Float[Array, "..."]:
+    """The entries of given pair types (None: only one); types come from the list, in range."""
+    return leaf[0] if types is None else leaf.at[types].get(mode="promise_in_bounds")
+
+
 class PairPotential(eqx.Module):
     """A bare pair potential; every array leaf is a parameter with one entry per pair type."""
 
@@ -25,7 +30,7 @@ class PairPotential(eqx.Module):
 
     def of(self, types: Int[Array, "..."] | None) -> PairPotential:
         """The parameters of given pair types; types None means that there is only one."""
-        return jax.tree.map(lambda leaf: leaf[0] if types is None else leaf[types], self)
+        return jax.tree.map(lambda leaf: of_type(leaf, types), self)
 
 
 class LennardJones(PairPotential):
@@ -123,7 +128,7 @@ class CutPotential(eqx.Module):
             at: `at_cutoff()`, made once outside the loop.
         """
         u, w = self.potential.of(types).evaluate(r2)
-        here = AtCutoff(*(leaf[0] if types is None else leaf[types] for leaf in at))
+        here = AtCutoff(*(of_type(leaf, types) for leaf in at))
         return self.cutoff.cut(r2, u, w, here)
 
     def jumps(self) -> tuple[Float[np.ndarray, "types"], Float[np.ndarray, "types"]]:

@@ -42,7 +42,7 @@ class Evaluation:
     Attributes:
         energy: total energy.
         forces: shape (atoms, 3), energy/length.
-        stress: dE/dstrain / volume (ASE's sign), shape (3, 3), energy/length³; NaN unless fully periodic.
+        stress: dE/dstrain / volume (ASE's sign), shape (3, 3), energy/length³; NaN without a volume.
         energies: per atom, shape (atoms,), pair terms split evenly; NaN for many-body potentials.
         i, j: pairs inside the (longest) cutoff, i < j.
         distance: of those pairs, length.
