@@ -37,9 +37,9 @@ if TYPE_CHECKING:
     from mdnum.errors import MdnumError as MdnumError
     from mdnum.errors import NumericalError as NumericalError
     from mdnum.references import MdnumCalculator as MdnumCalculator
-    from mdnum.workflow import run as run
     from mdnum.systems import build as build
     from mdnum.systems import load as load
+    from mdnum.workflow import run as run
 
 __all__ = [
     "CapacityError",

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-import mdnum.rollout
+import mdnum.workflow
 from mdnum.cli import main, output
 from mdnum.cli.progress import ProgressBar, describe
 from mdnum.cli.run import default_folder
@@ -62,7 +62,7 @@ class Recorder:
 def rollout(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Recorder:
     """`mdnum run` in an empty folder with the rollout replaced by a recorder."""
     recorder = Recorder()
-    monkeypatch.setattr(mdnum.rollout, "run", recorder, raising=False)
+    monkeypatch.setattr(mdnum.workflow, "run", recorder)
     monkeypatch.chdir(tmp_path)
     return recorder
 
@@ -401,3 +401,29 @@ def test_doctor_exits_by_its_verdict(capsys: pytest.CaptureFixture[str], monkeyp
 def test_report_of_no_run_is_a_mistake(crystal: Path, capsys: pytest.CaptureFixture[str]):
     assert call("report", "nowhere") == 2
     assert capsys.readouterr().err.startswith("mdnum: ")
+
+
+def test_a_real_run_its_report_and_its_resumption(crystal: Path, capsys: pytest.CaptureFixture[str]):
+    assert call("run", "crystal.toml", "--steps", "30", "--save-every", "10", "-o", "here", "--json") in (
+        0,
+        1,
+    )
+    document = json.loads(capsys.readouterr().out)
+    assert document["folder"] == "here"
+    assert document["steps"] == 30
+    assert document["ase"]["energy_rel"] < 1e-12
+    assert document == {"folder": "here", **json.loads(Path("here/summary.json").read_text())}
+    written = {path.name for path in Path("here").iterdir()}
+    assert {"system.toml", "provenance.json", "flips.parquet", "trajectory.traj", "report.html"} <= written
+
+    assert call("run", "crystal.toml", "-o", "here") == 2, "a folder that holds a run is not written to"
+    assert "here" in capsys.readouterr().err
+
+    Path("here/report.html").unlink()
+    assert call("report", "here", "--json") == 0
+    assert json.loads(capsys.readouterr().out)["report"] == "here/report.html"
+    assert "<html" in Path("here/report.html").read_text(encoding="utf-8")
+
+    assert call("run", "--resume", "here", "--steps", "40", "--no-check", "--no-report", "--json") in (0, 1)
+    assert json.loads(capsys.readouterr().out)["steps"] == 40
+    assert call("run", "--resume", "nowhere") == 2

@@ -63,8 +63,10 @@ def run(
                 progress=progress,
             )
     except KeyboardInterrupt:
+        folder = resume or out
+        written = folder is not None and folder.exists()
         raise output.Stopped(
-            "stopped", remedy=f"Continue with `mdnum run --resume {resume or out}`"
+            "stopped", remedy=f"Continue with `mdnum run --resume {folder}`" if written else None
         ) from None
     summary = dict(result.summary)
     if as_json:
