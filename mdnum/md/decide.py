@@ -84,7 +84,7 @@ class PairDecider:
         return np.sqrt(r2) if self.space == "r" else r2
 
     def inside(self, quantity: jax.Array, value: jax.Array) -> jax.Array:
-        """The decision: quantity against threshold value(s), as the convention has it."""
+        """The decision: quantity against threshold value(s), as the convention has it (jax or numpy)."""
         return quantity <= value if self.compare.endswith("<=") else quantity < value
 
 
@@ -108,13 +108,12 @@ class Decisions(NamedTuple):
 
     Attributes:
         bits: decisions, eight slots to a byte, shape (slots/8, atoms).
-        nearest: smallest |margin| of any listed pair, in the quantity's space.
-        ambiguous: listed pairs (each counted once) whose |margin| is within the rounding bound.
+        nearest: smallest |margin| of any listed pair, in the quantity's space. Only where it is within the
+            rounding bound can a decision be ambiguous, so the loop need not count those.
     """
 
     bits: UInt8[Array, "words atoms"]
     nearest: Float[Array, ""]
-    ambiguous: Int[Array, ""]
 
 
 class SlotJudge:
@@ -134,11 +133,10 @@ class SlotJudge:
         self.components = tuple(positions.astype(dtype))
         self.atoms = positions.shape[1]
         self.value = decider.values()
-        self.bound = jnp.asarray(decider.bounds, dtype)
 
-    def start(self) -> tuple[jax.Array, jax.Array]:
-        """An empty tally: nearest margin and number of ambiguous pairs, per atom."""
-        return jnp.full(self.atoms, jnp.inf, self.value.dtype), jnp.zeros(self.atoms, jnp.int32)
+    def start(self) -> jax.Array:
+        """An empty tally: the nearest margin of each atom."""
+        return jnp.full(self.atoms, jnp.inf, self.value.dtype)
 
     def slot(self, j, types):
         """Displacement, quantity and decision of the neighbors j (types: their pair types, or None)."""
@@ -147,23 +145,16 @@ class SlotJudge:
         threshold = of_type(self.value, types)
         return d, quantity, self.decider.inside(quantity, threshold) & (j < self.atoms), threshold
 
-    def tally(self, tally, bits, k, j, types, quantity, inside, threshold):
-        """Bits and tally with slot k of a block added."""
-        nearest, ambiguous = tally
+    def tally(self, nearest, bits, k, j, quantity, inside, threshold):
+        """Bits and nearest margin with slot k of a block added."""
         bits = bits | (inside.astype(jnp.uint8) << jnp.uint8(k))
-        margin = jnp.abs(threshold - quantity)
-        real = j < self.atoms
-        close = margin <= of_type(self.bound, types)
-        return bits, (
-            jnp.minimum(nearest, jnp.where(real, margin, jnp.inf)),
-            ambiguous + (close & real).astype(jnp.int32),
-        )
+        margin = jnp.where(j < self.atoms, jnp.abs(threshold - quantity), jnp.inf)
+        return bits, jnp.minimum(nearest, margin)
 
     @staticmethod
-    def finish(tally, bits) -> Decisions:
-        """The pass's decisions; every pair was met from both ends."""
-        nearest, ambiguous = tally
-        return Decisions(bits, jnp.min(nearest, initial=jnp.inf).astype(jnp.float64), jnp.sum(ambiguous) // 2)
+    def finish(nearest, bits) -> Decisions:
+        """The pass's decisions."""
+        return Decisions(bits, jnp.min(nearest, initial=jnp.inf).astype(jnp.float64))
 
 
 def displacements(components, cell: Cell, j):
@@ -177,14 +168,14 @@ def decide_table(
     """The decisions of a whole list at given positions, without forces."""
     judge = SlotJudge(decider, cell, zero, positions)
 
-    def block(tally, listed):
+    def block(nearest, listed):
         index, types = listed
         bits = jnp.zeros(judge.atoms, jnp.uint8)
         for k in range(SLOTS):
             t = None if types is None else types[k]
             _, quantity, inside, threshold = judge.slot(index[k], t)
-            bits, tally = judge.tally(tally, bits, k, index[k], t, quantity, inside, threshold)
-        return tally, bits
+            bits, nearest = judge.tally(nearest, bits, k, index[k], quantity, inside, threshold)
+        return nearest, bits
 
-    tally, bits = lax.scan(block, judge.start(), (tables.index, tables.types))
-    return judge.finish(tally, bits)
+    nearest, bits = lax.scan(block, judge.start(), (tables.index, tables.types))
+    return judge.finish(nearest, bits)

@@ -95,7 +95,7 @@ class PairForce(eqx.Module):
         at = self.model.at_cutoff()
 
         def block(carry, listed):
-            totals, tally = carry
+            totals, nearest = carry
             index, types = listed
             bits = jnp.zeros(judge.atoms, jnp.uint8)
             terms = []
@@ -103,7 +103,7 @@ class PairForce(eqx.Module):
                 t = None if types is None else types[k]
                 d, quantity, inside, threshold = judge.slot(index[k], t)
                 if decisions:
-                    bits, tally = judge.tally(tally, bits, k, index[k], t, quantity, inside, threshold)
+                    bits, nearest = judge.tally(nearest, bits, k, index[k], quantity, inside, threshold)
                 d = d if same else displacements(components, cell, index[k])
                 if same and self.decider.space == "r2":
                     r2 = quantity
@@ -118,10 +118,10 @@ class PairForce(eqx.Module):
                 terms.append([q.astype(accumulate) for q in term])
             summed = [self.reduction.within(total, list(q)) for total, *q in zip(totals, *terms, strict=True)]
             totals = tuple(total for total, _ in summed)
-            return (totals, tally), (bits if decisions else None, tuple(later for _, later in summed))
+            return (totals, nearest), (bits if decisions else None, tuple(later for _, later in summed))
 
         start = ((jnp.zeros(judge.atoms, accumulate),) * 5, judge.start())
-        (totals, tally), (bits, later) = lax.scan(block, start, (tables.index, tables.types))
+        (totals, nearest), (bits, later) = lax.scan(block, start, (tables.index, tables.types))
         fx, fy, fz, energy, virial = (
             self.reduction.finish(total, blocks) for total, blocks in zip(totals, later, strict=True)
         )
@@ -130,7 +130,7 @@ class PairForce(eqx.Module):
             jnp.stack([fx, fy, fz]),
             half * energy,
             -jnp.sum(half * virial, dtype=jnp.float64),
-            judge.finish(tally, bits) if decisions else None,
+            judge.finish(nearest, bits) if decisions else None,
         )
 
     def virial_tensor(self, positions: Float[Array, "3 atoms"], tables: Tables) -> Float[Array, "3 3"]:

@@ -20,7 +20,7 @@ from mdnum.rollout.epoch import Program, Record, State, empty_record, run_epoch
 from mdnum.systems.build import Simulation
 
 # bytes that the rows of one epoch's record may take, and the most rows; both bound memory, not accuracy
-_RECORD_BYTES = 48 * 2**20
+_RECORD_BYTES = 64 * 2**20
 _MOST_ROWS = 128
 
 
@@ -38,6 +38,7 @@ class Segment:
         built: step at which the list was built.
         opens: whether this is the first segment of its epoch.
         closes: why the epoch ended with it: "displacement", "interval", "end", "blow-up" or None.
+        moved: largest displacement since the list was built, at the step after the last row, length.
         state: where the rollout goes on.
         reference: wrapped positions at which the list was built, shape (atoms, 3).
     """
@@ -51,6 +52,7 @@ class Segment:
     built: int
     opens: bool
     closes: str | None
+    moved: float
     state: State
     reference: Float[np.ndarray, "atoms 3"]
 
@@ -182,6 +184,8 @@ class Engine:
         home = jnp.asarray(reference.T, self.simulation.policy.dtype("state"))
         first, opens, turn = int(state.step), int(state.step) == built, 0
         waiting: Segment | None = None
+        # the decisions of the step before: a new list looks back for them, one in use remembers them
+        before: np.ndarray | None = None
         while True:
             words = table.slots // 8
             outcome, record = run_epoch(
@@ -191,6 +195,7 @@ class Engine:
                 home,
                 jnp.asarray(built, jnp.int64),
                 jnp.asarray(self.last, jnp.int64),
+                jnp.asarray(before is None),
                 self._take(turn, words),
             )
             if waiting is not None:
@@ -199,26 +204,30 @@ class Engine:
                 self._records[1 - turn] = waiting.record
             rows = int(outcome.rows)
             closes = self._closes(outcome, first + rows)
+            if before is None and outcome.before is not None:
+                before = np.asarray(outcome.before)
             waiting = Segment(
                 first,
                 rows,
                 record,
-                None if outcome.before is None else np.asarray(outcome.before.bits),
+                before,
                 table,
                 epoch,
                 built,
                 opens,
                 closes,
+                float(outcome.moved),
                 outcome.state,
                 reference,
             )
             state, first, turn, opens = outcome.state, first + rows, 1 - turn, False
+            before = np.array(waiting.rows_of("bits")[-1]) if self.record and rows else None
             if closes in ("end", "blow-up"):
                 yield waiting
                 return
             if closes:
                 reference = np.asarray(state.x, np.float64).T.copy()
-                home, built, epoch, opens = state.x, first, epoch + 1, True
+                home, built, epoch, opens, before = state.x, first, epoch + 1, True, None
                 table = self.verlet.build(reference, cell)
                 tables = self.simulation.tables(table)
 

@@ -16,7 +16,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from mdnum.md.cell import Cell
-from mdnum.md.decide import Decisions, Tables
+from mdnum.md.decide import Tables
 from mdnum.md.integrators import Integrator
 from mdnum.md.pairforce import Forces
 
@@ -74,8 +74,7 @@ class Record(NamedTuple):
         images: shape (rows, 3, atoms), int32.
         bits: decisions, shape (rows, words, atoms).
         potential, kinetic, virial, heat: energies, shape (rows,).
-        nearest: smallest |margin|; ambiguous: pairs within the rounding bound; moved: largest displacement
-            since the list was built; each of shape (rows,).
+        nearest: smallest |margin|; moved: largest displacement since the list was built; of shape (rows,).
     """
 
     x: Float[Array, "rows 3 atoms"]
@@ -87,7 +86,6 @@ class Record(NamedTuple):
     virial: Float[Array, "rows"]
     heat: Float[Array, "rows"]
     nearest: Float[Array, "rows"]
-    ambiguous: Int[Array, "rows"]
     moved: Float[Array, "rows"]
 
 
@@ -99,14 +97,17 @@ class Outcome(NamedTuple):
         rows: how many rows were recorded.
         rebuild: the list must be rebuilt before the next forces.
         finite: every number so far was.
-        before: decisions of the list at the step before its first, for the count check and the first flips.
+        moved: largest displacement since the list was built, at the step that comes next, length.
+        before: decisions of the list at the step before, for the count check and the first flips of a new
+            list; all no where they were not asked for. None without recording.
     """
 
     state: State
     rows: Int[Array, ""]
     rebuild: Bool[Array, ""]
     finite: Bool[Array, ""]
-    before: Decisions | None
+    moved: Float[Array, ""]
+    before: UInt8[Array, "words atoms"] | None
 
 
 def empty_record(rows: int, words: int, atoms: int, dtype, record: bool) -> Record:
@@ -120,7 +121,6 @@ def empty_record(rows: int, words: int, atoms: int, dtype, record: bool) -> Reco
         jnp.zeros((rows, words, atoms if record else 0), jnp.uint8),
         *numbers,
         jnp.zeros(rows, jnp.float64),
-        jnp.zeros(rows, jnp.int32),
         jnp.zeros(rows, jnp.float64),
     )
 
@@ -146,6 +146,7 @@ def run_epoch(
     reference: Float[Array, "3 atoms"],
     built: Int[Array, ""],
     last: Int[Array, ""],
+    look_back: Bool[Array, ""],
     record: Record,
 ) -> tuple[Outcome, Record]:
     """Advance with one list until it is used up, the record is full or the last step is done.
@@ -157,6 +158,7 @@ def run_epoch(
         reference: wrapped positions at which the list was built, user's order.
         built: step at which the list was built.
         last: last step to evaluate.
+        look_back: whether to decide the step before with this list too.
         record: rows to fill; donated.
     """
     order = tables.order
@@ -170,7 +172,13 @@ def run_epoch(
 
     before = None
     if program.record:
-        before = program.force.decide(state.x_before[:, order], tables)  # type: ignore[attr-defined]
+        words = tables.index.shape[0]
+        before = lax.cond(
+            look_back,
+            lambda x: program.force.decide(x, tables).bits,  # type: ignore[attr-defined]
+            lambda x: jnp.zeros((words, x.shape[1]), jnp.uint8),
+            state.x_before[:, order],
+        )
 
     def moved(x):
         d = cell.minimum_image(*(x - home))
@@ -197,7 +205,7 @@ def run_epoch(
             d = made.decisions
             assert d is not None
             values |= {"x": x, "v": v, "images": images, "bits": d.bits}
-            values |= {"nearest": d.nearest, "ambiguous": d.ambiguous}
+            values["nearest"] = d.nearest
         record = _write(record, row, **values)
         finite = jnp.isfinite(potential) & jnp.isfinite(kinetic)
         after, v, taken = program.integrator.drift(x, v + half_step * acceleration, masses, step, order)
@@ -227,10 +235,12 @@ def run_epoch(
         moved(x),
         record,
     )
-    step, x, v, images, x_before, heat, rows, due, finite, _, record = lax.while_loop(go_on, body, carry)
+    step, x, v, images, x_before, heat, rows, due, finite, largest, record = lax.while_loop(
+        go_on, body, carry
+    )
 
     def unsorted(a):
         return jnp.zeros_like(a).at[:, order].set(a)
 
     end = State(step, unsorted(x), unsorted(v), unsorted(images), unsorted(x_before), heat)
-    return Outcome(end, rows, due, finite, before), record
+    return Outcome(end, rows, due, finite, largest, before), record

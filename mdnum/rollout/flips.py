@@ -37,6 +37,29 @@ class PairRecorder:
         """Pairs inside at every step of a segment."""
         return np.array([self.inside(bits) for bits in segment.rows_of("bits")], np.int64)
 
+    def ambiguous(self, segment: Segment) -> Int[np.ndarray, "rows"]:
+        """Pairs whose decision another legitimate rounding could have changed, at every step of a segment."""
+        counts = np.zeros(segment.rows, np.int64)
+        bounds = np.array(self.simulation.decider.bounds)
+        # almost always no pair comes that close; where one does, the host looks again
+        for row in np.flatnonzero(segment.rows_of("nearest") <= bounds.max()):
+            table, x = segment.table, segment.rows_of("x")[row]
+            slot, first = np.nonzero(table.index < self.simulation.atoms)
+            second = table.index[slot, first]
+            i, j = table.order[first], table.order[second]
+            _, margin = self._margins(x[:, first].T, x[:, second].T, i, j)
+            kind = self.simulation.type_of(i, j)
+            counts[row] = int(np.sum((np.abs(margin) <= bounds[kind]) & (i < j)))
+        return counts
+
+    def _margins(self, start, end, i, j):
+        """Pair types and margins of pairs at given positions, with the bits of the program's decision."""
+        decider = self.simulation.decider
+        kind = self.simulation.type_of(i, j)
+        d = displacement(self.simulation.cell, start, end, np.dtype(decider.dtype))
+        quantity = decider.host_quantity(*d).astype(np.float64)
+        return kind, np.array([t.value for t in decider.thresholds])[kind] - quantity
+
     def flips(self, segment: Segment) -> Ledger:
         """The flips of a segment, sorted by step, i and j (user's labels, i < j).
 
@@ -69,11 +92,7 @@ class PairRecorder:
         simulation, decider = self.simulation, self.simulation.decider
         x, v = segment.rows_of("x"), segment.rows_of("v")
         start, end = x[row, :, first], x[row, :, second]
-        kind = simulation.type_of(labels[:, 0], labels[:, 1])
-        quantity = decider.host_quantity(
-            *displacement(simulation.cell, start, end, np.dtype(decider.dtype))
-        ).astype(np.float64)
-        margin = np.array([t.value for t in decider.thresholds])[kind] - quantity
+        kind, margin = self._margins(start, end, labels[:, 0], labels[:, 1])
         inclusive = decider.compare.endswith("<=")
         if not np.array_equal(margin >= 0 if inclusive else margin > 0, entered):
             raise MdnumError(
@@ -149,7 +168,5 @@ def true_pairs(simulation: Simulation, wrapped: Float[np.ndarray, "atoms 3"]) ->
     i, j = i[keep], j[keep]
     d = displacement(simulation.cell, wrapped[i], wrapped[j], np.dtype(decider.dtype))
     values = np.array([t.value for t in decider.thresholds], np.dtype(decider.dtype))
-    quantity = decider.host_quantity(*d)
-    value = values[simulation.type_of(i, j)]
-    inside = quantity <= value if decider.compare.endswith("<=") else quantity < value
+    inside = decider.inside(decider.host_quantity(*d), values[simulation.type_of(i, j)])
     return pair_keys(i[inside], j[inside], simulation.atoms)

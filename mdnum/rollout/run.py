@@ -154,14 +154,15 @@ class Rollout:
         before = self.recorder.inside(segment.before)
         done.health.check_count(segment, before, done.pairs)
         pairs = self.recorder.counts(segment)
+        ambiguous = self.recorder.ambiguous(segment)
         ledger = self.recorder.flips(segment)
-        self.folder.append("series", series_columns(self.simulation, segment, pairs, ledger))
+        self.folder.append("series", series_columns(self.simulation, segment, pairs, ambiguous, ledger))
         if len(ledger):
             self.folder.append("flips", flip_columns(ledger))
         row = done.health.take(segment)
         if row is not None:
             self.folder.append("epochs", row)
-        done.tally.take(segment, pairs, ledger)
+        done.tally.take(segment, pairs, ambiguous, ledger)
         done.pairs = int(pairs[-1])
         if done.first is None:
             done.first = segment.unsorted("x", 0)

@@ -19,7 +19,7 @@ def degrees_of_freedom(simulation: Simulation) -> int:
 
 
 def series_columns(
-    simulation: Simulation, segment: Segment, pairs: np.ndarray, ledger: Ledger
+    simulation: Simulation, segment: Segment, pairs: np.ndarray, ambiguous: np.ndarray, ledger: Ledger
 ) -> dict[str, np.ndarray]:
     """The rows of series.parquet for a segment.
 
@@ -27,6 +27,7 @@ def series_columns(
         simulation: the system as objects.
         segment: what the engine recorded.
         pairs: pairs inside at each row.
+        ambiguous: pairs within the rounding bound at each row.
         ledger: the flips of the segment.
     """
     units = simulation.units
@@ -51,7 +52,7 @@ def series_columns(
         "left": left,
         "displacement": segment.rows_of("moved"),
         "energy_jump": np.bincount(row, weights=ledger.jump, minlength=count),
-        "ambiguous": segment.rows_of("ambiguous"),
+        "ambiguous": ambiguous,
         "min_margin": segment.rows_of("nearest"),
         "conserved": total - segment.rows_of("heat"),
     }

@@ -31,7 +31,7 @@ class Tally:
     seconds: float = 0.0
     steps_per_second: float = 0.0
 
-    def take(self, segment: Segment, pairs: np.ndarray, ledger: Ledger) -> None:
+    def take(self, segment: Segment, pairs: np.ndarray, ambiguous: np.ndarray, ledger: Ledger) -> None:
         """Add a segment."""
         if self.step < 0:
             self.pairs_first = int(pairs[0])
@@ -39,7 +39,7 @@ class Tally:
         self.pairs_last = int(pairs[-1])
         self.entered += int(ledger.entered.sum())
         self.left += int((~ledger.entered).sum())
-        self.ambiguous += int(segment.rows_of("ambiguous").sum())
+        self.ambiguous += int(ambiguous.sum())
         self.ambiguous_flips += int(ledger.ambiguous.sum())
 
     def to_dict(self) -> dict:
