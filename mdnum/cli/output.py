@@ -115,16 +115,19 @@ def console() -> Console:
 
 
 def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """A table for people; cells that name a severity are colored."""
+    """A table for people; cells that name a severity are colored; no header where no column has a name."""
     from rich.table import Table
     from rich.text import Text
 
-    table = Table(title=title, title_justify="left", box=None, pad_edge=False, header_style="bold")
+    out = console()
+    if title:
+        out.print(Text(title, style="bold"))
+    table = Table(box=None, pad_edge=False, header_style="bold", show_header=any(columns))
     for column in columns:
         table.add_column(column, overflow="fold")
     for row in rows:
         table.add_row(*(Text(show(cell), style=_STYLE.get(str(cell), "")) for cell in row))
-    console().print(table)
+    out.print(table)
 
 
 def print_records(title: str, records: Sequence[Mapping[str, Any]]) -> None:
