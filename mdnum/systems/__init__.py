@@ -6,6 +6,8 @@ Importing this package imports neither jax nor jax_md; `build` and `Simulation` 
 from __future__ import annotations
 
 import importlib
+import sys
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from mdnum.systems.load import System, copy, load, names, shipped_folder
@@ -17,11 +19,20 @@ if TYPE_CHECKING:
 __all__ = ["Simulation", "System", "SystemSpec", "build", "copy", "load", "names", "shipped_folder"]
 
 
+class _Package(ModuleType):
+    """This package, in which `build` is the function, whoever imports the file of that name first."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        # Python binds an imported submodule to its package; here that would hide the function of its name
+        if name == "build" and isinstance(value, ModuleType):
+            value = value.build
+        super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package
+
+
 def __getattr__(name: str) -> Any:
     if name in ("build", "Simulation"):
-        module = importlib.import_module("mdnum.systems.build")
-        # importing the submodule binds it to this package under the function's name: put the function there
-        globals()["build"] = module.build
-        globals()["Simulation"] = module.Simulation
-        return globals()[name]
+        return getattr(importlib.import_module("mdnum.systems.build"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

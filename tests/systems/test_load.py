@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
@@ -236,3 +238,23 @@ def test_a_hundred_thousand_atoms_are_checked(tmp_path: Path):
         text.replace('file = "liquid-864.extxyz"', structure), encoding="utf-8"
     )
     assert len(load(tmp_path / "large.toml").atoms) == 108_000
+
+
+@pytest.mark.parametrize(
+    "first",
+    ["from mdnum.systems.build import Simulation", "import mdnum.systems.build", "import mdnum.systems"],
+)
+def test_build_is_the_function_whoever_imports_its_file_first(first: str):
+    code = f"{first}\nfrom mdnum import systems\nfrom mdnum.systems import build, Simulation\n"
+    code += "assert build is systems.build\nprint(type(build).__name__, type(Simulation).__name__)"
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert said.split()[0] == "function"
+
+
+def test_the_packaged_copy_comes_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    packaged = tmp_path / "mdnum" / "_systems" / "argon"
+    packaged.mkdir(parents=True)
+    (packaged / "other.toml").write_text("")
+    assert ARGON in systems.names(), "the repository's, without a packaged copy"
+    monkeypatch.setattr("importlib.resources.files", lambda name: tmp_path / name)
+    assert systems.names() == ["argon/other"]
