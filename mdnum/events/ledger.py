@@ -59,7 +59,8 @@ class Ledger:
 
     def jumps(self, steps: int) -> Float[np.ndarray, "steps"]:
         """Sum of the jumps of the flips of each step 0..steps."""
-        return np.bincount(self.step, weights=self.jump, minlength=steps + 1)
+        # bincount of nothing is a row of integers, whatever its weights
+        return np.bincount(self.step, weights=self.jump, minlength=steps + 1).astype(np.float64)
 
 
 def sort_rows(step, subject) -> Int[np.ndarray, "rows"]:

@@ -27,7 +27,7 @@ def ordinal(x: Float[np.ndarray, "..."]) -> Int[np.ndarray, "..."]:
 
 def ulp_distance(a, b, dtype=np.float64) -> Int[np.ndarray, "..."]:
     """How many floats of dtype lie from a to b, with sign (b above a is positive)."""
-    return ordinal(np.asarray(b, dtype)) - ordinal(np.asarray(a, dtype))
+    return np.asarray(ordinal(np.asarray(b, dtype)) - ordinal(np.asarray(a, dtype)))
 
 
 def neighbor(x, ulps: int, dtype=np.float64):
@@ -36,4 +36,6 @@ def neighbor(x, ulps: int, dtype=np.float64):
     integer = _SIGNED[x.dtype]
     place = ordinal(x) + ulps
     lowest = np.int64(np.iinfo(integer).min)
-    return np.where(place < 0, lowest - place, place).astype(integer).view(x.dtype)[()]
+    # the branch not taken must not overflow
+    bits = np.where(place < 0, lowest - np.minimum(place, 0), place)
+    return bits.astype(integer).view(x.dtype)[()]
