@@ -64,14 +64,10 @@ def alternates(flips: Flips) -> bool:
     return not np.any((key[1:] == key[:-1]) & (entered[1:] == entered[:-1]))
 
 
-def busiest_pairs(flips: Flips, most: int | None = None) -> PairCounts:
-    """The pairs that flip most often.
-
-    Args:
-        most: only so many; None for all.
-    """
+def busiest_pairs(flips: Flips) -> PairCounts:
+    """The pairs that flipped, those that did so most often first."""
     key, counts = np.unique(_pair_key(flips), return_counts=True)
-    order = np.argsort(-counts, kind="stable")[:most]
+    order = np.argsort(-counts, kind="stable")
     return PairCounts(i=key[order] >> 32, j=key[order] & 0xFFFFFFFF, flips=counts[order])
 
 
@@ -87,14 +83,16 @@ def margins_in_bounds(flips: Flips) -> Float[np.ndarray, "flips"]:
     return ratio
 
 
-def expected_ambiguous(flips: Flips) -> float:
+def expected_ambiguous(ratio: Float[np.ndarray, "flips"]) -> float:
     """Flips one expects within their rounding bound, were the margins spread evenly near zero.
 
     They are where atoms move freely through the cutoff. The density is taken from the lower
     quarter of the margins; many more ambiguous flips than this mean that something holds pairs
     at the cutoff, a crystal's shell for example.
+
+    Args:
+        ratio: what `margins_in_bounds` gave.
     """
-    ratio = margins_in_bounds(flips)
     ratio = ratio[np.isfinite(ratio)]
     if len(ratio) < 4:
         return 0.0
@@ -102,9 +100,8 @@ def expected_ambiguous(flips: Flips) -> float:
     return float(0.25 * len(ratio) / quarter) if quarter > 0 else float(len(ratio))
 
 
-def closest(flips: Flips, most: int) -> Int[np.ndarray, "flips"]:
+def closest(ratio: Float[np.ndarray, "flips"], most: int) -> Int[np.ndarray, "nearest"]:
     """Rows of the flips nearest to their threshold, in units of rounding, nearest first."""
-    ratio = margins_in_bounds(flips)
     if len(ratio) > most:
         rows = np.argpartition(ratio, most)[:most]
     else:

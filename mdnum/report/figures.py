@@ -61,6 +61,7 @@ def flips(run: Run, figure: Figure) -> None:
     _legend(above)
     _line(below, series["time"], series["pairs"].astype(float), THIRD)
     _label(below, "pairs inside")
+    below.yaxis.set_major_locator(MaxNLocator(4, integer=True))
     below.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
     below.set_xlabel(f"time ({run.units.time})")
 
@@ -68,14 +69,14 @@ def flips(run: Run, figure: Figure) -> None:
 def margins(run: Run, figure: Figure) -> None:
     """How far from their threshold decisions were at a flip, in units of the rounding bound."""
     axes = figure.subplots()
-    ratio = analysis.margins_in_bounds(run.flips)
+    ratio = run.margins
     ratio = ratio[np.isfinite(ratio)]
     top = np.ceil(np.log10(max(ratio.max(initial=10.0), 10.0)))
     edges = np.arange(-1, top + 0.25, 0.25)
     counts, _ = np.histogram(np.log10(np.maximum(ratio, 0.1001)), edges)
     axes.stairs(counts, edges, color=FIRST, fill=True, alpha=0.35)
     axes.stairs(counts, edges, color=FIRST, lw=1.1, label="flips")
-    expected = analysis.expected_ambiguous(run.flips)
+    expected = analysis.expected_ambiguous(run.margins)
     if expected > 0:
         # a density that is even near zero puts counts in proportion to the width of a bin
         width = 10.0 ** edges[1:] - 10.0 ** edges[:-1]
@@ -104,7 +105,7 @@ def margins(run: Run, figure: Figure) -> None:
 def residence(run: Run, figure: Figure) -> None:
     """How long a pair keeps a decision between two flips."""
     axes = figure.subplots()
-    lengths = analysis.stays(run.flips)
+    lengths = run.stays
     longest = max(lengths.inside.max(initial=10), lengths.outside.max(initial=10))
     edges = np.unique(np.round(np.geomspace(1, longest + 1, 36)))
     for values, color, label in ((lengths.inside, FIRST, "inside"), (lengths.outside, SECOND, "outside")):

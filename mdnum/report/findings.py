@@ -51,6 +51,9 @@ def judge(run: Run) -> Verdict:
     findings = tuple(sorted(found, key=lambda finding: _ORDER.index(finding.severity)))
     errors = [finding.title for finding in findings if finding.severity == "error"]
     warnings = [finding.title for finding in findings if finding.severity == "warning"]
+    if len(errors) > 2:
+        # the first is the cause more often than not
+        errors[1:] = [f"{len(errors) - 1} more errors below"]
     if errors:
         headline = f"Do not rely on this run: {listed(errors)}."
     elif warnings:
@@ -94,8 +97,8 @@ def sharpness(run: Run) -> tuple[float, float] | None:
 def summarize(run: Run) -> dict[str, Any]:
     """Numbers on flips that the report shows beside its figures."""
     flips = run.flips
-    lengths = analysis.stays(flips)
-    ratio = analysis.margins_in_bounds(flips)
+    lengths = run.stays
+    ratio = run.margins
     finite = ratio[np.isfinite(ratio)]
     loaded = len(flips["step"])
     undone = lengths.undone_within(CHATTER_STEPS)
@@ -107,10 +110,10 @@ def summarize(run: Run) -> dict[str, Any]:
         "undone_share": undone / loaded if loaded else 0.0,
         "inside_median": float(np.median(lengths.inside)) if len(lengths.inside) else None,
         "outside_median": float(np.median(lengths.outside)) if len(lengths.outside) else None,
-        "pairs": len(analysis.busiest_pairs(flips).i),
+        "pairs": len(run.busiest.i),
         "ratio_min": float(finite.min()) if len(finite) else None,
         "ratio_median": float(np.median(finite)) if len(finite) else None,
-        "expected_ambiguous": analysis.expected_ambiguous(flips),
+        "expected_ambiguous": analysis.expected_ambiguous(ratio),
     }
 
 

@@ -46,12 +46,12 @@ def write_report(folder: RunFolder | str | Path) -> Path:
         (folder.path / "figures").mkdir(exist_ok=True)
     pictures = {}
     for name, title in _titles(run).items():
-        page = figures.draw(name, run)
-        write_text(folder.path / "figures" / f"{name}.svg", svg.standalone(page, name))
-        phone = figures.draw(name, run, figures.PHONE_WIDTH)
+        page = svg.markup(figures.draw(name, run), name)
+        phone = svg.markup(figures.draw(name, run, figures.PHONE_WIDTH), f"{name}-phone")
+        write_text(folder.path / "figures" / f"{name}.svg", svg.standalone(page))
         pictures[name] = Markup(
-            f'<div class="wide">{svg.inline(page, name, title)}</div>'
-            f'<div class="narrow">{svg.inline(phone, name + "-phone", title)}</div>'
+            f'<div class="wide">{svg.inline(page, title)}</div>'
+            f'<div class="narrow">{svg.inline(phone, title)}</div>'
         )
     path = folder.path / "report.html"
     write_text(path, render(run, verdict, pictures))
@@ -103,7 +103,7 @@ def _titles(run: Run) -> dict[str, str]:
     titles = {"energy": "Energy and its budget against time", "flips": "Flips per step against time"}
     if len(run.flips["step"]):
         titles["margins"] = "Histogram of margins in units of the rounding bound"
-    if len(analysis.stays(run.flips).all) > 1:
+    if len(run.stays.all) > 1:
         titles["residence"] = "Histogram of the steps between two flips of a pair"
     if len(run.epochs["epoch"]):
         titles["lists"] = "Skin consumed and steps per neighbor list"
@@ -197,11 +197,13 @@ def _value(value: Any) -> str:
 
 
 def _busiest(run: Run) -> list[dict[str, Any]]:
-    pairs = analysis.busiest_pairs(run.flips, _BUSIEST)
+    pairs = run.busiest
     total = run.steps or 1
     return [
         {"pair": f"{i}–{j}", "flips": int(n), "every": total / n}
-        for i, j, n in zip(pairs.i.tolist(), pairs.j.tolist(), pairs.flips.tolist(), strict=True)
+        for i, j, n in zip(
+            *(column[:_BUSIEST].tolist() for column in (pairs.i, pairs.j, pairs.flips)), strict=True
+        )
     ]
 
 
@@ -248,8 +250,8 @@ def _ase(run: Run) -> Iterator[tuple[str, str, str]]:
 def _table_rows(run: Run) -> list[list[Any]]:
     """The flips nearest to the threshold, in the order of steps: step, i, j, entered, and numbers."""
     flips = run.flips
-    chosen = np.sort(analysis.closest(flips, TABLE_ROWS))
-    ratio = analysis.margins_in_bounds(flips)[chosen]
+    chosen = np.sort(analysis.closest(run.margins, TABLE_ROWS))
+    ratio = run.margins[chosen]
     columns = [flips[name][chosen].tolist() for name in ("step", "i", "j")]
     columns.append(flips["entered"][chosen].astype(int).tolist())
     for name, digits in (("distance", 9), ("margin", 4), ("radial_speed", 4), ("energy_jump", 4)):

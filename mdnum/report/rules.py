@@ -27,6 +27,7 @@ _GRADIENT = (
     "adds, an error that a shorter time step does not shrink."
 )
 _RECORDER = "A flip was not recorded: the ledger cannot be used. Please report it."
+_LISTS_FIRST = "Lost pairs have no place in the ledger: mend the neighbor lists first."
 
 
 @dataclass(frozen=True)
@@ -125,7 +126,7 @@ def _algebra(run: Run) -> Iterator[Finding]:
     if len(wrong):
         title = f"pairs and flips disagree from step {_step(run, wrong[0])} on"
         text = f"Pairs inside are not pairs at the start + entered − left at {many(len(wrong), 'step')}."
-        yield Finding("EVENT_ALGEBRA", "error", title, text, _RECORDER)
+        yield Finding("EVENT_ALGEBRA", "error", title, text, _remedy(run, _RECORDER))
 
 
 def _ledger(run: Run) -> Iterator[Finding]:
@@ -144,7 +145,7 @@ def _ledger(run: Run) -> Iterator[Finding]:
             return
     if not analysis.alternates(run.flips):
         text = "A pair enters or leaves twice in a row; between the two there was a flip the other way."
-        yield Finding("LEDGER_INCOMPLETE", "error", title, text, _RECORDER)
+        yield Finding("LEDGER_INCOMPLETE", "error", title, text, _remedy(run, _RECORDER))
 
 
 def _budget(run: Run) -> Iterator[Finding]:
@@ -164,13 +165,8 @@ def _budget(run: Run) -> Iterator[Finding]:
         worst = int(np.argmax(moves))
         text += f" The largest jump that no flip explains is {number(float(moves[worst]))} {energy}"
         text += f" at step {_step(run, worst + 1)}."
-    if total(run, "lost_pairs"):
-        remedy = "Lost pairs have no place in the ledger: mend the neighbor lists first."
-    else:
-        remedy = (
-            "A flip is missing from the ledger, or an energy is wrong. Run mdnum doctor; please report it."
-        )
-    yield Finding("BUDGET_OPEN", "error", "the energy budget does not close", text, remedy)
+    remedy = "A flip is missing from the ledger, or an energy is wrong. Run mdnum doctor; please report it."
+    yield Finding("BUDGET_OPEN", "error", "the energy budget does not close", text, _remedy(run, remedy))
 
 
 def _tie(run: Run) -> Iterator[Finding]:
@@ -193,7 +189,7 @@ def _ambiguous(run: Run) -> Iterator[Finding]:
         f"{many(ambiguous, 'decision')} came out as {'it' if ambiguous == 1 else 'they'} did by rounding: "
         "another order of summation, compiler or machine may decide otherwise, and follow another trajectory "
         f"from there. Atoms that cross the cutoff freely would give "
-        f"{number(analysis.expected_ambiguous(run.flips), 2)}."
+        f"{number(analysis.expected_ambiguous(run.margins), 2)}."
     )
     remedy = "Move cutoff.radius between two neighbor shells."
     title = f"{many(ambiguous, 'decision')} within rounding of the cutoff"
@@ -202,12 +198,12 @@ def _ambiguous(run: Run) -> Iterator[Finding]:
 
 def _chatter(run: Run) -> Iterator[Finding]:
     flips = len(run.flips["step"])
-    undone = analysis.stays(run.flips).undone_within(CHATTER_STEPS)
+    undone = run.stays.undone_within(CHATTER_STEPS)
     # a handful of flips says nothing about the cutoff
     if flips < 20 or undone < CHATTER_SHARE * flips:
         return
     smooth = not jump(run) and not run.cutoff.get("force_jump")
-    busiest = analysis.busiest_pairs(run.flips, 1)
+    busiest = run.busiest
     text = (
         f"{count(undone)} of {many(flips, 'flip')} are taken back by the same pair within {CHATTER_STEPS} "
         f"steps; pair {busiest.i[0]}–{busiest.j[0]} alone flips {count(int(busiest.flips[0]))} times. Atoms "
@@ -289,8 +285,8 @@ RULES: tuple[Rule, ...] = (
 )  # fmt: skip
 CODES = frozenset({
     "RUN_FAILED", "NOT_FINISHED", "LOST_PAIRS", "LISTS_DISAGREE", "DANGEROUS_BUILDS", "EVENT_ALGEBRA",
-    "LEDGER_INCOMPLETE", "BUDGET_OPEN", "TIE_AT_CUTOFF", "AMBIGUOUS_DECISIONS", "CHATTER", "HARD_CUTOFF", "FORCE_JUMP",
-    "DRIFT", "ASE_DISAGREES", "ASE_NOT_COMPARED",
+    "LEDGER_INCOMPLETE", "BUDGET_OPEN", "TIE_AT_CUTOFF", "AMBIGUOUS_DECISIONS", "CHATTER", "HARD_CUTOFF",
+    "FORCE_JUMP", "DRIFT", "ASE_DISAGREES", "ASE_NOT_COMPARED",
 })  # fmt: skip
 
 
@@ -312,3 +308,7 @@ def total(run: Run, key: str, column: str | None = None) -> int:
 
 def _step(run: Run, row: int) -> str:
     return count(int(run.series["step"][row]))
+
+
+def _remedy(run: Run, otherwise: str) -> str:
+    return _LISTS_FIRST if total(run, "lost_pairs") else otherwise

@@ -10,9 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from mdnum import units
 from mdnum.errors import FolderError
+from mdnum.report import analysis
 from mdnum.store import RunFolder
 from mdnum.units import Units
 
@@ -65,6 +67,21 @@ class Run:
     def conservative(self) -> bool:
         """Whether the total energy should stay what it was."""
         return (self.system.get("dynamics") or {}).get("kind", "nve") == "nve"
+
+    @cached_property
+    def stays(self) -> analysis.Stays:
+        """Residence times of pairs on either side of the cutoff."""
+        return analysis.stays(self.flips)
+
+    @cached_property
+    def margins(self) -> Float[np.ndarray, "flips"]:
+        """|margin| of each flip in units of its rounding bound."""
+        return analysis.margins_in_bounds(self.flips)
+
+    @cached_property
+    def busiest(self) -> analysis.PairCounts:
+        """Pairs by the number of their flips, most first."""
+        return analysis.busiest_pairs(self.flips)
 
     @cached_property
     def budget(self) -> dict[str, np.ndarray]:

@@ -62,34 +62,12 @@ def style() -> AbstractContextManager[None]:
     )
 
 
-def inline(figure: Figure, name: str, title: str) -> str:
-    """An <svg> element for an HTML page that defines the colors as custom properties.
+def markup(figure: Figure, name: str) -> str:
+    """A figure as an <svg> element whose colors are roles.
 
     Args:
-        name: makes the element's ids unique on the page.
-        title: what a screen reader says.
+        name: makes the element's ids unique on a page.
     """
-    text = _svg(figure, name)
-    text = re.sub(r'<svg [^>]*?viewBox="([^"]+)"[^>]*>', r'<svg viewBox="\1" role="img">', text, count=1)
-    return text.replace('role="img">', f'role="img" aria-label="{title}">', 1)
-
-
-def standalone(figure: Figure, name: str) -> str:
-    """A whole SVG file, which carries both sets of colors and follows the viewer's preference."""
-    text = _svg(figure, name)
-    rules = (
-        f"svg {{ {_properties(LIGHT)} }} "
-        f"@media (prefers-color-scheme: dark) {{ svg {{ {_properties(DARK)} }} }} "
-        f"text {{ font-family: {FONT}; }}"
-    )
-    return re.sub(r"(<svg [^>]*>)", rf"\1<style>{rules}</style>", text, count=1)
-
-
-def _properties(colors: dict[str, str]) -> str:
-    return " ".join(f"--{role}: {color};" for role, color in colors.items())
-
-
-def _svg(figure: Figure, name: str) -> str:
     sink = io.StringIO()
     with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
         figure.savefig(sink, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
@@ -110,3 +88,32 @@ def _svg(figure: Figure, name: str) -> str:
     # a hundredth of a point is finer than any screen; what stands between the tags are the labels
     text = re.sub(r"<[^>]+>", lambda tag: re.sub(r"(\d+\.\d{2})\d+", r"\1", tag[0]), text)
     return re.sub(r"\n\s*\n*", "\n", text)
+
+
+def inline(text: str, title: str) -> str:
+    """An <svg> element for an HTML page that defines the colors as custom properties.
+
+    Args:
+        text: what `markup` gave.
+        title: what a screen reader says.
+    """
+    text = re.sub(r'<svg [^>]*?viewBox="([^"]+)"[^>]*>', r'<svg viewBox="\1" role="img">', text, count=1)
+    return text.replace('role="img">', f'role="img" aria-label="{title}">', 1)
+
+
+def standalone(text: str) -> str:
+    """A whole SVG file, which carries both sets of colors and follows the viewer's preference.
+
+    Args:
+        text: what `markup` gave.
+    """
+    rules = (
+        f"svg {{ {_properties(LIGHT)} }} "
+        f"@media (prefers-color-scheme: dark) {{ svg {{ {_properties(DARK)} }} }} "
+        f"text {{ font-family: {FONT}; }}"
+    )
+    return re.sub(r"(<svg [^>]*>)", rf"\1<style>{rules}</style>", text, count=1)
+
+
+def _properties(colors: dict[str, str]) -> str:
+    return " ".join(f"--{role}: {color};" for role, color in colors.items())

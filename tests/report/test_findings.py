@@ -91,6 +91,16 @@ def test_lost_pairs_are_told_with_numbers_and_a_remedy(good):
     assert not any("No pair was lost" in sentence for sentence in verdict.evidence)
 
 
+def test_what_follows_from_lost_pairs_does_not_hide_them(good):
+    changes = epochs(good, lost_pairs=3, lost_pair_steps=9, first_lost_step=25) | series(good, 77, pairs=1)
+    changes |= summary(good, energy_budget_closes=False)
+    verdict = findings.judge(dataclasses.replace(good, **changes))
+    assert verdict.headline.endswith("lost 3 pairs, from step 25 on and 2 more errors below.")
+    assert {finding.remedy for finding in verdict.findings[1:3]} == {
+        "Lost pairs have no place in the ledger: mend the neighbor lists first."
+    }
+
+
 def test_a_flip_dropped_by_the_recorder_is_noticed(tmp_path):
     run = load(make_run(tmp_path / "run", steps=60, candidates=800, drop_flip=True))
     verdict = findings.judge(run)
