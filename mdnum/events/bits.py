@@ -63,7 +63,7 @@ def set_bits(
 
 
 @numba.njit(cache=True, nogil=True)
-def count_set(packed) -> int:
+def count_set(packed):
     """How many decisions of packed bytes (any number of columns) are yes."""
     total = 0
     for value in packed.ravel():

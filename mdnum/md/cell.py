@@ -7,11 +7,14 @@ bits as separate rounding, and numpy reproduces what jit computed.
 
 from __future__ import annotations
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from numpy.typing import DTypeLike
 
 from mdnum.errors import InputError
 
@@ -32,7 +35,7 @@ class Cell(eqx.Module):
     orthorhombic: bool = eqx.field(static=True)
 
     @classmethod
-    def create(cls, matrix, pbc=True) -> Cell:
+    def create(cls, matrix, pbc: Any = True) -> Cell:
         """A cell from lattice vectors.
 
         Args:
@@ -61,7 +64,8 @@ class Cell(eqx.Module):
         inverse = np.linalg.inv(full)
         inverse[:, ~flags] = 0.0
         diagonal = bool(np.all(full == np.diag(np.diag(full))))
-        return cls(matrix.copy(), inverse, tuple(bool(f) for f in flags), diagonal)
+        a, b, c = (bool(flag) for flag in flags)
+        return cls(matrix.copy(), inverse, (a, b, c), diagonal)
 
     @property
     def widths(self) -> Float[np.ndarray, "3"]:
@@ -137,7 +141,10 @@ def wrap_positions(
 
 
 def displacement(
-    cell: Cell, start: Float[np.ndarray, "... 3"], end: Float[np.ndarray, "... 3"], dtype=np.float64
+    cell: Cell,
+    start: Float[np.ndarray, "... 3"],
+    end: Float[np.ndarray, "... 3"],
+    dtype: DTypeLike = np.float64,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Components of the nearest image of end - start, with the bits that the force loop computes in dtype."""
     host = Cell(np.asarray(cell.matrix, dtype), np.asarray(cell.inverse, dtype), cell.pbc, cell.orthorhombic)

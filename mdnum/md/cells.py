@@ -165,7 +165,8 @@ def _grid(cell: Cell, fractional_extent, r_list: float, atoms: int):
     reach = np.zeros(3, np.int64)
     for k in range(3):
         width = fractional_extent[k]
-        fine, coarse = int(2 * width / r_list), int(width / r_list)
+        # with the safety: a pair at r_list must never be three bins of r_list/2 apart by rounding
+        fine, coarse = int(2 * width / (r_list * _SAFETY)), int(width / (r_list * _SAFETY))
         if fine >= 5:
             bins[k], reach[k] = fine, 2
         elif coarse >= 3:

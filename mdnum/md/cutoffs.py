@@ -43,7 +43,7 @@ class Cutoff(eqx.Module):
     switches: ClassVar[bool] = False
 
     @abstractmethod
-    def cut(self, r2, u, w, at: AtCutoff):
+    def cut(self, r2, u, w, at: AtCutoff) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """Energy and slope of the cut potential inside r_cut.
 
         Args:
@@ -127,7 +127,7 @@ class _SwitchedInDistance(Cutoff):
     switches = True
 
     @abstractmethod
-    def switch(self, t):
+    def switch(self, t) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """Switching function and its derivative for t in [0, 1] from onset to cutoff."""
 
     def cut(self, r2, u, w, at):

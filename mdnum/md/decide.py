@@ -6,7 +6,7 @@ the ledger all compute them through this file, with the same bits.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -51,6 +51,11 @@ class PairDecider:
             )
 
     @property
+    def bare(self) -> PairDecider:
+        """Without what only bounds need: a box of another size is then the same compiled program."""
+        return replace(self, extent=(0.0, 0.0, 0.0))
+
+    @property
     def space(self) -> str:
         """The quantity that is compared: "r" or "r2"."""
         return self.compare.split()[0]
@@ -73,7 +78,7 @@ class PairDecider:
         """Threshold values as an array of the decision's dtype, shape (types,)."""
         return jnp.asarray([t.value for t in self.thresholds], np.dtype(self.dtype))
 
-    def quantity(self, dx: jax.Array, dy: jax.Array, dz: jax.Array, zero: jax.Array) -> jax.Array:
+    def quantity(self, dx, dy, dz, zero: jax.Array) -> jax.Array:
         """The compared quantity inside jit; bit for bit what `host_quantity` gives."""
         r2 = squared_norm(dx, dy, dz, zero)
         return jnp.sqrt(r2) if self.space == "r" else r2
@@ -83,7 +88,7 @@ class PairDecider:
         r2 = dx * dx + dy * dy + dz * dz
         return np.sqrt(r2) if self.space == "r" else r2
 
-    def inside(self, quantity: jax.Array, value: jax.Array) -> jax.Array:
+    def inside(self, quantity, value):
         """The decision: quantity against threshold value(s), as the convention has it (jax or numpy)."""
         return quantity <= value if self.compare.endswith("<=") else quantity < value
 

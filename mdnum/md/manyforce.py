@@ -37,7 +37,9 @@ class ManyBodyForce(eqx.Module):
     @classmethod
     def create(cls, potential, cell: Cell, decider: PairDecider, policy: PrecisionPolicy) -> ManyBodyForce:
         """The box as jax arrays."""
-        return cls(potential, cell.astype(np.float64), zero_bits(policy.dtype("decision")), decider, policy)
+        return cls(
+            potential, cell.astype(np.float64), zero_bits(policy.dtype("decision")), decider.bare, policy
+        )
 
     def decide(self, positions: Float[Array, "3 atoms"], tables: Tables) -> Decisions:
         """The decisions of a list at given positions."""

@@ -70,7 +70,7 @@ class PairForce(eqx.Module):
             model.astype(policy.dtype("force")),
             cell.astype(np.float64),
             zero_bits(policy.dtype("decision")),
-            decider,
+            decider.bare,
             policy,
             reduction,
         )

@@ -86,7 +86,10 @@ class PairTable:
 class ListBuilder(Protocol):
     """A neighbor search that fills a pair table."""
 
-    name: str
+    @property
+    def name(self) -> str:
+        """The word of system files."""
+        ...
 
     def build(
         self, positions: Float[np.ndarray, "atoms 3"], cell: Cell, r_list: float, slots: int

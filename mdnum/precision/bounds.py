@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from mdnum.precision.ulp import unit_roundoff
 
 
-def gamma(n: int, dtype=np.float64) -> float:
+def gamma(n: int, dtype: DTypeLike = np.float64) -> float:
     """n*u / (1 - n*u): bounds the relative error of n roundings in a row (Higham 2002, lemma 3.1)."""
     nu = n * unit_roundoff(dtype)
     return nu / (1.0 - nu)
 
 
-def squared_distance_bound(r, extent, dtype=np.float64):
+def squared_distance_bound(r, extent, dtype: DTypeLike = np.float64):
     """Bound on |computed r² - exact r²| for positions that are exact as given.
 
     The computation is d = (x_j - x_i) - n*L for each axis, then dx² + dy² + dz² with a rounding after
@@ -36,7 +37,7 @@ def squared_distance_bound(r, extent, dtype=np.float64):
     return 2.0 * r * component + component**2 + gamma(3, dtype) * (r + component) ** 2
 
 
-def distance_bound(r, extent, dtype=np.float64):
+def distance_bound(r, extent, dtype: DTypeLike = np.float64):
     """Bound on |computed r - exact r|, r = sqrt(r²) with a correctly rounded square root.
 
     Args, error analysis: as `squared_distance_bound`; sqrt halves the relative error and adds one rounding.

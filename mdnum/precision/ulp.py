@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float, Int
+from numpy.typing import DTypeLike
 
 _SIGNED = {np.dtype(np.float64): np.int64, np.dtype(np.float32): np.int32, np.dtype(np.float16): np.int16}
 
 
-def unit_roundoff(dtype) -> float:
+def unit_roundoff(dtype: DTypeLike) -> float:
     """Half the spacing of the floats at 1: the largest relative error of one rounding (Higham 2002, 2.1)."""
     return float(np.finfo(dtype).eps) / 2
 
@@ -25,12 +26,12 @@ def ordinal(x: Float[np.ndarray, "..."]) -> Int[np.ndarray, "..."]:
     return np.where(bits < 0, lowest - bits, bits)
 
 
-def ulp_distance(a, b, dtype=np.float64) -> Int[np.ndarray, "..."]:
+def ulp_distance(a, b, dtype: DTypeLike = np.float64) -> Int[np.ndarray, "..."]:
     """How many floats of dtype lie from a to b, with sign (b above a is positive)."""
     return np.asarray(ordinal(np.asarray(b, dtype)) - ordinal(np.asarray(a, dtype)))
 
 
-def neighbor(x, ulps: int, dtype=np.float64):
+def neighbor(x, ulps: int, dtype: DTypeLike = np.float64):
     """The float that lies the given number of ulps above x (below, where negative)."""
     x = np.asarray(x, dtype)
     integer = _SIGNED[x.dtype]

@@ -24,8 +24,8 @@ class MdnumCalculator(Calculator):
     """What mdnum computes for a system file, wherever ASE takes a calculator.
 
     For relaxing with ase.optimize, for stress and equations of state, and for holding mdnum's forces
-    against ASE's own tools. Every call searches neighbors anew; for molecular dynamics use mdnum's rollout,
-    which keeps a list and records its flips.
+    against ASE's own tools. A Verlet list is kept between calls until motion and box strain have used its
+    skin; for molecular dynamics use mdnum's rollout, which records its flips.
 
     Args:
         system: a `System`, or the name or path of one; its structure is not used.
@@ -75,25 +75,28 @@ class MdnumCalculator(Calculator):
             self._template = system
         else:
             self._template = systems.load(str(system), overrides)
-        self._simulation: Any = None
+        self._evaluator: Any = None
 
     @property
     def system(self) -> System:
         """What is evaluated: the tables of the system file with the atoms of the last call."""
-        return self._template if self._simulation is None else self._simulation.system
+        return self._template if self._evaluator is None else self._evaluator.simulation.system
 
     def calculate(self, atoms=None, properties=None, system_changes=all_changes):
         """Evaluate (see ase.calculators.calculator.Calculator)."""
         super().calculate(atoms, properties or ["energy"], system_changes)
         atoms = cast(Atoms, self.atoms)
-        if self._simulation is None or _REBUILD & set(system_changes):
+        if self._evaluator is None or _REBUILD & set(system_changes):
+            from mdnum.systems.evaluate import Evaluator
+
             # only what the forces depend on: constraints and the like stay with ASE
             bare = Atoms(numbers=atoms.numbers, positions=atoms.positions, cell=atoms.cell, pbc=atoms.pbc)
-            # no list outlives a call, so a skin would only ask for a wider box
+            # the evaluator keeps as much of the skin as the box has room for; it must not be refused for it
             neighbors = self._template.spec.neighbors.model_copy(update={"skin": 0.0})
             spec = self._template.spec.model_copy(update={"neighbors": neighbors})
-            self._simulation = systems.build(replace(self._template, spec=spec, atoms=bare))
-        evaluation = self._simulation.evaluate(atoms.get_positions(), np.asarray(atoms.cell))
+            simulation = systems.build(replace(self._template, spec=spec, atoms=bare))
+            self._evaluator = Evaluator(simulation, skin=self._template.spec.skin)
+        evaluation = self._evaluator(atoms.get_positions(), np.asarray(atoms.cell))
         energy = float(evaluation.energy)
         self.results = {
             "energy": energy,

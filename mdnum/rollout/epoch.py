@@ -89,6 +89,9 @@ class Record(NamedTuple):
     moved: Float[Array, "rows"]
 
 
+_NUMBERS = ("potential", "kinetic", "virial", "heat", "nearest", "moved")
+
+
 class Outcome(NamedTuple):
     """How an epoch's loop ended.
 
@@ -113,15 +116,12 @@ class Outcome(NamedTuple):
 def empty_record(rows: int, words: int, atoms: int, dtype, record: bool) -> Record:
     """Room for the rows of an epoch; without recording only the per-step numbers have room."""
     shape = (rows, 3, atoms) if record else (rows, 3, 0)
-    numbers = [jnp.zeros(rows, jnp.float64) for _ in range(4)]
     return Record(
-        jnp.zeros(shape, dtype),
-        jnp.zeros(shape, dtype),
-        jnp.zeros(shape, jnp.int32),
-        jnp.zeros((rows, words, atoms if record else 0), jnp.uint8),
-        *numbers,
-        jnp.zeros(rows, jnp.float64),
-        jnp.zeros(rows, jnp.float64),
+        x=jnp.zeros(shape, dtype),
+        v=jnp.zeros(shape, dtype),
+        images=jnp.zeros(shape, jnp.int32),
+        bits=jnp.zeros((rows, words, atoms if record else 0), jnp.uint8),
+        **{name: jnp.zeros(rows, jnp.float64) for name in _NUMBERS},
     )
 
 

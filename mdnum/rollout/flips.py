@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -160,8 +160,7 @@ def decided_pairs(simulation: Simulation, segment: Segment, row: int) -> Int[np.
 def true_pairs(simulation: Simulation, wrapped: Float[np.ndarray, "atoms 3"]) -> Int[np.ndarray, "pairs"]:
     """Keys of all pairs inside, from a fresh search; same convention and bits as the program's."""
     decider = simulation.decider
-    verlet = replace(simulation.verlet_list(), rule=replace(simulation.rule, skin=0.0), slots=0)
-    table = verlet.build(np.asarray(wrapped, np.float64), simulation.cell)
+    table = simulation.verlet_list(skin=0.0).build(np.asarray(wrapped, np.float64), simulation.cell)
     slot, column = np.nonzero(table.index < simulation.atoms)
     i, j = table.order[column], table.order[table.index[slot, column]]
     keep = i < j

@@ -89,7 +89,7 @@ class ListHealth:
 
     def _audit(self, segment: Segment, moved, epoch: Epoch) -> None:
         skin = self.simulation.rule.skin
-        for row in np.flatnonzero(2 * moved > skin):
+        for row in np.flatnonzero(2 * moved > skin).tolist():
             positions = segment.unsorted("x", row).astype(np.float64)
             if not np.all(np.isfinite(positions)):
                 continue
@@ -97,7 +97,7 @@ class ListHealth:
             missing = np.setdiff1d(true, decided_pairs(self.simulation, segment, row), assume_unique=True)
             if not len(missing):
                 continue
-            step = segment.first + int(row)
+            step = segment.first + row
             for tally in (epoch, self):
                 tally.lost_pair_steps += len(missing)
                 tally.lost |= set(missing.tolist())

@@ -151,6 +151,7 @@ class Rollout:
 
     def _take(self, segment: Segment, interval: int) -> None:
         done = self.done
+        assert segment.before is not None, "a recorded segment knows the decisions before it"
         before = self.recorder.inside(segment.before)
         done.health.check_count(segment, before, done.pairs)
         pairs = self.recorder.counts(segment)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -14,7 +14,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mdnum.errors import InputError
-from mdnum.md.cell import Cell, wrap_positions
+from mdnum.events import set_bits
+from mdnum.md.cell import Cell, displacement
 from mdnum.md.cutoffs import BY_NAME as CUTOFFS
 from mdnum.md.decide import PairDecider, Tables
 from mdnum.md.integrators import Integrator, Langevin, VelocityVerlet
@@ -28,33 +29,14 @@ from mdnum.systems import pairs, schema
 from mdnum.systems.load import System, load
 from mdnum.units import Units
 
+if TYPE_CHECKING:
+    from mdnum.systems.evaluate import Evaluation
+
 _POTENTIALS: Mapping[str, type[PairPotential]] = {
     "lennard-jones": LennardJones,
     "morse": Morse,
     "soft-sphere": SoftSphere,
 }
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """Energies and forces of one configuration.
-
-    Attributes:
-        energy: total energy.
-        forces: shape (atoms, 3), energy/length.
-        stress: dE/dstrain / volume (ASE's sign), shape (3, 3), energy/length³; NaN without a volume.
-        energies: per atom, shape (atoms,), pair terms split evenly; NaN for many-body potentials.
-        i, j: pairs inside the (longest) cutoff, i < j.
-        distance: of those pairs, length.
-    """
-
-    energy: float
-    forces: Float[np.ndarray, "atoms 3"]
-    stress: Float[np.ndarray, "3 3"]
-    energies: Float[np.ndarray, "atoms"]
-    i: Int[np.ndarray, "pairs"]
-    j: Int[np.ndarray, "pairs"]
-    distance: Float[np.ndarray, "pairs"]
 
 
 @dataclass(frozen=True)
@@ -150,9 +132,10 @@ class Simulation:
             return self.model.jumps()
         return np.array([float(self.model.energy_jump)]), np.array([float(self.model.force_jump)])
 
-    def verlet_list(self) -> VerletList:
-        """A new Verlet list for this system."""
-        return VerletList(BUILDERS[self.builder], self.rule, self.r_cut, guard=self._guard)
+    def verlet_list(self, skin: float | None = None) -> VerletList:
+        """A new Verlet list for this system, with another skin where one is given."""
+        rule = self.rule if skin is None else replace(self.rule, skin=skin)
+        return VerletList(BUILDERS[self.builder], rule, self.r_cut, guard=self._guard)
 
     @property
     def _guard(self) -> float:
@@ -195,36 +178,12 @@ class Simulation:
         Raises:
             InputError: the cutoff exceeds half the smallest perpendicular width.
         """
-        here = self if cell is None else self.with_cell(Cell.create(cell, self.pbc))
-        at = np.asarray(self.positions if positions is None else positions, np.float64)
-        wrapped, _ = wrap_positions(here.cell, at)
-        table = VerletList(BUILDERS[here.builder], replace(here.rule, skin=0.0), here.r_cut).build(
-            wrapped, here.cell
-        )
-        tables = here.tables(table)
-        x = jnp.asarray(wrapped[table.order].T, here.policy.dtype("state"))
-        result, virial = _evaluate(here.force, x, tables)
-        forces = np.empty((here.atoms, 3))
-        forces[table.order] = np.asarray(result.force, np.float64).T
-        energies = np.full(here.atoms, np.nan)
-        if here.pairwise:
-            energies[table.order] = np.asarray(result.energy, np.float64)
-        i, j, distance = here.inside(wrapped, table, np.asarray(result.decisions.bits))
-        return Evaluation(
-            float(jnp.sum(result.energy, dtype=jnp.float64)),
-            forces,
-            -np.asarray(virial) / here.cell.volume,
-            energies,
-            i,
-            j,
-            distance,
-        )
+        from mdnum.systems.evaluate import Evaluator
+
+        return Evaluator(self, skin=0.0)(positions, cell)
 
     def inside(self, wrapped, table: PairTable, bits) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Pairs i < j whose decision is yes, sorted, with their distances."""
-        from mdnum.events import set_bits
-        from mdnum.md.cell import displacement
-
         slots, columns = set_bits(bits)
         i, j = table.order[columns], table.order[table.index[slots, columns]]
         keep = i < j
@@ -233,13 +192,6 @@ class Simulation:
         i, j = i[order], j[order]
         dx, dy, dz = displacement(self.cell, wrapped[i], wrapped[j])
         return i, j, np.sqrt(dx * dx + dy * dy + dz * dz)
-
-
-@eqx.filter_jit
-def _evaluate(force: PairForce | ManyBodyForce, x, tables: Tables):
-    """Forces with decisions, and the virial tensor sum r_ij ⊗ F_ij."""
-    result = force(x, tables, decisions=True)
-    return result, force.virial_tensor(x, tables)
 
 
 def _extent(cell: Cell, positions) -> tuple[float, float, float]:
