@@ -58,7 +58,7 @@ def _dual(cell: Float[Array, "3 3"], periodic: tuple[int, ...]) -> Float[Array, 
 
 
 def displacement(
-    cell: Float[Array, "3 3"], pbc: tuple[bool, bool, bool] = (True, True, True)
+    cell: Float[Array | np.ndarray, "3 3"], pbc: tuple[bool, bool, bool] = (True, True, True)
 ) -> Displacement:
     """Minimum-image displacement in real coordinates, in the form every jax-md energy function takes.
 

@@ -70,7 +70,7 @@ def upstream() -> ModuleType:
     return jax_md
 
 
-def scalar(value: float) -> Float[Array, ""]:
+def scalar(value: float | np.ndarray) -> Float[Array, ""]:
     """A number in the only form that jax-md keeps in float64.
 
     jax_md.util.maybe_downcast turns Python floats, numpy floats and numpy arrays into float32 even under
@@ -267,7 +267,7 @@ class PairSearch:
 
 
 def dense_pairs(
-    positions: Float[np.ndarray, "atoms 3"],
+    positions: Float[Array | np.ndarray, "atoms 3"],
     cell: Float[np.ndarray, "3 3"],
     pbc: tuple[bool, bool, bool],
     r_list: float,
@@ -275,7 +275,8 @@ def dense_pairs(
     capacity_multiplier: float = 1.25,
 ) -> Int[np.ndarray, "atoms slots"]:
     """Neighbors within r_list found by jax-md, once; see PairSearch for repeated searches."""
-    return PairSearch(cell, pbc, r_list, capacity_multiplier=capacity_multiplier)(positions)
+    search = PairSearch(cell, pbc, r_list, capacity_multiplier=capacity_multiplier)
+    return search(np.asarray(positions))
 
 
 @dataclass(frozen=True)
@@ -297,7 +298,7 @@ class Relaxed:
 
 def relax(
     energy_or_force_fn: Callable[..., Array],
-    positions: Float[np.ndarray, "atoms 3"],
+    positions: Float[Array | np.ndarray, "atoms 3"],
     *,
     neighbors: Callable[[np.ndarray], Any] | None = None,
     skin: float | None = None,

@@ -1,0 +1,485 @@
+"""jax-md's defects, each asserted to be still there, beside the work-around that mdnum has for it.
+
+A test here turns red the day upstream mends the defect; its message says what may then be dropped. What
+mdnum does about each is asserted in the same test, so that a work-around cannot be lost either.
+"""
+
+from __future__ import annotations
+
+import io
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from ase import Atoms
+from ase.build import bulk
+from ase.neighborlist import neighbor_list
+
+from mdnum.errors import CapacityError, InputError, NumericalError
+from mdnum.md import jaxmd, manybody
+
+pytestmark = pytest.mark.jax_md
+ALWAYS = (True, True, True)
+
+
+@pytest.fixture(scope="module")
+def md():
+    return jaxmd.upstream()
+
+
+def mended(defect: str, drop: str) -> str:
+    return f"jax-md no longer {defect}; {drop}"
+
+
+def nothing(*_, **__):
+    """In place of a list builder, where only the energy function is wanted."""
+
+
+def random_points(atoms: int, cell: np.ndarray, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).random((atoms, 3)) @ cell
+
+
+def ase_rows(positions, cell, pbc, r_list) -> list[set[int]]:
+    atoms = Atoms(f"H{len(positions)}", positions=positions, cell=cell, pbc=pbc)
+    i, j = neighbor_list("ij", atoms, r_list)
+    return [set(j[i == atom]) for atom in range(len(positions))]
+
+
+def rows_of(idx: np.ndarray) -> list[set[int]]:
+    return [set(row[row < len(idx)]) for row in idx]
+
+
+def silicon(rattle: float) -> Atoms:
+    atoms = bulk("Si", "diamond", a=5.431, cubic=True) * (2, 2, 2)
+    atoms.rattle(rattle, seed=3)
+    return atoms
+
+
+def dense_list(atoms: Atoms, r_list: float):
+    idx = jaxmd.dense_pairs(atoms.positions, atoms.cell.array, ALWAYS, r_list)
+    padded = np.pad(idx, ((0, 0), (0, 2)), constant_values=len(atoms))
+    return jaxmd.as_neighbor_list(padded, atoms.positions)
+
+
+TERSOFF = {
+    "mTf": 3.0, "gamma": 1.0, "lam3": 1.7322, "cTf": 1.0039e5, "dTf": 16.218, "hTf": -0.59826, "nTf": 0.78734,
+    "beta": 1.0999e-6, "lam2": 1.7322, "B": 471.18, "R": 2.85, "D": 0.15, "lam1": 2.4799, "A": 1830.8,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("value", [3.405, np.float64(3.405), np.array(3.405)])
+def test_constants_are_rounded_to_float32_under_x64(md, value):
+    rounded = md.util.maybe_downcast(value)
+    assert rounded.dtype == jnp.float32, mended(
+        "rounds constants to float32 (util.maybe_downcast)", "mdnum.md.jaxmd.scalar may go"
+    )
+    kept = md.util.maybe_downcast(jaxmd.scalar(value))
+    assert kept.dtype == jnp.float64 and float(kept) == 3.405
+
+
+def test_the_threshold_moves_with_float32_constants(md):
+    cell = np.eye(3) * 20.0
+
+    def energy(constant):
+        _, fn = md.energy.lennard_jones_neighbor_list(
+            jaxmd.displacement(cell), 1.0, sigma=constant(3.405), epsilon=constant(0.0103),
+            r_onset=constant(2.0), r_cutoff=constant(2.5), neighbor_list_fn=nothing,
+        )  # fmt: skip
+        points = jnp.asarray([[0.0, 0, 0], [3.8, 0, 0]])
+        return float(fn(points, jaxmd.as_neighbor_list(np.array([[1], [0]]), np.asarray(points))))
+
+    exact = 4 * 0.0103 * ((3.405 / 3.8) ** 12 - (3.405 / 3.8) ** 6)
+    assert abs(energy(jaxmd.scalar) / exact - 1) < 1e-14
+    assert abs(energy(float) / exact - 1) > 1e-9, mended("loses digits of sigma", "scalar() may go")
+
+
+def test_malformed_box_is_inverted(md):
+    good = jnp.asarray([[9.0, 1.0, 0.5], [0, 9.0, 1.0], [0, 0, 9.0]])
+    flags = {}
+    for name, box in {"good": good, "bad": good.T}.items():
+        displacement, _ = md.space.periodic_general(box)
+        functions = md.partition.neighbor_list(
+            displacement, box, jaxmd.scalar(2.0), jaxmd.scalar(0.0), fractional_coordinates=True
+        )
+        flags[name] = bool(functions.allocate(jnp.asarray(random_points(60, np.eye(3)))).malformed_box)
+    assert flags == {"good": True, "bad": False}, mended(
+        "inverts malformed_box", "PairSearch may hand it boxes instead of widths"
+    )
+    # mdnum looks at its own cells
+    with pytest.raises(InputError, match="linearly dependent"):
+        jaxmd.dense_pairs(np.zeros((3, 3)), np.ones((3, 3)), ALWAYS, 1.0)
+
+
+def test_cell_list_drops_pairs_outside_the_box(md):
+    side, r_list = 12.0, 2.5
+    inside = random_points(400, np.eye(3) * side)
+    outside = inside + side * np.random.default_rng(1).integers(-2, 3, inside.shape)
+    displacement, _ = md.space.periodic(jaxmd.scalar(side), wrapped=False)
+    functions = md.partition.neighbor_list(displacement, jaxmd.scalar(side), jaxmd.scalar(r_list))
+
+    def count(points):
+        found = functions.allocate(jnp.asarray(points))
+        assert int(found.error.code) == 0
+        return int((found.idx < 400).sum())
+
+    assert count(outside) < count(inside), mended(
+        "drops pairs of unwrapped positions", "PairSearch need not fold positions"
+    )
+    expected = ase_rows(inside, np.eye(3) * side, ALWAYS, r_list)
+    search = jaxmd.PairSearch(np.eye(3) * side, ALWAYS, r_list)
+    for points in (inside, outside, inside - 1e-17):
+        assert rows_of(search(points)) == expected
+
+
+def test_a_shrinking_box_triggers_no_rebuild(md):
+    displacement, _ = md.space.periodic_general(jaxmd.scalar(12.0))
+    functions = md.partition.neighbor_list(
+        displacement, jaxmd.scalar(12.0), jaxmd.scalar(2.0), jaxmd.scalar(0.4),
+        fractional_coordinates=True, capacity_multiplier=4.0,
+    )  # fmt: skip
+    points = jnp.asarray(random_points(300, np.eye(3)))
+    before = functions.allocate(points)
+    smaller = jaxmd.scalar(9.0)
+    after = before.update(points, box=smaller)
+    fresh = functions.allocate(points, box=smaller)
+    listed, there = (int((found.idx < 300).sum()) for found in (after, fresh))
+    assert listed < there, mended(
+        "keeps a list while its box shrinks", "the strain criterion of the rebuild rule may go"
+    )
+    # mdnum's lists cannot update themselves: a new cell is a new search
+    own = dense_list(silicon(0.0), 3.0)
+    with pytest.raises(InputError, match="cannot update itself"):
+        own.update(own.reference_position)
+
+
+def test_a_cutoff_over_half_the_box_has_no_flag(md):
+    side, r_list = 4.0, 2.6
+    points = random_points(8, np.eye(3) * side)
+    displacement, _ = md.space.periodic(jaxmd.scalar(side))
+    found = md.partition.neighbor_list(displacement, jaxmd.scalar(side), jaxmd.scalar(r_list)).allocate(
+        jnp.asarray(points)
+    )
+    atoms = Atoms("H8", positions=points, cell=np.eye(3) * side, pbc=True)
+    assert int((found.idx < 8).sum()) < len(neighbor_list("i", atoms, r_list)), mended(
+        "misses further images", "the refusal in PairSearch may be relaxed"
+    )
+    assert int(found.error.code) == 0
+    with pytest.raises(InputError, match=r"radius 2\.6 in a cell 4 wide; .*up to 2"):
+        jaxmd.PairSearch(np.eye(3) * side, ALWAYS, r_list)
+    tilted = np.array([[6.0, 0, 0], [5.0, 6.0, 0], [0, 0, 6.0]])
+    with pytest.raises(InputError, match=r"in a cell 4\.60"):
+        jaxmd.PairSearch(tilted, ALWAYS, 2.5)
+
+
+def test_vmap_of_update_rebuilds_every_time(md):
+    displacement, _ = md.space.periodic(jaxmd.scalar(6.0))
+    functions = md.partition.neighbor_list(
+        displacement, jaxmd.scalar(6.0), jaxmd.scalar(1.5), jaxmd.scalar(0.3)
+    )
+    points = jnp.asarray(random_points(20, np.eye(3) * 6.0))
+    found = functions.allocate(points)
+
+    def update(positions):
+        return found.update(positions).idx
+
+    one = str(jax.make_jaxpr(update)(points))
+    many = str(jax.make_jaxpr(jax.vmap(update))(jnp.stack([points, points])))
+    assert "cond[" in one
+    assert "cond[" not in many, mended("rebuilds under vmap", "lists may be rebuilt inside a batched loop")
+
+
+def test_the_cutoff_has_no_derivative(md):
+    points = jnp.asarray([[0.0, 0, 0], [2.4, 0, 0]])
+    neighbor = jaxmd.as_neighbor_list(np.array([[1], [0]]), np.asarray(points))
+
+    def energy(r_cut):
+        _, fn = md.energy.lennard_jones_neighbor_list(
+            jaxmd.displacement(np.eye(3) * 20), 1.0, sigma=jaxmd.scalar(1.0), epsilon=jaxmd.scalar(1.0),
+            r_onset=jaxmd.scalar(2.4999), r_cutoff=r_cut, neighbor_list_fn=nothing,
+        )  # fmt: skip
+        return fn(points, neighbor)
+
+    # the energy jumps from 0 to u(r) as r_cut passes the pair, and no derivative says so
+    assert float(energy(jaxmd.scalar(2.5))) < -0.01
+    assert float(jax.grad(energy)(jaxmd.scalar(2.5))) == 0.0, mended(
+        "gives 0 for the derivative with respect to r_cut", "the event term may double count"
+    )
+    traced = []
+
+    def builder(*args, **_):
+        traced.append(args[2])
+
+    md.energy.lennard_jones_neighbor_list(
+        jaxmd.displacement(np.eye(3) * 20), 1.0, r_cutoff=jaxmd.scalar(2.5), neighbor_list_fn=builder
+    )
+    assert float(traced[0]) == 2.5
+
+
+def test_tersoff_forces_are_nan_beside_padding(md):
+    atoms = silicon(0.15)
+    neighbor = dense_list(atoms, 3.0)
+    _, energy_fn = md.energy.tersoff_neighbor_list(
+        jaxmd.displacement(atoms.cell.array), 1.0, [TERSOFF], neighbor_list_fn=nothing
+    )
+    positions = jnp.asarray(atoms.positions)
+    assert np.isfinite(float(energy_fn(positions, neighbor)))
+    gradient = np.asarray(jax.grad(energy_fn)(positions, neighbor))
+    assert np.isnan(gradient).any(), mended(
+        "masks the bond order after its power (NaN forces)",
+        "mdnum.md.manybody.tersoff may wrap jax-md's energy function, if its cosines are mended too",
+    )
+    cell = jnp.asarray(atoms.cell.array)
+    assert np.isfinite(np.asarray(manybody.tersoff().forces(positions, neighbor, cell))).all()
+
+
+def test_a_list_with_a_skin_changes_an_energy_that_does_not_test_its_cutoff(md):
+    cell = np.eye(3) * 12.0
+    points = jnp.asarray(random_points(100, cell))
+    energy_fn = md.smap.pair_neighbor_list(
+        lambda dr: 1 / (1 + dr) ** 6, md.space.canonicalize_displacement_or_metric(jaxmd.displacement(cell))
+    )
+    energies = [
+        float(energy_fn(points, jaxmd.as_neighbor_list(jaxmd.dense_pairs(points, cell, ALWAYS, r), points)))
+        for r in (3.0, 3.5)
+    ]
+    assert energies[0] != energies[1], mended(
+        "evaluates pairs of the skin", "the note in manybody.from_jax_md may go"
+    )
+
+
+def test_tersoff_wrapper_takes_real_coordinates_for_fractional_ones(md):
+    atoms = bulk("Si", "diamond", a=5.431, cubic=True) * (3, 3, 3)
+    side = jaxmd.scalar(float(atoms.cell.array[0, 0]))
+    displacement, _ = md.space.periodic(side)
+    points = jnp.asarray(atoms.positions)
+    energies = []
+    for extra in ({}, {"fractional_coordinates": False}):
+        neighbor_fn, energy_fn = md.energy.tersoff_neighbor_list(displacement, side, [TERSOFF], **extra)
+        energies.append(float(energy_fn(points, neighbor_fn.allocate(points))) / len(atoms))
+    assert energies[1] == pytest.approx(-4.63, abs=5e-3)
+    assert energies[0] > -1.0, mended(
+        "defaults to fractional coordinates in Tersoff", "nothing: mdnum uses none of its list builders"
+    )
+
+
+def test_tersoff_loader_refuses_one_line_and_a_second_species(md):
+    entry = (
+        "Si Si Si 3 1 1.7322 100390 16.218 -0.59826 0.78734 1.0999e-6 1.7322 471.18 2.85 0.15 2.4799 1830.8"
+    )
+    assert len(entry.split()) == 17
+    with pytest.raises(UnboundLocalError):
+        md.energy.load_lammps_tersoff_parameters(io.StringIO(entry))
+    with pytest.raises(NotImplementedError):
+        md.energy.tersoff_neighbor_list(
+            jaxmd.displacement(np.eye(3)), 1.0, [TERSOFF], species=jnp.zeros(2, jnp.int32)
+        )
+
+
+def test_eam_loader_wants_a_word_and_no_newline_and_rounds_to_float32(md):
+    n = 12
+    numbers = [f"{0.1 + k / 7:.17g}" for k in range(3 * n)]
+    table = ["Cu", "", "", "1 Cu", f"{n} 0.1 {n} 0.3 3.3", "29 63.546 3.615 fcc", *numbers]
+    with pytest.raises(ValueError, match="setfl"):
+        md.energy.load_lammps_eam_parameters(io.StringIO("\n".join(table)))
+    table[0] = "Cu setfl"
+    charge, embedding, _, _ = md.energy.load_lammps_eam_parameters(io.StringIO("\n".join([*table, ""])))
+    value = float(embedding(jnp.asarray(0.5)))
+    assert value != float(numbers[5]) and value == pytest.approx(float(numbers[5]), rel=1e-6), mended(
+        "rounds EAM tables to float32", "mdnum.md.manybody.setfl may go"
+    )
+    assert float(charge(jnp.asarray(100.0))) == 0.0, mended(
+        "returns 0 off its splines", "the NaN of EmbeddedAtom.embed may be reconsidered"
+    )
+    # the last number is dropped where no newline ends the file
+    with pytest.raises(Exception):  # noqa: B017  (whatever comes of a table that is one short)
+        md.energy.load_lammps_eam_parameters(io.StringIO("\n".join(table)))
+
+
+def test_eam_counts_the_density_of_the_atom_itself(md):
+    side = 6.0
+    points = jnp.asarray(random_points(10, np.eye(3) * side, seed=4))
+    displacement, _ = md.space.periodic(jaxmd.scalar(side))
+
+    def charge(r):
+        return jnp.exp(-r)
+
+    neighbor_fn, energy_fn = md.energy.eam_neighbor_list(
+        displacement, jaxmd.scalar(side), charge, lambda rho: rho, lambda r: 0 * r, jaxmd.scalar(2.9),
+        dr_threshold=jaxmd.scalar(0.0), format=md.partition.Dense,
+    )  # fmt: skip
+    theirs = float(energy_fn(points, neighbor_fn.allocate(points)))
+    idx = jaxmd.dense_pairs(np.asarray(points), np.eye(3) * side, ALWAYS, 2.9)
+    ours = float(energy_fn(points, jaxmd.as_neighbor_list(idx, np.asarray(points))))
+    # exp(0) = 1 for each of ten atoms
+    assert theirs - ours == pytest.approx(10.0, abs=1e-12), mended(
+        "counts the density at r = 0", "as_neighbor_list and EmbeddedAtom.charge need not exclude the atom"
+    )
+    # a list that names the atom itself is cleaned on the way in
+    with_self = np.concatenate([idx, np.arange(10, dtype=np.int32)[:, None]], axis=1)
+    assert float(energy_fn(points, jaxmd.as_neighbor_list(with_self, np.asarray(points)))) == ours
+
+
+def test_cosines_are_bent_by_a_length_of_1e_minus_7(md):
+    a, b = jnp.asarray([2.35, 0.0, 0.0]), jnp.asarray([0.0, 0.0, 2.35]) + jnp.asarray([2.35, 0.0, 0.0])
+    cosine = float(md.quantity.cosine_angle_between_two_vectors(a, b))
+    offset = np.sqrt(0.5) - cosine
+    assert offset == pytest.approx(np.sqrt(0.5) * (1e-7 / 2.35 + 1e-7 / (2.35 * np.sqrt(2))), rel=1e-3), (
+        mended("adds 1e-7 to lengths in cosines", "the unit of length in manybody.stillinger_weber may go")
+    )
+    scaled = float(md.quantity.cosine_angle_between_two_vectors(a * 2.0**24, b * 2.0**24))
+    assert abs(scaled - np.sqrt(0.5)) < 1e-14
+
+
+def test_fire_steps_in_float16(md):
+    init, _ = md.minimize.fire_descent(lambda R: jnp.sum(R**2), lambda R, dR, **_: R + dR, dt_start=0.1)
+    assert init(jnp.ones((2, 3))).dt.dtype == jnp.float16, mended(
+        "keeps FIRE's time step in float16", "relax need not replace it"
+    )
+
+
+def test_jax_md_cannot_be_imported_under_strict_promotion():
+    script = """
+import jax
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+try:
+    import jax_md
+except Exception as error:
+    print("refused", type(error).__name__)
+    for name in [name for name in __import__("sys").modules if name.startswith("jax_md")]:
+        del __import__("sys").modules[name]
+from mdnum.md import jaxmd
+print(jaxmd.upstream().__name__, jax.config.jax_numpy_dtype_promotion)
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "refused TypePromotionError" in done.stdout, mended(
+        "mixes dtypes while it is imported", "upstream() may be a plain import"
+    )
+    assert "jax_md strict" in done.stdout
+
+
+@pytest.mark.parametrize("pbc", [ALWAYS, (True, False, True), (False, True, False), (False, False, False)])
+@pytest.mark.parametrize("tilt", [0.0, 0.35])
+def test_pair_search_equals_ase_in_any_cell(pbc, tilt):
+    cell = np.array([[11.0, 0, 0], [tilt * 11, 12.0, 0], [tilt * 5, -tilt * 7, 13.0]])
+    search = jaxmd.PairSearch(cell, pbc, 3.1)
+    for seed in range(3):
+        points = random_points(250, cell, seed)
+        assert rows_of(search(points)) == ase_rows(points, cell, pbc, 3.1)
+        # atoms drift out of the frame along free axes
+        drifted = points + np.random.default_rng(seed).normal(0, 2.0, points.shape)
+        assert rows_of(search(drifted)) == ase_rows(drifted, cell, pbc, 3.1)
+
+
+def test_pair_search_grows_when_atoms_crowd():
+    cell = np.eye(3) * 15.0
+    search = jaxmd.PairSearch(cell, ALWAYS, 3.0, capacity_multiplier=1.0)
+    sparse = random_points(200, cell)
+    crowded = sparse.copy()
+    crowded[:60] = 7.0 + np.random.default_rng(5).random((60, 3))
+    assert search(sparse).shape[1] < 60
+    assert rows_of(search(crowded)) == ase_rows(crowded, cell, ALWAYS, 3.0)
+
+
+def test_pair_search_refuses_positions_that_are_not_finite():
+    points = random_points(20, np.eye(3) * 9)
+    points[7, 1] = np.nan
+    with pytest.raises(NumericalError, match="position of atom 7"):
+        jaxmd.dense_pairs(points, np.eye(3) * 9, ALWAYS, 3.0)
+
+
+@pytest.mark.parametrize("format", ["dense", "sparse", "ordered-sparse"])
+def test_a_list_from_outside_equals_jax_mds_own(md, format):
+    side = 9.0
+    points = random_points(80, np.eye(3) * side)
+    displacement, _ = md.space.periodic(jaxmd.scalar(side))
+    name = {"dense": "Dense", "sparse": "Sparse", "ordered-sparse": "OrderedSparse"}[format]
+    theirs = md.partition.neighbor_list(
+        displacement, jaxmd.scalar(side), jaxmd.scalar(2.8), format=getattr(md.partition, name)
+    ).allocate(jnp.asarray(points))
+    idx = jaxmd.dense_pairs(points, np.eye(3) * side, ALWAYS, 2.8)
+    ours = jaxmd.as_neighbor_list(idx, points, format)
+    traced = jax.jit(lambda rows: jaxmd.as_neighbor_list(rows, points, format).idx)(idx)
+    for found in (ours.idx, traced):
+        if format == "dense":
+            assert rows_of(np.asarray(found)) == rows_of(np.asarray(theirs.idx))
+        else:
+            pairs = [
+                {tuple(column) for column in np.asarray(a).T if column[0] < 80} for a in (found, theirs.idx)
+            ]
+            assert pairs[0] == pairs[1] and len(pairs[0]) > 50
+    assert ours.format is theirs.format
+    assert jax.tree.structure(jax.jit(lambda held: held)(ours)) == jax.tree.structure(ours)
+
+
+def test_a_sparse_list_too_small_is_an_error():
+    idx = jaxmd.dense_pairs(random_points(40, np.eye(3) * 8), np.eye(3) * 8, ALWAYS, 3.0)
+    count = int((idx < 40).sum())
+    roomy = jaxmd.as_neighbor_list(idx, np.zeros((40, 3)), "sparse", capacity=count)
+    assert roomy.idx.shape == (2, count)
+    with pytest.raises(CapacityError, match=f"{count} neighbors in a list with {count - 1} slots"):
+        jaxmd.as_neighbor_list(idx, np.zeros((40, 3)), "sparse", capacity=count - 1)
+
+
+def test_relaxation_finds_the_crystal_over_a_list_that_must_be_rebuilt():
+    atoms = silicon(0.25)
+    potential = manybody.stillinger_weber()
+    cell, built = jnp.asarray(atoms.cell.array), []
+
+    def neighbors(positions):
+        built.append(positions)
+        return dense_list(
+            Atoms("Si64", positions=positions, cell=atoms.cell, pbc=True), potential.r_cut + 0.2
+        )
+
+    def energy(positions, neighbor):
+        return potential.energy(positions, neighbor, cell)
+
+    relaxed = jaxmd.relax(energy, atoms.positions, neighbors=neighbors, skin=0.2, force_tolerance=1e-8)
+    assert relaxed.converged and relaxed.force_max <= 1e-8 and len(built) > 2
+    neighbor = neighbors(relaxed.positions)
+    # 2.16826 eV is half the cohesive energy of the crystal, in epsilon
+    per_atom = float(energy(jnp.asarray(relaxed.positions), neighbor)) / len(atoms)
+    assert per_atom == pytest.approx(-2 * potential.epsilon, abs=1e-4)
+    short = jaxmd.relax(energy, atoms.positions, neighbors=neighbors, skin=0.2, max_steps=3)
+    assert short.steps == 3 and not short.converged
+    with pytest.raises(InputError, match="needs a skin"):
+        jaxmd.relax(energy, atoms.positions, neighbors=neighbors)
+
+
+def test_relaxation_takes_forces_and_notices_nan():
+    start = np.array([[1.0, -2.0, 0.5], [0.3, 0.2, 0.1]])
+    relaxed = jaxmd.relax(lambda R: -4 * R, start, force_tolerance=1e-10)
+    assert relaxed.converged and np.abs(relaxed.positions).max() < 1e-10
+    with pytest.raises(NumericalError, match="not finite"):
+        jaxmd.relax(lambda R: jnp.sum(jnp.sqrt(R - 10)), start)
+
+
+@pytest.mark.parametrize("pbc", [ALWAYS, (True, True, False), (False, False, True), (False, False, False)])
+def test_displacement_is_ases_and_follows_a_cell_given_later(pbc):
+    from ase.geometry import find_mic
+
+    cell = np.array([[9.0, 0, 0], [2.0, 8.0, 0], [-1.0, 1.5, 10.0]])
+    points = random_points(40, cell, 2)
+    vectors = (points[:, None] - points[None]).reshape(-1, 3)
+    shortest, length = find_mic(vectors, cell, pbc)
+    near = length < 3.9
+    table = jax.vmap(jax.vmap(jaxmd.displacement(np.eye(3), pbc), (None, 0, None)), (0, None, None))
+    ours = np.asarray(table(jnp.asarray(points), jnp.asarray(points), jnp.asarray(cell))).reshape(-1, 3)
+    np.testing.assert_allclose(ours[near], shortest[near], rtol=0, atol=1e-13)
+    same = jaxmd.displacement(cell, pbc)(jnp.asarray(points[0]), jnp.asarray(points[0] + 0.125))
+    np.testing.assert_array_equal(np.asarray(same), points[0] - (points[0] + 0.125))
+    bent = jaxmd.displacement(cell, pbc)(
+        jnp.asarray(points[0]), jnp.asarray(points[0] + 0.125), perturbation=2 * jnp.eye(3)
+    )
+    np.testing.assert_array_equal(np.asarray(bent), 2 * np.asarray(same))
+
+
+def test_importing_the_adaptor_does_not_import_jax_md():
+    script = "import sys, mdnum.md.jaxmd, mdnum.md.manybody; print('jax_md' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"

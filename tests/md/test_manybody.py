@@ -1,0 +1,371 @@
+"""Many-body potentials against ASE and against extended precision, and at the places where they broke."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from ase import Atoms
+from ase.build import bulk
+from ase.neighborlist import NeighborList, neighbor_list
+from oracles_manybody import L, embedded_atom, energy_and_forces, stillinger_weber, tersoff
+
+from mdnum.errors import InputError, NumericalError
+from mdnum.md import jaxmd, manybody
+from mdnum.md.manybody.setfl import read_setfl
+
+COPPER = Path(__file__).parents[2] / "systems" / "copper" / "cu.eam.alloy"
+# relative energy, and forces relative to the largest one; measured 4e-16 and 8e-15 against extended
+# precision, 3e-14 and 1.3e-13 against ASE (whose Tersoff cancels c²/d² - c²/(d² + (h - cos)²), 4e7 a term)
+TOLERANCE = 1e-12
+
+
+def crystal(kind: str, repeat: int, rattle: float, seed: int = 1) -> Atoms:
+    cell = {"Cu": ("fcc", 3.615), "Si": ("diamond", 5.431)}[kind]
+    atoms = bulk(kind, cell[0], a=cell[1], cubic=True) * (repeat, repeat, repeat)
+    atoms.rattle(rattle, seed=seed)
+    return atoms
+
+
+def dense(atoms: Atoms, r_list: float, spare: int = 3) -> np.ndarray:
+    """A list from ASE's finder, with some padding in every row."""
+    i, j = neighbor_list("ij", atoms, r_list)
+    rows = np.full((len(atoms), np.bincount(i, minlength=len(atoms)).max() + spare), len(atoms), np.int32)
+    for atom in range(len(atoms)):
+        mine = np.sort(j[i == atom])
+        rows[atom, : len(mine)] = mine
+    return rows
+
+
+def evaluate(potential, atoms: Atoms, skin: float = 0.4):
+    neighbor = jaxmd.as_neighbor_list(dense(atoms, potential.r_cut + skin), atoms.positions, potential.format)
+    cell = jnp.asarray(atoms.cell.array)
+    energy, forces, stress = eqx.filter_jit(potential.evaluate)(jnp.asarray(atoms.positions), neighbor, cell)
+    return float(energy), np.asarray(forces), np.asarray(stress)
+
+
+def ase_calculator(name: str):
+    if name == "eam":
+        from ase.calculators.eam import EAM
+
+        class ShortListed(EAM):
+            # its own list reaches 2 (cutoff + skin) and takes minutes
+            def update(self, atoms):
+                self.Nelements, self.index, self.pbc = 1, np.zeros(len(atoms), int), atoms.get_pbc()
+                radii = np.full(len(atoms), 0.5 * self.cutoff * (1 + 1e-12))
+                self.neighbors = NeighborList(radii, skin=0.0, self_interaction=False, bothways=True)
+                self.neighbors.update(atoms)
+
+        return ShortListed(potential=str(COPPER), form="alloy", skin=0.0)
+    from ase.calculators.tersoff import Tersoff, TersoffParameters
+
+    p = manybody.tersoff()
+    names = ("gamma", "lambda3", "c", "d", "h", "n", "beta", "lambda2", "B", "R", "D", "lambda1", "A")
+    values = {name: getattr(p, name) for name in names}
+    return Tersoff({("Si",) * 3: TersoffParameters(m=3.0, **values)}, skin=0.0)
+
+
+CASES = {
+    "eam": (lambda: manybody.embedded_atom(COPPER), lambda a: embedded_atom(a, COPPER), "Cu", 4, 0.05),
+    "tersoff": (manybody.tersoff, tersoff, "Si", 3, 0.05),
+    # bonds inside the taper and beyond it
+    "tersoff, hot": (manybody.tersoff, tersoff, "Si", 3, 0.15),
+    "stillinger-weber": (manybody.stillinger_weber, stillinger_weber, "Si", 3, 0.05),
+    "stillinger-weber, hot": (manybody.stillinger_weber, stillinger_weber, "Si", 3, 0.15),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_energy_forces_and_stress_agree_with_extended_precision_and_with_ase(case):
+    make, oracle, kind, repeat, rattle = CASES[case]
+    atoms, potential = crystal(kind, repeat, rattle), make()
+    energy, forces, stress = evaluate(potential, atoms)
+    scale = np.abs(forces).max()
+    some = [0, 7, len(atoms) // 2, len(atoms) - 1]
+    exact, exact_forces = energy_and_forces(oracle(atoms), atoms.positions, some)
+    assert abs(energy - exact) <= TOLERANCE * abs(exact)
+    assert np.abs(forces[some] - exact_forces).max() <= TOLERANCE * scale
+    assert np.abs(forces.sum(axis=0)).max() <= 1e-12 * scale * len(atoms)
+    if case.startswith("stillinger-weber"):
+        np.testing.assert_allclose(stress, strained(oracle, atoms), rtol=0, atol=1e-9)
+        return
+    atoms.calc = ase_calculator(case.split(",")[0])
+    assert abs(energy - atoms.get_potential_energy()) <= TOLERANCE * abs(energy)
+    assert np.abs(forces - atoms.get_forces()).max() <= TOLERANCE * scale
+    if case != "eam":
+        theirs = atoms.get_stress(voigt=False)
+        assert np.abs(stress - theirs).max() <= 1e-11 * np.abs(theirs).max()
+    np.testing.assert_allclose(stress, strained(oracle, atoms), rtol=0, atol=1e-9)
+
+
+def strained(oracle, atoms: Atoms) -> np.ndarray:
+    """Stress of an oracle's energy by central differences in extended precision."""
+    step, stress = L("1e-5"), np.zeros((3, 3))
+    for a, b in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)):
+        ends = []
+        for sign in (1, -1):
+            deform = np.eye(3, dtype=L)
+            deform[a, b] += sign * step / 2
+            deform[b, a] += sign * step / 2
+            bent = atoms.copy()
+            bent.set_cell((atoms.cell.array @ deform).astype(float), scale_atoms=True)
+            ends.append(oracle(bent)(bent.positions.astype(L)))
+        stress[a, b] = stress[b, a] = float((ends[0] - ends[1]) / (2 * step)) / atoms.get_volume()
+    return stress
+
+
+@pytest.mark.parametrize("case", ["eam", "tersoff", "stillinger-weber"])
+def test_skin_masked_entries_images_and_folding_do_not_matter(case):
+    make, _, kind, repeat, _ = CASES[case]
+    atoms, potential = crystal(kind, repeat, 0.12), make()
+    energy, forces, _ = evaluate(potential, atoms, skin=0.5)
+    cell = jnp.asarray(atoms.cell.array)
+    listed = dense(atoms, potential.r_cut + 0.5)
+    far = atoms.get_all_distances(mic=True)
+    n = len(atoms)
+    reach = np.where(listed < n, far[np.arange(n)[:, None], np.minimum(listed, n - 1)], np.inf)
+    masked = np.where(reach < potential.r_cut, listed, n).astype(np.int32)
+    assert (masked == n).sum() > (listed == n).sum()
+    moved = atoms.positions + np.random.default_rng(3).integers(-2, 3, (n, 3)) @ atoms.cell.array
+
+    @eqx.filter_jit
+    def inside_jit(idx, positions):
+        return potential.evaluate(positions, jaxmd.as_neighbor_list(idx, positions, potential.format), cell)
+
+    for idx, positions in ((masked, atoms.positions), (listed, moved)):
+        other, other_forces, _ = inside_jit(jnp.asarray(idx), jnp.asarray(positions))
+        assert abs(float(other) - energy) <= 1e-13 * abs(energy)
+        np.testing.assert_allclose(np.asarray(other_forces), forces, rtol=0, atol=1e-11)
+
+
+def test_triclinic_and_slab_agree_with_extended_precision():
+    tilted = crystal("Si", 3, 0.1)
+    tilted.set_cell(
+        tilted.cell.array @ np.array([[1, 0, 0], [0.2, 1, 0], [-0.1, 0.15, 1]]), scale_atoms=False
+    )
+    slab = crystal("Si", 3, 0.1)
+    # a tilted vector along the free axis must not choose images in the plane
+    slab.set_cell(slab.cell.array + np.array([[0, 0, 0], [0, 0, 0], [9.0, 4.0, 0]]), scale_atoms=False)
+    slab.pbc = (True, True, False)
+    free = crystal("Si", 3, 0.1)
+    free.set_cell(np.zeros((3, 3)))
+    free.pbc = False
+    for atoms in (tilted, slab, free):
+        pbc = tuple(bool(flag) for flag in atoms.pbc)
+        for make, oracle in ((manybody.tersoff, tersoff), (manybody.stillinger_weber, stillinger_weber)):
+            potential = make(pbc=pbc)
+            idx = jaxmd.dense_pairs(atoms.positions, atoms.cell.array, pbc, potential.r_cut + 0.3)
+            np.testing.assert_array_equal(
+                np.sort(idx, axis=1)[:, : dense(atoms, potential.r_cut + 0.3, 0).shape[1]],
+                dense(atoms, potential.r_cut + 0.3, 0),
+            )
+            neighbor = jaxmd.as_neighbor_list(idx, atoms.positions, potential.format)
+            where = jnp.asarray(atoms.positions), neighbor, jnp.asarray(atoms.cell.array)
+            energy, forces = float(potential.energy(*where)), np.asarray(potential.forces(*where))
+            exact, exact_forces = energy_and_forces(oracle(atoms), atoms.positions, [0, 50])
+            assert abs(energy - exact) <= TOLERANCE * abs(exact)
+            assert np.abs(forces[[0, 50]] - exact_forces).max() <= TOLERANCE * np.abs(forces).max()
+
+
+def test_tersoff_dimer_has_a_force_and_no_third_neighbor():
+    # zeta = 0: jax-md's slope of the bond order is infinite there
+    atoms = Atoms("Si2", positions=[[0, 0, 0], [2.4, 0, 0]], cell=np.eye(3) * 20, pbc=True)
+    for r in (2.4, 2.8, 2.999):
+        atoms.positions[1, 0] = r
+        energy, forces, _ = evaluate(manybody.tersoff(), atoms)
+        exact, exact_forces = energy_and_forces(tersoff(atoms), atoms.positions, [0, 1])
+        assert abs(energy - exact) <= 1e-14
+        np.testing.assert_allclose(forces, exact_forces.astype(float), rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("case", ["eam", "tersoff", "stillinger-weber"])
+def test_smoothness_is_what_a_crossing_shows(case):
+    potential = CASES[case][0]()
+    element = CASES[case][2]
+
+    def at(r):
+        # a third atom, bonded to both, gives the crossing pair something to bend
+        points = [[0, 0, 0], [r, 0, 0], [potential.r_cut / 2, 2.0, 0.3]]
+        atoms = Atoms(f"{element}3", positions=points, cell=np.eye(3) * 30, pbc=True)
+        energy, forces, _ = evaluate(potential, atoms)
+        return energy, forces
+
+    def jumps(step):
+        inner, outer = at(potential.r_cut - step), at(potential.r_cut + step)
+        return abs(inner[0] - outer[0]), np.abs(inner[1] - outer[1]).max()
+
+    (energy, force), (_, coarse) = jumps(1e-7), jumps(1e-5)
+    assert energy <= potential.smoothness.energy_jump + 1e-6
+    if case == "tersoff":
+        # continuous with an infinite slope: the crossing atom is the only third neighbor of two bonds
+        assert coarse / force == pytest.approx(100 ** (2 * potential.n - 1), rel=0.02)
+    else:
+        assert force <= potential.smoothness.force_jump + 1e-5
+    assert potential.smoothness.order >= 1
+    assert potential.smoothness.energy_jump <= 1e-10 and potential.smoothness.force_jump <= 1e-6
+    assert (potential.smoothness.order == math.inf) == (case == "stillinger-weber")
+
+
+def test_a_density_off_the_table_is_never_silent():
+    potential = manybody.embedded_atom(COPPER)
+    atoms = crystal("Cu", 4, 0.02)
+    cell = jnp.asarray(atoms.cell.array)
+    neighbor = jaxmd.as_neighbor_list(dense(atoms, potential.r_cut), atoms.positions)
+    potential.check_density(jnp.asarray(atoms.positions), neighbor, cell)
+    at_rest = np.asarray(potential.densities(jnp.asarray(atoms.positions), neighbor, cell))
+    assert 0.95 < at_rest.min() < at_rest.max() < 1.05
+    squeezed = atoms.copy()
+    squeezed.set_cell(atoms.cell.array * 0.62, scale_atoms=True)
+    energy, forces, _ = evaluate(potential, squeezed, skin=0.0)
+    assert math.isnan(energy) and np.isnan(forces).all(axis=1).any()
+    squeezed_cell = jnp.asarray(squeezed.cell.array)
+    with pytest.raises(NumericalError, match=r"density at atom 0 is .*covers 0 to 4"):
+        potential.check_density(jnp.asarray(squeezed.positions), neighbor, squeezed_cell)
+
+
+def test_the_table_is_the_published_form():
+    import importlib.util
+
+    script = Path(__file__).parents[2] / "scripts" / "make_eam_table.py"
+    spec = importlib.util.spec_from_file_location("make_eam_table", script)
+    assert spec is not None and spec.loader is not None
+    form = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(form)
+    found = form.properties(form.pair, form.density, form.embedding)
+    digits = {"a (Å)": 5e-4, "E (eV/atom)": 5e-3, "C11 (GPa)": 0.05, "C12 (GPa)": 0.05, "C44 (GPa)": 0.05}
+    for name, published in form.PAPER.items():
+        assert abs(found[name] - published) <= digits[name], name
+    table = read_setfl(COPPER)
+    r = table.dr * np.arange(len(table.density))
+    np.testing.assert_allclose(table.density, form.density(r), rtol=1e-13, atol=1e-15)
+    np.testing.assert_allclose(table.r_pair, r * form.pair(r), rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(
+        table.embedding, form.embedding(table.drho * np.arange(len(table.embedding))), rtol=1e-13, atol=1e-13
+    )
+    # what the spline loses against the form between its points
+    potential = manybody.embedded_atom(COPPER)
+    between = np.linspace(1.9, 5.4, 5_000)
+    assert np.abs(np.asarray(potential.phi(jnp.asarray(between))) - form.pair(between)).max() < 1e-6
+    assert np.abs(np.asarray(potential.charge(jnp.asarray(between))) - form.density(between)).max() < 1e-8
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda t: t.replace("1 Cu\n", "2 Cu Al\n"), "a table for 2 elements"),
+        (lambda t: t.rsplit("\n", 2)[0], "2 words fewer"),
+        (lambda t: t.replace("5.50679\n29", "6.5\n29"), "its cutoff is 6.5"),
+        (lambda t: "nothing\nof\nthe kind\n", "no setfl table"),
+        (lambda t: t.replace("29 63.546 3.615 fcc\n", "29 63.546 3.615 fcc\nnan "), "expected 3003"),
+    ],
+)
+def test_a_broken_table_is_refused_in_one_line(tmp_path, change, message):
+    path = tmp_path / "broken.alloy"
+    path.write_text(change(COPPER.read_text()))
+    with pytest.raises(InputError) as caught:
+        manybody.embedded_atom(path)
+    text = str(caught.value)
+    assert str(path) in text and "\n" not in text
+    assert message in text or (message == "2 words fewer" and "3002 numbers" in text)
+
+
+def test_another_element_and_a_missing_table_are_refused(tmp_path):
+    with pytest.raises(InputError, match="a table for Cu, but the structure holds Al"):
+        manybody.embedded_atom(COPPER, ["Cu", "Al"])
+    with pytest.raises(InputError, match="no such potential table"):
+        manybody.embedded_atom(tmp_path / "none.alloy")
+    with pytest.raises(InputError, match="known are Si and Si-1989"):
+        manybody.tersoff("Ge")
+
+
+def test_the_1989_constants_differ_from_those_of_1988():
+    atoms = crystal("Si", 2, 0.0)
+    newer, older = manybody.tersoff("Si-1989"), manybody.tersoff("Si")
+    per_atom = [evaluate(p, atoms)[0] / len(atoms) for p in (newer, older)]
+    # cohesive energy of diamond silicon in both papers: 4.63 eV
+    np.testing.assert_allclose(per_atom, -4.63, atol=5e-3)
+    assert newer.lambda3 == 0.0 and older.lambda3 > 0 and newer.sources != older.sources
+
+
+@pytest.mark.jax_md
+@pytest.mark.parametrize("format", ["dense", "sparse", "ordered-sparse"])
+def test_any_jax_md_energy_function_runs_in_every_format(format):
+    from ase.calculators.lj import LennardJones
+    from jax_md import energy as jax_md_energy
+
+    atoms = bulk("Ar", "fcc", a=5.26, cubic=True) * (3, 3, 3)
+    atoms.rattle(0.2, seed=5)
+    atoms.set_cell(atoms.cell.array @ np.array([[1, 0, 0], [0.1, 1, 0], [0.05, -0.1, 1]]), scale_atoms=True)
+    cell = jnp.asarray(atoms.cell.array)
+    constants = {"sigma": 3.405, "epsilon": 0.0103}
+    _, energy_fn = jax_md_energy.lennard_jones_neighbor_list(
+        jaxmd.displacement(cell),
+        1.0,
+        r_onset=jaxmd.scalar(5.0 / 3.405),
+        r_cutoff=jaxmd.scalar(6.5 / 3.405),
+        neighbor_list_fn=lambda *_, **__: None,
+        **{name: jaxmd.scalar(value) for name, value in constants.items()},
+    )
+    potential = manybody.from_jax_md(energy_fn, 6.5, format)
+    energy, forces, stress = evaluate(potential, atoms)
+    atoms.calc = LennardJones(rc=6.5, ro=5.0, smooth=True, **constants)
+    assert abs(energy - atoms.get_potential_energy()) <= 1e-13 * abs(energy)
+    np.testing.assert_allclose(forces, atoms.get_forces(), rtol=0, atol=1e-13)
+    np.testing.assert_allclose(stress, atoms.get_stress(voigt=False), rtol=0, atol=1e-15)
+    neighbor = jaxmd.as_neighbor_list(dense(atoms, 7.0), atoms.positions, format)
+    potential.check_cell(jnp.asarray(atoms.positions), neighbor, cell)
+    assert math.isnan(potential.smoothness.energy_jump)
+
+
+@pytest.mark.jax_md
+def test_an_energy_function_that_ignores_the_cell_is_found_out():
+    from jax_md import energy as jax_md_energy
+    from jax_md import space
+
+    atoms = bulk("Ar", "fcc", a=5.26, cubic=True) * (3, 3, 3)
+    atoms.rattle(0.2, seed=5)
+    own_box, _ = space.periodic(jaxmd.scalar(3 * 5.26))
+    _, energy_fn = jax_md_energy.lennard_jones_neighbor_list(
+        own_box,
+        1.0,
+        sigma=jaxmd.scalar(3.405),
+        epsilon=jaxmd.scalar(0.0103),
+        r_onset=jaxmd.scalar(1.5),
+        r_cutoff=jaxmd.scalar(1.9),
+        neighbor_list_fn=lambda *_, **__: None,
+    )
+    potential = manybody.from_jax_md(energy_fn, 6.5, "dense", name="boxed")
+    neighbor = jaxmd.as_neighbor_list(dense(atoms, 7.0), atoms.positions)
+    with pytest.raises(InputError, match="boxed: the energy function ignores the cell"):
+        potential.check_cell(jnp.asarray(atoms.positions), neighbor, jnp.asarray(atoms.cell.array))
+
+
+def test_float32_positions_stay_float32():
+    atoms = crystal("Si", 2, 0.05)
+    for potential in (manybody.tersoff(), manybody.stillinger_weber()):
+        neighbor = jaxmd.as_neighbor_list(dense(atoms, 4.0), atoms.positions)
+        narrow = jnp.asarray(atoms.positions, jnp.float32)
+        with jax.numpy_dtype_promotion("standard"):
+            energy = potential.energy(narrow, neighbor, jnp.asarray(atoms.cell.array, jnp.float32))
+        wide = potential.energy(jnp.asarray(atoms.positions), neighbor, jnp.asarray(atoms.cell.array))
+        assert energy.dtype == jnp.float32
+        assert abs(float(energy) - float(wide)) <= 3e-6 * abs(float(wide))
+
+
+def test_setfl_keeps_every_digit(tmp_path):
+    table = read_setfl(COPPER)
+    assert table.element == "Cu" and table.r_cut == 5.50679 and "Mishin" in table.comment[0]
+    assert set(asdict(table)) >= {"embedding", "density", "r_pair"}
+    words = COPPER.read_text().split("\n", 6)[6].split()
+    np.testing.assert_array_equal(table.embedding, [float(word) for word in words[:1001]])
+    # five numbers a line, as LAMMPS writes them, and no newline at the end
+    head = COPPER.read_text().split("\n", 6)[:6]
+    folded = [" ".join(words[k : k + 5]) for k in range(0, len(words), 5)]
+    (tmp_path / "folded.alloy").write_text("\n".join(head + folded))
+    np.testing.assert_array_equal(read_setfl(tmp_path / "folded.alloy").r_pair, table.r_pair)
