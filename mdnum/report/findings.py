@@ -147,10 +147,9 @@ def _evidence(run: Run) -> Iterator[str]:
         yield f"The energy budget closes: {what}, {off}{where}."
     ase = run.summary.get("ase") or {}
     if ase.get("ok") and ase.get("energy_rel") is not None:
-        yield (
-            f"Energies agree with ASE to {number(ase['energy_rel'], 2)} (relative), forces to "
-            f"{number(ase.get('force_max'), 2)} {run.units.energy}/{run.units.length}."
-        )
+        energy = f"to {number(ase['energy_rel'], 2)} (relative)" if ase["energy_rel"] else "exactly"
+        forces = f"to {number(ase.get('force_max'), 2)} {run.units.energy}/{run.units.length}"
+        yield f"Energies agree with ASE {energy}, forces {forces}."
 
 
 def _restore(kept: dict[str, Any]) -> Finding:
