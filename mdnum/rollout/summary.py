@@ -110,7 +110,7 @@ def summarize(
             "compare": simulation.decider.compare,
             "energy_jump": float(energy_jump[np.argmax(np.abs(energy_jump))]),
             "force_jump": float(force_jump[np.argmax(np.abs(force_jump))]),
-            "smoothness": cutoff.smoothness if cutoff is not None else simulation.model.smoothness,
+            "smoothness": cutoff.smoothness if cutoff is not None else simulation.model.smoothness.order,
             "bound": float(max(simulation.decider.bounds)),
         },
         "ase": None,

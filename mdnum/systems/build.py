@@ -130,7 +130,8 @@ class Simulation:
         """Energy and radial force that a pair brings when it enters, per pair type."""
         if self.pairwise:
             return self.model.jumps()
-        return np.array([float(self.model.energy_jump)]), np.array([float(self.model.force_jump)])
+        smoothness = self.model.smoothness
+        return np.array([smoothness.energy_jump]), np.array([smoothness.force_jump])
 
     def verlet_list(self, skin: float | None = None) -> VerletList:
         """A new Verlet list for this system, with another skin where one is given."""
@@ -226,12 +227,16 @@ def _many_body_model(system: System):
     from mdnum.md import manybody
 
     potential = system.spec.potential
+    a, b, c = (bool(flag) for flag in system.atoms.pbc)
+    pbc = (a, b, c)
     if isinstance(potential, schema.EmbeddedAtom):
-        return manybody.embedded_atom(system.folder / potential.file, system.atoms.get_chemical_symbols())
+        return manybody.embedded_atom(
+            system.folder / potential.file, system.atoms.get_chemical_symbols(), pbc
+        )
     if isinstance(potential, schema.Tersoff):
-        return manybody.tersoff(potential.parameters)
+        return manybody.tersoff(potential.parameters, pbc)
     assert isinstance(potential, schema.StillingerWeber)
-    return manybody.stillinger_weber(potential.parameters)
+    return manybody.stillinger_weber(potential.parameters, pbc)
 
 
 def _velocities(system: System) -> Float[np.ndarray, "atoms 3"]:
