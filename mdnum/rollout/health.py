@@ -125,6 +125,8 @@ class ListHealth:
             "lost_pair_steps": epoch.lost_pair_steps,
             "first_lost_step": epoch.first_lost_step,
             "build_ms": epoch.build_ms,
+            # the flip of the `rebuild` channel: how far the skin was overdrawn at the step that follows
+            "margin": rule.skin / 2 - segment.moved if rebuilt else np.nan,
         }
         return {name: np.array([value]) for name, value in values.items()}
 

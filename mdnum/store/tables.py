@@ -39,6 +39,7 @@ COLUMNS: Mapping[str, Mapping[str, pa.DataType]] = MappingProxyType(
             epoch=_INT, start=_INT, length=_INT, displacement=_FLOAT, skin_consumed=_FLOAT,
             pairs_listed=_INT, capacity=_INT, occupancy=_INT, reason=_TEXT, dangerous=_BOOL,
             lost_pairs=_INT, lost_pair_steps=_INT, first_lost_step=_INT, build_ms=_FLOAT,
+            margin=_FLOAT,
         ),
     }
 )  # fmt: skip

@@ -171,6 +171,7 @@ def make_run(
                     "lost_pair_steps": 0,
                     "first_lost_step": -1,
                     "build_ms": float(rng.gamma(30.0, 0.2)),
+                    "margin": -float(rng.exponential(0.01)),
                 }
             )
             start, moved = step, 0.0
