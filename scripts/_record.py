@@ -1,0 +1,74 @@
+"""A recorded rollout kept in memory: for studies that make many short ones and need no run folder."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from mdnum.rollout.engine import Engine
+from mdnum.rollout.flips import PairRecorder, flip_columns
+from mdnum.rollout.health import ListHealth
+from mdnum.systems import Simulation
+
+Columns = dict[str, np.ndarray]
+
+_NUMBERS = ("potential", "kinetic", "heat", "moved")
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """What a rollout left behind.
+
+    Attributes:
+        time: of each step, user's unit.
+        potential: potential energy at each step.
+        conserved: total energy at each step, less what a thermostat put in.
+        displacement: largest at each step since the list in use was built, length.
+        flips: a row per flip, in the columns of flips.parquet.
+        health: rebuilds, dangerous builds and lost pairs.
+        steps_per_second: after compilation, decoding and audit of lost pairs included.
+    """
+
+    time: np.ndarray
+    potential: np.ndarray
+    conserved: np.ndarray
+    displacement: np.ndarray
+    flips: Columns
+    health: ListHealth
+    steps_per_second: float
+
+
+def record(simulation: Simulation, steps: int) -> Recorded:
+    """Roll a simulation out to a last step and keep energies, flips and the health of its lists."""
+    recorder, health = PairRecorder(simulation), ListHealth(simulation)
+    series: list[Columns] = []
+    flips: list[Columns] = []
+    began, counted = time.perf_counter(), 0
+    for segment in Engine(simulation, steps).segments():
+        # copied: the engine takes a segment's record back after the next one
+        series.append({name: segment.rows_of(name).copy() for name in _NUMBERS})
+        flips.append(flip_columns(recorder.flips(segment)))
+        health.take(segment)
+        if len(series) == 1:
+            # the first segment holds the compilation
+            began = time.perf_counter()
+        else:
+            counted += segment.rows
+    seconds = time.perf_counter() - began
+    rate = counted / seconds if counted else float("nan")
+    numbers = _joined(series)
+    return Recorded(
+        simulation.system.spec.dynamics.timestep * np.arange(len(numbers["potential"])),
+        numbers["potential"],
+        numbers["potential"] + numbers["kinetic"] - numbers["heat"],
+        numbers["moved"],
+        _joined(flips),
+        health,
+        rate,
+    )
+
+
+def _joined(parts: list[Columns]) -> Columns:
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
