@@ -49,8 +49,6 @@ class NumericalError(MdnumError):
         folder: the run folder that holds everything up to that number.
     """
 
-    exit_code = 1
-
     def __init__(
         self,
         message: str,

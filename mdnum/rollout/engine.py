@@ -24,6 +24,10 @@ _RECORD_BYTES = 64 * 2**20
 _MOST_ROWS = 128
 
 
+# how a rollout ends that should not have
+FAILURES = ("blow-up", "runaway")
+
+
 @dataclass(frozen=True)
 class Segment:
     """What one stretch of steps with one list left behind, on the host.
@@ -37,7 +41,8 @@ class Segment:
         epoch: number of the list's life.
         built: step at which the list was built.
         opens: whether this is the first segment of its epoch.
-        closes: why the epoch ended with it: "displacement", "interval", "end", "blow-up" or None.
+        closes: why the epoch ended with it: "displacement", "interval", "end", None, or
+            what went wrong: "blow-up" (the last row is not finite), "runaway" (what follows it is wild).
         moved: largest displacement since the list was built, at the step after the last row, length.
         state: where the rollout goes on.
         reference: wrapped positions at which the list was built, shape (atoms, 3).
@@ -176,7 +181,7 @@ class Engine:
         return empty_record(rows, words, self.simulation.atoms, dtype, self.record)
 
     def segments(self) -> Iterator[Segment]:
-        """Stretches of steps in order; the last one has `closes` set to "end" or "blow-up"."""
+        """Stretches of steps in order; the last one has `closes` set to "end" or one of FAILURES."""
         start, cell = self.start, self.simulation.cell
         state, reference, built, epoch = start.state, start.reference, start.built, start.epoch
         table = self.verlet.build(reference, cell)
@@ -222,7 +227,7 @@ class Engine:
             )
             state, first, turn, opens = outcome.state, first + rows, 1 - turn, False
             before = np.array(waiting.rows_of("bits")[-1]) if self.record and rows else None
-            if closes in ("end", "blow-up"):
+            if closes == "end" or closes in FAILURES:
                 yield waiting
                 return
             if closes:
@@ -236,6 +241,8 @@ class Engine:
             return "blow-up"
         if next_step > self.last:
             return "end"
+        if bool(outcome.runaway):
+            return "runaway"
         if bool(outcome.rebuild):
             return "displacement" if self.simulation.rule.check else "interval"
         return None

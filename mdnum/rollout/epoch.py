@@ -100,6 +100,8 @@ class Outcome(NamedTuple):
         rows: how many rows were recorded.
         rebuild: the list must be rebuilt before the next forces.
         finite: every number so far was.
+        runaway: an atom has just moved by more than a lattice vector in one step; forces there mean nothing,
+            and decisions would no longer be exact.
         moved: largest displacement since the list was built, at the step that comes next, length.
         before: decisions of the list at the step before, for the count check and the first flips of a new
             list; all no where they were not asked for. None without recording.
@@ -109,6 +111,7 @@ class Outcome(NamedTuple):
     rows: Int[Array, ""]
     rebuild: Bool[Array, ""]
     finite: Bool[Array, ""]
+    runaway: Bool[Array, ""]
     moved: Float[Array, ""]
     before: UInt8[Array, "words atoms"] | None
 
@@ -185,7 +188,7 @@ def run_epoch(
         return jnp.sqrt(jnp.max(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])).astype(jnp.float64)
 
     def body(carry):
-        step, x, v, images, _, heat, row, _, _, largest, record = carry
+        step, x, v, images, _, heat, row, _, _, _, largest, record = carry
         made: Forces = program.force(x, tables, decisions=program.record)  # type: ignore[operator]
         acceleration = made.force.astype(dtype) / mass_row
         # the first step of all starts from full-step velocities
@@ -210,17 +213,18 @@ def run_epoch(
         finite = jnp.isfinite(potential) & jnp.isfinite(kinetic)
         after, v, taken = program.integrator.drift(x, v + half_step * acceleration, masses, step, order)
         wrapped, n = cell.wrap(*after)
+        runaway = jnp.max(jnp.abs(jnp.stack(n))) > 1
         after, images = jnp.stack(wrapped), images + jnp.stack(n).astype(jnp.int32)
         step = step + 1
         largest = moved(after)
         age = step - built
         allowed = (age >= program.delay) & (age % program.every == 0)
         due = allowed & (largest > program.half_skin) if program.check else allowed
-        return step, after, v, images, x, heat + taken, row + 1, due, finite, largest, record
+        return step, after, v, images, x, heat + taken, row + 1, due, finite, runaway, largest, record
 
     def go_on(carry):
-        step, _, _, _, _, _, row, due, finite, _, _ = carry
-        return (step <= last) & (row < record.potential.shape[0]) & ~due & finite
+        step, _, _, _, _, _, row, due, finite, runaway, _, _ = carry
+        return (step <= last) & (row < record.potential.shape[0]) & ~due & finite & ~runaway
 
     carry = (
         state.step,
@@ -232,15 +236,15 @@ def run_epoch(
         jnp.zeros((), jnp.int64),
         jnp.zeros((), bool),
         jnp.ones((), bool),
+        jnp.zeros((), bool),
         moved(x),
         record,
     )
-    step, x, v, images, x_before, heat, rows, due, finite, largest, record = lax.while_loop(
-        go_on, body, carry
-    )
+    done = lax.while_loop(go_on, body, carry)
+    step, x, v, images, x_before, heat, rows, due, finite, runaway, largest, record = done
 
     def unsorted(a):
         return jnp.zeros_like(a).at[:, order].set(a)
 
     end = State(step, unsorted(x), unsorted(v), unsorted(images), unsorted(x_before), heat)
-    return Outcome(end, rows, due, finite, largest, before), record
+    return Outcome(end, rows, due, finite, runaway, largest, before), record

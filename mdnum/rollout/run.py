@@ -15,7 +15,7 @@ from mdnum import provenance
 from mdnum.errors import FolderError, InputError, NumericalError
 from mdnum.events import Ledger
 from mdnum.rollout.budget import EnergyBudget
-from mdnum.rollout.engine import Engine, Segment, Start, resume_point
+from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, resume_point
 from mdnum.rollout.flips import PairRecorder, flip_columns
 from mdnum.rollout.health import ListHealth
 from mdnum.rollout.series import series_columns
@@ -122,7 +122,7 @@ class Rollout:
         loop_began: float | None = None
         counted = 0
         for segment in engine.segments():
-            if segment.closes == "blow-up":
+            if segment.closes in FAILURES:
                 blown = segment
             kept = _finite_rows(segment)
             if kept.rows:
@@ -243,22 +243,23 @@ class Rollout:
         self.progress(step, self.steps, info)
 
     def _fail(self, blown: Segment, summary: dict[str, Any]) -> dict[str, Any]:
-        step = blown.last
-        row = blown.rows - 1
-        positions = blown.unsorted("x", row).astype(np.float64)
-        if not np.all(np.isfinite(positions)):
-            positions = np.asarray(self.done.last, np.float64)
-        where = closest_pair(self.simulation, positions)
+        step, positions = blown.last, np.asarray(self.done.last, np.float64)
+        if blown.closes == "runaway":
+            kept, what = step, f"an atom moved by more than the box in the step after {step}"
+        else:
+            kept, what = step - 1, f"the energy or a velocity stopped being a finite number at step {step}"
+            last = blown.unsorted("x", blown.rows - 1).astype(np.float64)
+            positions = last if np.all(np.isfinite(last)) else positions
+        message = what + closest_pair(self.simulation, positions)
         self.folder.checkpoint(self._to_dict(blown), force=True)
         self.folder.finalize()
-        message = f"the energy or a velocity stopped being a finite number at step {step}{where}"
         summary["error"] = message
         summary["verdict"] = f"Stopped: {message}."
         self.folder.write_summary(summary)
         raise NumericalError(
             message,
             where=self.simulation.system.name,
-            remedy=f"Everything up to step {step - 1} is in {self.folder.path}. "
+            remedy=f"Everything up to step {kept} is in {self.folder.path}. "
             "Use a shorter dynamics.timestep, relax the structure or lower the temperature",
             folder=self.folder.path,
         )
@@ -327,6 +328,12 @@ def _fresh(system: System, out, steps, save_every, progress, began) -> Rollout:
 
 def _resumed(path: Path, steps: int | None, progress, began) -> Rollout:
     folder = RunFolder.open(path)
+    if folder.summary.get("status") == "failed":
+        raise FolderError(
+            f"this run blew up: {folder.summary.get('error', 'see its report')}",
+            where=str(path),
+            remedy="Start a new run with a shorter dynamics.timestep",
+        )
     saved = folder.resume()
     if steps is not None and steps < int(np.asarray(saved["state_step"])) - 1:
         raise FolderError(f"has run past step {steps} already", where=str(path))

@@ -15,6 +15,7 @@ from pydantic import ValidationError
 
 from mdnum import units as unit_systems
 from mdnum.errors import InputError
+from mdnum.store.atomic import disk_errors
 from mdnum.systems import messages, pairs, schema, structures, toml
 
 if TYPE_CHECKING:
@@ -94,13 +95,14 @@ class System:
     def write(self, folder: str | Path) -> Path:
         """Write system.toml, structure.extxyz and the potential's tables; returns the TOML file's path."""
         target = Path(folder)
-        target.mkdir(parents=True, exist_ok=True)
-        for table in self.tables:
-            if table.resolve() != (target / table.name).resolve():
-                shutil.copyfile(table, target / table.name)
-        (target / STRUCTURE_FILE).write_text(structures.to_extxyz(self.atoms), encoding="utf-8")
-        path = target / SYSTEM_FILE
-        path.write_text(self.to_toml(), encoding="utf-8")
+        with disk_errors(target):
+            target.mkdir(parents=True, exist_ok=True)
+            for table in self.tables:
+                if table.resolve() != (target / table.name).resolve():
+                    shutil.copyfile(table, target / table.name)
+            (target / STRUCTURE_FILE).write_text(structures.to_extxyz(self.atoms), encoding="utf-8")
+            path = target / SYSTEM_FILE
+            path.write_text(self.to_toml(), encoding="utf-8")
         return path
 
 
