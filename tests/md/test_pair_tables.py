@@ -1,0 +1,239 @@
+"""Neighbor searches, against every image of every pair."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mdnum.errors import CapacityError, InputError
+from mdnum.md.cell import Cell, wrap_positions
+from mdnum.md.cells import neighbor_table
+from mdnum.md.verlet import BUILDERS, RebuildRule, VerletList, check_radius
+
+FLAGS = st.tuples(st.booleans(), st.booleans(), st.booleans())
+
+
+def brute_force(positions, matrix, pbc, radius):
+    """Pairs surely within radius, and pairs within it or at its edge, from all images near the box."""
+    spans = [(-1, 0, 1) if p else (0,) for p in pbc]
+    shifts = np.array(list(product(*spans)), float) @ np.where(np.asarray(pbc)[:, None], matrix, 0.0)
+    i, j = np.triu_indices(len(positions), 1)
+    d = positions[j] - positions[i]
+    shortest = np.full(len(i), np.inf)
+    for shift in shifts:
+        shortest = np.minimum(shortest, np.linalg.norm(d + shift, axis=1))
+    pairs = np.stack([i, j], axis=1)
+    sure = {tuple(p) for p in pairs[shortest < radius * (1 - 1e-11)].tolist()}
+    edge = {tuple(p) for p in pairs[shortest < radius * (1 + 1e-11)].tolist()}
+    return sure, edge
+
+
+def pairs_of(index, order, atoms):
+    """Directed pairs of a table in the user's labels, checked for form on the way."""
+    assert index.dtype == np.int32
+    assert sorted(order.tolist()) == list(range(atoms))
+    listed = []
+    for column in range(atoms):
+        row = index[:, column]
+        real = row[row < atoms]
+        # packed at the front, padded with the number of atoms, each neighbor once and never itself
+        assert np.all(row[: len(real)] < atoms) and np.all(row[len(real) :] == atoms)
+        assert len(set(real.tolist())) == len(real)
+        assert column not in real
+        listed += [(int(order[column]), int(order[k])) for k in real]
+    return listed
+
+
+def check(builder, positions, cell, radius):
+    matrix, pbc, atoms = np.asarray(cell.matrix), cell.pbc, len(positions)
+    index, order, most = builder.build(positions, cell, radius, 8 * (atoms // 8 + 1))
+    listed = pairs_of(index, order, atoms)
+    assert most == max(np.bincount([i for i, _ in listed], minlength=atoms), default=0)
+    assert {(j, i) for i, j in listed} == set(listed), "a pair is listed from one end only"
+    sure, edge = brute_force(positions, matrix, pbc, radius)
+    found = {(i, j) for i, j in listed if i < j}
+    assert sure <= found, f"missed {sorted(sure - found)[:5]}"
+    assert found <= edge, f"phantom {sorted(found - edge)[:5]}"
+
+
+@st.composite
+def configurations(draw, most=60):
+    """Boxes that are thin, skewed, small or huge beside the radius, with atoms in odd places."""
+    radius = draw(st.floats(0.5, 4.0))
+    edges = radius * np.array(
+        [draw(st.sampled_from([2.02, 2.3, 2.6, 3.1, 4.2, 6.0, 11.0, 40.0])) for _ in range(3)]
+    )
+    matrix = np.diag(edges)
+    if draw(st.booleans()):
+        tilts = [draw(st.sampled_from([0.0, 0.5, -0.5, 0.31, -0.77])) for _ in range(3)]
+        matrix[1, 0], matrix[2, 0], matrix[2, 1] = (
+            t * edges[k] for t, k in zip(tilts, (0, 0, 1), strict=True)
+        )
+    pbc = draw(FLAGS)
+    cell = Cell.create(matrix, pbc)
+    # what the caller promises: the radius fits half of every periodic width
+    scale = max(1.0, 2 * radius / min(np.min(cell.widths), 1e6))
+    cell = Cell.create(matrix * scale, pbc)
+    atoms = draw(st.integers(1, most))
+    rng = np.random.default_rng(draw(st.integers(0, 2**31)))
+    fractional = rng.uniform(0, 1, (atoms, 3))
+    if draw(st.booleans()):
+        # crowd them in a corner of the box, across its faces
+        fractional = 0.5 * fractional**3 - 0.1
+    special = rng.random((atoms, 3)) < 0.15
+    fractional[special] = rng.choice([0.0, 1.0, 0.5, 1 / 3, -1e-18, 1 - 2**-53], special.sum())
+    if atoms > 1 and draw(st.booleans()):
+        fractional[-1] = fractional[0]
+    positions, _ = wrap_positions(cell, fractional @ np.asarray(cell.matrix))
+    return positions, cell, radius
+
+
+@settings(max_examples=250)
+@given(configurations())
+def test_the_host_search_finds_every_pair_once_from_both_ends(configuration):
+    check(BUILDERS["host"], *configuration)
+
+
+@pytest.mark.jax_md
+@pytest.mark.filterwarnings("ignore:scatter inputs")
+@settings(max_examples=5)
+@given(configurations(most=25))
+def test_the_search_of_jax_md_finds_the_same(configuration):
+    positions, cell, radius = configuration
+    half = float(np.min(cell.widths)) / 2
+    check(BUILDERS["jax-md"], positions, cell, min(radius, 0.999 * half))
+
+
+@pytest.mark.slow
+@pytest.mark.jax_md
+@pytest.mark.filterwarnings("ignore:scatter inputs")
+@settings(max_examples=150)
+@given(configurations())
+def test_the_search_of_jax_md_finds_the_same_in_many_boxes(configuration):
+    positions, cell, radius = configuration
+    half = float(np.min(cell.widths)) / 2
+    check(BUILDERS["jax-md"], positions, cell, min(radius, 0.999 * half))
+
+
+@pytest.mark.parametrize("bins", [5, 6, 7, 8, 10, 12])
+def test_a_pair_at_the_radius_is_not_lost_between_bins(bins):
+    """Bins of exactly half a radius put some pairs at the radius three bins apart by rounding."""
+    rng = np.random.default_rng(bins)
+    tried = 0
+    for _ in range(1500):
+        radius = rng.uniform(1, 3)
+        edge = bins * radius / 2 * (1 + int(rng.integers(-3, 4)) * 2.0**-52)
+        first = int(rng.integers(0, bins - 2)) * radius / 2 * (1 + int(rng.integers(-3, 4)) * 2.0**-53)
+        second = first + radius
+        if not (edge >= 2 * radius and second < edge and second - first <= radius):
+            continue
+        tried += 1
+        positions = np.array([[first, 1.0, 1.0], [second, 1.0, 1.0]])
+        _, _, most = neighbor_table(positions, Cell.create([edge] * 3), radius, 8)
+        assert most == 1, (radius, edge, first, second)
+    assert tried > 100
+
+
+@pytest.mark.parametrize("builder", BUILDERS)
+@pytest.mark.jax_md
+@pytest.mark.filterwarnings("ignore:scatter inputs")
+def test_one_atom_has_no_neighbors_and_two_have_each_other(builder):
+    for pbc in (True, False, (True, False, True)):
+        cell = Cell.create([10.0, 10.0, 10.0], pbc)
+        for positions in ([[10.0, 5, 5]], [[10.0, 5, 5], [0.5, 5, 5]], [[1.0, 1, 1], [1.0, 1, 1]]):
+            check(BUILDERS[builder], np.array(positions), cell, 3.0)
+
+
+def test_the_order_of_the_table_follows_the_bins():
+    rng = np.random.default_rng(8)
+    cell = Cell.create([40.0, 40.0, 40.0])
+    positions = rng.uniform(0, 40, (2000, 3))
+    _, order, _ = neighbor_table(positions, cell, 4.0, 64)
+    sorted_x = positions[order][:, 0]
+    # slabs of bins along x come one after the other: no atom lies a bin behind one that came before
+    assert np.max(np.maximum.accumulate(sorted_x) - sorted_x) < 2.2
+    assert np.max(np.maximum.accumulate(positions[:, 0]) - positions[:, 0]) > 30
+
+
+@pytest.mark.parametrize("room", [8, 16])
+def test_a_table_that_is_too_narrow_says_how_wide_it_must_be(room):
+    rng = np.random.default_rng(4)
+    positions, cell = rng.uniform(0, 9, (80, 3)), Cell.create([9.0] * 3)
+    index, _, most = neighbor_table(positions, cell, 4.0, room)
+    full, _, again = neighbor_table(positions, cell, 4.0, 80)
+    assert most == again > room
+    assert index.shape == (room, 80)
+    assert np.array_equal(index, full[:room])
+
+
+def test_a_verlet_list_grows_until_its_pairs_fit():
+    rng = np.random.default_rng(4)
+    cell = Cell.create([9.0] * 3)
+    positions = rng.uniform(0, 9, (80, 3))
+    verlet = VerletList(BUILDERS["host"], RebuildRule(0.5), 3.0, slots=8)
+    table = verlet.build(positions, cell)
+    assert verlet.slots == table.slots > 8 and table.slots % 8 == 0
+    assert 8 < table.occupancy <= table.slots
+    sure, edge = brute_force(positions, np.diag([9.0] * 3), cell.pbc, 3.5)
+    assert len(sure) <= table.pairs <= len(edge)
+    rows = table.unsorted()
+    assert {(i, int(j)) for i in range(80) for j in rows[i] if j < 80 and i < j} == sure
+    # the next build starts from the room that was needed
+    assert verlet.build(positions, cell).slots == table.slots
+
+
+def test_more_neighbors_than_atoms_are_an_error():
+    class Broken:
+        name = "broken"
+
+        def build(self, positions, cell, r_list, slots):
+            atoms = len(positions)
+            return np.full((slots, atoms), atoms, np.int32), np.arange(atoms), 2 * slots
+
+    with pytest.raises(CapacityError, match="16 neighbors among 3 atoms"):
+        VerletList(Broken(), RebuildRule(0.5), 1.0, slots=8).build(np.zeros((3, 3)), Cell.create([9.0] * 3))
+
+
+def test_the_skin_that_is_consumed_counts_motion_and_strain():
+    verlet = VerletList(BUILDERS["host"], RebuildRule(0.5), 3.0)
+    cell = Cell.create([20.0] * 3)
+    reference = np.array([[1.0, 1, 1], [19.9, 5, 5]])
+    moved = reference + np.array([[0.1, 0, 0], [0.2, 0, 0]])
+    wrapped, _ = wrap_positions(cell, moved)
+    assert verlet.consumed(wrapped, cell, reference, cell) == pytest.approx(2 * 0.2 / 0.5)
+    # the box alone: nobody moved within it, yet every listed distance shrank
+    smaller = Cell.create([19.0] * 3)
+    assert verlet.consumed(reference * 0.95, smaller, reference, cell) == pytest.approx(3.5 * 0.05 / 0.5)
+    larger = Cell.create([21.0] * 3)
+    assert verlet.consumed(reference * 1.05, larger, reference, cell) == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    "rule, first, safe",
+    [
+        (RebuildRule(1.0), 1, True),
+        (RebuildRule(1.0, every=5), 5, False),
+        (RebuildRule(1.0, every=2, delay=7), 7, False),
+        (RebuildRule(1.0, check=False), 1, False),
+        (RebuildRule(1.0, delay=1), 1, True),
+    ],
+)
+def test_which_rules_are_safe(rule, first, safe):
+    assert rule.first_allowed == first
+    assert rule.safe == safe
+
+
+def test_a_radius_beyond_half_the_box_is_refused_with_what_would_fit():
+    check_radius(Cell.create([7.0, 9.0, 9.0]), 3.0, 0.5)
+    with pytest.raises(InputError, match=r"3\.51 exceeds .* 3\.5.*skin of at most 0\.5"):
+        check_radius(Cell.create([7.0, 9.0, 9.0]), 3.0, 0.51)
+    with pytest.raises(InputError, match="Repeat the box"):
+        check_radius(Cell.create([7.0, 9.0, 9.0]), 4.0, 0.1)
+    # the width of a skewed box is less than its edges
+    with pytest.raises(InputError):
+        check_radius(Cell.create([[7.0, 0, 0], [5.0, 5.0, 0], [0, 0, 9.0]]), 3.0, 0.0)
+    check_radius(Cell.create([1.0, 9.0, 9.0], (False, True, True)), 3.0, 0.5)
