@@ -178,7 +178,7 @@ def test_mistakes_are_one_line_and_exit_2(
     ("error", "expected"),
     [
         (InputError("r_cut + skin is 9.5 Å", remedy="Shrink it", where="a.toml"), 2),
-        (NumericalError("potential energy is NaN", where="step 12"), 1),
+        (NumericalError("potential energy is NaN", where="step 12"), 2),
         (OSError(28, "No space left on device", "runs/x-1/series.parquet"), 2),
         (KeyboardInterrupt(), 130),
     ],
