@@ -175,11 +175,18 @@ class VerletList:
         """
         r_list = self.r_cut + self.rule.skin
         atoms = len(positions)
-        if not self.slots:
+        first = not self.slots
+        if first:
             self.slots = self._guess(atoms, cell, r_list)
         begin = time.perf_counter()
         while True:
             index, order, most = self.builder.build(positions, cell, r_list + self.guard, self.slots)
+            if most <= self.slots and first:
+                # every size of table is compiled for: settle on one with room before the first use
+                first, wanted = False, self._rounded(most * self.slack)
+                if wanted != self.slots:
+                    self.slots = wanted
+                    continue
             if most <= self.slots:
                 return PairTable(index, order, r_list, most, time.perf_counter() - begin)
             if most >= atoms and atoms > 1:
