@@ -20,6 +20,7 @@ from ase.neighborlist import neighbor_list
 
 from mdnum.errors import CapacityError, InputError, NumericalError
 from mdnum.md import jaxmd, manybody
+from mdnum.md.relaxation import relax
 
 pytestmark = pytest.mark.jax_md
 ALWAYS = (True, True, True)
@@ -439,24 +440,24 @@ def test_relaxation_finds_the_crystal_over_a_list_that_must_be_rebuilt():
     def energy(positions, neighbor):
         return potential.energy(positions, neighbor, cell)
 
-    relaxed = jaxmd.relax(energy, atoms.positions, neighbors=neighbors, skin=0.2, force_tolerance=1e-8)
+    relaxed = relax(energy, atoms.positions, neighbors=neighbors, skin=0.2, force_tolerance=1e-8)
     assert relaxed.converged and relaxed.force_max <= 1e-8 and len(built) > 2
     neighbor = neighbors(relaxed.positions)
     # each of the two bonds an atom of the crystal has to itself is worth epsilon
     per_atom = float(energy(jnp.asarray(relaxed.positions), neighbor)) / len(atoms)
     assert per_atom == pytest.approx(-2 * potential.epsilon, abs=1e-4)
-    short = jaxmd.relax(energy, atoms.positions, neighbors=neighbors, skin=0.2, max_steps=3)
+    short = relax(energy, atoms.positions, neighbors=neighbors, skin=0.2, max_steps=3)
     assert short.steps == 3 and not short.converged
     with pytest.raises(InputError, match="needs a skin"):
-        jaxmd.relax(energy, atoms.positions, neighbors=neighbors)
+        relax(energy, atoms.positions, neighbors=neighbors)
 
 
 def test_relaxation_takes_forces_and_notices_nan():
     start = np.array([[1.0, -2.0, 0.5], [0.3, 0.2, 0.1]])
-    relaxed = jaxmd.relax(lambda R: -4 * R, start, force_tolerance=1e-10)
+    relaxed = relax(lambda R: -4 * R, start, force_tolerance=1e-10)
     assert relaxed.converged and np.abs(relaxed.positions).max() < 1e-10
     with pytest.raises(NumericalError, match="not finite"):
-        jaxmd.relax(lambda R: jnp.sum(jnp.sqrt(R - 10)), start)
+        relax(lambda R: jnp.sum(jnp.sqrt(R - 10)), start)
 
 
 @pytest.mark.parametrize("pbc", [ALWAYS, (True, True, False), (False, False, True), (False, False, False)])

@@ -58,9 +58,8 @@ def read_setfl(path: Path) -> Setfl:
         count, *elements = lines[3].split()
         if int(count) != len(elements):
             raise ValueError(f"{count} elements announced, {len(elements)} named")
-        n_rho, drho, n_r, dr, r_cut = (
-            kind(word) for kind, word in zip(_SIZES, lines[4].split(), strict=True)
-        )
+        first, drho, second, dr, r_cut = (float(word) for word in lines[4].split())
+        n_rho, n_r = int(first), int(second)
     except (IndexError, ValueError) as error:
         raise InputError(
             f"this is no setfl table: lines 4 and 5 should name the elements and the grids ({error})",
