@@ -9,12 +9,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Integer
 
 from mdnum.md.cutoffs import AtCutoff, Cutoff
 
 
-def of_type(leaf: Float[Array, "types"], types: Int[Array, "..."] | None) -> Float[Array, "..."]:
+def of_type(leaf: Float[Array, "types"], types: Integer[Array, "..."] | None) -> Float[Array, "..."]:
     """The entries of given pair types (None: only one); types come from the list, in range."""
     return leaf[0] if types is None else leaf.at[types].get(mode="promise_in_bounds")
 
@@ -28,7 +28,7 @@ class PairPotential(eqx.Module):
     def evaluate(self, r2: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """Energy u and du/d(r²) at squared distances, parameters broadcast against r2."""
 
-    def of(self, types: Int[Array, "..."] | None) -> PairPotential:
+    def of(self, types: Integer[Array, "..."] | None) -> PairPotential:
         """The parameters of given pair types; types None means that there is only one."""
         return jax.tree.map(lambda leaf: of_type(leaf, types), self)
 
