@@ -141,11 +141,10 @@ class Rollout:
             if blown is None:
                 self._checkpoint(segment, force=segment.closes == "end")
         status = "complete" if blown is None else "failed"
-        summary = summarize(self.simulation, self.folder, self.done, self.steps, status)
+        summary = summarize(self.simulation, self.done, self.steps, status)
         if blown is not None:
             return self._fail(blown, summary)
         self.folder.finalize()
-        summary = summarize(self.simulation, self.folder, self.done, self.steps, status)
         self.folder.write_summary(summary)
         return summary
 
@@ -157,13 +156,14 @@ class Rollout:
         pairs = self.recorder.counts(segment)
         ambiguous = self.recorder.ambiguous(segment)
         ledger = self.recorder.flips(segment)
-        self.folder.append("series", series_columns(self.simulation, segment, pairs, ambiguous, ledger))
+        rows = series_columns(self.simulation, segment, pairs, ambiguous, ledger)
+        self.folder.append("series", rows)
         if len(ledger):
             self.folder.append("flips", flip_columns(ledger))
-        row = done.health.take(segment)
-        if row is not None:
-            self.folder.append("epochs", row)
-        done.tally.take(segment, pairs, ambiguous, ledger)
+        ended = done.health.take(segment)
+        if ended is not None:
+            self.folder.append("epochs", ended)
+        done.tally.take(segment, rows, ledger)
         done.pairs = int(pairs[-1])
         if done.first is None:
             done.first = segment.unsorted("x", 0)

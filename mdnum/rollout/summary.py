@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -12,8 +12,40 @@ from mdnum.events import Ledger
 from mdnum.md.cell import displacement, wrap_positions
 from mdnum.rollout.engine import Segment
 from mdnum.rollout.series import degrees_of_freedom
-from mdnum.store import RunFolder
 from mdnum.systems.build import Simulation
+
+
+@dataclass
+class Line:
+    """A least-squares line through points that are not kept: a run's memory must not grow with its steps.
+
+    Values are taken relative to the first, so the sums carry the drift and not the energy itself.
+    """
+
+    count: int = 0
+    first: float = 0.0
+    x: float = 0.0
+    y: float = 0.0
+    xx: float = 0.0
+    xy: float = 0.0
+
+    def add(self, x: Float[np.ndarray, "rows"], y: Float[np.ndarray, "rows"]) -> None:
+        """Take more points."""
+        if not self.count:
+            self.first = float(y[0])
+        relative = y - self.first
+        self.count += len(x)
+        self.x += float(x.sum())
+        self.y += float(relative.sum())
+        self.xx += float(x @ x)
+        self.xy += float(x @ relative)
+
+    @property
+    def slope(self) -> float | None:
+        """dy/dx; None for fewer than three points."""
+        if self.count < 3:
+            return None
+        return (self.count * self.xy - self.x * self.y) / (self.count * self.xx - self.x**2)
 
 
 @dataclass
@@ -30,26 +62,29 @@ class Tally:
     start_up_seconds: float = 0.0
     seconds: float = 0.0
     steps_per_second: float = 0.0
+    conserved: Line = field(default_factory=Line)
 
-    def take(self, segment: Segment, pairs: np.ndarray, ambiguous: np.ndarray, ledger: Ledger) -> None:
-        """Add a segment."""
+    def take(self, segment: Segment, rows: dict[str, np.ndarray], ledger: Ledger) -> None:
+        """Add a segment: its rows of series.parquet and its flips."""
+        pairs = rows["pairs"]
         if self.step < 0:
             self.pairs_first = int(pairs[0])
         self.step = segment.last
         self.pairs_last = int(pairs[-1])
         self.entered += int(ledger.entered.sum())
         self.left += int((~ledger.entered).sum())
-        self.ambiguous += int(ambiguous.sum())
+        self.ambiguous += int(rows["ambiguous"].sum())
         self.ambiguous_flips += int(ledger.ambiguous.sum())
+        self.conserved.add(rows["time"], rows["conserved"])
 
     def to_dict(self) -> dict:
         """Plain values, for a checkpoint."""
-        return dict(self.__dict__)
+        return asdict(self)
 
     @classmethod
     def from_dict(cls, values: dict) -> Tally:
         """The inverse of `to_dict`."""
-        return cls(**values)
+        return cls(**{**values, "conserved": Line(**values["conserved"])})
 
 
 def log_line(simulation: Simulation, segment: Segment, row: int, pairs: int, flips: int) -> str:
@@ -64,14 +99,12 @@ def log_line(simulation: Simulation, segment: Segment, row: int, pairs: int, fli
     )
 
 
-def summarize(
-    simulation: Simulation, folder: RunFolder, done: Any, steps: int, status: str
-) -> dict[str, Any]:
+def summarize(simulation: Simulation, done: Any, steps: int, status: str) -> dict[str, Any]:
     """The content of summary.json, without the references' and the report's part."""
     tally, health, budget = done.tally, done.health, done.budget
     energy_jump, force_jump = simulation.jumps()
     timestep = simulation.system.spec.dynamics.timestep
-    cutoff = simulation.cutoff
+    cutoff, slope = simulation.cutoff, tally.conserved.slope
     return {
         "system": simulation.system.name,
         "about": simulation.system.spec.about,
@@ -95,7 +128,7 @@ def summarize(
         "first_lost_step": health.first_lost_step,
         "ambiguous": tally.ambiguous,
         "ambiguous_flips": tally.ambiguous_flips,
-        "energy_drift": drift(folder, simulation.atoms),
+        "energy_drift": None if slope is None else slope / simulation.atoms,
         "energy_budget_residual": budget.residual,
         "energy_budget_tolerance": budget.tolerance,
         "energy_budget_checks": budget.checks,
@@ -117,14 +150,6 @@ def summarize(
         "findings": [],
         "verdict": "",
     }
-
-
-def drift(folder: RunFolder, atoms: int) -> float | None:
-    """Slope of the conserved energy per atom, by least squares; None for fewer than three rows."""
-    rows = folder.read("series", ["time", "conserved"])
-    if len(rows["time"]) < 3:
-        return None
-    return float(np.polyfit(rows["time"], rows["conserved"] - rows["conserved"][0], 1)[0] / atoms)
 
 
 def closest_pair(simulation: Simulation, positions: Float[np.ndarray, "atoms 3"]) -> str:
