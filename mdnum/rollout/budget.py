@@ -57,9 +57,11 @@ class EnergyBudget:
             potential: potential energy that the run computed there.
         """
         difference = potential - self._reference.evaluate(positions).energy
+        # a reference that is the system itself has the jumps, too
+        jumps = 0.0 if self._reference is self.simulation else self.jumps
         if self.start is None:
-            self.start = difference - self.jumps
-        deviation = difference - self.start - self.jumps
+            self.start = difference - jumps
+        deviation = difference - self.start - jumps
         if abs(deviation) >= abs(self.residual):
             self.residual, self.step = deviation, step
         self.checks += 1
@@ -68,10 +70,9 @@ class EnergyBudget:
     @property
     def tolerance(self) -> float:
         """Deviation below which the budget closes: a tenth of the smallest jump, or rounding."""
-        jumps = np.abs(self.simulation.jumps()[0])
-        jumps = jumps[jumps > 0]
-        if len(jumps):
-            return _SHARE_OF_A_JUMP * float(jumps.min())
+        if self._reference is not self.simulation:
+            jumps = np.abs(self.simulation.jumps()[0])
+            return _SHARE_OF_A_JUMP * float(jumps[jumps > 0].min())
         eps = float(np.finfo(self.simulation.policy.dtype("force")).eps)
         return 1e3 * eps * max(1.0, abs(self._reference.evaluate().energy))
 
