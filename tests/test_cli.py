@@ -18,8 +18,8 @@ import pytest
 import mdnum.workflow
 from mdnum.cli import main, output
 from mdnum.cli.progress import ProgressBar, describe
-from mdnum.cli.run import default_folder
 from mdnum.errors import InputError, NumericalError
+from mdnum.store.naming import default_folder
 
 SUMMARY: dict[str, Any] = {
     "system": "argon/crystal-108",

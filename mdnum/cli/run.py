@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +10,6 @@ import typer
 from mdnum.cli import output
 from mdnum.cli.progress import ProgressBar
 from mdnum.errors import InputError
-
-_RUNS = Path("runs")
 
 
 def run(
@@ -45,6 +42,8 @@ def run(
             "--set would make the rest of a resumed run another run", remedy="Start a new run instead"
         )
     if resume is None:
+        from mdnum.store.naming import default_folder
+
         out = default_folder(str(system)) if out is None else out
 
     from mdnum.workflow import run as run_system
@@ -74,25 +73,6 @@ def run(
     else:
         _print_summary(summary, result.folder)
     return output.exit_code(summary.get("findings", ()), ok=summary.get("status", "complete") == "complete")
-
-
-def default_folder(system: str, runs: Path = _RUNS) -> Path:
-    """runs/NAME-N with the system's name in dashes and the first N past those that exist.
-
-    Args:
-        system: a system's name, or the path of its file.
-        runs: the folder of run folders.
-    """
-    path = Path(system)
-    word = path.stem if path.suffix == ".toml" else system
-    slug = re.sub(r"[^A-Za-z0-9._]+", "-", word).strip("-.") or "run"
-    taken = re.compile(re.escape(slug) + r"-(\d+)")
-    numbers = [
-        int(match[1])
-        for entry in (runs.iterdir() if runs.is_dir() else ())
-        if (match := taken.fullmatch(entry.name))
-    ]
-    return runs / f"{slug}-{max(numbers, default=0) + 1}"
 
 
 def _print_summary(summary: dict[str, Any], folder: Path | None) -> None:

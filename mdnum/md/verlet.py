@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -83,6 +83,7 @@ class PairTable:
         return out
 
 
+@runtime_checkable
 class ListBuilder(Protocol):
     """A neighbor search that fills a pair table."""
 

@@ -21,6 +21,7 @@ from mdnum.rollout.health import ListHealth
 from mdnum.rollout.series import series_columns
 from mdnum.rollout.summary import Tally, closest_pair, log_line, summarize
 from mdnum.store import RunFolder
+from mdnum.store.naming import default_folder
 from mdnum.systems.build import Simulation, build
 from mdnum.systems.load import System, load
 
@@ -320,7 +321,7 @@ def _fresh(system: System, out, steps, save_every, progress, began) -> Rollout:
     every = system.spec.record.save_every if save_every is None else save_every
     if last < 0 or every < 0:
         raise InputError("steps and save_every must not be negative")
-    folder = RunFolder.create(Path(out) if out is not None else _free_folder(system.name))
+    folder = RunFolder.create(Path(out) if out is not None else default_folder(system.name))
     system.write(folder.path)
     folder.write_provenance(provenance.collect(system))
     return Rollout(simulation, folder, last, every, progress, began)
@@ -342,10 +343,3 @@ def _resumed(path: Path, steps: int | None, progress, began) -> Rollout:
     rollout = Rollout(simulation, folder, last, int(saved["save_every"]), progress, began)
     rollout.restore(saved)
     return rollout
-
-
-def _free_folder(name: str) -> Path:
-    number = 1
-    while (path := Path("runs") / f"{name.replace('/', '-')}-{number}").exists():
-        number += 1
-    return path
