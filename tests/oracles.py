@@ -70,3 +70,48 @@ def minimum_image_pairs(positions, cell, pbc, r_cut, compare="r2 <") -> set:
         "r <=": np.sqrt(r2) <= r_cut,
     }[compare]
     return set(zip(i[inside].tolist(), j[inside].tolist(), strict=True))
+
+
+def all_pairs(positions, cell, pbc):
+    """(i, j, displacement) of every pair i < j, by float64 minimum image over fractional coordinates."""
+    positions, cell = np.asarray(positions, float), np.asarray(cell, float)
+    i, j = np.triu_indices(len(positions), 1)
+    d = positions[j] - positions[i]
+    periodic = [k for k in range(3) if pbc[k]]
+    if periodic:
+        # the dual of the periodic vectors alone: a free vector has no part in the choice of the image
+        rows = cell[periodic]
+        fractional = np.rint(d @ np.linalg.pinv(rows))
+        d = d - fractional @ rows
+    return i, j, d
+
+
+def margins(d, r_cut, compare="r2 <"):
+    """(inside, threshold - quantity) of displacements d; r_cut may be one radius or one for each."""
+    assert compare in COMPARISONS
+    r2 = d[:, 0] * d[:, 0] + d[:, 1] * d[:, 1] + d[:, 2] * d[:, 2]
+    quantity = r2 if compare.startswith("r2") else np.sqrt(r2)
+    threshold = np.asarray(r_cut, float) * np.asarray(r_cut, float) if compare.startswith("r2") else r_cut
+    margin = threshold - quantity
+    return margin >= 0 if compare.endswith("<=") else margin > 0, margin
+
+
+def recomputed_flips(frames, cell, pbc, r_cut, compare="r2 <"):
+    """The ledger of a trajectory, from its frames alone: rows (step, i, j, entered, margin, distance).
+
+    Args:
+        frames: positions at step 0, 1, 2, ..., each of shape (atoms, 3).
+        r_cut: one radius, or a function of index arrays (i, j) that gives one for each pair.
+    """
+    rows, before, counts = [], None, []
+    for step, positions in enumerate(frames):
+        i, j, d = all_pairs(positions, cell, pbc)
+        radius = r_cut(i, j) if callable(r_cut) else r_cut
+        inside, margin = margins(d, radius, compare)
+        counts.append(int(inside.sum()))
+        if before is not None:
+            for k in np.flatnonzero(inside != before):
+                distance = float(np.linalg.norm(d[k]))
+                rows.append((step, int(i[k]), int(j[k]), bool(inside[k]), float(margin[k]), distance))
+        before = inside
+    return rows, counts
