@@ -24,6 +24,11 @@ def _orthorhombic(simulation: Simulation) -> np.ndarray:
     return np.diag(np.asarray(simulation.cell.matrix)).copy()
 
 
+def _float64(value: float) -> Any:
+    # jax-md annotates floats but keeps float64 only in arrays
+    return scalar(value)
+
+
 def jax_md_neighbors(simulation: Simulation) -> tuple[Any, Any, Any, Any]:
     """jax-md's energy and its list over the simulation's start: (energy, shift, list, positions)."""
     from jax_md import energy, partition, space
@@ -31,15 +36,14 @@ def jax_md_neighbors(simulation: Simulation) -> tuple[Any, Any, Any, Any]:
     box = jnp.asarray(_orthorhombic(simulation))
     positions = jnp.mod(jnp.asarray(simulation.positions), box)
     displacement, shift = space.periodic(box)
-    # every number as a float64 array: jax-md would make float32 of a Python float
     neighbor_fn, energy_fn = energy.lennard_jones_neighbor_list(
         displacement,
         box,
-        sigma=scalar(1.0),
-        epsilon=scalar(1.0),
-        r_onset=scalar(0.8 * simulation.r_cut),
-        r_cutoff=scalar(simulation.r_cut),
-        dr_threshold=scalar(simulation.rule.skin),
+        sigma=_float64(1.0),
+        epsilon=_float64(1.0),
+        r_onset=_float64(0.8 * simulation.r_cut),
+        r_cutoff=_float64(simulation.r_cut),
+        dr_threshold=_float64(simulation.rule.skin),
         format=partition.OrderedSparse,
     )
     return energy_fn, shift, neighbor_fn.allocate(positions), positions
@@ -55,7 +59,7 @@ def jax_md_loop(simulation: Simulation) -> Loop:
 
     energy_fn, shift, neighbors, positions = jax_md_neighbors(simulation)
     init, apply = simulate.nve(energy_fn, shift, float(simulation.integrator.timestep))
-    state = init(jax.random.key(0), positions, scalar(1.0), neighbor=neighbors)
+    state = init(jax.random.key(0), positions, _float64(1.0), neighbor=neighbors)
     state = state.set(momentum=jnp.asarray(simulation.velocities))
 
     @jax.jit

@@ -23,11 +23,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import resource
-import subprocess
-import sys
-import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -38,8 +33,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from _liquid import R_CUT, SKIN, liquid
 from _output import COLORS, figure, parser, save, say, start, table
-
-from mdnum.provenance import cpu, package_versions
+from _processes import machine, memory, start_up
 
 if TYPE_CHECKING:
     from mdnum.systems import Simulation
@@ -203,50 +197,6 @@ def list_builds(atoms: int, repeats: int) -> dict[str, float]:
     return {name: median(values) for name, values in times.items()}
 
 
-def start_up() -> dict[str, float]:
-    """Seconds that a fresh process needs to the first step of argon/liquid-864, and the CPU time of it."""
-    with tempfile.TemporaryDirectory() as scratch:
-        words = [
-            "run",
-            "argon/liquid-864",
-            "--steps",
-            "1",
-            "--no-check",
-            "--no-report",
-            "-o",
-            f"{scratch}/run",
-        ]
-        before, begin = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-        subprocess.run([sys.executable, "-m", "mdnum", *words], check=True, stdout=subprocess.DEVNULL)
-        wall, after = time.perf_counter() - begin, resource.getrusage(resource.RUSAGE_CHILDREN)
-    busy = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    return {"seconds": wall, "cpu_seconds": busy}
-
-
-def memory(atoms: int, steps: int) -> list[dict[str, float]]:
-    """Peak memory of a process that runs into a folder, after each quarter of the steps."""
-    words = ["--memory-of", str(atoms), str(steps)]
-    done = subprocess.run([sys.executable, __file__, *words], check=True, stdout=subprocess.PIPE, text=True)
-    return json.loads(done.stdout)
-
-
-def _memory_of(atoms: int, steps: int) -> None:
-    """The process that memory() looks at."""
-    from mdnum.rollout import run
-
-    unit = 2**20 if sys.platform == "darwin" else 2**10
-    seen: list[dict[str, float]] = []
-
-    def look(step: int, _: int, info: dict[str, Any]) -> None:
-        if info["phase"] == "run" and 4 * step >= (len(seen) + 1) * steps:
-            peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
-            seen.append({"step": step, "flips": info["flips"], "peak_mb": peak})
-
-    with tempfile.TemporaryDirectory() as scratch:
-        run(liquid(atoms), out=f"{scratch}/run", steps=steps, progress=look)
-    print(json.dumps(seen))
-
-
 def verdicts(result: dict[str, Any]) -> list[tuple[str, float, str, bool]]:
     """What was measured against what it should be: (claim, measured, wanted, holds)."""
     speeds = {(row["code"], row["atoms"]): Speed(**row) for row in result["speeds"]}
@@ -340,39 +290,24 @@ def draw(result: dict[str, Any], path: Path) -> None:
     save(drawn, path)
 
 
-def machine() -> str:
-    """What it ran on, in a line."""
-    processor, versions = cpu(), package_versions()
-    named = ", ".join(
-        f"{name} {versions[name]}" for name in ("mdnum", "jax", "jax-md", "numba", "numpy", "vesin")
-    )
-    load = f", load {os.getloadavg()[0]:.1f} at the end" if hasattr(os, "getloadavg") else ""
-    return f"{processor['model']}, {processor['cores']} cores{load}; Python {sys.version.split()[0]}, {named}"
-
-
 def _options() -> argparse.Namespace:
     made = parser(__file__, __doc__)
-    made.add_argument("--quick", action="store_true", help="one small size and short turns: does it work?")
-    made.add_argument(
-        "--sizes", nargs="+", type=int, metavar="N", help="atoms, about (default 4000 32000 108000)"
-    )
+    made.add_argument("--quick", action="store_true", help="500 atoms and short turns: does it work?")
+    made.add_argument("--full", action="store_true", help="4000, 32000 and 108000 atoms; a few minutes")
+    made.add_argument("--sizes", nargs="+", type=int, metavar="N", help="atoms, about (default 4000)")
     made.add_argument("--peers-to", type=int, default=40_000, metavar="N", help="largest size for the others")
     made.add_argument("--seconds", type=float, help="length of a turn, about (default 1)")
     made.add_argument("--turns", type=int, help="turns of each contender (default 3)")
     made.add_argument("--json", action="store_true", help="print one JSON document instead of tables")
-    made.add_argument("--memory-of", nargs=2, type=int, help=argparse.SUPPRESS)
     return made.parse_args()
 
 
 def main() -> None:
     """Parse, measure, print and draw."""
     chosen = _options()
-    if chosen.memory_of:
-        _memory_of(*chosen.memory_of)
-        return
     import _peers
 
-    sizes = chosen.sizes or ([500] if chosen.quick else [4_000, 32_000, 108_000])
+    sizes = chosen.sizes or ([500] if chosen.quick else [4_000, 32_000, 108_000] if chosen.full else [4_000])
     seconds = chosen.seconds or (0.1 if chosen.quick else 1.0)
     turns = chosen.turns or 3
     has_lammps = _peers.lammps_version() is not None
@@ -385,7 +320,7 @@ def main() -> None:
         result["speeds"] += [asdict(row) for row in race(atoms, codes, seconds, turns)]
     for atoms in [size for size in sizes if size <= chosen.peers_to]:
         say(f"N = {atoms:,}: neighbor searches")
-        result["list_builds_ms"][str(atoms)] = list_builds(atoms, 2 * turns)
+        result["list_builds_ms"][str(atoms)] = list_builds(atoms, turns)
     steps = max(80, round(4 * seconds / _EXPECTED[RECORDED] / sizes[0]))
     say(f"memory over {steps:,} steps")
     result |= {"memory_atoms": sizes[0], "memory": memory(sizes[0], steps)}

@@ -121,8 +121,8 @@ def main() -> None:
         help="skins in the system's unit (default a third of, once and one and a half times its own)",
     )  # fmt: skip
     made.add_argument(
-        "--every", nargs="+", type=int, default=[0, 20, 40, 80], metavar="K",
-        help="rebuild blindly every so many steps; 0 checks displacements (default 0 20 40 80)",
+        "--every", nargs="+", type=int, default=[0, 20, 40], metavar="K",
+        help="rebuild blindly every so many steps; 0 checks displacements (default 0 20 40)",
     )  # fmt: skip
     chosen = made.parse_args()
     system = load(chosen.system)

@@ -19,6 +19,7 @@ report.html, whose path is the last line.
 
 from __future__ import annotations
 
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -55,10 +56,10 @@ def facts(run: Run) -> list[tuple[str, str]]:
         ("pairs inside, first and last step", f"{summary['pairs_first']:,}, {summary['pairs_last']:,}"),
     ]
     if total:
-        counts = analysis.busiest_pairs(flips).flips
+        counts = run.busiest.flips
         top = max(1, len(counts) // 100)
-        stays = analysis.stays(flips)
-        margins = analysis.margins_in_bounds(flips)
+        stays = run.stays
+        margins = run.margins
         rows += [
             ("pairs that flipped", f"{len(counts):,}; {counts[0]} times at most"),
             (f"flips of the busiest {top:,} of them", f"{counts[:top].sum() / counts.sum():.1%}"),
@@ -67,7 +68,7 @@ def facts(run: Run) -> list[tuple[str, str]]:
             ("smallest margin", f"{margins.min():.3g} rounding bounds"),
             (
                 "ambiguous flips",
-                f"{int(flips['ambiguous'].sum()):,}; {analysis.expected_ambiguous(flips):.2g} expected",
+                f"{int(flips['ambiguous'].sum()):,}; {analysis.expected_ambiguous(margins):.2g} expected",
             ),
         ]
     closes = "closes" if summary["energy_budget_closes"] else "does not close"
@@ -99,11 +100,11 @@ def draw(run: Run, path: Path) -> None:
     per_step.set_ylim(bottom=0)
     per_step.legend()
     if run.flips_total:
-        counts = analysis.busiest_pairs(run.flips).flips
+        counts = run.busiest.flips
         times, pairs = np.unique(counts, return_counts=True)
         per_pair.bar(times, pairs, log=True)
         per_pair.xaxis.set_major_locator(MaxNLocator(integer=True))
-        lengths = analysis.stays(run.flips)
+        lengths = run.stays
         longest = max(lengths.all.max(initial=10), 10)
         edges = np.unique(np.round(np.geomspace(1, longest + 1, 30)))
         for values, label in ((lengths.inside, "inside"), (lengths.outside, "outside")):
@@ -112,7 +113,7 @@ def draw(run: Run, path: Path) -> None:
         stayed.legend()
         stayed.set_xscale("log")
         stayed.set_yscale("log", nonpositive="mask")
-        ratio = analysis.margins_in_bounds(run.flips)
+        ratio = run.margins
         ratio = ratio[np.isfinite(ratio) & (ratio > 0)]
         if len(ratio):
             low = np.floor(np.log10(min(ratio.min(), 1)))
@@ -145,14 +146,11 @@ def main() -> None:
         words=2,
     )
     if run.flips_total:
-        busiest = analysis.busiest_pairs(run.flips, chosen.busiest)
+        busiest = zip(run.busiest.i, run.busiest.j, run.busiest.flips, strict=True)
         table(
             "\npairs that flip most",
             ("pair", "flips", f"mean distance ({run.units.length})", "fastest radial speed"),
-            (
-                (f"{i}-{j}", count, *_where(run, i, j))
-                for i, j, count in zip(busiest.i, busiest.j, busiest.flips, strict=True)
-            ),
+            ((f"{i}-{j}", count, *_where(run, i, j)) for i, j, count in islice(busiest, chosen.busiest)),
         )
     draw(run, chosen.output)
     print(f"\n{run.summary['verdict']}\n\n{folder / 'report.html'}")

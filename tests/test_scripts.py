@@ -1,0 +1,135 @@
+"""Each study runs from its command line with small settings and leaves its table and its figure."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
+STUDIES = (
+    "ase_comparison",
+    "benchmark",
+    "cutoff_sensitivity",
+    "skin_sensitivity",
+    "topology_flip_report",
+)
+
+# every one starts a Python with jax and compiles; a minute on a busy machine
+pytestmark = pytest.mark.slow
+
+
+def study(name: str, *words: str, cwd: Path, code: int = 0) -> str:
+    """What a script prints to stdout; it is run elsewhere, as a user would."""
+    done = subprocess.run(
+        [sys.executable, str(SCRIPTS / f"{name}.py"), *words],
+        cwd=cwd,
+        env={**os.environ, "MPLBACKEND": "Agg"},
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+    assert done.returncode == code, done.stderr
+    return done.stdout if code == 0 else done.stderr
+
+
+def row(table: str, *first: str) -> list[str]:
+    """The cells of the only line whose first cells are these."""
+    lines = [re.split(r"\s{2,}", line.strip()) for line in table.splitlines()]
+    found = [cells for cells in lines if cells[: len(first)] == list(first)]
+    assert len(found) == 1, (first, table)
+    return found[0]
+
+
+def is_png(path: Path) -> bool:
+    """Whether a file holds a picture."""
+    return path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n" and path.stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_help_says_the_question_and_how_to_read_the_answer(name: str, tmp_path: Path) -> None:
+    text = study(name, "--help", cwd=tmp_path)
+    assert "?" in text.split("\n\n")[1]
+    assert "How to read it." in text
+
+
+def test_hard_and_shifted_cutoffs_flip_alike_and_conserve_differently(tmp_path: Path) -> None:
+    words = ["argon/crystal-108", "--steps", "150", "--kinds", "hard", "shifted", "switched"]
+    table = study("cutoff_sensitivity", *words, "--scales", "1", "-o", "c.png", cwd=tmp_path)
+    hard, shifted, switched = (row(table, kind) for kind in ("hard", "shifted", "switched"))
+    column = ["cutoff", "r_cut", "E/N", "std", "drift", "flips", "energy_jump", "force_jump", "smooth"].index
+    assert float(hard[column("flips")]) > 0
+    assert hard[column("flips")] == shifted[column("flips")]
+    assert hard[column("force_jump")] == shifted[column("force_jump")]
+    assert float(hard[column("energy_jump")]) < 0 == float(shifted[column("energy_jump")])
+    assert float(hard[column("std")]) > 10 * float(shifted[column("std")]) > 0
+    assert float(switched[column("force_jump")]) == 0
+    assert [int(one[-1]) for one in (hard, shifted, switched)] == [-1, 0, 1]
+    assert is_png(tmp_path / "c.png")
+
+
+def test_a_cutoff_study_refuses_a_potential_without_one(tmp_path: Path) -> None:
+    text = study("cutoff_sensitivity", "silicon/stillinger-weber-512", cwd=tmp_path, code=2)
+    assert "carries its own cutoff" in text
+    assert "Traceback" not in text
+    assert not list(tmp_path.iterdir())
+
+
+def test_blind_rebuilds_lose_pairs_and_checked_ones_do_not(tmp_path: Path) -> None:
+    words = ["argon/langevin-500", "--steps", "200", "--skins", "0.3", "--every", "0", "100"]
+    table = study("skin_sensitivity", *words, "-o", "s.svg", cwd=tmp_path)
+    column = ["skin", "rule", "rebuilds", "dangerous", "used", "lost", "pair_steps", "first", "rate"].index
+    checked, blind = row(table, "0.3", "check"), row(table, "0.3", "blind, every 100")
+    assert int(checked[column("lost")]) == 0
+    assert float(checked[column("used")]) <= 1.0
+    assert checked[column("first")] == "-"
+    assert int(blind[column("pair_steps")]) >= int(blind[column("lost")]) > 0
+    assert 0 < int(blind[column("first")]) <= 200
+    assert (tmp_path / "s.svg").read_text().lstrip().startswith("<?xml")
+
+
+def test_flips_of_a_new_run_and_of_its_folder_are_the_same(tmp_path: Path) -> None:
+    words = ["--busiest", "3", "-o", "t.png"]
+    made = study(
+        "topology_flip_report", "argon/crystal-108", "--steps", "150", "--folder", "run", *words, cwd=tmp_path
+    )
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    flips = summary["flips_entered"] + summary["flips_left"]
+    assert flips > 0
+    assert row(made, "flips")[1].startswith(f"{flips:,}: ")
+    assert (tmp_path / made.splitlines()[-1]).is_file()
+    assert is_png(tmp_path / "t.png")
+    assert study("topology_flip_report", "run", *words, cwd=tmp_path) == made
+
+
+def test_ase_agrees_and_searches_are_listed_with_where_they_stop(tmp_path: Path) -> None:
+    words = ["argon/crystal-108", "--every-kind", "none", "--pairs", "argon/crystal-108"]
+    table = study("ase_comparison", *words, "-o", "a.png", cwd=tmp_path)
+    compared = row(table, "argon/crystal-108", "hard")
+    assert compared[-1] == "yes"
+    assert float(compared[3]) <= 1e-12
+    assert float(compared[4]) <= 1e-10
+    assert row(table, "vesin")[-1] == "agrees"
+    assert row(table, "vesin")[-2] == "-1 ulp"
+    assert "relative" in row(table, "MDAnalysis nsgrid")[-2]
+    assert is_png(tmp_path / "a.png")
+
+
+def test_the_benchmark_measures_what_it_names(tmp_path: Path) -> None:
+    made = json.loads(study("benchmark", "--quick", "--turns", "1", "--json", "-o", "b.png", cwd=tmp_path))
+    speeds = {one["code"]: one for one in made["speeds"]}
+    assert {"mdnum, recorded", "mdnum, unrecorded", "jax-md loop"} <= set(speeds)
+    assert all(one["steps_per_second"] > 0 and one["cpu_ms_per_step"] > 0 for one in speeds.values())
+    assert {one["atoms"] for one in speeds.values()} == {500}
+    steps = [one["step"] for one in made["memory"]]
+    assert len(steps) == 4
+    assert steps == sorted(set(steps))
+    assert all(one["flips"] > 0 for one in made["memory"])
+    assert set(made["list_builds_ms"]["500"]) == {"mdnum host", "vesin", "jax-md update"}
+    assert made["start_up"]["cpu_seconds"] > 0
+    assert is_png(tmp_path / "b.png")
