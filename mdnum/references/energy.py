@@ -12,7 +12,7 @@ from ase import Atoms
 from mdnum.references.ase_models import Reference, evaluate, independent, reference
 from mdnum.references.closed_forms import pair_forms
 from mdnum.references.findings import finding, plain
-from mdnum.references.independent import Edges, PairModel
+from mdnum.references.independent import Edges, PairModel, edges_of
 from mdnum.references.oracle import rounding_bound
 from mdnum.references.trajectory import trajectory
 from mdnum.systems import System
@@ -308,14 +308,12 @@ class _Scales:
             )
         model = PairModel(pair_forms(system.spec, system.species))
         edges = Edges(np.array(atoms.get_chemical_symbols()), i, j, np.zeros((len(i), 3)), r)
-        energies, forces, stiffness, ambiguous = np.zeros(len(i)), np.zeros(len(i)), np.zeros(len(i)), 0
-        bound = rounding_bound(positions, cell, float(system.r_cut), unit_roundoff=unit)
+        energies, forces, stiffness = np.zeros(len(i)), np.zeros(len(i)), np.zeros(len(i))
         for form, rows in model.groups(edges):
             u, du = form(r[rows])
             step = 1e-4 * form.r_cut
             energies[rows], forces[rows] = np.abs(u), np.abs(du)
             stiffness[rows] = np.abs(form(r[rows] + step)[1] - form(r[rows] - step)[1]) / (2 * step)
-            ambiguous += int((np.abs(r[rows] - form.r_cut) <= bound).sum())
         per_atom = np.zeros(len(atoms))
         np.add.at(per_atom, i, (stiffness * shift) ** 2 + (12.0 * unit * forces) ** 2)
         np.add.at(per_atom, j, (stiffness * shift) ** 2 + (12.0 * unit * forces) ** 2)
@@ -332,8 +330,20 @@ class _Scales:
             float((forces * r).sum()) / volume,
             float(energy_expected),
             float(np.sqrt(per_atom.max(initial=0.0))) + 4.0 * unit * force,
-            ambiguous,
+            _ambiguous(model, atoms, unit),
         )
+
+
+def _ambiguous(model: PairModel, atoms: Atoms, unit: float) -> int:
+    """Pairs within rounding of their cutoff, counted as inside or not."""
+    bound = rounding_bound(atoms.get_positions(), np.asarray(atoms.cell), model.reach, unit_roundoff=unit)
+    edges = edges_of(atoms, model.reach + bound)
+    once = edges.i < edges.j
+    radius = np.zeros(len(edges.i))
+    for a, b in model.forms:
+        chosen = (edges.symbols[edges.i] == a) & (edges.symbols[edges.j] == b)
+        radius[chosen] = model.forms[a, b].r_cut
+    return int((once & (np.abs(edges.r - radius) <= bound)).sum())
 
 
 def _findings(frames: Sequence[FrameComparison], judge: Reference, precision: str) -> list[dict[str, str]]:

@@ -88,9 +88,10 @@ class Finder:
             )
         except MdnumError:
             raise
-        except (
-            Exception
-        ) as error:  # another library's search may fail in any way; that is a result, not a crash
+        except Exception as error:
+            if self.ours:  # a defect to see whole
+                raise
+            # another library's search may fail in any way; that is a result of the comparison
             raise FinderError(f"{type(error).__name__}: {error}", where=self.name) from error
         order = np.lexsort((distance, j, i))
         return i[order], j[order], distance[order]

@@ -9,11 +9,11 @@ import pytest
 from ase import Atoms
 from ase.build import bulk
 from ase.calculators.fd import calculate_numerical_forces, calculate_numerical_stress
+from small_systems import make
 
 from mdnum.references.ase_models import evaluate, independent, reference
 from mdnum.references.closed_forms import pair_forms
 from mdnum.references.independent import OnNeighborList, StillingerWeberModel, TersoffModel
-from mdnum.systems import System, SystemSpec
 
 CUTOFFS = ["hard", "shifted", "force-shifted", "switched", "quintic", "cosine"]
 POTENTIALS = {
@@ -29,12 +29,6 @@ WITH_A_CLASS = {
     ("morse", "shifted"),
     ("morse", "quintic"),
 }
-
-
-def make(atoms: Atoms, potential: dict, cutoff: dict | None = None, units: str = "lj") -> System:
-    tables = {"units": units, "structure": {"file": "none"}, "potential": potential}
-    tables |= {"dynamics": {"kind": "nve", "timestep": 0.004}} | ({"cutoff": cutoff} if cutoff else {})
-    return System("test", SystemSpec.model_validate(tables), None, atoms)
 
 
 def crystal(repeat: int = 3) -> Atoms:
