@@ -1,0 +1,125 @@
+"""Recording changes nothing, hard and shifted are one trajectory, and buffers do not grow with the steps."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import jax
+import numpy as np
+import pytest
+from rollout.harness import go, liquid, tables_equal, write_system
+
+from mdnum.rollout.engine import _MOST_ROWS, _RECORD_BYTES, Engine
+from mdnum.rollout.epoch import Record
+from mdnum.systems import load
+from mdnum.systems.build import build
+
+STEPS = 150
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    return write_system(tmp_path_factory.mktemp("fluid"), liquid())
+
+
+def rows_and_end(simulation, last, record):
+    """The numbers of every step and the bits of the last state."""
+    numbers = {name: [] for name in ("potential", "kinetic", "virial", "heat", "moved")}
+    closed = []
+    for segment in Engine(simulation, last, record=record).segments():
+        for name, values in numbers.items():
+            values.append(np.array(segment.rows_of(name)))
+        closed.append((segment.last, segment.closes))
+    state = {name: np.asarray(value) for name, value in segment.state._asdict().items()}
+    return {name: np.concatenate(values) for name, values in numbers.items()}, state, closed
+
+
+def same(a, b):
+    assert a.keys() == b.keys()
+    for name in a:
+        assert a[name].tobytes() == b[name].tobytes(), name
+
+
+def test_a_run_that_is_recorded_has_the_bits_of_one_that_is_not(path):
+    simulation = build(load(path))
+    seen, seen_end, seen_closed = rows_and_end(simulation, STEPS, True)
+    blind, blind_end, blind_closed = rows_and_end(simulation, STEPS, False)
+    assert len(seen["potential"]) == STEPS + 1 and len(seen_closed) > 2
+    same(seen, blind)
+    same(seen_end, blind_end)
+    assert seen_closed == blind_closed
+
+
+def test_two_runs_have_the_same_bits(path):
+    first, second = (rows_and_end(build(load(path)), STEPS, True) for _ in range(2))
+    same(first[0], second[0])
+    same(first[1], second[1])
+
+
+def test_hard_and_shifted_are_the_same_trajectory_with_other_energies(path, tmp_path):
+    hard, one = go(tmp_path / "hard", path, STEPS)
+    shifted, other = go(tmp_path / "shifted", path, STEPS, {"cutoff.kind": "shifted"})
+    tables_equal(one, other, "flips", but=("energy_jump",))
+    tables_equal(one, other, "epochs", but=("build_ms",))
+    apart = ("potential", "total", "conserved", "energy_jump")
+    tables_equal(one, other, "series", but=apart)
+    a, b = one.load_checkpoint(), other.load_checkpoint()
+    for name in ("state_x", "state_v", "state_images"):
+        assert a[name].tobytes() == b[name].tobytes()
+    x, y = one.read("series"), other.read("series")
+    jump = 4 * (2.0**-12 - 2.0**-6)
+    assert np.allclose(x["potential"] - y["potential"], x["pairs"] * jump, rtol=0, atol=1e-10)
+    assert np.any(x["energy_jump"] != 0) and not np.any(y["energy_jump"])
+    assert not np.any(other.read("flips")["energy_jump"])
+    assert (
+        hard.summary["cutoff"]["energy_jump"] == pytest.approx(jump)
+        and shifted.summary["cutoff"]["energy_jump"] == 0
+    )
+    # which is why a hard run's energy jumps while the shifted one keeps it
+    assert np.std(x["total"]) > 5 * np.std(y["total"])
+
+
+@pytest.mark.slow
+def test_the_order_of_the_sum_is_part_of_the_program(path, tmp_path):
+    _, one = go(tmp_path / "s", path, STEPS)
+    _, other = go(tmp_path / "p", path, STEPS, {"precision.reduction": "pairwise"})
+    a, b = one.read("series"), other.read("series")
+    assert a["potential"][0] == pytest.approx(b["potential"][0], rel=1e-13)
+    assert not np.array_equal(a["potential"], b["potential"])
+    assert np.array_equal(a["pairs"], b["pairs"])
+
+
+def record_bytes(engine, words):
+    record = jax.eval_shape(lambda: engine._take(0, words))
+    assert isinstance(record, Record)
+    return sum(int(np.prod(leaf.shape)) * leaf.dtype.itemsize for leaf in jax.tree.leaves(record))
+
+
+def test_record_buffers_do_not_grow_with_the_steps(path):
+    simulation = build(load(path))
+    sizes = [record_bytes(Engine(simulation, last), 6) for last in (1_000, 100_000, 10**9)]
+    assert len(set(sizes)) == 1
+    assert sizes[0] <= _RECORD_BYTES
+    rows = []
+    for segment in Engine(simulation, 400).segments():
+        rows.append(segment.rows)
+        assert segment.record.x.shape[0] <= _MOST_ROWS
+    assert sum(rows) == 401
+    # a large system gets fewer rows, not more memory
+    engine = Engine(simulation, 10**6)
+    engine.simulation = SimpleNamespace(atoms=200_000, policy=simulation.policy)
+    assert record_bytes(engine, 11) <= _RECORD_BYTES * 1.1
+
+
+def test_a_short_run_takes_little_room(path):
+    engine = Engine(build(load(path)), 3)
+    assert 4 <= engine._room(6) <= 8
+    assert record_bytes(engine, 6) < 100_000
+
+
+def test_no_steps_at_all_is_one_evaluation(path, tmp_path):
+    result, folder = go(tmp_path, path, 0)
+    series = folder.read("series")
+    assert series["step"].tolist() == [0]
+    assert len(folder.read("flips")["step"]) == 0
+    assert result.summary["status"] == "complete" and result.summary["energy_budget_closes"]
