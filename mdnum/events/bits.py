@@ -13,28 +13,32 @@ from jaxtyping import Int, UInt8
 _POPULATION = np.array([int(byte).bit_count() for byte in range(256)], np.int64)
 
 
-@numba.njit(cache=True, nogil=True)
-def _count_changed(before, now):
-    total = 0
-    for w in range(now.shape[0]):
-        for c in range(now.shape[1]):
-            total += _POPULATION[before[w, c] ^ now[w, c]]
-    return total
+# most bytes do not change: this many are looked at together before any is looked at alone
+_BLOCK = 16
 
 
 @numba.njit(cache=True, nogil=True)
-def _list_changed(before, now, slots, columns, values):
+def _scan_changed(before, now, places, values, write):
+    """Count the changed bits of flat byte arrays; with write, also note byte * 8 + bit and the bit now."""
     at = 0
-    for w in range(now.shape[0]):
-        for c in range(now.shape[1]):
-            changed = before[w, c] ^ now[w, c]
-            if changed:
-                for k in range(8):
-                    if (changed >> k) & 1:
-                        slots[at] = 8 * w + k
-                        columns[at] = c
-                        values[at] = (now[w, c] >> k) & 1
-                        at += 1
+    n = now.shape[0]
+    for first in range(0, n, _BLOCK):
+        last = min(first + _BLOCK, n)
+        any_changed = np.uint8(0)
+        for q in range(first, last):
+            any_changed |= before[q] ^ now[q]
+        if any_changed:
+            for q in range(first, last):
+                changed = before[q] ^ now[q]
+                if changed and not write:
+                    at += _POPULATION[changed]
+                elif changed:
+                    for k in range(8):
+                        if (changed >> k) & 1:
+                            places[at] = 8 * q + k
+                            values[at] = (now[q] >> k) & 1
+                            at += 1
+    return at
 
 
 def changed_bits(
@@ -45,13 +49,14 @@ def changed_bits(
     Returns:
         slot, column and the decision now (1 yes, 0 no) of every changed bit, by slot word, column, bit.
     """
-    count = _count_changed(before, now)
-    slots = np.empty(count, np.int64)
-    columns = np.empty(count, np.int64)
-    values = np.empty(count, np.uint8)
-    if count:
-        _list_changed(before, now, slots, columns, values)
-    return slots, columns, values
+    old, new = np.ascontiguousarray(before).ravel(), np.ascontiguousarray(now).ravel()
+    none, no_values = np.empty(0, np.int64), np.empty(0, np.uint8)
+    count = _scan_changed(old, new, none, no_values, False)
+    places, values = np.empty(count, np.int64), np.empty(count, np.uint8)
+    _scan_changed(old, new, places, values, True)
+    byte, bit = np.divmod(places, 8)
+    word, column = np.divmod(byte, now.shape[1]) if now.shape[1] else (byte, byte)
+    return 8 * word + bit, column, values
 
 
 def set_bits(

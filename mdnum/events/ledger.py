@@ -65,8 +65,14 @@ class Ledger:
 
 def sort_rows(step, subject) -> Int[np.ndarray, "rows"]:
     """Order of rows by step, then by the labels of the subject, first label first."""
-    keys = tuple(subject[:, k] for k in range(subject.shape[1] - 1, -1, -1))
-    return np.lexsort((*keys, step))
+    sizes = [int(column.max(initial=0)) + 1 for column in subject.T]
+    key = step - step.min(initial=0)
+    if float(key.max(initial=0) + 1) * float(np.prod(np.array(sizes, float))) >= 2**63:
+        return np.lexsort((*subject.T[::-1], step))
+    # one integer sorts several times faster than three keys
+    for column, size in zip(subject.T, sizes, strict=True):
+        key = key * size + column
+    return np.argsort(key, kind="stable")
 
 
 def broken_alternations(ledger: Ledger) -> int:

@@ -58,7 +58,7 @@ class Cell(eqx.Module):
                 f"axis {axis} is periodic but its lattice vector is zero",
                 remedy="Give the structure a cell or set structure.pbc = false for that axis",
             )
-        full = _completed(matrix)
+        full = complete(matrix, flags)
         if abs(np.linalg.det(full)) < 1e-12 * np.prod(np.linalg.norm(full, axis=1)):
             raise InputError("the lattice vectors span no volume")
         inverse = np.linalg.inv(full)
@@ -161,21 +161,22 @@ def strain_loss(reference: Cell, now: Cell, r_list: float) -> float:
 
     Source: kUPS issue 263, `2 max|u| + r_list max(0, 1 - sigma_min(F)) <= r_list - r_cut`.
     """
-    a, b = _completed(np.asarray(reference.matrix)), _completed(np.asarray(now.matrix))
+    flags = np.array(reference.pbc)
+    a, b = complete(np.asarray(reference.matrix), flags), complete(np.asarray(now.matrix), flags)
     smallest = np.linalg.svd(np.linalg.solve(a, b), compute_uv=False)[-1]
     return float(r_list * max(0.0, 1.0 - smallest))
 
 
-def _completed(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
-    """Lattice vectors with each zero row replaced by a unit vector that is orthogonal to the others."""
-    full = np.array(matrix, np.float64, copy=True)
-    missing: Bool[np.ndarray, "3"] = np.linalg.norm(full, axis=1) == 0
-    if missing.all():
-        return np.eye(3)
-    for k in np.flatnonzero(missing):
-        others = full[np.linalg.norm(full, axis=1) > 0]
-        # a null vector of the vectors that are there: the last right singular vector
-        full[k] = np.linalg.svd(others)[2][len(others)]
-    if missing.any() and np.linalg.det(full) < 0:
-        full[np.flatnonzero(missing)[0]] *= -1
-    return full
+def complete(cell: Float[np.ndarray, "3 3"], pbc: Bool[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """The cell with every non-periodic vector replaced by a unit vector perpendicular to the others.
+
+    A tilted row of a free axis would otherwise leak into the choice of the image along the periodic ones.
+
+    Args:
+        cell: lattice vectors as rows, length; rows of non-periodic axes may be anything.
+        pbc: which axes are periodic.
+    """
+    from ase.geometry import complete_cell
+
+    rows = np.where(np.asarray(pbc, bool)[:, None], np.asarray(cell, np.float64), 0.0)
+    return np.asarray(complete_cell(rows), np.float64)

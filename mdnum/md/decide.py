@@ -150,11 +150,11 @@ class SlotJudge:
         threshold = of_type(self.value, types)
         return d, quantity, self.decider.inside(quantity, threshold) & (j < self.atoms), threshold
 
-    def tally(self, nearest, bits, k, j, quantity, inside, threshold):
+    def tally(self, nearest, bits, k, quantity, inside, threshold):
         """Bits and nearest margin with slot k of a block added."""
         bits = bits | (inside.astype(jnp.uint8) << jnp.uint8(k))
-        margin = jnp.where(j < self.atoms, jnp.abs(threshold - quantity), jnp.inf)
-        return bits, jnp.minimum(nearest, margin)
+        # padding repeats the last atom, which is listed too or too far away to be the nearest to a threshold
+        return bits, jnp.minimum(nearest, jnp.abs(threshold - quantity))
 
     @staticmethod
     def finish(nearest, bits) -> Decisions:
@@ -179,7 +179,7 @@ def decide_table(
         for k in range(SLOTS):
             t = None if types is None else types[k]
             _, quantity, inside, threshold = judge.slot(index[k], t)
-            bits, nearest = judge.tally(nearest, bits, k, index[k], quantity, inside, threshold)
+            bits, nearest = judge.tally(nearest, bits, k, quantity, inside, threshold)
         return nearest, bits
 
     nearest, bits = lax.scan(block, judge.start(), (tables.index, tables.types))

@@ -12,21 +12,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 import mdnum.precision  # noqa: F401  (switches float64 on before the first array exists)
 from mdnum.errors import InputError
+from mdnum.md.cell import complete
 
 Displacement = Callable[..., Array]
-
-
-def complete(cell: Float[np.ndarray, "3 3"], pbc: Bool[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """The cell with every non-periodic vector replaced by a unit vector perpendicular to the others.
-
-    Args:
-        cell: lattice vectors as rows, length; rows of non-periodic axes may be anything.
-        pbc: which axes are periodic.
-    """
-    from ase.geometry import complete_cell
-
-    rows = np.where(np.asarray(pbc, bool)[:, None], np.asarray(cell, np.float64), 0.0)
-    return np.asarray(complete_cell(rows), np.float64)
 
 
 def widths(cell: Float[np.ndarray, "3 3"], pbc: Bool[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:

@@ -103,7 +103,7 @@ class PairForce(eqx.Module):
                 t = None if types is None else types[k]
                 d, quantity, inside, threshold = judge.slot(index[k], t)
                 if decisions:
-                    bits, nearest = judge.tally(nearest, bits, k, index[k], quantity, inside, threshold)
+                    bits, nearest = judge.tally(nearest, bits, k, quantity, inside, threshold)
                 d = d if same else displacements(components, cell, index[k])
                 if same and self.decider.space == "r2":
                     r2 = quantity

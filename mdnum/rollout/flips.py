@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
@@ -14,15 +12,21 @@ from mdnum.rollout.engine import Segment
 from mdnum.systems.build import Simulation
 
 
-@dataclass(frozen=True)
 class PairRecorder:
     """Writes the `pair` channel of a simulation.
 
-    Attributes:
+    Args:
         simulation: the system as objects.
     """
 
-    simulation: Simulation
+    def __init__(self, simulation: Simulation):
+        self.simulation = simulation
+        decider = simulation.decider
+        self._dtype = np.dtype(decider.dtype)
+        self._inclusive = decider.compare.endswith("<=")
+        self._thresholds = np.array([t.value for t in decider.thresholds])
+        self._bounds = np.array(decider.bounds)
+        self._energy_jumps, self._force_jumps = simulation.jumps()
 
     def inside(self, bits: UInt8[np.ndarray, "words atoms"]) -> int:
         """Number of pairs inside; a full list holds each twice."""
@@ -40,7 +44,7 @@ class PairRecorder:
     def ambiguous(self, segment: Segment) -> Int[np.ndarray, "rows"]:
         """Pairs whose decision another legitimate rounding could have changed, at every step of a segment."""
         counts = np.zeros(segment.rows, np.int64)
-        bounds = np.array(self.simulation.decider.bounds)
+        bounds = self._bounds
         # almost always no pair comes that close; where one does, the host looks again
         for row in np.flatnonzero(segment.rows_of("nearest") <= bounds.max()):
             table, x = segment.table, segment.rows_of("x")[row]
@@ -54,11 +58,10 @@ class PairRecorder:
 
     def _margins(self, start, end, i, j):
         """Pair types and margins of pairs at given positions, with the bits of the program's decision."""
-        decider = self.simulation.decider
         kind = self.simulation.type_of(i, j)
-        d = displacement(self.simulation.cell, start, end, np.dtype(decider.dtype))
-        quantity = decider.host_quantity(*d).astype(np.float64)
-        return kind, np.array([t.value for t in decider.thresholds])[kind] - quantity
+        d = displacement(self.simulation.cell, start, end, self._dtype)
+        quantity = self.simulation.decider.host_quantity(*d).astype(np.float64)
+        return kind, self._thresholds[kind] - quantity
 
     def flips(self, segment: Segment) -> Ledger:
         """The flips of a segment, sorted by step, i and j (user's labels, i < j).
@@ -89,12 +92,11 @@ class PairRecorder:
         return self._ledger(segment, row, column, neighbor, entered, np.stack([i, j], axis=1))
 
     def _ledger(self, segment: Segment, row, first, second, entered, labels) -> Ledger:
-        simulation, decider = self.simulation, self.simulation.decider
+        simulation = self.simulation
         x, v = segment.rows_of("x"), segment.rows_of("v")
         start, end = x[row, :, first], x[row, :, second]
         kind, margin = self._margins(start, end, labels[:, 0], labels[:, 1])
-        inclusive = decider.compare.endswith("<=")
-        if not np.array_equal(margin >= 0 if inclusive else margin > 0, entered):
+        if not np.array_equal(margin >= 0 if self._inclusive else margin > 0, entered):
             raise MdnumError(
                 "a recorded margin contradicts its decision",
                 remedy="Run `mdnum doctor`; the compiled arithmetic is not the one expected",
@@ -102,7 +104,6 @@ class PairRecorder:
         d = np.stack(displacement(simulation.cell, start, end), axis=1)
         distance = np.sqrt(np.sum(d * d, axis=1))
         approach = np.sum((v[row, :, second] - v[row, :, first]).astype(np.float64) * d, axis=1)
-        energy, force = simulation.jumps()
         sign = np.where(entered, 1.0, -1.0)
         step = segment.first + row
         order = sort_rows(step, labels)
@@ -111,7 +112,7 @@ class PairRecorder:
                 "distance": distance[order],
                 # user units of time: the ledger is for people
                 "radial_speed": (approach / distance)[order] * simulation.units.time_factor,
-                "force_jump": (sign * force[kind])[order],
+                "force_jump": (sign * self._force_jumps[kind])[order],
             }
         return Ledger(
             "pair",
@@ -119,8 +120,8 @@ class PairRecorder:
             labels[order],
             entered[order],
             margin[order],
-            np.array(decider.bounds)[kind][order],
-            (sign * energy[kind])[order],
+            self._bounds[kind][order],
+            (sign * self._energy_jumps[kind])[order],
             extra,
         )
 
