@@ -2,25 +2,72 @@
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from mdnum.errors import MdnumError
-from mdnum.events import Ledger, changed_bits, count_set, sort_rows
+from mdnum.events import Ledger, changed_bits, count_set, set_bits, sort_rows
 from mdnum.md.cell import displacement
+from mdnum.md.verlet import PairTable
 from mdnum.rollout.engine import Segment
 from mdnum.systems.build import Simulation
+
+
+@numba.njit(cache=True, nogil=True)
+def _mixed(key):
+    """A well-mixed 64-bit number for a key (the finalizer of splitmix64)."""
+    z = np.uint64(key) + np.uint64(0x9E3779B97F4A7C15)
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return z ^ (z >> np.uint64(31))
+
+
+@numba.njit(cache=True, nogil=True)
+def _fingerprint_of_bits(bits, index, order):
+    """Number and mixed sum of the keys of all pairs inside; the same for every list that decides alike."""
+    count, total = 0, np.uint64(0)
+    atoms = order.shape[0]
+    for w in range(bits.shape[0]):
+        for c in range(bits.shape[1]):
+            byte = bits[w, c]
+            if byte:
+                i = order[c]
+                for k in range(8):
+                    if (byte >> k) & 1:
+                        j = order[index[8 * w + k, c]]
+                        if i < j:
+                            count += 1
+                            total += _mixed(i * atoms + j)
+    return count, total
+
+
+@numba.njit(cache=True, nogil=True)
+def _fingerprint_of_keys(keys):
+    total = np.uint64(0)
+    for key in keys:
+        total += _mixed(key)
+    return len(keys), total
 
 
 class PairRecorder:
     """Writes the `pair` channel of a simulation.
 
+    A flip is a difference between what the program acted on at two steps, also where a new list came in
+    between: one that a spent list had missed enters when the new list finds it, one that has flown beyond the
+    new list leaves.
+
     Args:
         simulation: the system as objects.
+        held: keys of the pairs that the list before the first one counted as inside, where a run goes on
+            with a new list.
     """
 
-    def __init__(self, simulation: Simulation):
+    def __init__(self, simulation: Simulation, held: Int[np.ndarray, "pairs"] | None = None):
         self.simulation = simulation
+        self._held_keys = held
+        self._held_segment: tuple[PairTable, UInt8[np.ndarray, "words atoms"]] | None = None
+        self.missed = 0
         decider = simulation.decider
         self._dtype = np.dtype(decider.dtype)
         self._inclusive = decider.compare.endswith("<=")
@@ -76,6 +123,9 @@ class PairRecorder:
         bits = segment.rows_of("bits")
         before = segment.before
         assert before is not None
+        replaced = self._replace(segment, before)
+        if replaced is not None:
+            before = bits[0]
         found = [
             (row, *changed_bits(bits[row - 1] if row else before, bits[row])) for row in range(segment.rows)
         ]
@@ -89,7 +139,46 @@ class PairRecorder:
         if 2 * int(keep.sum()) != len(keep):
             raise MdnumError("a flip was recorded from one end only", remedy="Report this as a bug")
         row, column, neighbor, entered, i, j = (a[keep] for a in (row, column, neighbor, entered, i, j))
+        if replaced is not None:
+            keys, now = replaced
+            low, high = np.divmod(keys, self.simulation.atoms)
+            place = np.argsort(segment.table.order)
+            row = np.concatenate([np.zeros(len(keys), np.int64), row])
+            column, neighbor = np.append(place[low], column), np.append(place[high], neighbor)
+            entered, i, j = np.append(now, entered), np.append(low, i), np.append(high, j)
+        if segment.closes:
+            self._held_segment, self._held_keys = (segment.table, np.array(bits[-1])), None
         return self._ledger(segment, row, column, neighbor, entered, np.stack([i, j], axis=1))
+
+    def held(self) -> Int[np.ndarray, "pairs"] | None:
+        """Keys of the pairs inside at the last step, where a list has ended with it."""
+        if self._held_segment is not None:
+            self._held_keys = _keys(self.simulation, *self._held_segment)
+        return self._held_keys
+
+    def _replace(self, segment: Segment, before) -> tuple[np.ndarray, np.ndarray] | None:
+        """Where a new list and the one before it disagree on the step before: the flips between the two.
+
+        Returns:
+            keys of the flipped pairs and whether each entered; None where the lists agree, as they should.
+        """
+        self.missed = 0
+        if not segment.opens or (self._held_segment is None and self._held_keys is None):
+            return None
+        if self._held_segment is not None:
+            table, bits = self._held_segment
+            old = _fingerprint_of_bits(bits, table.index, table.order)
+        else:
+            old = _fingerprint_of_keys(self._held_keys)
+        if old == _fingerprint_of_bits(before, segment.table.index, segment.table.order):
+            return None
+        held = self.held()
+        assert held is not None
+        now = _keys(self.simulation, segment.table, segment.rows_of("bits")[0])
+        looked_back = _keys(self.simulation, segment.table, before)
+        self.missed = len(np.setdiff1d(looked_back, held, assume_unique=True))
+        keys = np.setxor1d(held, now, assume_unique=True)
+        return keys, np.isin(keys, now, assume_unique=True)
 
     def _ledger(self, segment: Segment, row, first, second, entered, labels) -> Ledger:
         simulation = self.simulation
@@ -150,12 +239,17 @@ def pair_keys(
     return np.sort(i.astype(np.int64) * atoms + j)
 
 
+def _keys(simulation: Simulation, table: PairTable, bits: UInt8[np.ndarray, "words atoms"]):
+    """Sorted keys of the pairs inside."""
+    slots, columns = set_bits(bits)
+    i, j = table.order[columns], table.order[table.index[slots, columns]]
+    keep = i < j
+    return pair_keys(i[keep], j[keep], simulation.atoms)
+
+
 def decided_pairs(simulation: Simulation, segment: Segment, row: int) -> Int[np.ndarray, "pairs"]:
     """Keys of the pairs that the program counted as inside at a row of a segment."""
-    i, j, _ = simulation.inside(
-        segment.unsorted("x", row).astype(np.float64), segment.table, segment.rows_of("bits")[row]
-    )
-    return pair_keys(i, j, simulation.atoms)
+    return _keys(simulation, segment.table, segment.rows_of("bits")[row])
 
 
 def true_pairs(simulation: Simulation, wrapped: Float[np.ndarray, "atoms 3"]) -> Int[np.ndarray, "pairs"]:

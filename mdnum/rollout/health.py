@@ -59,7 +59,7 @@ class ListHealth:
         first_lost_step: -1 while nothing was lost.
         rebuilds: lists built after the first.
         dangerous: rebuilds at the first step they were allowed at, in LAMMPS's meaning.
-        mismatches: rebuilds at which the old list and the new one disagreed on how many pairs are inside.
+        mismatches: rebuilds at which the new list found pairs that the old one had missed at its last step.
     """
 
     simulation: Simulation
@@ -71,13 +71,14 @@ class ListHealth:
     dangerous: int = 0
     mismatches: int = 0
 
-    def check_count(self, segment: Segment, inside_before: int, count_before: int | None) -> None:
-        """Compare a new list's count of pairs at the step before it with what the old list counted there."""
-        if segment.opens and count_before is not None and segment.first > 0 and inside_before != count_before:
-            self.mismatches += 1
+    def take(self, segment: Segment, missed: int) -> dict[str, np.ndarray] | None:
+        """Account for a segment; returns the row of its epoch where it ends one.
 
-    def take(self, segment: Segment) -> dict[str, np.ndarray] | None:
-        """Account for a segment; returns the row of its epoch where it ends one."""
+        Args:
+            segment: what the engine recorded.
+            missed: pairs that the list before had missed at its last step, as this one found.
+        """
+        self.mismatches += missed > 0
         if self.current is None or self.current.epoch != segment.epoch:
             self.current = Epoch.of(segment)
         epoch = self.current

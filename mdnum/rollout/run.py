@@ -56,7 +56,6 @@ class _Progress:
     tally: Tally
     health: ListHealth
     budget: EnergyBudget
-    pairs: int | None = None
     first: np.ndarray | None = None
     last: np.ndarray | None = None
 
@@ -65,7 +64,6 @@ class _Progress:
             "tally": self.tally.to_dict(),
             "health": self.health.to_dict(),
             "budget": self.budget.to_dict(),
-            "pairs": self.pairs,
         }
 
 
@@ -103,11 +101,11 @@ class Rollout:
             Tally.from_dict(done["tally"]),
             ListHealth.from_dict(self.simulation, done["health"]),
             EnergyBudget.from_dict(self.simulation, done["budget"]),
-            done["pairs"],
             np.asarray(saved["first"]),
             np.asarray(saved["last"]),
         )
         self._earlier_seconds = self.done.tally.seconds
+        self.recorder = PairRecorder(self.simulation, saved.get("held"))
 
     def run(self) -> dict[str, Any]:
         """Run to the last step and write everything but the report; returns the summary.
@@ -151,9 +149,6 @@ class Rollout:
 
     def _take(self, segment: Segment, interval: int) -> None:
         done = self.done
-        assert segment.before is not None, "a recorded segment knows the decisions before it"
-        before = self.recorder.inside(segment.before)
-        done.health.check_count(segment, before, done.pairs)
         pairs = self.recorder.counts(segment)
         ambiguous = self.recorder.ambiguous(segment)
         ledger = self.recorder.flips(segment)
@@ -161,11 +156,10 @@ class Rollout:
         self.folder.append("series", rows)
         if len(ledger):
             self.folder.append("flips", flip_columns(ledger))
-        ended = done.health.take(segment)
+        ended = done.health.take(segment, self.recorder.missed)
         if ended is not None:
             self.folder.append("epochs", ended)
         done.tally.take(segment, rows, ledger)
-        done.pairs = int(pairs[-1])
         if done.first is None:
             done.first = segment.unsorted("x", 0)
         done.last = segment.unsorted("x", segment.rows - 1)
@@ -213,6 +207,7 @@ class Rollout:
             "done": self.done.to_dict(),
             "steps": self.steps,
             "save_every": self.save_every,
+            **({} if (held := self.recorder.held()) is None or not segment.closes else {"held": held}),
         }
 
     def _log(self, segment: Segment, pairs: np.ndarray, ledger: Ledger) -> None:

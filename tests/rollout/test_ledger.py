@@ -175,10 +175,6 @@ def test_a_capacity_that_grows_loses_no_step(fluid, tmp_path, monkeypatch):
     tables_equal(plain, grown, "flips")
 
 
-@pytest.mark.xfail(
-    raises=AssertionError,
-    reason="a new list does not hold a pair that leaves by more than the skin in one step",
-)
 @pytest.mark.parametrize("skin", [0.0, 0.001])
 def test_pairs_that_leave_beyond_the_skin_in_one_step_are_told(tmp_path, skin):
     result, folder = go(tmp_path, "argon/crystal-108", 40, {"neighbors.skin": skin}, save_every=1)
