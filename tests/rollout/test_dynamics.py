@@ -1,0 +1,159 @@
+"""Dynamics: order and reversibility of the integrator, temperature and noise of the thermostat."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from rollout.harness import go, liquid, shaken, write_system
+
+from mdnum.rollout.engine import Engine, unwrapped
+from mdnum.systems import load
+from mdnum.systems.build import build
+
+
+def rows(simulation, last, names=("potential", "kinetic", "heat")):
+    """Per-step numbers, and wrapped positions, velocities and unwrapped positions at the last step."""
+    numbers = {name: [] for name in names}
+    for segment in Engine(simulation, last).segments():
+        for name in names:
+            numbers[name].append(np.array(segment.rows_of(name)))
+    x, v, images = (segment.unsorted(name, segment.rows - 1) for name in ("x", "v", "images"))
+    return (
+        {k: np.concatenate(a) for k, a in numbers.items()},
+        x,
+        v,
+        unwrapped(simulation.cell.matrix, x, images),
+    )
+
+
+def stepped(simulation, timestep):
+    import equinox as eqx
+
+    integrator = eqx.tree_at(lambda i: i.timestep, simulation.integrator, jnp.asarray(timestep, jnp.float64))
+    return replace(simulation, integrator=integrator)
+
+
+@pytest.fixture(scope="module")
+def smooth(tmp_path_factory):
+    """A fluid whose potential has two continuous derivatives."""
+    path = write_system(tmp_path_factory.mktemp("smooth"), liquid(), cutoff={"kind": "quintic", "onset": 1.5})
+    return build(shaken(load(path), 4, 0.7, 0.02))
+
+
+def test_the_energy_error_is_of_second_order(smooth):
+    spreads = []
+    for halvings in range(3):
+        timestep = 0.004 / 2**halvings
+        seen, *_ = rows(stepped(smooth, timestep), 120 * 2**halvings)
+        total = seen["potential"] + seen["kinetic"]
+        spreads.append(np.std(total))
+    ratios = np.array(spreads[:-1]) / np.array(spreads[1:])
+    assert np.all(np.abs(np.log2(ratios) - 2) < 0.2), ratios
+
+
+def test_a_trajectory_turned_around_comes_back(smooth):
+    _, x, v, _ = rows(smooth, 100)
+    turned = replace(smooth, positions=np.asarray(x), velocities=-np.asarray(v))
+    _, _, back_v, back = rows(turned, 100)
+    d = back - smooth.positions
+    d -= np.rint(d / np.diag(smooth.cell.matrix)) * np.diag(smooth.cell.matrix)
+    assert np.max(np.abs(d)) < 1e-10
+    assert np.max(np.abs(back_v + smooth.velocities)) < 1e-9
+    # while the way there was long
+    assert np.max(np.linalg.norm(rows(smooth, 100)[3] - smooth.positions, axis=1)) > 0.2
+
+
+def test_momentum_is_kept_to_rounding(smooth):
+    _, _, v, _ = rows(smooth, 100)
+    assert np.max(np.abs(v.sum(axis=0) - smooth.velocities.sum(axis=0))) < 1e-11
+
+
+def test_against_a_plain_velocity_verlet(smooth):
+    """Numpy, all pairs, textbook order of operations."""
+    box, h = np.diag(smooth.cell.matrix), 0.004
+    i, j = np.triu_indices(108, 1)
+
+    def force(x):
+        d = x[j] - x[i]
+        d -= np.rint(d / box) * box
+        r = np.linalg.norm(d, axis=1)
+        t = np.clip((r - 1.5) / 0.5, 0, 1)
+        s, ds = 1 - 10 * t**3 + 15 * t**4 - 6 * t**5, -30 * t**2 * (1 - t) ** 2 / 0.5
+        u, du = 4 * (r**-12 - r**-6), -24 * (2 * r**-13 - r**-7)
+        pull = ((du * s + u * ds) / r)[:, None] * d
+        total = np.zeros_like(x)
+        np.add.at(total, i, pull)
+        np.add.at(total, j, -pull)
+        return total
+
+    x, v = smooth.positions.copy(), smooth.velocities.copy()
+    f = force(x)
+    for _ in range(70):
+        v = v + 0.5 * h * f
+        x = x + h * v
+        f = force(x)
+        v = v + 0.5 * h * f
+    _, _, found_v, found = rows(smooth, 70)
+    assert np.max(np.abs(found - x)) < 1e-10
+    assert np.max(np.abs(found_v - v)) < 1e-9
+
+
+@pytest.fixture(scope="module")
+def bath(tmp_path_factory):
+    dynamics = {"kind": "langevin", "friction": 2.0, "temperature": 1.3, "timestep": 0.005}
+    return write_system(tmp_path_factory.mktemp("bath"), liquid(rattle=0.03), dynamics=dynamics)
+
+
+def test_a_thermostat_holds_its_temperature_and_keeps_the_books(bath, tmp_path):
+    _, folder = go(tmp_path, bath, 4000)
+    series = folder.read("series")
+    settled = series["temperature"][1000:]
+    # error of the mean from the means of stretches much longer than the correlation time 1/(2 friction)
+    stretches = settled[: len(settled) // 20 * 20].reshape(20, -1).mean(axis=1)
+    error = stretches.std(ddof=1) / np.sqrt(20)
+    assert error < 0.03
+    assert abs(settled.mean() - 1.3) < 4 * error + 0.01
+    # heat is all that comes and goes: the conserved energy wanders far less than the total one
+    # (the hard cutoff's own jumps aside)
+    conserved = series["conserved"] - np.cumsum(series["energy_jump"])
+    assert np.ptp(conserved[1000:]) < 0.2 * np.ptp(series["total"][1000:])
+
+
+def test_kinetic_energies_are_those_of_a_canonical_ensemble(bath, tmp_path):
+    _, folder = go(tmp_path, bath, 4000)
+    kinetic = folder.read("series")["kinetic"][1000:]
+    freedom = 3 * 108
+    # variance of a gamma distribution; many correlated samples, hence the room
+    assert np.var(kinetic) == pytest.approx(freedom / 2 * 1.3**2, rel=0.35)
+
+
+def test_noise_belongs_to_the_atom_and_the_step(bath, tmp_path):
+    """Neither the skin nor the order in which the list sorts the atoms has a say."""
+    ends = []
+    for skin in (0.1, 0.3):
+        simulation = build(load(bath, {"neighbors.skin": skin}))
+        ends.append(rows(simulation, 63)[3])
+    assert np.max(np.abs(ends[0] - ends[1])) < 1e-9
+    other = rows(build(load(bath, {"dynamics.seed": 4, "structure.velocities": "drawn"})), 63)[3]
+    assert np.max(np.abs(other - ends[0])) > 1e-2
+
+
+@pytest.mark.slow
+@pytest.mark.jax_md
+@pytest.mark.filterwarnings("ignore:scatter inputs")
+def test_noise_does_not_depend_on_the_builder(bath):
+    ends = [rows(build(load(bath, {"neighbors.builder": b})), 63)[3] for b in ("host", "jax-md")]
+    assert np.max(np.abs(ends[0] - ends[1])) < 1e-9
+
+
+def test_velocities_drawn_have_the_temperature_and_no_drift(tmp_path):
+    atoms = liquid(cells=3)
+    simulation = build(load(write_system(tmp_path, atoms, dynamics={"temperature": 0.8, "seed": 5})))
+    v = simulation.velocities
+    assert np.max(np.abs(v.sum(axis=0))) < 1e-12
+    assert (v**2).sum() / (3 * 107) == pytest.approx(0.8, rel=0.15)
+    again = build(load(write_system(tmp_path / "again", atoms, dynamics={"temperature": 0.8, "seed": 5})))
+    assert np.array_equal(again.velocities, v)
