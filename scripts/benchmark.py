@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from _liquid import R_CUT, SKIN, liquid
-from _output import COLORS, figure, parser, save, say, start, table
+from _output import figure, parser, save, say, start, table
 from _processes import machine, memory, start_up
 
 if TYPE_CHECKING:
@@ -269,24 +269,26 @@ def show(result: dict[str, Any]) -> None:
 
 
 def draw(result: dict[str, Any], path: Path) -> None:
-    """CPU and clock time of an atom's step, by code and size."""
+    """Clock and CPU time of an atom's step, by code, a panel for each size."""
     speeds = [Speed(**row) for row in result["speeds"]]
-    drawn = figure(9.0, 3.8)
-    clock, busy = drawn.subplots(1, 2)
+    sizes = sorted({row.atoms for row in speeds})
     codes = list(dict.fromkeys(row.code for row in speeds))
-    for code, color in zip(codes, COLORS, strict=False):
-        mine = [row for row in speeds if row.code == code]
-        sizes = [row.atoms for row in mine]
-        clock.loglog(sizes, [row.ns_per_atom for row in mine], "o-", ms=4, color=color, label=code)
-        busy.loglog(sizes, [row.cpu_ns_per_atom for row in mine], "o-", ms=4, color=color)
-    clock.set_title("clock time of an atom's step (ns)")
-    busy.set_title("CPU time of an atom's step (ns)")
-    for axes in (clock, busy):
-        sizes = sorted({row.atoms for row in speeds})
-        axes.set_xticks(sizes, [f"{size:,}" for size in sizes])
-        axes.minorticks_off()
-        axes.set_xlabel("atoms")
-    drawn.legend(loc="outside lower center", ncols=len(codes))
+    drawn = figure(3.0 + 2.5 * len(sizes), 3.2)
+    panels = drawn.subplots(1, len(sizes), sharex=True, sharey=True, squeeze=False)[0]
+    for axes, atoms in zip(panels, sizes, strict=True):
+        mine = [row for row in speeds if row.atoms == atoms]
+        at = np.array([codes.index(row.code) for row in mine])
+        for shift, label, values in (
+            (-0.2, "clock", [row.ns_per_atom for row in mine]),
+            (0.2, "CPU, all cores", [row.cpu_ns_per_atom for row in mine]),
+        ):
+            axes.barh(at + shift, values, 0.38, label=label if atoms == sizes[0] else None)
+        axes.set_xscale("log")
+        axes.set_yticks(range(len(codes)), codes)
+        axes.set_title(f"N = {atoms:,}")
+        axes.set_xlabel("ns per atom and step")
+    panels[0].invert_yaxis()
+    drawn.legend(loc="outside lower center", ncols=2)
     save(drawn, path)
 
 

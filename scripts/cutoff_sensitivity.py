@@ -11,8 +11,8 @@ and the table says for each:
     smooth      number of continuous derivatives of the energy at the cutoff; -1: the energy itself jumps
 
 How to read it. A hard and a shifted cutoff have the same forces, hence the same trajectory and the
-same flips, yet std(E) differs by an order of magnitude: that part is bookkeeping. From shifted to
-force-shifted to switched the force becomes continuous and what is left of std(E) is the
+same flips, yet std(E) differs by orders of magnitude: that part is bookkeeping. From shifted to
+force-shifted to switched the force becomes continuous, too, and what is left of std(E) is the
 integrator's. The radius moves the energy more than the treatment does; the number of flips hardly
 depends on the treatment and grows with the radius, because the sphere's surface does. Runs of a
 liquid part by chaos, so the last digits of std(E) and drift are those of one sample.
@@ -103,9 +103,9 @@ def draw(rows: list[Row], units, path) -> None:
         parts["flips"].plot(radii, [row.flips for row in mine], "o-", ms=4)
         for row in mine:
             if row.radius == last:
-                parts["time"].plot(row.time, row.change, lw=1.2)
-    parts["time"].set_yscale("symlog", linthresh=max(min(row.spread for row in rows), 1e-300))
-    parts["time"].set_title(f"change of the total energy per atom, r_cut = {last:.4g} {units.length}")
+                parts["time"].plot(row.time[1:], np.abs(row.change[1:]), lw=1.2)
+    parts["time"].set_yscale("log", nonpositive="mask")
+    parts["time"].set_title(f"|E(t) - E(0)| per atom, r_cut = {last:.4g} {units.length}")
     parts["time"].set_xlabel(f"time ({units.time})")
     parts["time"].set_ylabel(units.energy)
     parts["spread"].set_yscale("log")

@@ -99,9 +99,7 @@ def draw(rows: list[Row], steps: int, unit: str, path: Path) -> None:
         for row in mine:
             face = color if row.lost == 0 else "white"
             rate.plot(row.skin, row.rate, "o", ms=5, color=color, mfc=face)
-    smallest = min((row.lost_steps for row in rows if row.lost_steps), default=1) / steps
-    lost.set_yscale("symlog", linthresh=smallest)
-    lost.set_ylim(bottom=-0.3 * smallest)
+    lost.set_ylim(bottom=0)
     lost.set_title("lost pairs per step")
     rate.set_title("steps per second (hollow: pairs were lost)")
     rate.set_ylim(bottom=0)
@@ -121,8 +119,8 @@ def main() -> None:
         help="skins in the system's unit (default a third of, once and one and a half times its own)",
     )  # fmt: skip
     made.add_argument(
-        "--every", nargs="+", type=int, default=[0, 20, 40], metavar="K",
-        help="rebuild blindly every so many steps; 0 checks displacements (default 0 20 40)",
+        "--every", nargs="+", type=int, default=[0, 40, 80], metavar="K",
+        help="rebuild blindly every so many steps; 0 checks displacements (default 0 40 80)",
     )  # fmt: skip
     chosen = made.parse_args()
     system = load(chosen.system)

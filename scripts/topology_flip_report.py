@@ -103,6 +103,7 @@ def draw(run: Run, path: Path) -> None:
         counts = run.busiest.flips
         times, pairs = np.unique(counts, return_counts=True)
         per_pair.bar(times, pairs, log=True)
+        per_pair.set_ylim(bottom=0.5)
         per_pair.xaxis.set_major_locator(MaxNLocator(integer=True))
         lengths = run.stays
         longest = max(lengths.all.max(initial=10), 10)
