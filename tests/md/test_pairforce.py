@@ -1,0 +1,247 @@
+"""Pair forces over a list, against all pairs in plain numpy; and the decision on record is the one used."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from oracles import COMPARISONS, all_pairs
+from rollout.harness import liquid, write_system
+
+from mdnum.events import count_set, set_bits
+from mdnum.md.cell import wrap_positions
+from mdnum.md.cutoffs import BY_NAME
+from mdnum.systems import load
+from mdnum.systems.build import build
+
+PAIRS = {
+    "Ar-Ar": {"sigma": 1.0, "epsilon": 1.0},
+    "Ar-Ne": {"sigma": 0.9, "epsilon": 1.2},
+    "Ne-Ne": {"sigma": 0.85, "epsilon": 0.6},
+}
+RADII = {"Ar-Ar": 1.9, "Ar-Ne": 1.7, "Ne-Ne": 1.55}
+ONSET = 0.8  # of each radius
+
+
+def cut_energy(kind, r, sigma, epsilon, rc):
+    """u(r) of a cut Lennard-Jones pair, also for complex r: its derivative comes from a complex step."""
+
+    def u(x):
+        return 4 * epsilon * ((sigma / x) ** 12 - (sigma / x) ** 6)
+
+    def slope(x):
+        return -24 * epsilon * (2 * sigma**12 / x**13 - sigma**6 / x**7)
+
+    ro = ONSET * rc
+    if kind == "hard":
+        return u(r)
+    if kind == "shifted":
+        return u(r) - u(rc)
+    if kind == "force-shifted":
+        return u(r) - u(rc) - (r - rc) * slope(rc)
+    if kind == "switched":
+        s = (rc**2 - r**2) ** 2 * (rc**2 + 2 * r**2 - 3 * ro**2) / (rc**2 - ro**2) ** 3
+    else:
+        t = (r - ro) / (rc - ro)
+        s = 1 - 10 * t**3 + 15 * t**4 - 6 * t**5 if kind == "quintic" else 0.5 * (1 + np.cos(np.pi * t))
+    return u(r) * np.where(r.real > ro, s, 1.0)
+
+
+def reference(kind, atoms):
+    """Energy, forces, energy of each atom and sum of r ⊗ F over pairs."""
+    i, j, d = all_pairs(atoms.positions, atoms.cell.array, atoms.pbc)
+    symbols = np.array(atoms.get_chemical_symbols())
+    keys = ["-".join(sorted(pair)) for pair in zip(symbols[i], symbols[j], strict=True)]
+    sigma, epsilon = (np.array([PAIRS[key][name] for key in keys]) for name in ("sigma", "epsilon"))
+    rc = np.array([RADII[key] for key in keys])
+    r = np.linalg.norm(d, axis=1)
+    near = r < rc
+    i, j, d, r = i[near], j[near], d[near], r[near]
+    constants = (sigma[near], epsilon[near], rc[near])
+    energy = cut_energy(kind, r.astype(complex), *constants).real
+    slope = cut_energy(kind, r + 1e-30j, *constants).imag / 1e-30
+    pull = (slope / r)[:, None] * d
+    forces, energies = np.zeros_like(atoms.positions), np.zeros(len(atoms))
+    np.add.at(forces, i, pull)
+    np.add.at(forces, j, -pull)
+    np.add.at(energies, i, energy / 2)
+    np.add.at(energies, j, energy / 2)
+    return (
+        energy.sum(),
+        forces,
+        energies,
+        -np.einsum("pa,pb->ab", d, pull),
+        set(zip(i.tolist(), j.tolist(), strict=True)),
+    )
+
+
+def compare(simulation, kind, atoms):
+    found = simulation.evaluate()
+    energy, forces, energies, virial, pairs = reference(kind, atoms)
+    scale = np.abs(forces).max()
+    assert found.energy == pytest.approx(energy, rel=1e-13)
+    assert np.max(np.abs(found.forces - forces)) < 1e-12 * scale
+    assert np.max(np.abs(found.energies - energies)) < 1e-12 * np.abs(energies).max()
+    # stress is minus the virial by volume, in ASE's sign
+    assert np.allclose(found.stress * atoms.get_volume(), -virial, rtol=0, atol=1e-12 * np.abs(virial).max())
+    assert set(zip(found.i.tolist(), found.j.tolist(), strict=True)) == pairs
+    i, j, d = all_pairs(atoms.positions, atoms.cell.array, atoms.pbc)
+    distance = dict(zip(zip(i.tolist(), j.tolist(), strict=True), np.linalg.norm(d, axis=1), strict=True))
+    assert np.allclose(found.distance, [distance[k] for k in zip(found.i, found.j, strict=True)], rtol=1e-13)
+
+
+def mixture(tilt, pbc=True, seed=3):
+    atoms = liquid(tilt=tilt, rattle=0.05, seed=seed)
+    atoms.symbols[np.random.default_rng(seed).random(len(atoms)) < 0.35] = "Ne"
+    # a few atoms out of the box: nothing may depend on it
+    atoms.pbc = pbc
+    shifts = np.random.default_rng(seed).integers(-2, 3, (len(atoms), 3)) * np.broadcast_to(pbc, 3)
+    atoms.positions += shifts @ atoms.cell.array
+    return atoms
+
+
+def tables(kind):
+    onset = {"onset": ONSET * 1.9} if BY_NAME[kind].switches else {}
+    return {
+        "potential": {"kind": "lennard-jones", "pairs": PAIRS, "sigma": 1.0, "epsilon": 1.0},
+        "cutoff": {"kind": kind, "radius": 1.9, "pairs": RADII, **onset},
+    }
+
+
+@pytest.mark.parametrize("kind", BY_NAME)
+def test_a_mixture_in_a_tilted_box(tmp_path, kind):
+    atoms = mixture(tilt=True)
+    compare(build(load(write_system(tmp_path, atoms, **tables(kind)))), kind, atoms)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", BY_NAME)
+@pytest.mark.parametrize("pbc", [(True, True, True), (True, False, True), (False, False, False)])
+def test_one_species_in_boxes_of_every_kind(tmp_path, kind, pbc):
+    atoms = liquid(rattle=0.05)
+    atoms.pbc = pbc
+    onset = {"onset": ONSET * 1.9} if BY_NAME[kind].switches else {}
+    path = write_system(tmp_path, atoms, cutoff={"kind": kind, "radius": 1.9, **onset})
+    compare(build(load(path)), kind, atoms)
+
+
+@pytest.mark.jax_md
+@pytest.mark.filterwarnings("ignore:scatter inputs")
+def test_the_list_of_jax_md_gives_the_same(tmp_path):
+    atoms = mixture(tilt=True, pbc=(True, False, True))
+    path = write_system(tmp_path, atoms, **tables("switched"), neighbors={"builder": "jax-md"})
+    compare(build(load(path)), "switched", atoms)
+
+
+def test_stress_is_the_derivative_of_the_energy_by_strain(tmp_path):
+    atoms = mixture(tilt=True)
+    simulation = build(load(write_system(tmp_path, atoms, **tables("quintic"))))
+    stress = simulation.evaluate().stress
+    for a, b in ((0, 0), (1, 1), (0, 1), (2, 0)):
+        energies = []
+        for h in (1e-5, -1e-5):
+            strain = np.eye(3)
+            strain[a, b] += h / 2
+            strain[b, a] += h / 2
+            energies.append(simulation.evaluate(atoms.positions @ strain, atoms.cell.array @ strain).energy)
+        slope = (energies[0] - energies[1]) / 2e-5 / atoms.get_volume()
+        assert slope == pytest.approx(stress[a, b], rel=1e-6, abs=1e-6)
+    assert np.array_equal(stress, stress.T)
+
+
+def forces_over(simulation, positions, skin=0.2):
+    """One evaluation over a list with a skin: forces, decisions, and the list."""
+    wrapped, _ = wrap_positions(simulation.cell, positions)
+    table = simulation.verlet_list(skin).build(wrapped, simulation.cell)
+    x = jnp.asarray(wrapped[table.order].T)
+    return jax.jit(lambda f, x, t: f(x, t, decisions=True))(
+        simulation.force, x, simulation.tables(table)
+    ), table
+
+
+def counted(simulation, positions):
+    """How many pairs the energy holds: hard less shifted is u(r_cut) for each of them."""
+    hard, _ = forces_over(simulation, positions)
+    shifted, _ = forces_over(simulation.with_cutoff("shifted"), positions)
+    assert np.array_equal(hard.force, shifted.force)
+    assert np.array_equal(hard.decisions.bits, shifted.decisions.bits)
+    jump = float(simulation.jumps()[0][0])
+    number = float(jnp.sum(hard.energy) - jnp.sum(shifted.energy)) / jump
+    assert number == pytest.approx(round(number), abs=1e-6)
+    return round(number), int(count_set(np.asarray(hard.decisions.bits))) // 2
+
+
+def shell(shift=0.0):
+    """An fcc crystal of 108 atoms with its 324 second neighbors at 1.75, all of it exact in binary."""
+    from ase.build import bulk
+
+    atoms = bulk("Ar", "fcc", a=1.75, cubic=True) * (3, 3, 3)
+    atoms.positions += shift
+    return atoms
+
+
+@pytest.mark.parametrize("compare", COMPARISONS)
+def test_at_the_cutoff_the_convention_decides_and_the_energy_follows(tmp_path, compare):
+    path = write_system(
+        tmp_path, shell(), cutoff={"radius": 1.75, "compare": compare}, neighbors={"skin": 0.2}
+    )
+    simulation = build(load(path))
+    in_energy, recorded = counted(simulation, simulation.positions)
+    assert in_energy == recorded == (648 + 324 if compare.endswith("<=") else 648)
+
+
+def test_the_energy_follows_the_recorded_decision_where_another_precision_would_differ(tmp_path):
+    """Distances that float32 cannot tell from the cutoff: the float64 forces obey the float32 decision."""
+    rng = np.random.default_rng(6)
+    atoms = shell(shift=0.3)
+    atoms.positions += rng.normal(0, 3e-8, atoms.positions.shape)
+    path = write_system(tmp_path, atoms, cutoff={"radius": 1.75}, neighbors={"skin": 0.2})
+    results = {}
+    for decision in ("float64", "float32"):
+        simulation = build(load(path, {"precision.decision": decision}))
+        results[decision] = counted(simulation, simulation.positions)
+        assert results[decision][0] == results[decision][1]
+    assert results["float64"] != results["float32"]
+    _, _, d = all_pairs(atoms.positions, atoms.cell.array, (True,) * 3)
+    assert results["float64"][0] == int(((d**2).sum(axis=1) < 1.75**2).sum())
+
+
+def test_listed_pairs_beyond_the_cutoff_add_nothing_not_even_when_the_list_is_padded(tmp_path):
+    atoms = liquid(rattle=0.05)
+    simulation = build(load(write_system(tmp_path, atoms)))
+    narrow, _ = forces_over(simulation, simulation.positions, skin=0.0)
+    wide, table = forces_over(simulation, simulation.positions, skin=0.5)
+    assert table.pairs > int(count_set(np.asarray(narrow.decisions.bits))) // 2
+    assert float(jnp.sum(wide.energy)) == pytest.approx(float(jnp.sum(narrow.energy)), rel=1e-14)
+    slots, columns = set_bits(np.asarray(wide.decisions.bits))
+    # padding is never decided to be inside
+    assert np.all(table.index[slots, columns] < len(atoms))
+
+
+def test_two_atoms_on_one_spot_are_seen_and_not_hidden_by_padding(tmp_path):
+    from ase import Atoms
+
+    atoms = Atoms("Ar3", positions=[[1, 1, 1], [2.5, 1, 1], [6, 6, 6.0]], cell=[9.0] * 3, pbc=True)
+    simulation = build(load(write_system(tmp_path, atoms)))
+    finite, _ = forces_over(simulation, simulation.positions)
+    assert np.all(np.isfinite(finite.force)) and float(jnp.sum(finite.energy)) < 0
+    on_top = np.array([[1, 1, 1], [1, 1, 1], [6, 6, 6.0]])
+    singular, _ = forces_over(simulation, on_top)
+    assert not np.isfinite(float(jnp.sum(singular.energy)))
+    assert float(singular.decisions.nearest) == 4.0
+
+
+def test_the_nearest_margin_is_that_of_all_listed_pairs(tmp_path):
+    atoms = liquid(rattle=0.08)
+    simulation = build(load(write_system(tmp_path, atoms)))
+    result, _ = forces_over(simulation, simulation.positions)
+    _, _, d = all_pairs(atoms.positions, atoms.cell.array, (True,) * 3)
+    assert float(result.decisions.nearest) == pytest.approx(np.abs(4.0 - (d**2).sum(axis=1)).min(), rel=1e-9)
+
+
+def test_forces_add_up_to_nothing(tmp_path):
+    simulation = build(load(write_system(tmp_path, mixture(tilt=True), **tables("hard"))))
+    result, _ = forces_over(simulation, simulation.positions)
+    force = np.asarray(result.force)
+    assert np.max(np.abs(force.sum(axis=1))) < 1e-12 * np.abs(force).sum()
