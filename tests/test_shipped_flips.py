@@ -41,13 +41,7 @@ def check(tmp_path, name, steps, **overrides):
 
 
 # one of each kind always; compiling all of them takes minutes
-QUICK = {
-    "argon/crystal-108",
-    "argon/tilted-500",
-    "binary/kob-andersen-1000",
-    "pair/at-cutoff",
-    "silicon/stillinger-weber-512",
-}
+QUICK = {"argon/crystal-108", "argon/tilted-500", "pair/at-cutoff"}
 
 
 @pytest.mark.jax_md

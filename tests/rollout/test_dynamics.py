@@ -107,10 +107,16 @@ def bath(tmp_path_factory):
     return write_system(tmp_path_factory.mktemp("bath"), liquid(rattle=0.03), dynamics=dynamics)
 
 
-def test_a_thermostat_holds_its_temperature_and_keeps_the_books(bath, tmp_path):
-    _, folder = go(tmp_path, bath, 4000)
-    series = folder.read("series")
-    settled = series["temperature"][1000:]
+@pytest.fixture(scope="module")
+def warm(bath, tmp_path_factory):
+    """Per-step numbers of 3000 steps in the bath."""
+    _, folder = go(tmp_path_factory.mktemp("warm"), bath, 3000)
+    return folder.read("series")
+
+
+def test_a_thermostat_holds_its_temperature_and_keeps_the_books(warm):
+    series = warm
+    settled = series["temperature"][500:]
     # error of the mean from the means of stretches much longer than the correlation time 1/(2 friction)
     stretches = settled[: len(settled) // 20 * 20].reshape(20, -1).mean(axis=1)
     error = stretches.std(ddof=1) / np.sqrt(20)
@@ -119,17 +125,17 @@ def test_a_thermostat_holds_its_temperature_and_keeps_the_books(bath, tmp_path):
     # heat is all that comes and goes: the conserved energy wanders far less than the total one
     # (the hard cutoff's own jumps aside)
     conserved = series["conserved"] - np.cumsum(series["energy_jump"])
-    assert np.ptp(conserved[1000:]) < 0.2 * np.ptp(series["total"][1000:])
+    assert np.ptp(conserved[500:]) < 0.2 * np.ptp(series["total"][500:])
 
 
-def test_kinetic_energies_are_those_of_a_canonical_ensemble(bath, tmp_path):
-    _, folder = go(tmp_path, bath, 4000)
-    kinetic = folder.read("series")["kinetic"][1000:]
+def test_kinetic_energies_are_those_of_a_canonical_ensemble(warm):
+    kinetic = warm["kinetic"][500:]
     freedom = 3 * 108
     # variance of a gamma distribution; many correlated samples, hence the room
     assert np.var(kinetic) == pytest.approx(freedom / 2 * 1.3**2, rel=0.35)
 
 
+@pytest.mark.slow
 def test_noise_belongs_to_the_atom_and_the_step(bath, tmp_path):
     """Neither the skin nor the order in which the list sorts the atoms has a say."""
     ends = []

@@ -38,10 +38,6 @@ def test_a_step_that_is_far_too_long_blows_up_and_says_where(path, tmp_path, tim
     assert np.all(folder.read("flips")["step"] <= kept)
 
 
-@pytest.mark.xfail(
-    raises=AssertionError,
-    reason="a new list does not hold a pair that leaves by more than the skin in one step",
-)
 def test_what_came_before_is_a_complete_ledger(path, tmp_path):
     system = load(path, {"dynamics.timestep": 0.05})
     with pytest.raises(NumericalError):

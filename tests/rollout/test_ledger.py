@@ -150,7 +150,7 @@ def test_a_budget_notices_a_flip_that_was_not_told(fluid, tmp_path):
 
 def test_the_ledger_does_not_depend_on_the_skin(tmp_path):
     rows = {}
-    for skin in (0.1, 0.3, 0.6):
+    for skin in (0.1, 0.6):
         result, folder = go(
             tmp_path / str(skin), "argon/crystal-108", 200, {"neighbors.skin": skin}, save_every=1
         )
@@ -158,10 +158,9 @@ def test_the_ledger_does_not_depend_on_the_skin(tmp_path):
         if skin == 0.1:
             assert assert_ledger_is_complete(result, folder) > 100
             assert result.summary["rebuilds"] > 3
-    for skin in (0.3, 0.6):
-        for name in ("step", "i", "j", "entered"):
-            assert np.array_equal(rows[0.1][name], rows[skin][name])
-        assert np.allclose(rows[0.1]["margin"], rows[skin]["margin"], rtol=0, atol=1e-10)
+    for name in ("step", "i", "j", "entered"):
+        assert np.array_equal(rows[0.1][name], rows[0.6][name])
+    assert np.allclose(rows[0.1]["margin"], rows[0.6]["margin"], rtol=0, atol=1e-10)
 
 
 def test_a_capacity_that_grows_loses_no_step(fluid, tmp_path, monkeypatch):

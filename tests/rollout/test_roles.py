@@ -56,6 +56,7 @@ def test_everything_narrow(path, tmp_path):
     assert list(zip(*(flips[n].tolist() for n in ("step", "i", "j", "entered")), strict=True)) == rows
 
 
+@pytest.mark.slow
 def test_a_wide_decision_on_a_narrow_state_is_the_exact_one(path, tmp_path):
     result, folder = go(tmp_path, path, 70, {"precision.state": "float32"}, save_every=1)
     assert assert_ledger_is_complete(result, folder) > 100
