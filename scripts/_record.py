@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,7 +27,6 @@ class Recorded:
         displacement: largest at each step since the list in use was built, length.
         flips: a row per flip, in the columns of flips.parquet.
         health: rebuilds, dangerous builds and lost pairs.
-        steps_per_second: after compilation, decoding and audit of lost pairs included.
     """
 
     time: np.ndarray
@@ -37,7 +35,6 @@ class Recorded:
     displacement: np.ndarray
     flips: Columns
     health: ListHealth
-    steps_per_second: float
 
 
 def record(simulation: Simulation, steps: int) -> Recorded:
@@ -45,19 +42,11 @@ def record(simulation: Simulation, steps: int) -> Recorded:
     recorder, health = PairRecorder(simulation), ListHealth(simulation)
     series: list[Columns] = []
     flips: list[Columns] = []
-    began, counted = time.perf_counter(), 0
     for segment in Engine(simulation, steps).segments():
         # copied: the engine takes a segment's record back after the next one
         series.append({name: segment.rows_of(name).copy() for name in _NUMBERS})
         flips.append(flip_columns(recorder.flips(segment)))
-        health.take(segment)
-        if len(series) == 1:
-            # the first segment holds the compilation
-            began = time.perf_counter()
-        else:
-            counted += segment.rows
-    seconds = time.perf_counter() - began
-    rate = counted / seconds if counted else float("nan")
+        health.take(segment, recorder.missed)
     numbers = _joined(series)
     return Recorded(
         simulation.system.spec.dynamics.timestep * np.arange(len(numbers["potential"])),
@@ -66,7 +55,6 @@ def record(simulation: Simulation, steps: int) -> Recorded:
         numbers["moved"],
         _joined(flips),
         health,
-        rate,
     )
 
 

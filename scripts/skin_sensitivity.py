@@ -11,7 +11,7 @@ and the table says:
     lost pairs   different pairs that were inside the cutoff and not in the list
     pair-steps   the same, counted at every step they were missing
     first lost   the step of the first one
-    steps/s      recorded rollout after compilation, without the audit
+    steps/s      recorded rollout after compilation, without decoding and audit
 
 How to read it. Choose the fastest of the rows that lost nothing. "dangerous" warns where nothing
 was lost and can be silent where something was: believe the lost pairs. A blind rule is safe only
