@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mdnum.events.bits import changed_bits, count_set, set_bits
+from mdnum.events.bits import changed_bits, changes_in_time, count_set, set_bits
 from mdnum.events.ledger import Ledger, broken_alternations, sort_rows
 from mdnum.events.threshold import Threshold
 
@@ -11,6 +11,7 @@ __all__ = [
     "Threshold",
     "broken_alternations",
     "changed_bits",
+    "changes_in_time",
     "count_set",
     "set_bits",
     "sort_rows",

@@ -18,17 +18,17 @@ _BLOCK = 16
 
 
 @numba.njit(cache=True, nogil=True)
-def _scan_changed(before, now, places, values, write):
+def _scan_changed(before, now, first, places, values, write):
     """Count the changed bits of flat byte arrays; with write, also note byte * 8 + bit and the bit now."""
-    at = 0
+    at = first
     n = now.shape[0]
-    for first in range(0, n, _BLOCK):
-        last = min(first + _BLOCK, n)
+    for start in range(0, n, _BLOCK):
+        end = min(start + _BLOCK, n)
         any_changed = np.uint8(0)
-        for q in range(first, last):
+        for q in range(start, end):
             any_changed |= before[q] ^ now[q]
         if any_changed:
-            for q in range(first, last):
+            for q in range(start, end):
                 changed = before[q] ^ now[q]
                 if changed and not write:
                     at += _POPULATION[changed]
@@ -41,6 +41,42 @@ def _scan_changed(before, now, places, values, write):
     return at
 
 
+@numba.njit(cache=True, nogil=True)
+def _scan_rows(before, rows, ends, places, values, write):
+    """`_scan_changed` from row to row; ends[r] is the number of changes up to and including row r."""
+    at = 0
+    for r in range(rows.shape[0]):
+        at = _scan_changed(before if r == 0 else rows[r - 1], rows[r], at, places, values, write)
+        ends[r] = at
+    return at
+
+
+def changes_in_time(
+    before: UInt8[np.ndarray, "words columns"], rows: UInt8[np.ndarray, "rows words columns"]
+) -> tuple[
+    Int[np.ndarray, "flips"], Int[np.ndarray, "flips"], Int[np.ndarray, "flips"], UInt8[np.ndarray, "flips"]
+]:
+    """The decisions that differ from the row before, for consecutive rows of one list.
+
+    Args:
+        before: decisions ahead of the first row.
+        rows: decisions of each row.
+
+    Returns:
+        row, slot, column and the decision now (1 yes, 0 no) of every change, by row, slot word, column, bit.
+    """
+    count, words, columns = rows.shape
+    flat = np.ascontiguousarray(rows).reshape(count, words * columns)
+    first = np.ascontiguousarray(before).ravel()
+    ends = np.zeros(count, np.int64)
+    total = _scan_rows(first, flat, ends, np.empty(0, np.int64), np.empty(0, np.uint8), False)
+    places, values = np.empty(total, np.int64), np.empty(total, np.uint8)
+    _scan_rows(first, flat, ends, places, values, True)
+    word, column = np.divmod(places >> 3, max(columns, 1))
+    row = np.repeat(np.arange(count), np.diff(ends, prepend=0))
+    return row, 8 * word + (places & 7), column, values
+
+
 def changed_bits(
     before: UInt8[np.ndarray, "words columns"], now: UInt8[np.ndarray, "words columns"]
 ) -> tuple[Int[np.ndarray, "flips"], Int[np.ndarray, "flips"], UInt8[np.ndarray, "flips"]]:
@@ -49,14 +85,8 @@ def changed_bits(
     Returns:
         slot, column and the decision now (1 yes, 0 no) of every changed bit, by slot word, column, bit.
     """
-    old, new = np.ascontiguousarray(before).ravel(), np.ascontiguousarray(now).ravel()
-    none, no_values = np.empty(0, np.int64), np.empty(0, np.uint8)
-    count = _scan_changed(old, new, none, no_values, False)
-    places, values = np.empty(count, np.int64), np.empty(count, np.uint8)
-    _scan_changed(old, new, places, values, True)
-    byte, bit = np.divmod(places, 8)
-    word, column = np.divmod(byte, now.shape[1]) if now.shape[1] else (byte, byte)
-    return 8 * word + bit, column, values
+    _, slot, column, values = changes_in_time(before, now[None])
+    return slot, column, values
 
 
 def set_bits(

@@ -86,22 +86,6 @@ class Cell(eqx.Module):
             jnp.asarray(self.matrix, dtype), jnp.asarray(self.inverse, dtype), self.pbc, self.orthorhombic
         )
 
-    def _images(self, x, y, z, rounding):
-        """Lattice coordinates of a vector, rounded: how many lattice vectors to subtract per axis."""
-        m = self.inverse
-        if self.orthorhombic:
-            return rounding(x * m[0, 0]), rounding(y * m[1, 1]), rounding(z * m[2, 2])
-        return tuple(rounding(x * m[0, k] + y * m[1, k] + z * m[2, k]) for k in range(3))
-
-    def _subtract(self, x, y, z, n):
-        a = self.matrix
-        if self.orthorhombic:
-            return x - n[0] * a[0, 0], y - n[1] * a[1, 1], z - n[2] * a[2, 2]
-        for k in range(3):
-            if self.pbc[k]:
-                x, y, z = x - n[k] * a[k, 0], y - n[k] * a[k, 1], z - n[k] * a[k, 2]
-        return x, y, z
-
     def minimum_image(self, x, y, z):
         """Components of a displacement reduced to its nearest image.
 
@@ -111,7 +95,8 @@ class Cell(eqx.Module):
         if not any(self.pbc):
             return x, y, z
         rounding = np.rint if isinstance(x, np.ndarray) else jnp.round
-        return self._subtract(x, y, z, self._images(x, y, z, rounding))
+        lattice = (self.matrix, self.inverse, self.pbc, self.orthorhombic)
+        return _subtract(lattice, x, y, z, _images(lattice, x, y, z, rounding))
 
     def wrap(self, x, y, z):
         """Components brought into the box, and the integer lattice coordinates that were taken off."""
@@ -119,8 +104,46 @@ class Cell(eqx.Module):
             zero = np.zeros_like(x) if isinstance(x, np.ndarray) else jnp.zeros_like(x)
             return (x, y, z), (zero, zero, zero)
         floor = np.floor if isinstance(x, np.ndarray) else jnp.floor
-        n = self._images(x, y, z, floor)
-        return self._subtract(x, y, z, n), n
+        lattice = (self.matrix, self.inverse, self.pbc, self.orthorhombic)
+        n = _images(lattice, x, y, z, floor)
+        return _subtract(lattice, x, y, z, n), n
+
+
+def _images(lattice, x, y, z, rounding):
+    """Lattice coordinates of a vector, rounded: how many lattice vectors to subtract per axis."""
+    _, m, _, orthorhombic = lattice
+    if orthorhombic:
+        return rounding(x * m[0, 0]), rounding(y * m[1, 1]), rounding(z * m[2, 2])
+    return tuple(rounding(x * m[0, k] + y * m[1, k] + z * m[2, k]) for k in range(3))
+
+
+def _subtract(lattice, x, y, z, n):
+    a, _, pbc, orthorhombic = lattice
+    if orthorhombic:
+        return x - n[0] * a[0, 0], y - n[1] * a[1, 1], z - n[2] * a[2, 2]
+    for k in range(3):
+        if pbc[k]:
+            x, y, z = x - n[k] * a[k, 0], y - n[k] * a[k, 1], z - n[k] * a[k, 2]
+    return x, y, z
+
+
+class HostCell:
+    """A cell's arithmetic on the host in one dtype, without a module's overhead: for many small calls."""
+
+    def __init__(self, cell: Cell, dtype: DTypeLike = np.float64):
+        self.dtype = np.dtype(dtype)
+        matrix, inverse = np.asarray(cell.matrix, dtype), np.asarray(cell.inverse, dtype)
+        self._lattice = (matrix, inverse, cell.pbc, cell.orthorhombic)
+
+    def displacement(
+        self, start: Float[np.ndarray, "... 3"], end: Float[np.ndarray, "... 3"]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Components of the nearest image of end - start, with the bits that the force loop computes."""
+        start, end = np.asarray(start, self.dtype), np.asarray(end, self.dtype)
+        x, y, z = (end[..., k] - start[..., k] for k in range(3))
+        if not any(self._lattice[2]):
+            return x, y, z
+        return _subtract(self._lattice, x, y, z, _images(self._lattice, x, y, z, np.rint))
 
 
 def wrap_positions(
@@ -147,9 +170,7 @@ def displacement(
     dtype: DTypeLike = np.float64,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Components of the nearest image of end - start, with the bits that the force loop computes in dtype."""
-    host = Cell(np.asarray(cell.matrix, dtype), np.asarray(cell.inverse, dtype), cell.pbc, cell.orthorhombic)
-    start, end = np.asarray(start, dtype), np.asarray(end, dtype)
-    return host.minimum_image(*(end[..., k] - start[..., k] for k in range(3)))
+    return HostCell(cell, dtype).displacement(start, end)
 
 
 def strain_loss(reference: Cell, now: Cell, r_list: float) -> float:

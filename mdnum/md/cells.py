@@ -80,47 +80,54 @@ def _segments(b0, b1, b2, bins, reach, periodic, start, matrix, first, last, shi
 
 
 @numba.njit(cache=True, nogil=True)
-def _near(x, i, begin, end, sx, sy, sz, r2_list, buffer, filled):
-    """Append the atoms of a run that lie within the list radius; free of branches, hence fast."""
-    xi, yi, zi = x[0, i] - sx, x[1, i] - sy, x[2, i] - sz
-    for j in range(begin, end):
-        dx, dy, dz = x[0, j] - xi, x[1, j] - yi, x[2, j] - zi
-        buffer[filled] = j
-        filled += int((dx * dx + dy * dy + dz * dz <= r2_list) & (i != j))
-    return filled
+def _gather(x, runs, first, last, shift, near):
+    """Copy the atoms of all runs side by side, moved by their lattice vectors; returns how many."""
+    count = 0
+    for q in range(runs):
+        for j in range(first[q], last[q]):
+            for c in range(3):
+                near[c, count] = x[c, j] + shift[q, c]
+            near[3, count] = j
+            count += 1
+    return count
 
 
 @numba.njit(cache=True, nogil=True)
-def _near_image(x, i, begin, end, sx, sy, sz, matrix, inverse, r2_list, buffer, filled):
-    """As `_near`, where an axis has a single bin and its nearest image must be looked for pair by pair."""
-    xi, yi, zi = x[0, i] - sx, x[1, i] - sy, x[2, i] - sz
-    for j in range(begin, end):
-        dx, dy, dz = x[0, j] - xi, x[1, j] - yi, x[2, j] - zi
+def _distances(near, count, xi, yi, zi, squares):
+    """Squared distances to all candidates; a loop without branches, which vectorizes."""
+    for k in range(count):
+        dx, dy, dz = near[0, k] - xi, near[1, k] - yi, near[2, k] - zi
+        squares[k] = dx * dx + dy * dy + dz * dz
+
+
+@numba.njit(cache=True, nogil=True)
+def _image_distances(near, count, xi, yi, zi, matrix, inverse, squares):
+    """As `_distances`, where an axis has a single bin and the nearest image is looked for pair by pair."""
+    for k in range(count):
+        dx, dy, dz = near[0, k] - xi, near[1, k] - yi, near[2, k] - zi
         f = np.rint(dx * inverse[0, 0] + dy * inverse[1, 0] + dz * inverse[2, 0])
         g = np.rint(dx * inverse[0, 1] + dy * inverse[1, 1] + dz * inverse[2, 1])
         h = np.rint(dx * inverse[0, 2] + dy * inverse[1, 2] + dz * inverse[2, 2])
         dx -= f * matrix[0, 0] + g * matrix[1, 0] + h * matrix[2, 0]
         dy -= f * matrix[0, 1] + g * matrix[1, 1] + h * matrix[2, 1]
         dz -= f * matrix[0, 2] + g * matrix[1, 2] + h * matrix[2, 2]
-        buffer[filled] = j
-        filled += int((dx * dx + dy * dy + dz * dz <= r2_list) & (i != j))
-    return filled
+        squares[k] = dx * dx + dy * dy + dz * dz
 
 
 @numba.njit(cache=True, nogil=True)
 def _fill(x, matrix, inverse, periodic, bins, reach, start, r2_list, table):
     """Neighbors of every (bin-sorted) atom; returns the largest number found, which may exceed the room.
 
-    x is bin-sorted, (3, n), each coordinate in the box. table is (n, room); of a row that does not fit,
-    what fits is written.
+    x is bin-sorted, (3, n), each coordinate in the box. table is (room, n); of an atom whose neighbors do not
+    fit, those that do are written.
     """
     n = x.shape[1]
-    room = table.shape[1]
+    room = table.shape[0]
     most = 0
     by_pair = False
     for k in range(3):
         by_pair = by_pair or (periodic[k] and reach[k] == 0)
-    buffer = np.empty(n + 1, np.int32)
+    near, squares, chosen = np.empty((4, n + 1)), np.empty(n + 1), np.empty(n + 1, np.int32)
     first, last = np.empty(75, np.int64), np.empty(75, np.int64)
     shift = np.empty((75, 3))
     for b0 in range(bins[0]):
@@ -130,33 +137,23 @@ def _fill(x, matrix, inverse, periodic, bins, reach, start, r2_list, table):
                 if start[here] == start[here + 1]:
                     continue
                 runs = _segments(b0, b1, b2, bins, reach, periodic, start, matrix, first, last, shift)
+                count = _gather(x, runs, first, last, shift, near)
                 for i in range(start[here], start[here + 1]):
+                    if by_pair:
+                        _image_distances(near, count, x[0, i], x[1, i], x[2, i], matrix, inverse, squares)
+                    else:
+                        _distances(near, count, x[0, i], x[1, i], x[2, i], squares)
                     filled = 0
-                    for q in range(runs):
-                        begin, end = first[q], last[q]
-                        sx, sy, sz = shift[q, 0], shift[q, 1], shift[q, 2]
-                        if by_pair:
-                            filled = _near_image(
-                                x, i, begin, end, sx, sy, sz, matrix, inverse, r2_list, buffer, filled
-                            )
-                        else:
-                            filled = _near(x, i, begin, end, sx, sy, sz, r2_list, buffer, filled)
+                    # no branch to mispredict: every candidate is written, and overwritten unless it is kept
+                    for k in range(count):
+                        j = np.int32(near[3, k])
+                        chosen[filled] = j
+                        filled += int((squares[k] <= r2_list) & (j != i))
                     most = max(most, filled)
+                    # the slots of consecutive atoms share cache lines, so this is no slower than by rows
                     for k in range(min(filled, room)):
-                        table[i, k] = buffer[k]
+                        table[k, i] = chosen[k]
     return most
-
-
-@numba.njit(cache=True, nogil=True)
-def _transpose(table, out):
-    """(n, room) to (room, n) in blocks that fit the cache; out beyond room keeps its padding."""
-    n, room = table.shape
-    block = 64
-    for first in range(0, n, block):
-        last = min(first + block, n)
-        for k in range(room):
-            for i in range(first, last):
-                out[k, i] = table[i, k]
 
 
 def _grid(cell: Cell, fractional_extent, r_list: float, atoms: int):
@@ -213,7 +210,7 @@ def neighbor_table(
     start = np.zeros(int(np.prod(bins)) + 1, np.int64)
     order = np.empty(atoms, np.int64)
     _bin_atoms(fractional, bins, np.empty(atoms, np.int64), start, order)
-    table = np.full((atoms, room), atoms, np.int32)
+    table = np.full((room, atoms), atoms, np.int32)
     most = _fill(
         np.ascontiguousarray(components[:, order]),
         np.asarray(cell.matrix, np.float64),
@@ -225,9 +222,7 @@ def neighbor_table(
         (r_list * _SAFETY) ** 2,
         table,
     )
-    out = np.empty((room, atoms), np.int32)
-    _transpose(table, out)
-    return out, order, int(most)
+    return table, order, int(most)
 
 
 def _free_axis(cell: Cell, components, k: int):

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from mdnum.errors import MdnumError
-from mdnum.events import Ledger, changed_bits, count_set, set_bits, sort_rows
-from mdnum.md.cell import displacement
+from mdnum.events import Ledger, changes_in_time, count_set, set_bits, sort_rows
+from mdnum.md.cell import HostCell, displacement
 from mdnum.md.verlet import PairTable
 from mdnum.rollout.engine import Segment
 from mdnum.systems.build import Simulation
@@ -69,7 +69,7 @@ class PairRecorder:
         self._held_segment: tuple[PairTable, UInt8[np.ndarray, "words atoms"]] | None = None
         self.missed = 0
         decider = simulation.decider
-        self._dtype = np.dtype(decider.dtype)
+        self._cell, self._decision_cell = HostCell(simulation.cell), HostCell(simulation.cell, decider.dtype)
         self._inclusive = decider.compare.endswith("<=")
         self._thresholds = np.array([t.value for t in decider.thresholds])
         self._bounds = np.array(decider.bounds)
@@ -106,7 +106,7 @@ class PairRecorder:
     def _margins(self, start, end, i, j):
         """Pair types and margins of pairs at given positions, with the bits of the program's decision."""
         kind = self.simulation.type_of(i, j)
-        d = displacement(self.simulation.cell, start, end, self._dtype)
+        d = self._decision_cell.displacement(start, end)
         quantity = self.simulation.decider.host_quantity(*d).astype(np.float64)
         return kind, self._thresholds[kind] - quantity
 
@@ -126,13 +126,8 @@ class PairRecorder:
         replaced = self._replace(segment, before)
         if replaced is not None:
             before = bits[0]
-        found = [
-            (row, *changed_bits(bits[row - 1] if row else before, bits[row])) for row in range(segment.rows)
-        ]
-        row = np.concatenate([np.full(len(slots), r, np.int64) for r, slots, _, _ in found])
-        slot = np.concatenate([slots for _, slots, _, _ in found])
-        column = np.concatenate([columns for _, _, columns, _ in found])
-        entered = np.concatenate([values for _, _, _, values in found]).astype(bool)
+        row, slot, column, entered = changes_in_time(before, bits)
+        entered = entered.astype(bool)
         neighbor = segment.table.index[slot, column].astype(np.int64)
         i, j = segment.table.order[column], segment.table.order[neighbor]
         keep = i < j
@@ -190,9 +185,10 @@ class PairRecorder:
                 "a recorded margin contradicts its decision",
                 remedy="Run `mdnum doctor`; the compiled arithmetic is not the one expected",
             )
-        d = np.stack(displacement(simulation.cell, start, end), axis=1)
-        distance = np.sqrt(np.sum(d * d, axis=1))
-        approach = np.sum((v[row, :, second] - v[row, :, first]).astype(np.float64) * d, axis=1)
+        dx, dy, dz = self._cell.displacement(start, end)
+        distance = np.sqrt(dx * dx + dy * dy + dz * dz)
+        u = (v[row, :, second] - v[row, :, first]).astype(np.float64)
+        approach = u[:, 0] * dx + u[:, 1] * dy + u[:, 2] * dz
         sign = np.where(entered, 1.0, -1.0)
         step = segment.first + row
         order = sort_rows(step, labels)
