@@ -13,42 +13,29 @@ from jaxtyping import Int, UInt8
 _POPULATION = np.array([int(byte).bit_count() for byte in range(256)], np.int64)
 
 
-# most bytes do not change: this many are looked at together before any is looked at alone
-_BLOCK = 16
-
-
 @numba.njit(cache=True, nogil=True)
-def _scan_changed(before, now, first, places, values, write):
-    """Count the changed bits of flat byte arrays; with write, also note byte * 8 + bit and the bit now."""
-    at = first
-    n = now.shape[0]
-    for start in range(0, n, _BLOCK):
-        end = min(start + _BLOCK, n)
-        any_changed = np.uint8(0)
-        for q in range(start, end):
-            any_changed |= before[q] ^ now[q]
-        if any_changed:
-            for q in range(start, end):
-                changed = before[q] ^ now[q]
-                if changed and not write:
-                    at += _POPULATION[changed]
-                elif changed:
-                    for k in range(8):
-                        if (changed >> k) & 1:
-                            places[at] = 8 * q + k
-                            values[at] = (now[q] >> k) & 1
-                            at += 1
-    return at
+def _scan(rows, ends, places, values, write):
+    """Count the bits that change from row to row; with write, note byte * 8 + bit and the bit now.
 
-
-@numba.njit(cache=True, nogil=True)
-def _scan_rows(before, rows, ends, places, values, write):
-    """`_scan_changed` from row to row; ends[r] is the number of changes up to and including row r."""
+    rows holds 64 decisions to a word; most words do not change, and those cost one comparison.
+    """
     at = 0
-    for r in range(rows.shape[0]):
-        at = _scan_changed(before if r == 0 else rows[r - 1], rows[r], at, places, values, write)
-        ends[r] = at
-    return at
+    for r in range(1, rows.shape[0]):
+        for w in range(rows.shape[1]):
+            changed = rows[r, w] ^ rows[r - 1, w]
+            if changed:
+                now = rows[r, w]
+                for byte in range(8):
+                    bits = (changed >> np.uint64(8 * byte)) & np.uint64(255)
+                    if bits and not write:
+                        at += _POPULATION[bits]
+                    elif bits:
+                        for k in range(8):
+                            if (bits >> np.uint64(k)) & np.uint64(1):
+                                places[at] = 64 * w + 8 * byte + k
+                                values[at] = (now >> np.uint64(8 * byte + k)) & np.uint64(1)
+                                at += 1
+        ends[r - 1] = at
 
 
 def changes_in_time(
@@ -66,12 +53,17 @@ def changes_in_time(
         row, slot, column and the decision now (1 yes, 0 no) of every change, by row, slot word, column, bit.
     """
     count, words, columns = rows.shape
-    flat = np.ascontiguousarray(rows).reshape(count, words * columns)
-    first = np.ascontiguousarray(before).ravel()
+    size = words * columns
+    padded = np.zeros((count + 1, -(-size // 8) * 8), np.uint8)
+    padded[0, :size] = before.reshape(-1)
+    padded[1:, :size] = rows.reshape(count, size)
+    # on a big-endian machine the bytes of a word would be met in the other order
+    wide = padded.view("<u8").astype(np.uint64, copy=False)
     ends = np.zeros(count, np.int64)
-    total = _scan_rows(first, flat, ends, np.empty(0, np.int64), np.empty(0, np.uint8), False)
+    _scan(wide, ends, np.empty(0, np.int64), np.empty(0, np.uint8), False)
+    total = int(ends[-1]) if count else 0
     places, values = np.empty(total, np.int64), np.empty(total, np.uint8)
-    _scan_rows(first, flat, ends, places, values, True)
+    _scan(wide, ends, places, values, True)
     word, column = np.divmod(places >> 3, max(columns, 1))
     row = np.repeat(np.arange(count), np.diff(ends, prepend=0))
     return row, 8 * word + (places & 7), column, values

@@ -164,7 +164,7 @@ class VerletList:
     builder: ListBuilder
     rule: RebuildRule
     r_cut: float
-    slack: float = 1.1
+    slack: float = 1.04
     guard: float = 0.0
     slots: int = field(default=0)
 

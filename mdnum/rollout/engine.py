@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -162,6 +163,8 @@ class Engine:
             rule.check,
             record,
         )
+        leaves, self._structure = jax.tree.flatten(self.program)
+        self._leaves = tuple(leaves)
         self._records: list[Record | None] = [None, None]
 
     def _room(self, words: int) -> int:
@@ -194,7 +197,8 @@ class Engine:
         while True:
             words = table.slots // 8
             outcome, record = run_epoch(
-                self.program,
+                self._leaves,
+                self._structure,
                 tables,
                 state,
                 home,
@@ -207,8 +211,8 @@ class Engine:
                 # the device is at work: the caller may read the record before this one
                 yield waiting
                 self._records[1 - turn] = waiting.record
-            rows = int(outcome.rows)
-            closes = self._closes(outcome, first + rows)
+            rows, rebuild, finite, runaway = np.asarray(outcome.flags).tolist()
+            closes = self._closes(first + rows, rebuild=rebuild, finite=finite, runaway=runaway)
             if before is None and outcome.before is not None:
                 before = np.asarray(outcome.before)
             waiting = Segment(
@@ -236,14 +240,14 @@ class Engine:
                 table = self.verlet.build(reference, cell)
                 tables = self.simulation.tables(table)
 
-    def _closes(self, outcome, next_step: int) -> str | None:
-        if not bool(outcome.finite):
+    def _closes(self, next_step: int, *, rebuild: int, finite: int, runaway: int) -> str | None:
+        if not finite:
             return "blow-up"
         if next_step > self.last:
             return "end"
-        if bool(outcome.runaway):
+        if runaway:
             return "runaway"
-        if bool(outcome.rebuild):
+        if rebuild:
             return "displacement" if self.simulation.rule.check else "interval"
         return None
 

@@ -7,7 +7,7 @@ finite. The host then rebuilds the list and starts the next epoch.
 from __future__ import annotations
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -97,21 +97,17 @@ class Outcome(NamedTuple):
 
     Attributes:
         state: where to go on.
-        rows: how many rows were recorded.
-        rebuild: the list must be rebuilt before the next forces.
-        finite: every number so far was.
-        runaway: an atom has just moved by more than a lattice vector in one step; forces there mean nothing,
-            and decisions would no longer be exact.
+        flags: four numbers that travel together: how many rows were recorded; whether the list must be
+            rebuilt before the next forces; whether every number so far was finite; and whether an atom has
+            just moved by more than a lattice vector in one step, so that forces there would mean nothing and
+            decisions would no longer be exact.
         moved: largest displacement since the list was built, at the step that comes next, length.
         before: decisions of the list at the step before, for the count check and the first flips of a new
             list; all no where they were not asked for. None without recording.
     """
 
     state: State
-    rows: Int[Array, ""]
-    rebuild: Bool[Array, ""]
-    finite: Bool[Array, ""]
-    runaway: Bool[Array, ""]
+    flags: Int[Array, "4"]
     moved: Float[Array, ""]
     before: UInt8[Array, "words atoms"] | None
 
@@ -141,9 +137,11 @@ def _write(record: Record, row, **values) -> Record:
 
 
 # the record is donated: two of them take turns, and no epoch pays for clearing one
-@partial(jax.jit, donate_argnames=("record",))
+# flattening a program's many leaves anew costs a small system more than its step: it is done once
+@partial(jax.jit, static_argnames=("structure",), donate_argnames=("record",))
 def run_epoch(
-    program: Program,
+    leaves: tuple[Array, ...],
+    structure: Any,
     tables: Tables,
     state: State,
     reference: Float[Array, "3 atoms"],
@@ -155,7 +153,7 @@ def run_epoch(
     """Advance with one list until it is used up, the record is full or the last step is done.
 
     Args:
-        program: what stays the same.
+        leaves, structure: the program, flattened by jax.tree.flatten.
         tables: the list.
         state: where the rollout stands, user's order.
         reference: wrapped positions at which the list was built, user's order.
@@ -164,6 +162,7 @@ def run_epoch(
         look_back: whether to decide the step before with this list too.
         record: rows to fill; donated.
     """
+    program: Program = jax.tree.unflatten(structure, leaves)
     order = tables.order
     dtype = state.x.dtype
     x, v, images = state.x[:, order], state.v[:, order], state.images[:, order]
@@ -247,4 +246,5 @@ def run_epoch(
         return jnp.zeros_like(a).at[:, order].set(a)
 
     end = State(step, unsorted(x), unsorted(v), unsorted(images), unsorted(x_before), heat)
-    return Outcome(end, rows, due, finite, runaway, largest, before), record
+    flags = jnp.stack([rows, due.astype(rows.dtype), finite.astype(rows.dtype), runaway.astype(rows.dtype)])
+    return Outcome(end, flags, largest, before), record

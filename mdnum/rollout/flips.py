@@ -50,6 +50,40 @@ def _fingerprint_of_keys(keys):
     return len(keys), total
 
 
+@numba.njit(cache=True, nogil=True)
+def _from_first_end(row, slot, column, values, index, order):
+    """The changes seen from the atom with the smaller label: row, sorted atoms, decision, labels."""
+    total = row.shape[0]
+    kept = 0
+    rows, first, second = np.empty(total, np.int64), np.empty(total, np.int64), np.empty(total, np.int64)
+    entered = np.empty(total, np.bool_)
+    low, high = np.empty(total, np.int64), np.empty(total, np.int64)
+    for q in range(total):
+        c = column[q]
+        n = index[slot[q], c]
+        i, j = order[c], order[n]
+        if i < j:
+            rows[kept], first[kept], second[kept], entered[kept] = row[q], c, n, values[q] == 1
+            low[kept], high[kept] = i, j
+            kept += 1
+    return rows[:kept], first[:kept], second[:kept], entered[:kept], low[:kept], high[:kept]
+
+
+@numba.njit(cache=True, nogil=True)
+def _gather(values, row, place, out):
+    """out[c, f] = values[row[f], c, place[f]]: a column of a record at the flips, component by component."""
+    for c in range(3):
+        for f in range(row.shape[0]):
+            out[c, f] = values[row[f], c, place[f]]
+
+
+def _at(values: np.ndarray, row: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """Rows of a (rows, 3, atoms) record at given rows and atoms, shape (flips, 3)."""
+    out = np.empty((3, len(row)), values.dtype)
+    _gather(values, row, place, out)
+    return out.T
+
+
 class PairRecorder:
     """Writes the `pair` channel of a simulation.
 
@@ -67,6 +101,7 @@ class PairRecorder:
         self.simulation = simulation
         self._held_keys = held
         self._held_segment: tuple[PairTable, UInt8[np.ndarray, "words atoms"]] | None = None
+        self._held_positions: np.ndarray | None = None
         self.missed = 0
         decider = simulation.decider
         self._cell, self._decision_cell = HostCell(simulation.cell), HostCell(simulation.cell, decider.dtype)
@@ -126,14 +161,12 @@ class PairRecorder:
         replaced = self._replace(segment, before)
         if replaced is not None:
             before = bits[0]
-        row, slot, column, entered = changes_in_time(before, bits)
-        entered = entered.astype(bool)
-        neighbor = segment.table.index[slot, column].astype(np.int64)
-        i, j = segment.table.order[column], segment.table.order[neighbor]
-        keep = i < j
-        if 2 * int(keep.sum()) != len(keep):
+        row, slot, column, values = changes_in_time(before, bits)
+        table = segment.table
+        ends = _from_first_end(row, slot, column, values, table.index, table.order)
+        if 2 * len(ends[0]) != len(row):
             raise MdnumError("a flip was recorded from one end only", remedy="Report this as a bug")
-        row, column, neighbor, entered, i, j = (a[keep] for a in (row, column, neighbor, entered, i, j))
+        row, column, neighbor, entered, i, j = ends
         if replaced is not None:
             keys, now = replaced
             low, high = np.divmod(keys, self.simulation.atoms)
@@ -143,6 +176,7 @@ class PairRecorder:
             entered, i, j = np.append(now, entered), np.append(low, i), np.append(high, j)
         if segment.closes:
             self._held_segment, self._held_keys = (segment.table, np.array(bits[-1])), None
+            self._held_positions = segment.unsorted("x", segment.rows - 1)
         return self._ledger(segment, row, column, neighbor, entered, np.stack([i, j], axis=1))
 
     def held(self) -> Int[np.ndarray, "pairs"] | None:
@@ -150,6 +184,19 @@ class PairRecorder:
         if self._held_segment is not None:
             self._held_keys = _keys(self.simulation, *self._held_segment)
         return self._held_keys
+
+    def _cannot_differ(self, segment: Segment, before) -> bool:
+        """Whether the two lists hold the same pairs inside for certain.
+
+        A safe rule has missed nothing, and no pair gets from inside to beyond the new list unless two atoms
+        cover the skin in a single step. The count is compared all the same: it costs nothing.
+        """
+        rule = self.simulation.rule
+        if self._held_segment is None or self._held_positions is None or not rule.safe:
+            return False
+        steps = self._cell.displacement(self._held_positions, segment.unsorted("x", 0))
+        longest = np.sqrt(np.max(sum(c * c for c in steps), initial=0.0))
+        return bool(2 * longest < rule.skin) and self.inside(self._held_segment[1]) == self.inside(before)
 
     def _replace(self, segment: Segment, before) -> tuple[np.ndarray, np.ndarray] | None:
         """Where a new list and the one before it disagree on the step before: the flips between the two.
@@ -159,6 +206,8 @@ class PairRecorder:
         """
         self.missed = 0
         if not segment.opens or (self._held_segment is None and self._held_keys is None):
+            return None
+        if self._cannot_differ(segment, before):
             return None
         if self._held_segment is not None:
             table, bits = self._held_segment
@@ -178,7 +227,7 @@ class PairRecorder:
     def _ledger(self, segment: Segment, row, first, second, entered, labels) -> Ledger:
         simulation = self.simulation
         x, v = segment.rows_of("x"), segment.rows_of("v")
-        start, end = x[row, :, first], x[row, :, second]
+        start, end = _at(x, row, first), _at(x, row, second)
         kind, margin = self._margins(start, end, labels[:, 0], labels[:, 1])
         if not np.array_equal(margin >= 0 if self._inclusive else margin > 0, entered):
             raise MdnumError(
@@ -187,7 +236,7 @@ class PairRecorder:
             )
         dx, dy, dz = self._cell.displacement(start, end)
         distance = np.sqrt(dx * dx + dy * dy + dz * dz)
-        u = (v[row, :, second] - v[row, :, first]).astype(np.float64)
+        u = (_at(v, row, second) - _at(v, row, first)).astype(np.float64)
         approach = u[:, 0] * dx + u[:, 1] * dy + u[:, 2] * dz
         sign = np.where(entered, 1.0, -1.0)
         step = segment.first + row
