@@ -71,7 +71,8 @@ def test_one_narrow_role_at_a_time(path, tmp_path, role):
     assert result.summary["status"] == "complete" and algebra_holds(folder)
     assert result.summary["lost_pairs"] == result.summary["count_mismatches"] == 0
     energies = folder.read("series")["potential"], wide.read("series")["potential"]
-    assert np.allclose(*energies, rtol=1e-4)
+    # a flip that comes a step later is one u(r_cut), 0.06, for a step
+    assert np.allclose(*energies, rtol=0, atol=0.3)
     if role != "decision":
         # narrow arithmetic must show, or the role does nothing
         assert not np.array_equal(*energies)
