@@ -14,12 +14,12 @@ _POPULATION = np.array([int(byte).bit_count() for byte in range(256)], np.int64)
 
 
 @numba.njit(cache=True, nogil=True)
-def _scan(rows, ends, places, values, write):
-    """Count the bits that change from row to row; with write, note byte * 8 + bit and the bit now.
+def _scan(rows, columns, row, slot, column, values):
+    """Note the bits that change from row to row; returns their number, of which those that fit are noted.
 
     rows holds 64 decisions to a word; most words do not change, and those cost one comparison.
     """
-    at = 0
+    at, room = 0, row.shape[0]
     for r in range(1, rows.shape[0]):
         for w in range(rows.shape[1]):
             changed = rows[r, w] ^ rows[r - 1, w]
@@ -27,15 +27,18 @@ def _scan(rows, ends, places, values, write):
                 now = rows[r, w]
                 for byte in range(8):
                     bits = (changed >> np.uint64(8 * byte)) & np.uint64(255)
-                    if bits and not write:
+                    if bits and at + 8 > room:
                         at += _POPULATION[bits]
                     elif bits:
+                        place = 8 * w + byte
                         for k in range(8):
                             if (bits >> np.uint64(k)) & np.uint64(1):
-                                places[at] = 64 * w + 8 * byte + k
+                                row[at] = r - 1
+                                slot[at] = 8 * (place // columns) + k
+                                column[at] = place % columns
                                 values[at] = (now >> np.uint64(8 * byte + k)) & np.uint64(1)
                                 at += 1
-        ends[r - 1] = at
+    return at
 
 
 def changes_in_time(
@@ -59,14 +62,15 @@ def changes_in_time(
     padded[1:, :size] = rows.reshape(count, size)
     # on a big-endian machine the bytes of a word would be met in the other order
     wide = padded.view("<u8").astype(np.uint64, copy=False)
-    ends = np.zeros(count, np.int64)
-    _scan(wide, ends, np.empty(0, np.int64), np.empty(0, np.uint8), False)
-    total = int(ends[-1]) if count else 0
-    places, values = np.empty(total, np.int64), np.empty(total, np.uint8)
-    _scan(wide, ends, places, values, True)
-    word, column = np.divmod(places >> 3, max(columns, 1))
-    row = np.repeat(np.arange(count), np.diff(ends, prepend=0))
-    return row, 8 * word + (places & 7), column, values
+    # rarely too little; where it is, the count says how much is needed
+    room = wide.size // 4 + 64
+    while True:
+        row, slot, column = (np.empty(room, np.int64) for _ in range(3))
+        values = np.empty(room, np.uint8)
+        total = _scan(wide, max(columns, 1), row, slot, column, values)
+        if total + 8 <= room:
+            return row[:total], slot[:total], column[:total], values[:total]
+        room = total + 8
 
 
 def changed_bits(
