@@ -1,8 +1,8 @@
 """A cell-list neighbor search on the host, compiled by numba: the fast builder of Verlet lists.
 
-Bins are half a list radius wide where the box allows it; boxes with fewer than five bins along a periodic
-axis fall back to bins of the whole radius, and below three bins to all pairs along that axis. Distances are
-those of the minimum image, so the caller refuses radii beyond half the smallest perpendicular width.
+Bins are half a list radius wide, or wider; an axis with room for fewer than five has a single one, and every
+atom meets every atom along it. Distances are those of the minimum image, so the caller refuses radii beyond
+half the smallest perpendicular width.
 """
 
 from __future__ import annotations
@@ -163,11 +163,9 @@ def _grid(cell: Cell, fractional_extent, r_list: float, atoms: int):
     for k in range(3):
         width = fractional_extent[k]
         # with the safety: a pair at r_list must never be three bins of r_list/2 apart by rounding
-        fine, coarse = int(2 * width / (r_list * _SAFETY)), int(width / (r_list * _SAFETY))
+        fine = int(2 * width / (r_list * _SAFETY))
         if fine >= 5:
             bins[k], reach[k] = fine, 2
-        elif coarse >= 3:
-            bins[k], reach[k] = coarse, 1
         # fewer: one bin along this axis, every atom meets every atom once
     # empty bins cost a visit each: a dilute system gets no more bins than about two per atom
     while np.prod(bins.astype(float)) > max(27.0, 2.0 * atoms) and bins.max() > 5:

@@ -173,7 +173,8 @@ class PairSearch:
         capacity_multiplier: float = 1.25,
     ):
         narrowest = float(np.min(widths(cell, np.asarray(pbc))))
-        if not 0 < r_list <= narrowest / 2:
+        # a hair beyond half the width is the room that callers add for rounding, not another image
+        if not 0 < r_list <= narrowest / 2 * (1 + 1e-9):
             raise InputError(
                 f"a neighbor list of radius {r_list:g} in a cell {narrowest:g} wide; "
                 f"expected a radius above 0 and up to {narrowest / 2:g}",

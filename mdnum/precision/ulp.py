@@ -27,8 +27,16 @@ def ordinal(x: Float[np.ndarray, "..."]) -> Int[np.ndarray, "..."]:
 
 
 def ulp_distance(a, b, dtype: DTypeLike = np.float64) -> Int[np.ndarray, "..."]:
-    """How many floats of dtype lie from a to b, with sign (b above a is positive)."""
-    return np.asarray(ordinal(np.asarray(b, dtype)) - ordinal(np.asarray(a, dtype)))
+    """How many floats of dtype lie from a to b, with sign (b above a is positive).
+
+    Error: exact up to 2^62; further apart (floats of opposite sign) the answer is ±2^62.
+    """
+    start, end = ordinal(np.asarray(a, dtype)), ordinal(np.asarray(b, dtype))
+    limit = np.int64(2**62)
+    # halves cannot overflow, and tell where the difference would
+    far = np.abs(end // 2 - start // 2) >= limit // 2
+    with np.errstate(over="ignore"):
+        return np.where(far, np.where(end > start, limit, -limit), end - start)
 
 
 def neighbor(x, ulps: int, dtype: DTypeLike = np.float64):

@@ -44,7 +44,8 @@ class Segment:
         opens: whether this is the first segment of its epoch.
         closes: why the epoch ended with it: "displacement", "interval", "end", None, or
             what went wrong: "blow-up" (the last row is not finite), "runaway" (what follows it is wild).
-        moved: largest displacement since the list was built, at the step after the last row, length.
+        due: the list must not be used for the step after the last row.
+        moved: largest displacement since the list was built, at that step, length.
         state: where the rollout goes on.
         reference: wrapped positions at which the list was built, shape (atoms, 3).
     """
@@ -58,6 +59,7 @@ class Segment:
     built: int
     opens: bool
     closes: str | None
+    due: bool
     moved: float
     state: State
     reference: Float[np.ndarray, "atoms 3"]
@@ -225,6 +227,7 @@ class Engine:
                 built,
                 opens,
                 closes,
+                bool(rebuild),
                 float(outcome.moved),
                 outcome.state,
                 reference,
@@ -255,7 +258,7 @@ class Engine:
 def resume_point(segment: Segment) -> Start:
     """Where a rollout goes on after a segment: with its list, or with a new one where its list is used up."""
     state = segment.state
-    if segment.closes in ("displacement", "interval"):
+    if segment.due:
         reference = np.asarray(state.x, np.float64).T.copy()
         return Start(state, reference, segment.last + 1, segment.epoch + 1, segment.table.slots)
     return Start(state, segment.reference, segment.built, segment.epoch, segment.table.slots)

@@ -23,6 +23,7 @@ class Epoch:
     build_ms: float
     length: int = 0
     displacement: float = 0.0
+    next_displacement: float = 0.0
     lost: set[int] = field(default_factory=set)
     lost_pair_steps: int = 0
     first_lost_step: int = -1
@@ -71,22 +72,33 @@ class ListHealth:
     dangerous: int = 0
     mismatches: int = 0
 
-    def take(self, segment: Segment, missed: int) -> dict[str, np.ndarray] | None:
-        """Account for a segment; returns the row of its epoch where it ends one.
+    def take(self, segment: Segment, missed: int) -> list[dict[str, np.ndarray]]:
+        """Account for a segment; returns the rows of the epochs that are known to have ended.
 
         Args:
             segment: what the engine recorded.
             missed: pairs that the list before had missed at its last step, as this one found.
         """
         self.mismatches += missed > 0
+        rows = []
+        if self.current is not None and self.current.epoch != segment.epoch:
+            # the run had ended with this list just used up, and was continued
+            rows.append(
+                self._close(self.current, "displacement" if self.simulation.rule.check else "interval")
+            )
         if self.current is None or self.current.epoch != segment.epoch:
             self.current = Epoch.of(segment)
         epoch = self.current
         moved = segment.rows_of("moved")
         epoch.length += segment.rows
         epoch.displacement = max(epoch.displacement, float(np.max(moved, initial=0.0)))
+        epoch.next_displacement = segment.moved
         self._audit(segment, moved, epoch)
-        return self._close(segment, epoch) if segment.closes else None
+        if segment.closes:
+            rows.append(self._close(epoch, segment.closes))
+            # a run that has come to its end may be continued with the list it has
+            self.current = epoch if segment.closes == "end" else None
+        return rows
 
     def _audit(self, segment: Segment, moved, epoch: Epoch) -> None:
         skin = self.simulation.rule.skin
@@ -104,10 +116,10 @@ class ListHealth:
                 tally.lost |= set(missing.tolist())
                 tally.first_lost_step = step if tally.first_lost_step < 0 else tally.first_lost_step
 
-    def _close(self, segment: Segment, epoch: Epoch) -> dict[str, np.ndarray]:
+    def _close(self, epoch: Epoch, reason: str) -> dict[str, np.ndarray]:
         rule = self.simulation.rule
-        rebuilt = segment.closes in ("displacement", "interval")
-        dangerous = segment.closes == "displacement" and epoch.length == rule.first_allowed
+        rebuilt = reason in ("displacement", "interval")
+        dangerous = reason == "displacement" and epoch.length == rule.first_allowed
         self.rebuilds += rebuilt
         self.dangerous += dangerous
         consumed = 2 * epoch.displacement / rule.skin if rule.skin > 0 else np.inf
@@ -120,14 +132,14 @@ class ListHealth:
             "pairs_listed": epoch.pairs_listed,
             "capacity": epoch.capacity,
             "occupancy": epoch.occupancy,
-            "reason": segment.closes,
+            "reason": reason,
             "dangerous": dangerous,
             "lost_pairs": len(epoch.lost),
             "lost_pair_steps": epoch.lost_pair_steps,
             "first_lost_step": epoch.first_lost_step,
             "build_ms": epoch.build_ms,
             # the flip of the `rebuild` channel: how far the skin was overdrawn at the step that follows
-            "margin": rule.skin / 2 - segment.moved if rebuilt else np.nan,
+            "margin": rule.skin / 2 - epoch.next_displacement if rebuilt else np.nan,
         }
         return {name: np.array([value]) for name, value in values.items()}
 

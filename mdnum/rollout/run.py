@@ -92,6 +92,7 @@ class Rollout:
         self.done = _Progress(Tally(), ListHealth(self.simulation), EnergyBudget(self.simulation))
         self.start: Start | None = None
         self._earlier_seconds = 0.0
+        self._last_epoch: dict[str, np.ndarray] | None = None
 
     def restore(self, saved: Mapping[str, Any]) -> None:
         """Continue from a checkpoint's state instead of from the beginning."""
@@ -143,6 +144,8 @@ class Rollout:
         summary = summarize(self.simulation, self.done, self.steps, status)
         if blown is not None:
             return self._fail(blown, summary)
+        if self._last_epoch is not None:
+            self.folder.append("epochs", self._last_epoch)
         self.folder.finalize()
         self.folder.write_summary(summary)
         return summary
@@ -156,9 +159,12 @@ class Rollout:
         self.folder.append("series", rows)
         if len(ledger):
             self.folder.append("flips", flip_columns(ledger))
-        ended = done.health.take(segment, self.recorder.missed)
-        if ended is not None:
-            self.folder.append("epochs", ended)
+        for row in done.health.take(segment, self.recorder.missed):
+            # the row of the last list is written after the checkpoint: a run that goes on drops it
+            if row["reason"][0] == "end":
+                self._last_epoch = row
+            else:
+                self.folder.append("epochs", row)
         done.tally.take(segment, rows, ledger)
         if done.first is None:
             done.first = segment.unsorted("x", 0)
@@ -189,7 +195,8 @@ class Rollout:
         atoms: Atoms = self.simulation.system.atoms.copy()
         atoms.set_positions(segment.unsorted("x", row).astype(np.float64))
         atoms.set_velocities(segment.unsorted("v", row).astype(np.float64))
-        atoms.set_array("images", segment.unsorted("images", row))
+        # ASE's trajectories drop arrays that they do not know
+        atoms.info["images"] = segment.unsorted("images", row)
         atoms.info["step"] = step
         atoms.info["time"] = step * self.simulation.system.spec.dynamics.timestep
         return atoms
@@ -207,7 +214,7 @@ class Rollout:
             "done": self.done.to_dict(),
             "steps": self.steps,
             "save_every": self.save_every,
-            **({} if (held := self.recorder.held()) is None or not segment.closes else {"held": held}),
+            **({} if (held := self.recorder.held()) is None or not segment.due else {"held": held}),
         }
 
     def _log(self, segment: Segment, pairs: np.ndarray, ledger: Ledger) -> None:

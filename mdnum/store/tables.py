@@ -45,7 +45,7 @@ COLUMNS: Mapping[str, Mapping[str, pa.DataType]] = MappingProxyType(
 )  # fmt: skip
 
 # rows held back before a part is written without waiting for a checkpoint: bounds the memory of a run
-_BUFFER_ROWS = 500_000
+_BUFFER_ROWS = 100_000
 # fixed, so that the merged file has the same bytes however the run was cut into parts
 _GROUP_ROWS = 262_144
 
