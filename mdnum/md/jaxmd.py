@@ -9,7 +9,9 @@ jax_md takes seconds to import, so it is imported inside the functions that need
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager
+import warnings
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
 from functools import lru_cache
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal
@@ -52,6 +54,14 @@ _SEARCH_MARGIN = 1e-6
 def standard_promotion() -> AbstractContextManager[None]:
     """The dtype rules that jax-md's code needs: it mixes widths everywhere, even while it is imported."""
     return jax.numpy_dtype_promotion("standard")
+
+
+@contextmanager
+def _quiet_scatter() -> Iterator[None]:
+    """jax-md scatters int64 indices into int32 arrays, and jax warns of it at every trace."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "scatter inputs have incompatible types", FutureWarning)
+        yield
 
 
 def upstream() -> ModuleType:
@@ -243,12 +253,12 @@ class PairSearch:
         folded = self._fold(fractional)
         found = None
         if self._list is not None and (folded >= 0).all() and (folded < 1).all():
-            with standard_promotion():
+            with standard_promotion(), _quiet_scatter():
                 found = self._update(jnp.asarray(folded), self._list)
         if found is None or bool(found.did_buffer_overflow):
             self._frame(fractional)
             folded = self._fold(fractional)
-            with standard_promotion():
+            with standard_promotion(), _quiet_scatter():
                 found = self._allocate(folded)
             if bool(found.did_buffer_overflow):
                 raise CapacityError("jax-md's list overflows right after its allocation")

@@ -149,7 +149,7 @@ def _evidence(run: Run) -> Iterator[str]:
     if ase.get("ok") and ase.get("energy_rel") is not None:
         energy = f"to {number(ase['energy_rel'], 2)} (relative)" if ase["energy_rel"] else "exactly"
         forces = f"to {number(ase.get('force_max'), 2)} {run.units.energy}/{run.units.length}"
-        yield f"Energies agree with ASE {energy}, forces {forces}."
+        yield f"Energies agree with {ase.get('reference') or 'ASE'} {energy}, forces {forces}."
 
 
 def _restore(kept: dict[str, Any]) -> Finding:

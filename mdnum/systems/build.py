@@ -111,9 +111,11 @@ class Simulation:
     @cached_property
     def force(self) -> PairForce | ManyBodyForce:
         """Forces and decisions over a list, for use in jit."""
-        if self.pairwise:
-            return PairForce.create(self.model, self.cell, self.decider, self.policy, self.reduction)
-        return ManyBodyForce.create(self.model, self.cell, self.decider, self.policy)
+        # kept for later calls, so it must hold no tracer even where its first use is inside a jit
+        with jax.ensure_compile_time_eval():
+            if self.pairwise:
+                return PairForce.create(self.model, self.cell, self.decider, self.policy, self.reduction)
+            return ManyBodyForce.create(self.model, self.cell, self.decider, self.policy)
 
     @property
     def pair_types(self) -> int:

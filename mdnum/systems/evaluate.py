@@ -98,7 +98,10 @@ class Evaluator:
             table, tables, reference, reference_cell = self._kept
             if self._verlet.consumed(wrapped, here.cell, reference, reference_cell) <= 1.0:
                 return table, tables
+        slots = self._verlet.slots
         self._verlet = here.verlet_list(min(self.skin, float(here.cell.widths.min()) / 2 - here.r_cut))
+        # capacity only grows: each new size would be compiled for
+        self._verlet.slots = slots
         table = self._verlet.build(wrapped, here.cell)
         self._kept = table, here.tables(table), wrapped, here.cell
         self.builds += 1
