@@ -16,7 +16,6 @@ _HOMES = {
     "CapacityError": "mdnum.errors:CapacityError",
     "FolderError": "mdnum.errors:FolderError",
     "InputError": "mdnum.errors:InputError",
-    "LostPairsError": "mdnum.errors:LostPairsError",
     "MdnumCalculator": "mdnum.references:MdnumCalculator",
     "MdnumError": "mdnum.errors:MdnumError",
     "NumericalError": "mdnum.errors:NumericalError",
@@ -33,7 +32,6 @@ if TYPE_CHECKING:
     from mdnum.errors import CapacityError as CapacityError
     from mdnum.errors import FolderError as FolderError
     from mdnum.errors import InputError as InputError
-    from mdnum.errors import LostPairsError as LostPairsError
     from mdnum.errors import MdnumError as MdnumError
     from mdnum.errors import NumericalError as NumericalError
     from mdnum.references import MdnumCalculator as MdnumCalculator
@@ -45,7 +43,6 @@ __all__ = [
     "CapacityError",
     "FolderError",
     "InputError",
-    "LostPairsError",
     "MdnumCalculator",
     "MdnumError",
     "NumericalError",

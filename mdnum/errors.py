@@ -38,10 +38,6 @@ class CapacityError(MdnumError):
     """A neighbor list would need more room than it can have."""
 
 
-class LostPairsError(MdnumError):
-    """A list in use missed pairs inside the cutoff, and the caller asked that this be fatal."""
-
-
 class NumericalError(MdnumError):
     """A number that must be finite is not.
 

@@ -1,6 +1,6 @@
 """Prepare the structures of systems/ again: melt, equilibrate and write them, with their velocities.
 
-Run it as `python scripts/make_systems.py [NAME ...]`; without names it makes all of them, in a few minutes.
+Run it as `python scripts/make_systems.py [NAME ...]`; without names it makes all of them, in about a minute.
 The shipped structures are the input of the systems, so their exact bits matter more than how they came
 about: a small self-contained Langevin integrator makes them, independent of the code they are used to test.
 """

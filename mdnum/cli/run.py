@@ -37,6 +37,10 @@ def run(
         raise InputError(
             "--resume continues in its own folder, so --out cannot name another", remedy="Leave out --out"
         )
+    if resume is not None and (system is not None or save_every is not None):
+        raise InputError(
+            "--resume continues a run with its own system and --save-every", remedy="Leave out the others"
+        )
     if resume is not None and overrides:
         raise InputError(
             "--set would make the rest of a resumed run another run", remedy="Start a new run instead"
@@ -75,6 +79,10 @@ def run(
     return output.exit_code(summary.get("findings", ()), ok=summary.get("status", "complete") == "complete")
 
 
+def _speed(rate: float | None) -> str:
+    return "too short a run to tell" if rate is None else f"{output.show(rate)} steps/s"
+
+
 def _print_summary(summary: dict[str, Any], folder: Path | None) -> None:
     out = output.console()
     ase = summary.get("ase") or {}
@@ -96,7 +104,7 @@ def _print_summary(summary: dict[str, Any], folder: Path | None) -> None:
             if ase.get("energy_rel") is not None
             else "not compared",
         ),
-        ("speed", f"{output.show(summary.get('steps_per_second'))} steps/s"),
+        ("speed", _speed(summary.get("steps_per_second"))),
     ]
     if verdict := summary.get("verdict"):
         out.print(verdict, style="bold", markup=False)

@@ -36,7 +36,7 @@ def show(
 ) -> int:
     """Print a system file with every default filled in."""
     loaded = _load(system, settings)
-    text = loaded.to_toml()
+    text = loaded.to_toml(beside=False)
     if as_json:
         output.print_json(tomllib.loads(text))
     else:

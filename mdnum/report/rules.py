@@ -94,7 +94,7 @@ def _dangerous_builds(run: Run) -> Iterator[Finding]:
     dangerous = total(run, "dangerous_builds", "dangerous")
     if not dangerous:
         return
-    worst = float(np.max(run.epochs["skin_consumed"], initial=0.0))
+    overdrawn = float(np.max(-run.epochs["margin"][run.epochs["dangerous"]], initial=0.0))
     audit = (
         "Pairs were lost."
         if total(run, "lost_pairs")
@@ -102,7 +102,8 @@ def _dangerous_builds(run: Run) -> Iterator[Finding]:
     )
     text = (
         f"{count(dangerous)} of {count(len(run.epochs['epoch']))} lists may have been in use for too long "
-        f"(LAMMPS’s meaning of the word); at worst {percent(worst)} of the skin was consumed. {audit}"
+        "(LAMMPS’s meaning of the word): at the first step at which a rebuild was allowed, an atom had moved "
+        f"by up to {number(overdrawn)} {run.units.length} more than half the skin. {audit}"
     )
     remedy = "Rebuild earlier (every and delay in neighbors.rebuild) or raise neighbors.skin."
     yield Finding("DANGEROUS_BUILDS", "warning", many(dangerous, "dangerous build"), text, remedy)
@@ -246,7 +247,9 @@ def _drift(run: Run) -> Iterator[Finding]:
     if not atoms or run.steps < 2 or not np.isfinite(run.budget["residual"]).all():
         return
     # jumps do not count: what they add follows the number of pairs, up and down
-    drift = float(np.polyfit(run.series["time"], run.budget["residual"], 1)[0]) / atoms
+    stated = run.summary.get("energy_drift_without_jumps")
+    fitted = float(np.polyfit(run.series["time"], run.budget["residual"], 1)[0]) / atoms
+    drift = fitted if stated is None else float(stated)
     moved = abs(drift) * time
     if not thermal > 0 or moved < DRIFT_SHARE * thermal:
         return

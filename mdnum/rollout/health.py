@@ -94,11 +94,15 @@ class ListHealth:
         epoch.displacement = max(epoch.displacement, float(np.max(moved, initial=0.0)))
         epoch.next_displacement = segment.moved
         self._audit(segment, moved, epoch)
-        if segment.closes:
+        # a run that has come to its end may be continued with the list it has: see last_row
+        if segment.closes and segment.closes != "end":
             rows.append(self._close(epoch, segment.closes))
-            # a run that has come to its end may be continued with the list it has
-            self.current = epoch if segment.closes == "end" else None
+            self.current = None
         return rows
+
+    def last_row(self) -> dict[str, np.ndarray] | None:
+        """The row of the list that is in use when a run comes to its end."""
+        return None if self.current is None else self._close(self.current, "end")
 
     def _audit(self, segment: Segment, moved, epoch: Epoch) -> None:
         skin = self.simulation.rule.skin

@@ -92,7 +92,6 @@ class Rollout:
         self.done = _Progress(Tally(), ListHealth(self.simulation), EnergyBudget(self.simulation))
         self.start: Start | None = None
         self._earlier_seconds = 0.0
-        self._last_epoch: dict[str, np.ndarray] | None = None
 
     def restore(self, saved: Mapping[str, Any]) -> None:
         """Continue from a checkpoint's state instead of from the beginning."""
@@ -102,8 +101,8 @@ class Rollout:
             Tally.from_dict(done["tally"]),
             ListHealth.from_dict(self.simulation, done["health"]),
             EnergyBudget.from_dict(self.simulation, done["budget"]),
-            np.asarray(saved["first"]),
-            np.asarray(saved["last"]),
+            saved.get("first"),
+            saved.get("last"),
         )
         self._earlier_seconds = self.done.tally.seconds
         self.recorder = PairRecorder(self.simulation, saved.get("held"))
@@ -118,7 +117,10 @@ class Rollout:
         engine = Engine(self.simulation, self.steps, start=self.start)
         interval = max(1, self.steps // _BUDGET_CHECKS)
         blown: Segment | None = None
-        self._say("compile", 0 if self.start is None else int(self.start.state.step))
+        if self.start is None:
+            # from here on a run that is stopped can be resumed
+            self.folder.checkpoint(self._to_dict(engine.start), force=True)
+        self._say("compile", int(engine.start.state.step))
         loop_began: float | None = None
         counted = 0
         for segment in engine.segments():
@@ -135,7 +137,7 @@ class Rollout:
             else:
                 counted += segment.rows
             self.done.tally.seconds = self._earlier_seconds + now - self.began
-            if loop_began < now:
+            if counted and loop_began < now:
                 self.done.tally.steps_per_second = counted / (now - loop_began)
             self._say("run", segment.last)
             if blown is None:
@@ -144,8 +146,9 @@ class Rollout:
         summary = summarize(self.simulation, self.done, self.steps, status)
         if blown is not None:
             return self._fail(blown, summary)
-        if self._last_epoch is not None:
-            self.folder.append("epochs", self._last_epoch)
+        # after the checkpoint: a run that is continued goes on with this list, and drops the row
+        if (row := self.done.health.last_row()) is not None:
+            self.folder.append("epochs", row)
         self.folder.finalize()
         self.folder.write_summary(summary)
         return summary
@@ -160,11 +163,7 @@ class Rollout:
         if len(ledger):
             self.folder.append("flips", flip_columns(ledger))
         for row in done.health.take(segment, self.recorder.missed):
-            # the row of the last list is written after the checkpoint: a run that goes on drops it
-            if row["reason"][0] == "end":
-                self._last_epoch = row
-            else:
-                self.folder.append("epochs", row)
+            self.folder.append("epochs", row)
         done.tally.take(segment, rows, ledger)
         if done.first is None:
             done.first = segment.unsorted("x", 0)
@@ -203,18 +202,18 @@ class Rollout:
 
     def _checkpoint(self, segment: Segment, *, force: bool) -> None:
         if force or self.folder.checkpoint_due():
-            self.folder.checkpoint(self._to_dict(segment), force=True)
+            self.folder.checkpoint(self._to_dict(resume_point(segment), segment.due), force=True)
 
-    def _to_dict(self, segment: Segment) -> dict[str, Any]:
-        """Everything that a resumed run needs to go on after a segment as if nothing had happened."""
+    def _to_dict(self, point: Start, new_list: bool = False) -> dict[str, Any]:
+        """Everything that a resumed run needs to go on from a point as if nothing had happened."""
+        held = self.recorder.held() if new_list else None
+        frames = {"first": self.done.first, "last": self.done.last, "held": held}
         return {
-            **resume_point(segment).to_arrays(),
-            "first": self.done.first,
-            "last": self.done.last,
+            **point.to_arrays(),
+            **{name: values for name, values in frames.items() if values is not None},
             "done": self.done.to_dict(),
             "steps": self.steps,
             "save_every": self.save_every,
-            **({} if (held := self.recorder.held()) is None or not segment.due else {"held": held}),
         }
 
     def _log(self, segment: Segment, pairs: np.ndarray, ledger: Ledger) -> None:
@@ -254,7 +253,7 @@ class Rollout:
             last = blown.unsorted("x", blown.rows - 1).astype(np.float64)
             positions = last if np.all(np.isfinite(last)) else positions
         message = what + closest_pair(self.simulation, positions)
-        self.folder.checkpoint(self._to_dict(blown), force=True)
+        self.folder.checkpoint(self._to_dict(resume_point(blown)), force=True)
         self.folder.finalize()
         summary["error"] = message
         summary["verdict"] = f"Stopped: {message}."
@@ -300,6 +299,15 @@ def run(
     """
     began = time.perf_counter()
     if resume is not None:
+        if system is not None or save_every is not None or overrides:
+            raise InputError(
+                "a resumed run keeps its own system, settings and save_every",
+                remedy="Give only the folder and, to go further, steps",
+                where=str(resume),
+            )
+        finished = _finished(Path(resume), steps)
+        if finished is not None:
+            return finished
         rollout = _resumed(Path(resume), steps, progress, began)
     elif system is None:
         raise InputError("no system given", remedy="Name a system, or a folder to resume")
@@ -329,6 +337,20 @@ def _fresh(system: System, out, steps, save_every, progress, began) -> Rollout:
     return Rollout(simulation, folder, last, every, progress, began)
 
 
+def _finished(path: Path, steps: int | None) -> RunResult | None:
+    """The result of a run that has nothing left to do; None where it has."""
+    folder = RunFolder.open(path)
+    summary = folder.summary
+    if summary.get("status") != "complete" or not folder.has_checkpoint():
+        return None
+    saved = folder.load_checkpoint()
+    wanted = int(saved["steps"]) if steps is None else steps
+    if summary["steps"] != wanted:
+        return None
+    frames = (np.asarray(saved["first"], np.float64), np.asarray(saved["last"], np.float64))
+    return RunResult(path, summary, build(load(path / "system.toml")), frames)
+
+
 def _resumed(path: Path, steps: int | None, progress, began) -> Rollout:
     folder = RunFolder.open(path)
     if folder.summary.get("status") == "failed":
@@ -337,9 +359,10 @@ def _resumed(path: Path, steps: int | None, progress, began) -> Rollout:
             where=str(path),
             remedy="Start a new run with a shorter dynamics.timestep",
         )
-    saved = folder.resume()
-    if steps is not None and steps < int(np.asarray(saved["state_step"])) - 1:
+    # a run that is refused stays as it is: resuming drops what was written after its checkpoint
+    if steps is not None and steps < int(np.asarray(folder.load_checkpoint()["state_step"])) - 1:
         raise FolderError(f"has run past step {steps} already", where=str(path))
+    saved = folder.resume()
     simulation = build(load(path / "system.toml"))
     last = int(saved["steps"]) if steps is None else steps
     rollout = Rollout(simulation, folder, last, int(saved["save_every"]), progress, began)

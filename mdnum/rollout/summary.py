@@ -61,8 +61,10 @@ class Tally:
     pairs_last: int = 0
     start_up_seconds: float = 0.0
     seconds: float = 0.0
-    steps_per_second: float = 0.0
+    steps_per_second: float | None = None
+    jumps: float = 0.0
     conserved: Line = field(default_factory=Line)
+    without_jumps: Line = field(default_factory=Line)
 
     def take(self, segment: Segment, rows: dict[str, np.ndarray], ledger: Ledger) -> None:
         """Add a segment: its rows of series.parquet and its flips."""
@@ -75,7 +77,10 @@ class Tally:
         self.left += int((~ledger.entered).sum())
         self.ambiguous += int(rows["ambiguous"].sum())
         self.ambiguous_flips += int(ledger.ambiguous.sum())
+        jumps = self.jumps + np.cumsum(rows["energy_jump"])
+        self.jumps = float(jumps[-1])
         self.conserved.add(rows["time"], rows["conserved"])
+        self.without_jumps.add(rows["time"], rows["conserved"] - jumps)
 
     def to_dict(self) -> dict:
         """Plain values, for a checkpoint."""
@@ -84,7 +89,8 @@ class Tally:
     @classmethod
     def from_dict(cls, values: dict) -> Tally:
         """The inverse of `to_dict`."""
-        return cls(**{**values, "conserved": Line(**values["conserved"])})
+        lines = {name: Line(**values[name]) for name in ("conserved", "without_jumps")}
+        return cls(**{**values, **lines})
 
 
 def log_line(simulation: Simulation, segment: Segment, row: int, pairs: int, flips: int) -> str:
@@ -104,7 +110,8 @@ def summarize(simulation: Simulation, done: Any, steps: int, status: str) -> dic
     tally, health, budget = done.tally, done.health, done.budget
     energy_jump, force_jump = simulation.jumps()
     timestep = simulation.system.spec.dynamics.timestep
-    cutoff, slope = simulation.cutoff, tally.conserved.slope
+    cutoff = simulation.cutoff
+    slope, without = tally.conserved.slope, tally.without_jumps.slope
     return {
         "system": simulation.system.name,
         "about": simulation.system.spec.about,
@@ -129,6 +136,8 @@ def summarize(simulation: Simulation, done: Any, steps: int, status: str) -> dic
         "ambiguous": tally.ambiguous,
         "ambiguous_flips": tally.ambiguous_flips,
         "energy_drift": None if slope is None else slope / simulation.atoms,
+        # the flips' own jumps follow the number of pairs, up and down, and are no drift of the integrator
+        "energy_drift_without_jumps": None if without is None else without / simulation.atoms,
         "energy_budget_residual": budget.residual,
         "energy_budget_tolerance": budget.tolerance,
         "energy_budget_checks": budget.checks,

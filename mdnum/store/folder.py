@@ -76,8 +76,13 @@ class RunFolder:
                 else "Choose an empty or a new folder",
                 where=str(path),
             )
-        with disk_errors(folder.path):
+        try:
             folder.path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise FolderError(
+                f"cannot be made: {error.strerror}", remedy="Choose another folder", where=str(path)
+            ) from error
+        with disk_errors(folder.path):
             folder._take_lock()
             for name in _FILES:
                 (folder.path / name).unlink(missing_ok=True)

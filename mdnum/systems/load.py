@@ -78,14 +78,21 @@ class System:
         potential = self.spec.potential
         return {self.folder / potential.file} if isinstance(potential, schema.EmbeddedAtom) else set()
 
-    def to_toml(self) -> str:
-        """The system file with every default written out, for the folder that write() makes.
+    def to_toml(self, *, beside: bool = True) -> str:
+        """The system file with every default written out.
 
-        It refers to the structure that write() puts beside it; loading it there gives this system again, bit
-        for bit.
+        Args:
+            beside: for the folder that write() makes: it refers to the structure that is put beside it, and
+                loading it there gives this system again, bit for bit. Otherwise it refers to the files that
+                this system was read from, wherever it is saved.
         """
         spec = self.spec.model_dump(mode="python", exclude_none=True)
         structure = spec["structure"]
+        if not beside:
+            for table in (structure, spec["potential"]):
+                if "file" in table:
+                    table["file"] = str((self.folder / table["file"]).resolve())
+            return toml.dump({"name": self.name, **_kind_first(spec)})
         kept = {key: structure[key] for key in ("masses", "velocities") if key in structure}
         spec["structure"] = {"file": STRUCTURE_FILE, **kept}
         if isinstance(self.spec.potential, schema.EmbeddedAtom):

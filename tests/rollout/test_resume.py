@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from rollout.harness import frames_of, go, liquid, tables_equal, write_system
 
-from mdnum.errors import FolderError
+from mdnum.errors import FolderError, InputError
 from mdnum.rollout.run import run
 from mdnum.store import RunFolder
 from mdnum.systems import load
@@ -159,10 +159,29 @@ def test_what_cannot_be_continued_is_refused(path, whole, tmp_path):
         run(load(path), out=whole[1].path, steps=5)
     with pytest.raises(FolderError, match="no such folder"):
         run(None, resume=tmp_path / "nothing")
-    # a run stopped before its first checkpoint has nothing to go on from
-    with pytest.raises(Stop):
-        run(load(path), out=tmp_path / "early", steps=STEPS, progress=at_once)
-    with pytest.raises(FolderError, match="no checkpoint"):
-        run(None, resume=tmp_path / "early")
+    for more in ({"save_every": 3}, {"overrides": {"neighbors.skin": 0.2}}):
+        with pytest.raises(InputError, match="keeps its own"):
+            run(None, resume=whole[1].path, **more)
+    with pytest.raises(InputError, match="keeps its own"):
+        run("argon/crystal-108", resume=whole[1].path)
     # and nothing of the first one was touched
     assert RunFolder.open(whole[1].path).rows("series") == STEPS + 1
+
+
+def test_a_run_stopped_before_its_first_step_can_be_resumed(path, whole, tmp_path):
+    with pytest.raises(Stop):
+        run(load(path), out=tmp_path / "early", steps=STEPS, save_every=10, progress=at_once)
+    run(None, resume=tmp_path / "early")
+    folder = RunFolder.open(tmp_path / "early")
+    for table in ("series", "flips"):
+        tables_equal(whole[1], folder, table)
+    tables_equal(whole[1], folder, "epochs", but=("build_ms",))
+
+
+def test_resuming_a_finished_run_leaves_it_as_it_is(path, tmp_path):
+    go(tmp_path, path, 20)
+    folder = tmp_path / "run"
+    before = {file.name: file.read_bytes() for file in folder.iterdir() if file.is_file()}
+    again = run(None, resume=folder)
+    assert again.summary["steps"] == 20
+    assert {file.name: file.read_bytes() for file in folder.iterdir() if file.is_file()} == before
