@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int, UInt8
+from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from mdnum.errors import InputError
 from mdnum.events import Threshold
@@ -129,6 +129,17 @@ class Decisions(NamedTuple):
 
     bits: UInt8[Array, "words atoms"]
     nearest: Float[Array, ""]
+
+
+def halves_of(bits: UInt8[Array, "words atoms"]) -> UInt8[Array, "groups atoms"]:
+    """Packed decisions a group at a time, in the low bits: the inverse of `SlotJudge.finish`."""
+    mask = jnp.uint8((1 << GROUP) - 1)
+    return jnp.stack([bits & mask, bits >> jnp.uint8(GROUP)], axis=1).reshape(-1, bits.shape[-1])
+
+
+def unpacked(half: UInt8[Array, "atoms"]) -> Bool[Array, "4 atoms"]:
+    """The decisions of one group."""
+    return (half[None, :] >> jnp.arange(GROUP, dtype=jnp.uint8)[:, None]) & jnp.uint8(1) == 1
 
 
 class SlotJudge:

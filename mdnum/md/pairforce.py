@@ -14,10 +14,19 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, UInt8
 
 from mdnum.md.cell import Cell
-from mdnum.md.decide import Decisions, PairDecider, SlotJudge, Tables, decide_table, displacements
+from mdnum.md.decide import (
+    Decisions,
+    PairDecider,
+    SlotJudge,
+    Tables,
+    decide_table,
+    displacements,
+    halves_of,
+    unpacked,
+)
 from mdnum.md.potentials import CutPotential
 from mdnum.precision import PrecisionPolicy
 from mdnum.precision.exact import zero_bits
@@ -76,13 +85,22 @@ class PairForce(eqx.Module):
         """The decisions of a list at given positions, without forces."""
         return decide_table(self.decider, self.cell, self.zero, positions, tables)
 
-    def __call__(self, positions: Float[Array, "3 atoms"], tables: Tables, *, decisions: bool) -> Forces:
+    def __call__(
+        self,
+        positions: Float[Array, "3 atoms"],
+        tables: Tables,
+        *,
+        decisions: bool,
+        given: UInt8[Array, "words atoms"] | None = None,
+    ) -> Forces:
         """Forces at sorted, wrapped positions.
 
         Args:
             positions: shape (3, atoms), length, in the order of the tables.
             tables: the list.
             decisions: whether to return them too; forces have the same bits either way.
+            given: decisions to act on instead of the list's own (packed as those returned). The ones returned
+                are its own all the same, so that the two can be compared.
         """
         judge = SlotJudge(self.decider, self.cell, self.zero, positions)
         force_dtype, accumulate = self.policy.dtype("force"), self.policy.dtype("accumulate")
@@ -93,11 +111,13 @@ class PairForce(eqx.Module):
 
         def block(carry, listed):
             totals, nearest = carry
-            j, types = listed
+            (j, types), told = listed
             d, quantity, inside, threshold = judge.group(j, types)
             bits = None
             if decisions:
                 bits, nearest = judge.tally(nearest, quantity, inside, threshold)
+            if told is not None:
+                inside = unpacked(told)
             d = d if same else displacements(components, cell, j)
             if same and self.decider.space == "r2":
                 r2 = quantity
@@ -116,7 +136,9 @@ class PairForce(eqx.Module):
             return (totals, nearest), (bits, tuple(later for _, later in summed))
 
         start = ((jnp.zeros(judge.atoms, accumulate),) * 5, judge.start())
-        (totals, nearest), (halves, later) = lax.scan(block, start, tables.groups())
+        (totals, nearest), (halves, later) = lax.scan(
+            block, start, (tables.groups(), None if given is None else halves_of(given))
+        )
         fx, fy, fz, energy, virial = (
             self.reduction.finish(total, blocks) for total, blocks in zip(totals, later, strict=True)
         )
