@@ -6,9 +6,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from mdnum.events import Ledger
+from mdnum.precision import distance_bound
 from mdnum.rollout.engine import Segment
 from mdnum.rollout.flips import decided_pairs, true_pairs
+from mdnum.store import RunFolder
 from mdnum.systems.build import Simulation
+from mdnum.systems.load import load
 
 
 @dataclass
@@ -159,3 +163,35 @@ class ListHealth:
         current = None if values["current"] is None else Epoch.from_dict(values["current"])
         rest = {k: v for k, v in values.items() if k not in ("lost", "current")}
         return cls(simulation, current=current, lost=set(values["lost"]), **rest)
+
+
+def rebuild_ledger(folder: RunFolder) -> Ledger:
+    """The `rebuild` channel of a run: the decision that a list is used up, a row for every list that was.
+
+    Args:
+        folder: a run folder.
+
+    Returns:
+        step: the first step that the list could not serve; subject: the number of its life; margin: by how
+        much an atom had moved beyond half the skin (positive: the decision is yes, as everywhere; negative
+        where a blind rule rebuilt early), length. A rebuild does nothing to the energy: its jump is zero.
+
+    Error:
+        the bound is that of a displacement between two wrapped positions in float64.
+    """
+    rows = folder.read("epochs")
+    chosen = np.isin(rows["reason"].astype(str), ("displacement", "interval"))
+    margin = -rows["margin"][chosen]
+    moved = rows["displacement"][chosen]
+    # a coordinate may have been wrapped in between: the difference is then as large as the box
+    box = np.abs(np.asarray(load(folder.path).atoms.cell)).sum(axis=0)
+    count = int(chosen.sum())
+    return Ledger(
+        "rebuild",
+        rows["start"][chosen] + rows["length"][chosen],
+        rows["epoch"][chosen][:, None],
+        np.ones(count, bool),
+        margin,
+        np.asarray(distance_bound(moved, box + np.max(moved, initial=0.0)), np.float64),
+        np.zeros(count),
+    )
