@@ -46,17 +46,23 @@ def _check_pairs(pairs: Mapping[str, Any] | None) -> None:
 
 
 class LennardJonesPair(Table):
+    """Constants of one pair of species, Lennard-Jones."""
+
     sigma: Length
     epsilon: Energy
 
 
 class MorsePair(Table):
+    """Constants of one pair of species, Morse."""
+
     depth: Energy = Field(description="well depth (eV or ε)")
     alpha: float = Field(gt=0, description="stiffness (1/length)")
     r0: Length = Field(description="distance of the minimum (Å or σ)")
 
 
 class SoftSpherePair(Table):
+    """Constants of one pair of species, soft sphere."""
+
     sigma: Length
     epsilon: Energy
     alpha: float = Field(default=2.0, gt=1, description="exponent")
