@@ -7,9 +7,10 @@ from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 
 from mdnum.errors import CapacityError, InputError
+from mdnum.events import set_bits
 from mdnum.md.cell import Cell, displacement, strain_loss
 from mdnum.md.cells import neighbor_table
 
@@ -73,6 +74,15 @@ class PairTable:
     def pairs(self) -> int:
         """Number of listed pairs, each counted once."""
         return int(np.count_nonzero(self.index < self.index.shape[1])) // 2
+
+    def decided(
+        self, bits: UInt8[np.ndarray, "words atoms"]
+    ) -> tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]]:
+        """Labels i < j of the pairs whose packed decision is yes, each once, in the order of the table."""
+        slots, columns = set_bits(bits)
+        i, j = self.order[columns], self.order[self.index[slots, columns]]
+        keep = i < j
+        return i[keep], j[keep]
 
     def unsorted(self) -> Int[np.ndarray, "atoms slots"]:
         """Neighbors in the user's labels, one row per atom, padded with the number of atoms."""

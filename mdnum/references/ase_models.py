@@ -111,6 +111,13 @@ def independent(system: System) -> Reference:
     )
 
 
+def _steps_at_cutoff(form: PairForm, atoms: Atoms) -> tuple[np.ndarray, float]:
+    """Neighbors inside the cutoff of each atom, and the energy u(r_cut) that a pair of them steps by."""
+    edges = edges_of(atoms, form.r_cut)
+    inside = np.bincount(edges.i[form.inside(edges.r)], minlength=len(atoms))
+    return inside, float(form.bare(np.array([form.r_cut]))[0][0])
+
+
 class LennardJonesHard(Calculator):
     """ASE's LennardJones with the energy shift taken out again: u(r_cut) for each pair inside.
 
@@ -132,9 +139,7 @@ class LennardJonesHard(Calculator):
         atoms = cast(Atoms, self.atoms)
         # get_property, not calculate: it is what tells ASE's class that the atoms have changed
         results = _results(self.shifted, atoms)
-        edges = edges_of(atoms, self.form.r_cut)
-        inside = np.bincount(edges.i[self.form.inside(edges.r)], minlength=len(atoms))
-        at_cut = float(self.form.bare(np.array([self.form.r_cut]))[0][0])
+        inside, at_cut = _steps_at_cutoff(self.form, atoms)
         energies = results["energies"] + 0.5 * at_cut * inside
         energy = results["energy"] + at_cut * (inside.sum() // 2)
         self.results = {**results, "energy": energy, "free_energy": energy, "energies": energies}
@@ -160,9 +165,7 @@ class MorseShifted(Calculator):
         super().calculate(atoms, properties or ["energy"], system_changes)
         atoms = cast(Atoms, self.atoms)
         results = _results(self.hard, atoms)
-        edges = edges_of(atoms, self.form.r_cut)
-        inside = np.bincount(edges.i[self.form.inside(edges.r)], minlength=len(atoms))
-        at_cut = float(self.form.bare(np.array([self.form.r_cut]))[0][0])
+        inside, at_cut = _steps_at_cutoff(self.form, atoms)
         energies = results["energies"] - 0.5 * at_cut * inside
         energy = results["energy"] - at_cut * (inside.sum() // 2)
         self.results = {**results, "energy": energy, "free_energy": energy, "energies": energies}

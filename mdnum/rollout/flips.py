@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from mdnum.errors import MdnumError
-from mdnum.events import Ledger, changes_in_time, count_set, set_bits, sort_rows
+from mdnum.events import Ledger, changes_in_time, count_set, sort_rows
 from mdnum.md.cell import HostCell, displacement
 from mdnum.md.verlet import PairTable
 from mdnum.rollout.engine import Segment
@@ -133,8 +133,7 @@ class PairRecorder:
             slot, first = np.nonzero(table.index < self.simulation.atoms)
             second = table.index[slot, first]
             i, j = table.order[first], table.order[second]
-            _, margin = self._margins(x[:, first].T, x[:, second].T, i, j)
-            kind = self.simulation.type_of(i, j)
+            kind, margin = self._margins(x[:, first].T, x[:, second].T, i, j)
             counts[row] = int(np.sum((np.abs(margin) <= bounds[kind]) & (i < j)))
         return counts
 
@@ -286,10 +285,7 @@ def pair_keys(
 
 def _keys(simulation: Simulation, table: PairTable, bits: UInt8[np.ndarray, "words atoms"]):
     """Sorted keys of the pairs inside."""
-    slots, columns = set_bits(bits)
-    i, j = table.order[columns], table.order[table.index[slots, columns]]
-    keep = i < j
-    return pair_keys(i[keep], j[keep], simulation.atoms)
+    return pair_keys(*table.decided(bits), simulation.atoms)
 
 
 def decided_pairs(simulation: Simulation, segment: Segment, row: int) -> Int[np.ndarray, "pairs"]:

@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mdnum.errors import InputError
-from mdnum.events import set_bits
 from mdnum.md.cell import Cell, displacement
 from mdnum.md.cutoffs import BY_NAME as CUTOFFS
 from mdnum.md.decide import PairDecider, Tables
@@ -187,10 +186,7 @@ class Simulation:
 
     def inside(self, wrapped, table: PairTable, bits) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Pairs i < j whose decision is yes, sorted, with their distances."""
-        slots, columns = set_bits(bits)
-        i, j = table.order[columns], table.order[table.index[slots, columns]]
-        keep = i < j
-        i, j = i[keep], j[keep]
+        i, j = table.decided(bits)
         order = np.lexsort((j, i))
         i, j = i[order], j[order]
         dx, dy, dz = displacement(self.cell, wrapped[i], wrapped[j])
