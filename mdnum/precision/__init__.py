@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax
 
 from mdnum.precision.bounds import distance_bound, gamma, squared_distance_bound
-from mdnum.precision.policy import PrecisionPolicy
+from mdnum.precision.policy import PrecisionPolicy, RolePrecision
 from mdnum.precision.ulp import neighbor, ordinal, ulp_distance, unit_roundoff
 
 # every threshold, margin and ledger entry is a float64; jax would otherwise make them float32 in silence
@@ -13,6 +13,7 @@ jax.config.update("jax_enable_x64", True)
 
 __all__ = [
     "PrecisionPolicy",
+    "RolePrecision",
     "distance_bound",
     "gamma",
     "neighbor",

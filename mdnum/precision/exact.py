@@ -9,25 +9,39 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import ml_dtypes
 import numpy as np
 from jax import lax
 
-_INTEGER = {np.dtype(np.float64): jnp.int64, np.dtype(np.float32): jnp.int32}
+_INTEGER = {
+    np.dtype(np.float64): jnp.int64,
+    np.dtype(np.float32): jnp.int32,
+    np.dtype(np.float16): jnp.int16,
+    np.dtype(ml_dtypes.bfloat16): jnp.int16,
+}
+
+
+def integer_of(dtype):
+    """The signed integer type as wide as a float dtype."""
+    return _INTEGER[np.dtype(dtype)]
 
 
 def zero_bits(dtype) -> jax.Array:
     """An integer zero of the width of dtype; pass it into jit as an argument, so that XLA cannot fold it."""
-    return jnp.zeros((), _INTEGER[np.dtype(dtype)])
+    return jnp.zeros((), integer_of(dtype))
 
 
 def _through_integers(x, zero):
-    integer = _INTEGER[np.dtype(x.dtype)]
+    integer = integer_of(x.dtype)
     return lax.bitcast_convert_type(lax.bitcast_convert_type(x, integer) ^ zero.astype(integer), x.dtype)
 
 
 @jax.custom_jvp
 def fence(x: jax.Array, zero: jax.Array) -> jax.Array:
     """x, opaque to fused multiply-add contraction: XLA sees an integer operation with a runtime zero.
+
+    For float16 and bfloat16 it also forces the rounding: between two operations of one fusion XLA keeps
+    float32 values, but an integer operation needs the sixteen bits.
 
     Source: optimization_barrier and reduce_precision do not stop the contraction on CPU
     (openxla/xla#41579); the exclusive-or with a runtime integer does.

@@ -1,19 +1,37 @@
-"""Precision by role: which dtype the state, the force, the decision and the sums are kept in."""
+"""Precision by role: which dtype the state, the arithmetic, the decision and the sums are kept in."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
 
+import ml_dtypes
 import numpy as np
 
 from mdnum.errors import InputError
 
-_DTYPES = {"float64": np.dtype(np.float64), "float32": np.dtype(np.float32)}
+WIDE: Mapping[str, np.dtype] = {"float64": np.dtype(np.float64), "float32": np.dtype(np.float32)}
+ALL: Mapping[str, np.dtype] = {
+    **WIDE,
+    "float16": np.dtype(np.float16),
+    "bfloat16": np.dtype(ml_dtypes.bfloat16),
+}
+_ROUNDINGS = ("nearest", "stochastic")
+
+
+def _check(policy: object, roles: tuple[str, ...], known: Mapping[str, np.dtype]) -> None:
+    for role in roles:
+        value = getattr(policy, role)
+        if value not in known:
+            raise InputError(
+                f"unknown dtype {value!r}; known are {', '.join(known)}", where=f"precision.{role}"
+            )
 
 
 @dataclass(frozen=True)
 class PrecisionPolicy:
-    """The dtype of each role of a number in a rollout.
+    """The dtype of each role of a number in a rollout of molecular dynamics.
 
     Attributes:
         state: positions and velocities as they are carried from step to step.
@@ -28,14 +46,51 @@ class PrecisionPolicy:
     accumulate: str = "float64"
 
     def __post_init__(self):
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if value not in _DTYPES:
-                raise InputError(
-                    f"unknown dtype {value!r}; known are {', '.join(_DTYPES)}",
-                    where=f"precision.{field.name}",
-                )
+        _check(self, ("state", "force", "decision", "accumulate"), WIDE)
 
     def dtype(self, role: str) -> np.dtype:
         """The numpy dtype of a role ("state", "force", "decision" or "accumulate")."""
-        return _DTYPES[getattr(self, role)]
+        return WIDE[getattr(self, role)]
+
+
+@dataclass(frozen=True)
+class RolePrecision:
+    """The dtype of each role of a number in a small world, where sixteen bits are allowed too.
+
+    Attributes:
+        state: what is carried from step to step.
+        arithmetic: the operations between one state and the next.
+        decision: the quantity and the threshold that a decision compares.
+        accumulate: sums; wider than `arithmetic` it is "store low, accumulate high".
+        loss: the scalar that is differentiated.
+        rounding: how a result becomes a state: "nearest" (ties to even) or "stochastic" (up or down with
+            probabilities that make the mean exact).
+        seed: of stochastic rounding.
+    """
+
+    state: str = "float64"
+    arithmetic: str = "float64"
+    decision: str = "float64"
+    accumulate: str = "float64"
+    loss: str = "float64"
+    rounding: Literal["nearest", "stochastic"] = "nearest"
+    seed: int = 0
+
+    def __post_init__(self):
+        _check(self, ("state", "arithmetic", "decision", "accumulate", "loss"), ALL)
+        if self.rounding not in _ROUNDINGS:
+            raise InputError(
+                f"unknown rounding {self.rounding!r}; known are {', '.join(_ROUNDINGS)}",
+                where="precision.rounding",
+            )
+        if self.seed < 0:
+            raise InputError(f"{self.seed} is negative", remedy="Give 0 or more.", where="precision.seed")
+
+    def dtype(self, role: str) -> np.dtype:
+        """The numpy dtype of a role ("state", "arithmetic", "decision", "accumulate" or "loss")."""
+        return ALL[getattr(self, role)]
+
+    @classmethod
+    def all(cls, name: str) -> RolePrecision:
+        """Every role in one dtype."""
+        return cls(name, name, name, name, name)

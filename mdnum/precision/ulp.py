@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import ml_dtypes
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import DTypeLike
 
-_SIGNED = {np.dtype(np.float64): np.int64, np.dtype(np.float32): np.int32, np.dtype(np.float16): np.int16}
+_SIGNED = {
+    np.dtype(np.float64): np.int64,
+    np.dtype(np.float32): np.int32,
+    np.dtype(np.float16): np.int16,
+    np.dtype(ml_dtypes.bfloat16): np.int16,
+}
 
 
 def unit_roundoff(dtype: DTypeLike) -> float:
     """Half the spacing of the floats at 1: the largest relative error of one rounding (Higham 2002, 2.1)."""
-    return float(np.finfo(dtype).eps) / 2
+    # ml_dtypes' finfo knows bfloat16 too
+    return float(ml_dtypes.finfo(np.dtype(dtype)).eps) / 2
 
 
 def ordinal(x: Float[np.ndarray, "..."]) -> Int[np.ndarray, "..."]:
