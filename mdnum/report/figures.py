@@ -6,18 +6,14 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 
 import numpy as np
-from jaxtyping import Float
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from mdnum.report import analysis
+from mdnum.report.axes import PAGE_WIDTH, POINTS, drawn, envelope, legend, line, log_ticks, y_label
 from mdnum.report.run import Run
-from mdnum.report.svg import BAD, FIRST, GRID, INK, MUTED, SECOND, THIRD, style
-from mdnum.report.words import MINUS, power
-
-#: Points a line is thinned to; longer ones become an envelope of smallest and largest values.
-POINTS = 600
+from mdnum.report.svg import BAD, FIRST, MUTED, SECOND, THIRD
+from mdnum.report.words import power
 
 
 def energy(run: Run, figure: Figure) -> None:
@@ -26,16 +22,16 @@ def energy(run: Run, figure: Figure) -> None:
     time, budget, unit = run.series["time"], run.budget, run.units.energy
     if np.any(run.series["energy_jump"]):
         # one upon the other where the budget closes: a broad pale line, and a thin one that runs in it
-        _line(above, time, budget["change"], FIRST, "E(t) − E(0)", width=4, alpha=0.4)
-        _line(above, time, budget["jumps"], SECOND, "sum of the ledger’s jumps", width=0.9, band=False)
-        _label(below, f"difference ({unit})")
+        line(above, time, budget["change"], FIRST, "E(t) − E(0)", width=4, alpha=0.4)
+        line(above, time, budget["jumps"], SECOND, "sum of the ledger’s jumps", width=0.9, band=False)
+        y_label(below, f"difference ({unit})")
     else:
-        _line(above, time, budget["change"], FIRST, "E(t) − E(0); no flip changes the energy")
-        _label(below, f"residual ({unit})")
-    _label(above, f"energy ({unit})")
-    _legend(above)
+        line(above, time, budget["change"], FIRST, "E(t) − E(0); no flip changes the energy")
+        y_label(below, f"residual ({unit})")
+    y_label(above, f"energy ({unit})")
+    legend(above)
     below.axhline(0, color=MUTED, lw=0.6)
-    _line(below, time, budget["residual"], THIRD)
+    line(below, time, budget["residual"], THIRD)
     below.set_xlabel(f"time ({run.units.time})")
 
 
@@ -51,16 +47,16 @@ def flips(run: Run, figure: Figure) -> None:
     ):
         if not len(values):
             continue
-        low, middle, high, at = _envelope(time, values.astype(float), 240)
+        low, middle, high, at = envelope(time, values.astype(float), 240)
         above.fill_between(at, sign * low, sign * high, color=color, alpha=0.3, lw=0, step="mid")
         above.step(at, sign * middle, color=color, lw=1.1, where="mid", label=label)
     above.axhline(0, color=MUTED, lw=0.6)
     above.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{abs(value):g}"))
     above.yaxis.set_major_locator(MaxNLocator(5, integer=True))
-    _label(above, "flips per step")
-    _legend(above)
-    _line(below, series["time"], series["pairs"].astype(float), THIRD)
-    _label(below, "pairs inside")
+    y_label(above, "flips per step")
+    legend(above)
+    line(below, series["time"], series["pairs"].astype(float), THIRD)
+    y_label(below, "pairs inside")
     below.yaxis.set_major_locator(MaxNLocator(4, integer=True))
     below.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
     below.set_xlabel(f"time ({run.units.time})")
@@ -96,10 +92,10 @@ def margins(run: Run, figure: Figure) -> None:
     )  # fmt: skip
     axes.xaxis.set_major_locator(MaxNLocator(8, integer=True))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: power(round(value))))
-    _log_ticks(axes)
-    _label(axes, "flips per quarter decade")
+    log_ticks(axes)
+    y_label(axes, "flips per quarter decade")
     axes.set_xlabel("|margin| / rounding bound")
-    _legend(axes)
+    legend(axes)
 
 
 def residence(run: Run, figure: Figure) -> None:
@@ -117,10 +113,10 @@ def residence(run: Run, figure: Figure) -> None:
     axes.set_xscale("log")
     axes.set_yscale("log", nonpositive="mask")
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
-    _log_ticks(axes)
-    _label(axes, "stays per step of length")
+    log_ticks(axes)
+    y_label(axes, "stays per step of length")
     axes.set_xlabel("steps between two flips of a pair")
-    _legend(axes)
+    legend(axes)
 
 
 def lists(run: Run, figure: Figure) -> None:
@@ -132,7 +128,7 @@ def lists(run: Run, figure: Figure) -> None:
     above.axhline(1, color=BAD, lw=0.9, ls=(0, (4, 3)), zorder=1.5, label="skin used up")
     for axes, values in ((above, skin), (below, length)):
         if len(values) > POINTS:
-            low, middle, high, at = _envelope(step, values)
+            low, middle, high, at = envelope(step, values)
             axes.fill_between(at, low, high, color=FIRST, alpha=0.3, lw=0)
             axes.plot(at, middle, color=FIRST, lw=1.1)
         else:
@@ -146,9 +142,9 @@ def lists(run: Run, figure: Figure) -> None:
     above.set_ylim(0, max(1.18, 1.08 * float(np.max(skin, initial=0))))
     below.set_ylim(0, 1.15 * float(np.max(length, initial=1)))
     below.yaxis.set_major_locator(MaxNLocator(4, integer=True))
-    _legend(above)
-    _label(above, "skin consumed")
-    _label(below, "steps per list")
+    legend(above)
+    y_label(above, "skin consumed")
+    y_label(below, "steps per list")
     below.set_xlabel("step at which the list was built")
     below.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
 
@@ -164,8 +160,6 @@ FIGURES: Mapping[str, tuple[Callable[[Run, Figure], None], float]] = MappingProx
     }
 )
 
-PAGE_WIDTH, PHONE_WIDTH = 7.6, 3.7
-
 
 def draw(name: str, run: Run, width: float = PAGE_WIDTH) -> Figure:
     """One of `FIGURES`.
@@ -174,97 +168,8 @@ def draw(name: str, run: Run, width: float = PAGE_WIDTH) -> Figure:
         width: inches; a phone's is drawn a little lower, its labels as large.
     """
     function, height = FIGURES[name]
-    with style():
-        figure = Figure(
-            figsize=(width, height if width == PAGE_WIDTH else 0.85 * height), layout="constrained"
-        )
-        figure.get_layout_engine().set(h_pad=0.05, w_pad=0.02, hspace=0.04)  # type: ignore[union-attr]
-        function(run, figure)
-        figure.align_ylabels()
-        for axes in figure.axes:
-            axes.grid(True, color=GRID, lw=0.6)
-            axes.set_axisbelow(True)
-            for side in ("top", "right", "left"):
-                axes.spines[side].set_visible(False)
-            axes.tick_params(length=0)
-            if width != PAGE_WIDTH and axes.get_xscale() == "linear":
-                axes.xaxis.set_major_locator(MaxNLocator(5, integer=name == "margins"))
+    figure = drawn(lambda figure: function(run, figure), height, width)
+    for axes in figure.axes:
+        if width != PAGE_WIDTH and axes.get_xscale() == "linear":
+            axes.xaxis.set_major_locator(MaxNLocator(5, integer=name == "margins"))
     return figure
-
-
-def _envelope(
-    at: Float[np.ndarray, "points"], values: Float[np.ndarray, "points"], most: int = POINTS
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """(smallest, mean, largest, position) in at most so many equal groups; a group of one is its value."""
-    if len(values) <= most:
-        return values, values, values, at
-    starts = np.unique(np.linspace(0, len(values), most, endpoint=False).astype(int))
-    sizes = np.diff(np.append(starts, len(values)))
-    return (
-        np.minimum.reduceat(values, starts),
-        np.add.reduceat(values, starts) / sizes,
-        np.maximum.reduceat(values, starts),
-        np.add.reduceat(at, starts) / sizes,
-    )
-
-
-def _line(
-    axes: Axes,
-    at: np.ndarray,
-    values: np.ndarray,
-    color: str,
-    label: str = "",
-    width: float = 1.2,
-    alpha: float = 1.0,
-    band: bool = True,
-) -> None:
-    low, middle, high, position = _envelope(at, values)
-    if band and len(values) > POINTS:
-        axes.fill_between(position, low, high, color=color, alpha=0.3, lw=0)
-    axes.plot(position, middle, color=color, lw=width, alpha=alpha, label=label or None)
-    axes.yaxis.set_major_formatter(_Engineering())
-    axes.yaxis.set_major_locator(MaxNLocator(5))
-
-
-class _Engineering(FuncFormatter):
-    """Plain numbers, with one power of ten for the axis written into its topmost label's place."""
-
-    def __init__(self) -> None:
-        super().__init__(lambda value, _: f"{value:g}")
-        self.exponent = 0
-
-    def set_locs(self, locs: list[float]) -> None:
-        super().set_locs(locs)
-        largest = max((abs(loc) for loc in locs), default=0.0)
-        exponent = int(np.floor(np.log10(largest))) if largest > 0 else 0
-        self.exponent = exponent if exponent < -2 or exponent > 4 else 0
-
-    def __call__(self, x: float, pos: int | None = None) -> str:
-        scaled = round(x / 10.0**self.exponent, 6)
-        return f"{scaled:g}".replace("-", MINUS)
-
-    def get_offset(self) -> str:
-        return f"× {power(self.exponent)}" if self.exponent else ""
-
-
-def _log_ticks(axes: Axes) -> None:
-    axes.yaxis.set_major_locator(LogLocator(numticks=6))
-    axes.yaxis.set_major_formatter(
-        FuncFormatter(lambda value, _: f"{value:g}" if 0.1 < value < 999 else power(round(np.log10(value))))
-    )
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_minor_formatter(NullFormatter())
-    axes.minorticks_off()
-
-
-def _label(axes: Axes, text: str) -> None:
-    axes.set_ylabel(text, color=INK)
-
-
-def _legend(axes: Axes) -> None:
-    handles, labels = axes.get_legend_handles_labels()
-    if handles:
-        axes.legend(
-            handles, labels, loc="lower left", bbox_to_anchor=(0, 1.0), ncols=len(handles), frameon=False,
-            handlelength=1.3, columnspacing=1.4, borderaxespad=0.1, fontsize=8.5,
-        )  # fmt: skip

@@ -2,43 +2,18 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from mdnum.report import analysis
-from mdnum.report.rules import CHATTER_STEPS, CODES, RULES, Finding, jump, residual, total
+from mdnum.report.rules import CHATTER_STEPS, CODES, RULES, jump, residual, total
 from mdnum.report.run import Run, load
-from mdnum.report.words import listed, many, number
+from mdnum.report.verdict import Verdict, conclude, restore
+from mdnum.report.words import many, number
 from mdnum.store import RunFolder
-
-_ORDER = ("error", "warning", "info")
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """What to think of a run.
-
-    Attributes:
-        tone: the worst severity; "good" if there is neither error nor warning.
-        headline: the verdict in one sentence.
-        evidence: what it rests on, a sentence each.
-        findings: errors first.
-    """
-
-    tone: Literal["good", "warning", "error"]
-    headline: str
-    evidence: tuple[str, ...]
-    findings: tuple[Finding, ...]
-
-    @property
-    def text(self) -> str:
-        """Headline and evidence."""
-        return " ".join((self.headline, *self.evidence))
 
 
 def judge(run: Run) -> Verdict:
@@ -47,25 +22,8 @@ def judge(run: Run) -> Verdict:
     Findings that others left in summary.json (a check, say) are kept; those of `rules` are decided anew.
     """
     found = [finding for rule in RULES for finding in rule(run)]
-    found += [_restore(kept) for kept in run.summary.get("findings") or () if kept.get("code") not in CODES]
-    findings = tuple(sorted(found, key=lambda finding: _ORDER.index(finding.severity)))
-    errors = [finding.title for finding in findings if finding.severity == "error"]
-    warnings = [finding.title for finding in findings if finding.severity == "warning"]
-    if len(errors) > 2:
-        # the first is the cause more often than not
-        errors[1:] = [f"{len(errors) - 1} more errors below"]
-    if errors:
-        headline = f"Do not rely on this run: {listed(errors)}."
-    elif warnings:
-        headline = (
-            f"The record is complete; look at {many(len(warnings), 'point')} first: {listed(warnings)}."
-        )
-    elif run.summary.get("status") == "complete":
-        headline = "The record is complete and nothing needs attention."
-    else:
-        headline = "As far as it went, the record is complete and nothing needs attention."
-    tone = "error" if errors else "warning" if warnings else "good"
-    return Verdict(tone, headline, tuple(_evidence(run)), findings)
+    found += [restore(kept) for kept in run.summary.get("findings") or () if kept.get("code") not in CODES]
+    return conclude(found, _evidence(run), run.summary.get("status") == "complete")
 
 
 def record(folder: RunFolder | str | Path) -> Verdict:
@@ -79,8 +37,7 @@ def record(folder: RunFolder | str | Path) -> Verdict:
 
 def store(folder: RunFolder, run: Run, verdict: Verdict) -> None:
     """Writes findings and verdict into summary.json, beside what is there."""
-    findings = [dataclasses.asdict(finding) for finding in verdict.findings]
-    folder.write_summary({**run.summary, "findings": findings, "verdict": verdict.text})
+    verdict.store(folder, run.summary)
 
 
 def sharpness(run: Run) -> tuple[float, float] | None:
@@ -150,10 +107,3 @@ def _evidence(run: Run) -> Iterator[str]:
         energy = f"to {number(ase['energy_rel'], 2)} (relative)" if ase["energy_rel"] else "exactly"
         forces = f"to {number(ase.get('force_max'), 2)} {run.units.energy}/{run.units.length}"
         yield f"Energies agree with {ase.get('reference') or 'ASE'} {energy}, forces {forces}."
-
-
-def _restore(kept: dict[str, Any]) -> Finding:
-    values = {field.name: str(kept.get(field.name) or "") for field in dataclasses.fields(Finding)}
-    if values["severity"] not in _ORDER:
-        values["severity"] = "info"
-    return Finding(**values)  # type: ignore[arg-type]

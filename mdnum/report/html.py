@@ -2,28 +2,24 @@
 
 from __future__ import annotations
 
-import json
-import re
 from collections.abc import Iterator, Mapping
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, StrictUndefined
-from markupsafe import Markup
 
-from mdnum.report import analysis, figures, findings, svg
-from mdnum.report.findings import Verdict
+from mdnum.report import analysis, figures, findings, page
+from mdnum.report.browse import Browse, Column, plain_rows
+from mdnum.report.page import picture
 from mdnum.report.rules import CHATTER_STEPS, residual
 from mdnum.report.run import FLIPS_LOADED, Run, load
-from mdnum.report.words import count, many, number, percent, plain
+from mdnum.report.verdict import Verdict
+from mdnum.report.words import count, many, number, plain
 from mdnum.store import RunFolder
-from mdnum.store.atomic import disk_errors, write_text
+from mdnum.store.atomic import write_text
 
 #: Rows of the flip table that the page carries.
 TABLE_ROWS = 5_000
-_STATIC_ROWS = 20
 _BUSIEST = 10
 
 
@@ -42,17 +38,10 @@ def write_report(folder: RunFolder | str | Path) -> Path:
     run = load(folder)
     verdict = findings.judge(run)
     findings.store(folder, run, verdict)
-    with disk_errors(folder.path / "figures"):
-        (folder.path / "figures").mkdir(exist_ok=True)
-    pictures = {}
-    for name, title in _titles(run).items():
-        page = svg.markup(figures.draw(name, run), name)
-        phone = svg.markup(figures.draw(name, run, figures.PHONE_WIDTH), f"{name}-phone")
-        write_text(folder.path / "figures" / f"{name}.svg", svg.standalone(page))
-        pictures[name] = Markup(
-            f'<div class="wide">{svg.inline(page, title)}</div>'
-            f'<div class="narrow">{svg.inline(phone, title)}</div>'
-        )
+    pictures = {
+        name: picture(folder.path, name, title, lambda width, name=name: figures.draw(name, run, width))
+        for name, title in _titles(run).items()
+    }
     path = folder.path / "report.html"
     write_text(path, render(run, verdict, pictures))
     return path
@@ -64,26 +53,15 @@ def render(run: Run, verdict: Verdict, pictures: Mapping[str, str]) -> str:
     Args:
         pictures: markup by the names of `figures.FIGURES`; one that is missing is left out.
     """
-    environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    environment.filters |= {"number": number, "count": count, "percent": percent, "plain": plain}
-    environment.globals |= {"many": many}
-    here = files("mdnum.report")
-    template = environment.from_string((here / "report.html.j2").read_text(encoding="utf-8"))
-    rows = _table_rows(run)
-    return template.render(
+    browsed = _browsed(run)
+    return page.render(
+        "report.html.j2",
         run=run,
         verdict=verdict,
         pictures=pictures,
         units=run.units,
         summary=run.summary,
-        style=Markup((here / "report.css").read_text(encoding="utf-8")),
-        script=Markup((here / "report.js").read_text(encoding="utf-8")),
-        light=svg.LIGHT,
-        dark=svg.DARK,
-        font=Markup(svg.FONT),
-        key_figures=list(_key_figures(run)),
+        figures=list(_key_figures(run)),
         what=list(_what_was_run(run)),
         flips=findings.summarize(run),
         sharpness=findings.sharpness(run),
@@ -91,11 +69,10 @@ def render(run: Run, verdict: Verdict, pictures: Mapping[str, str]) -> str:
         busiest=_busiest(run),
         lists=_lists(run),
         ase=list(_ase(run)),
-        rows=rows,
-        rows_json=Markup(_script_safe(rows)),
-        static_rows=_STATIC_ROWS,
+        browsed=browsed,
+        scripted=bool(browsed.rows),
         flips_loaded=FLIPS_LOADED,
-        provenance=list(_flat(run.provenance)),
+        provenance=list(page.flat(run.provenance)),
     )
 
 
@@ -152,9 +129,9 @@ def _what_was_run(run: Run) -> Iterator[tuple[str, str]]:
         ),
     )
     if potential := system.get("potential"):
-        yield "Potential", _words(potential)
+        yield "Potential", page.in_words(potential)
     if cutoff := system.get("cutoff"):
-        yield "Cutoff", _words(cutoff, {"radius": units.length, "onset": units.length})
+        yield "Cutoff", page.in_words(cutoff, {"radius": units.length, "onset": units.length})
     jumps = run.cutoff
     if jumps.get("energy_jump") is not None:
         force = jumps.get("force_jump")
@@ -164,36 +141,15 @@ def _what_was_run(run: Run) -> Iterator[tuple[str, str]]:
             f"{units.energy}/{units.length}",
         )
     if neighbors := system.get("neighbors"):
-        yield "Neighbor lists", _words(neighbors, {"skin": units.length})
+        yield "Neighbor lists", page.in_words(neighbors, {"skin": units.length})
     if dynamics := system.get("dynamics"):
         # how many steps were made is said above; the file says how many were planned
         made = {key: value for key, value in dynamics.items() if key != "steps"}
-        yield "Dynamics", _words(made, {"timestep": units.time, "temperature": units.temperature})
+        yield "Dynamics", page.in_words(made, {"timestep": units.time, "temperature": units.temperature})
     mean = float(np.mean(run.series["temperature"]))
     yield "Temperature", f"{number(mean, 4)} {units.temperature} (mean over the run)"
     if precision := system.get("precision"):
-        yield "Precision", _words(precision)
-
-
-def _words(table: Mapping[str, Any], units: Mapping[str, str] | None = None) -> str:
-    parts = []
-    for key, value in table.items():
-        if isinstance(value, Mapping):
-            inner = (
-                f"{name} ({_words(item)})" if isinstance(item, Mapping) else f"{name} {_value(item)}"
-                for name, item in value.items()
-            )
-            parts.append(f"{key}: {'; '.join(inner)}")
-        elif key == "kind":
-            parts.insert(0, str(value))
-        elif value is not None:
-            unit = (units or {}).get(key)
-            parts.append(f"{key.replace('_', ' ')} {_value(value)}{f' {unit}' if unit else ''}")
-    return ", ".join(parts)
-
-
-def _value(value: Any) -> str:
-    return str(value).lower() if isinstance(value, bool) else str(value)
+        yield "Precision", page.in_words(precision)
 
 
 def _busiest(run: Run) -> list[dict[str, Any]]:
@@ -247,48 +203,36 @@ def _ase(run: Run) -> Iterator[tuple[str, str, str]]:
         yield "stress", number(ase["stress_max"]), f"{units.energy}/{units.length}³, largest component"
 
 
-def _table_rows(run: Run) -> list[list[Any]]:
-    """The flips nearest to the threshold, in the order of steps: step, i, j, entered, and numbers."""
+def _browsed(run: Run) -> Browse:
+    """The flips nearest to the threshold, in the order of steps."""
     flips = run.flips
     chosen = np.sort(analysis.closest(run.margins, TABLE_ROWS))
-    ratio = run.margins[chosen]
-    columns = [flips[name][chosen].tolist() for name in ("step", "i", "j")]
-    columns.append(flips["entered"][chosen].astype(int).tolist())
+    columns: list[tuple[np.ndarray, int | None]] = [
+        (flips[name][chosen], None) for name in ("step", "i", "j")
+    ]
+    columns.append((flips["entered"][chosen].astype(int), None))
     for name, digits in (("distance", 9), ("margin", 4), ("radial_speed", 4), ("energy_jump", 4)):
-        columns.append([_short(value, digits) for value in flips[name][chosen].tolist()])
-    columns.append([_short(value, 3) for value in ratio.tolist()])
-    return [list(row) for row in zip(*columns, strict=True)]
-
-
-def _short(value: float, digits: int) -> float | None:
-    return float(f"{value:.{digits}g}") if np.isfinite(value) else None
-
-
-def _flat(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    for key, item in value.items():
-        name = f"{prefix}{key}".replace("_", " ")
-        if isinstance(item, Mapping):
-            scalars = {inner: text for inner, text in item.items() if not isinstance(text, Mapping | list)}
-            if scalars:
-                yield name, ", ".join(f"{inner} {_text(text)}" for inner, text in scalars.items())
-            yield from _flat({key: inner for key, inner in item.items() if key not in scalars}, f"{name} ")
-        elif isinstance(item, list):
-            texts = [_words(part) if isinstance(part, Mapping) else _text(part) for part in item]
-            yield name, ", ".join(texts) or "none"
-        else:
-            yield name, _text(item)
-
-
-def _text(value: Any) -> str:
-    if value is None:
-        return "none"
-    text = ("on" if value else "off") if isinstance(value, bool) else str(value)
-    if re.fullmatch(r"[0-9a-f]{32,}\+?", text):
-        # enough of a hash to tell two apart; provenance.json has the whole
-        text = text[:12] + "…"
-    return text or "none"
-
-
-def _script_safe(value: Any) -> str:
-    # "</script>" inside a string would end the element it stands in
-    return json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+        columns.append((flips[name][chosen], digits))
+    columns.append((run.margins[chosen], 3))
+    units = run.units
+    return Browse(
+        name="flips",
+        row_id="flip-rows",
+        label="Search flips",
+        placeholder="atom 17, pair 17-203, step:100..200, entered, ambiguous",
+        columns=(
+            Column(0, "step", kind="count"),
+            Column(1, "pair", kind="pair"),
+            Column(3, "decision", kind="word", words=("left", "entered"), colors=("out", "in")),
+            Column(4, "distance", units.length, kind="fixed", digits=6),
+            Column(5, "margin", str(run.cutoff.get("compare", "r2 <"))),
+            Column(6, "radial speed", f"{units.length}/{units.time}"),
+            Column(7, "energy jump", units.energy),
+            Column(8, "margin", "÷ bound", digits=2, missing="∞"),
+        ),
+        rows=plain_rows(columns),
+        words={"entered": (3, 1), "in": (3, 1), "left": (3, 0), "out": (3, 0)},
+        ranges={"step": 0},
+        subjects=(1, 2),
+        ambiguous=8,
+    )

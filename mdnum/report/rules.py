@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
 from mdnum.report import analysis
 from mdnum.report.run import Run
+from mdnum.report.verdict import Finding
 from mdnum.report.words import count, many, number, percent
-
-Severity = Literal["info", "warning", "error"]
 
 #: A flip taken back within so many steps is chatter.
 CHATTER_STEPS = 10
@@ -28,25 +25,6 @@ _GRADIENT = (
 )
 _RECORDER = "A flip was not recorded: the ledger cannot be used. Please report it."
 _LISTS_FIRST = "Lost pairs have no place in the ledger: mend the neighbor lists first."
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One thing a person should know about a run.
-
-    Attributes:
-        code: stable name, for scripts.
-        severity: error: do not use the numbers; warning: look before you do; info: good to know.
-        title: one line, without a capital or a full stop.
-        text: what was seen, with its numbers.
-        remedy: what to do, empty if nothing.
-    """
-
-    code: str
-    severity: Severity
-    title: str
-    text: str
-    remedy: str = ""
 
 
 Rule = Callable[[Run], Iterator[Finding]]

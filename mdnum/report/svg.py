@@ -5,12 +5,13 @@ from __future__ import annotations
 import io
 import re
 from contextlib import AbstractContextManager
+from html import escape
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
 
 # colors that stand for a role; no figure uses them otherwise, so they can be replaced in the finished file
-INK, MUTED, GRID, FIRST, SECOND, THIRD, BAD = (f"#0102{index:02x}" for index in range(1, 8))
+INK, MUTED, GRID, FIRST, SECOND, THIRD, BAD, PAPER = (f"#0102{index:02x}" for index in range(1, 9))
 _ROLES = {
     INK: "ink",
     MUTED: "muted",
@@ -19,15 +20,16 @@ _ROLES = {
     SECOND: "second",
     THIRD: "third",
     BAD: "bad",
+    PAPER: "paper",
 }
 
 LIGHT = {
     "ink": "#1c2430", "muted": "#66707e", "grid": "#e3e6ea", "first": "#2563a8", "second": "#c2661a",
-    "third": "#2c7a63", "bad": "#b3261e",
+    "third": "#2c7a63", "bad": "#b3261e", "paper": "#ffffff",
 }  # fmt: skip
 DARK = {
     "ink": "#e4e7ec", "muted": "#98a2b0", "grid": "#2b323c", "first": "#74a9e8", "second": "#e79a58",
-    "third": "#63bda1", "bad": "#f07b72",
+    "third": "#63bda1", "bad": "#f07b72", "paper": "#14181e",
 }  # fmt: skip
 FONT = 'system-ui, -apple-system, "Segoe UI", Roboto, "Liberation Sans", "Helvetica Neue", Arial, sans-serif'
 
@@ -98,7 +100,7 @@ def inline(text: str, title: str) -> str:
         title: what a screen reader says.
     """
     text = re.sub(r'<svg [^>]*?viewBox="([^"]+)"[^>]*>', r'<svg viewBox="\1" role="img">', text, count=1)
-    return text.replace('role="img">', f'role="img" aria-label="{title}">', 1)
+    return text.replace('role="img">', f'role="img" aria-label="{escape(title)}">', 1)
 
 
 def standalone(text: str) -> str:

@@ -22,10 +22,10 @@ SCRIPT = """
 const lines = () => [...document.querySelectorAll("#flips tbody tr")];
 const cells = (column) => lines().map((row) => row.cells[column].textContent);
 const type = (text) => {
-  const search = document.getElementById("search");
+  const search = document.querySelector(".browse input");
   search.value = text;
   search.dispatchEvent(new Event("input"));
-  return document.getElementById("found").textContent;
+  return document.querySelector(".browse output").textContent;
 };
 const head = (column) => document.querySelector(`#flips th[data-column="${column}"] button`).click();
 const seen = {};
@@ -33,8 +33,8 @@ seen.start = cells(0);
 head(8); seen.ratio = cells(7); seen.sorted = document.querySelector('#flips th[data-column="8"]').ariaSort;
 head(8); seen.ratio_down = cells(7);
 head(0);
-document.querySelectorAll("#pager button")[1].click(); seen.second_page = cells(0);
-seen.pages = document.querySelector("#pager span").textContent;
+document.querySelectorAll(".browse .pager button")[1].click(); seen.second_page = cells(0);
+seen.pages = document.querySelector(".browse .pager span").textContent;
 seen.entered = type("entered"); seen.entered_words = cells(2);
 seen.pair = type(PAIR); seen.pairs = cells(1);
 seen.atom = type(ATOM); seen.atoms = cells(1);

@@ -1,0 +1,125 @@
+"""What every page shares: its template environment, its look, and figures for wide and narrow screens."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterator, Mapping
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from jinja2 import Environment, FunctionLoader, StrictUndefined
+from markupsafe import Markup
+
+from mdnum.report import svg
+from mdnum.report.axes import PAGE_WIDTH, PHONE_WIDTH
+from mdnum.report.words import count, many, number, percent, plain
+from mdnum.store.atomic import disk_errors, write_text
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_HERE = files("mdnum.report")
+
+
+def render(template: str, **content: Any) -> str:
+    """A page's text.
+
+    Args:
+        template: file in mdnum/report, "ball/run.html.j2" say; it extends base.html.j2.
+        content: what the template names.
+    """
+    environment = Environment(
+        loader=FunctionLoader(_text),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {"number": number, "count": count, "percent": percent, "plain": plain}
+    environment.globals |= {
+        "many": many,
+        "style": Markup(_text("report.css")),
+        "script": Markup(_text("report.js")),
+        "light": svg.LIGHT,
+        "dark": svg.DARK,
+        "font": Markup(svg.FONT),
+    }
+    return environment.get_template(template).render(**content)
+
+
+def picture(folder: Path, name: str, title: str, draw: Callable[[float], Figure]) -> Markup:
+    """A figure for a wide and for a narrow screen; the wide one is also written to figures/<name>.svg.
+
+    Args:
+        folder: the page's own.
+        title: what a screen reader says.
+        draw: draws it at a width in inches.
+    """
+    page = svg.markup(draw(PAGE_WIDTH), name)
+    phone = svg.markup(draw(PHONE_WIDTH), f"{name}-phone")
+    with disk_errors(folder / "figures"):
+        (folder / "figures").mkdir(exist_ok=True)
+    write_text(folder / "figures" / f"{name}.svg", svg.standalone(page))
+    return Markup(
+        f'<div class="wide">{svg.inline(page, title)}</div>'
+        f'<div class="narrow">{svg.inline(phone, title)}</div>'
+    )
+
+
+def in_words(table: Mapping[str, Any], units: Mapping[str, str] | None = None) -> str:
+    """A table of a system file as a phrase: its kind first, then name and value of the rest."""
+    parts = []
+    for key, value in table.items():
+        if isinstance(value, Mapping):
+            inner = (
+                f"{name} ({in_words(item)})" if isinstance(item, Mapping) else f"{name} {_value(item)}"
+                for name, item in value.items()
+            )
+            parts.append(f"{key}: {'; '.join(inner)}")
+        elif key == "kind":
+            parts.insert(0, str(value))
+        elif value is not None:
+            unit = (units or {}).get(key)
+            parts.append(f"{key.replace('_', ' ')} {_value(value)}{f' {unit}' if unit else ''}")
+    return ", ".join(parts)
+
+
+def flat(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+    """(name, text) of everything in nested tables, those of plain values in one line each."""
+    for key, item in value.items():
+        name = f"{prefix}{key}".replace("_", " ")
+        if isinstance(item, Mapping):
+            scalars = {inner: text for inner, text in item.items() if not isinstance(text, Mapping | list)}
+            if scalars:
+                yield name, ", ".join(f"{inner} {_short(text)}" for inner, text in scalars.items())
+            yield from flat({key: inner for key, inner in item.items() if key not in scalars}, f"{name} ")
+        elif isinstance(item, list):
+            texts = [in_words(part) if isinstance(part, Mapping) else _short(part) for part in item]
+            yield name, ", ".join(texts) or "none"
+        else:
+            yield name, _short(item)
+
+
+def script_safe(value: Any) -> Markup:
+    """JSON that can stand in a script element: "</script>" inside a string would end it."""
+    return Markup(json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"))
+
+
+def _text(name: str) -> str:
+    return _HERE.joinpath(*name.split("/")).read_text(encoding="utf-8")
+
+
+def _value(value: Any) -> str:
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def _short(value: Any) -> str:
+    if value is None:
+        return "none"
+    text = ("on" if value else "off") if isinstance(value, bool) else str(value)
+    if re.fullmatch(r"[0-9a-f]{32,}\+?", text):
+        # enough of a hash to tell two apart; provenance.json has the whole
+        text = text[:12] + "…"
+    return text or "none"
