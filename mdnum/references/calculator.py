@@ -74,7 +74,7 @@ class MdnumCalculator(Calculator):
                 )
             self._template = system
         else:
-            self._template = systems.load(str(system), overrides)
+            self._template = systems.load(str(system), overrides, world="md")
         self._evaluator: Any = None
 
     @property

@@ -10,13 +10,26 @@ import sys
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from mdnum.systems.ball import BallSpec
+from mdnum.systems.ball_system import BallSystem
 from mdnum.systems.load import System, copy, load, names, shipped_folder
 from mdnum.systems.schema import SystemSpec
 
 if TYPE_CHECKING:
     from mdnum.systems.build import Simulation, build
 
-__all__ = ["Simulation", "System", "SystemSpec", "build", "copy", "load", "names", "shipped_folder"]
+__all__ = [
+    "BallSpec",
+    "BallSystem",
+    "Simulation",
+    "System",
+    "SystemSpec",
+    "build",
+    "copy",
+    "load",
+    "names",
+    "shipped_folder",
+]
 
 
 class _Package(ModuleType):

@@ -262,7 +262,7 @@ def build(system: System | str, overrides: Mapping[str, Any] | None = None) -> S
         InputError: the cutoff and skin do not fit the box, or the file cannot be run.
     """
     if not isinstance(system, System):
-        system = load(system, overrides)
+        system = load(system, overrides, world="md")
     spec, units = system.spec, system.units
     cell = Cell.create(np.asarray(system.atoms.cell), system.atoms.pbc)
     precision = spec.precision

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import importlib.resources
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, overload
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -17,12 +16,20 @@ from mdnum import units as unit_systems
 from mdnum.errors import InputError
 from mdnum.store.atomic import disk_errors
 from mdnum.systems import messages, pairs, schema, structures, toml
+from mdnum.systems import overrides as overrides_module
+from mdnum.systems.ball_system import BALL_SCHEMA, BallSystem, Source, kind_first
+from mdnum.systems.ball_system import make as make_ball
+from mdnum.systems.find import SYSTEM_FILE, find, names, shipped_folder, shown
+from mdnum.systems.grammar import Grammar
 
 if TYPE_CHECKING:
     from ase import Atoms
 
+__all__ = ["STRUCTURE_FILE", "SYSTEM_FILE", "System", "copy", "find", "load", "names", "shipped_folder"]
+
 STRUCTURE_FILE = "structure.extxyz"
-SYSTEM_FILE = "system.toml"
+
+GRAMMAR = Grammar(schema.SystemSpec)
 
 
 @dataclass(frozen=True)
@@ -92,12 +99,12 @@ class System:
             for table in (structure, spec["potential"]):
                 if "file" in table:
                     table["file"] = str((self.folder / table["file"]).resolve())
-            return toml.dump({"name": self.name, **_kind_first(spec)})
+            return toml.dump({"name": self.name, **kind_first(spec)})
         kept = {key: structure[key] for key in ("masses", "velocities") if key in structure}
         spec["structure"] = {"file": STRUCTURE_FILE, **kept}
         if isinstance(self.spec.potential, schema.EmbeddedAtom):
             spec["potential"]["file"] = Path(self.spec.potential.file).name
-        return toml.dump({"name": self.name, **_kind_first(spec)})
+        return toml.dump({"name": self.name, **kind_first(spec)})
 
     def write(self, folder: str | Path) -> Path:
         """Write system.toml, structure.extxyz and the potential's tables; returns the TOML file's path."""
@@ -113,58 +120,7 @@ class System:
         return path
 
 
-def _kind_first(spec: Mapping[str, Any]) -> dict[str, Any]:
-    """Put kind at the head of each table, where a reader looks for it, and name and about at the very top."""
-    ordered = {key: spec[key] for key in ("name", "about", "units") if key in spec}
-    for key, value in spec.items():
-        if isinstance(value, Mapping):
-            head = {"kind": value["kind"]} if "kind" in value else {}
-            ordered[key] = {**head, **{k: v for k, v in value.items() if k != "kind"}}
-        else:
-            ordered.setdefault(key, value)
-    return ordered
-
-
-# --- finding ------------------------------------------------------------------------------------------
-
-
-def shipped_folder() -> Path:
-    """The folder of shipped systems: the packaged copy, else the repository's (editable installs)."""
-    package = Path(str(importlib.resources.files("mdnum")))
-    packaged = package / "_systems"
-    return packaged if packaged.is_dir() else package.parent / "systems"
-
-
-def names() -> list[str]:
-    """Names of the shipped systems, such as "argon/liquid-864"."""
-    root = shipped_folder()
-    return sorted(path.relative_to(root).with_suffix("").as_posix() for path in root.glob("*/*.toml"))
-
-
-def find(name: str | Path) -> tuple[str, Path]:
-    """Name and file of a system: a path to a TOML file, a folder that holds system.toml, or a shipped name.
-
-    Raises:
-        InputError: nothing of that name; says the nearest shipped one.
-    """
-    path = Path(name)
-    text = str(name)
-    if path.is_dir() and (path / SYSTEM_FILE).is_file():
-        return path.resolve().name, path / SYSTEM_FILE
-    if path.is_file():
-        return path.stem, path
-    if path.suffix == ".toml":
-        raise InputError("no such system file", where=text, remedy="Check the path")
-    known = names()
-    if text in known:
-        return text, shipped_folder() / f"{text}.toml"
-    short = [one for one in known if one.split("/")[-1] == text]
-    near = short[0] if short else messages.nearest(text, known)
-    hint = f"Did you mean {near}? " if near else ""
-    raise InputError(
-        f"no system called {text!r}, and no file of that name",
-        remedy=f"{hint}`mdnum systems list` names those shipped; your own system is a path to a .toml file",
-    )
+# --- copying ----------------------------------------------------------------------------------------
 
 
 def copy(name: str | Path, folder: str | Path) -> Path:
@@ -173,18 +129,19 @@ def copy(name: str | Path, folder: str | Path) -> Path:
     Raises:
         InputError: no such system, or a file of that name is there already.
     """
-    system = load(name)
+    system: System | BallSystem = load(name)
     if system.path is None:
         raise TypeError("a loaded system has a path")
     target = Path(folder)
-    files = sorted(system.tables)
-    if isinstance(system.spec.structure, schema.FileStructure):
+    is_ball = isinstance(system, BallSystem)
+    files = [] if is_ball else sorted(system.tables)
+    if not is_ball and isinstance(system.spec.structure, schema.FileStructure):
         files.append(system.folder / system.spec.structure.file)
-    schema_file = shipped_folder() / "schema.json"
+    schema_file = shipped_folder() / (BALL_SCHEMA if is_ball else "schema.json")
     text = system.path.read_text(encoding="utf-8")
     if schema_file.is_file():
         files.append(schema_file)
-        text = text.replace("#:schema ../schema.json", "#:schema schema.json")
+        text = text.replace(f"#:schema ../{schema_file.name}", f"#:schema {schema_file.name}")
     goal = target / system.path.name
     there = [path for path in (goal, *(target / file.name for file in files)) if path.exists()]
     there = [path for path in there if path.name != schema_file.name]
@@ -200,20 +157,34 @@ def copy(name: str | Path, folder: str | Path) -> Path:
 # --- loading ------------------------------------------------------------------------------------------
 
 
-def load(name: str | Path, overrides: Mapping[str, Any] | None = None) -> System:
-    """A system by name or path, checked.
+@overload
+def load(name: str | Path, overrides: Mapping[str, Any] | None = None, *, world: Literal["md"]) -> System: ...
+@overload
+def load(
+    name: str | Path, overrides: Mapping[str, Any] | None = None, *, world: Literal["ball"]
+) -> BallSystem: ...
+@overload
+def load(name: str | Path, overrides: Mapping[str, Any] | None = None) -> Any: ...
+def load(
+    name: str | Path,
+    overrides: Mapping[str, Any] | None = None,
+    *,
+    world: Literal["md", "ball"] | None = None,
+) -> System | BallSystem:
+    """A system by name or path, checked: a System, or a BallSystem where the file says `world = "ball"`.
 
     Args:
         name: a shipped name, a path to a TOML file, or a folder that holds system.toml.
         overrides: dotted key to value, as `--set` gives them: `{"cutoff.kind": "switched"}`; text is read as
             TOML would read it. Changing a kind drops the file's keys that the new kind does not have;
             changing the temperature or seed of an NVE run draws its velocities anew.
+        world: refuse systems of the other world.
 
     Raises:
         InputError: anything that cannot be run, in one line.
     """
     found, path = find(name)
-    where = _shown(path)
+    where = shown(path)
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -221,74 +192,51 @@ def load(name: str | Path, overrides: Mapping[str, Any] | None = None) -> System
             f"cannot be read ({error})", where=where, remedy="A system file is UTF-8 text"
         ) from error
     data = toml.parse(text, where)
-    changes = {toml.dotted(key): value for key, value in (overrides or {}).items()}
-    values = {key: toml.scalar(value) if isinstance(value, str) else value for key, value in changes.items()}
-    for key, value in values.items():
-        _override(data, key, value)
-    _drop_foreign_keys(data, values)
-    _draw_again(data, values)
+    values = overrides_module.read(overrides)
+    source = Source(found, path, where, text, values)
+    is_ball = _is_ball(data, where)
+    if world is not None and is_ball != (world == "ball"):
+        verb, what = ("ball", "a ball") if is_ball else ("run", "molecular dynamics")
+        raise InputError(f"this system is {what}", where=str(name), remedy=f"Use `mdnum {verb} {name}`")
+    return make_ball(source, data) if is_ball else _make(source, data)
+
+
+def _is_ball(data: Mapping[str, Any], where: str) -> bool:
+    if "world" not in data:
+        if "contact" in data:
+            raise InputError(
+                "key 'world' missing in the system file",
+                where=where,
+                remedy='Add `world = "ball"` at the top',
+            )
+        return False
+    if data["world"] != "ball":
+        raise InputError(
+            f'world = {data["world"]!r}; expected "ball"',
+            where=where,
+            remedy="Leave the key out for molecular dynamics",
+        )
+    return True
+
+
+def _make(source: Source, data: dict[str, Any]) -> System:
+    """The atoms' system of the tables of a file."""
+    overrides_module.apply(data, source.values, GRAMMAR)
+    _draw_again(data, source.values)
     try:
         spec = schema.SystemSpec.model_validate(data)
     except ValidationError as error:
-        raise messages.explain(error, data, text, where, values) from None
+        raise messages.explain(error, data, source.text, source.where, source.values, GRAMMAR) from None
     spec = _resolve(spec)
     try:
-        atoms = structures.make(spec.structure, spec.units, path.parent)
-        system = System(spec.name or found, spec, path, atoms)
+        atoms = structures.make(spec.structure, spec.units, source.path.parent)
+        system = System(spec.name or source.name, spec, source.path, atoms)
         structures.check(atoms, spec, system.r_cut, system.units.length)
     except InputError as error:
         if error.where:
             raise
-        raise InputError(error.message, remedy=error.remedy, where=where) from None
+        raise InputError(error.message, remedy=error.remedy, where=source.where) from None
     return system
-
-
-def _shown(path: Path) -> str:
-    try:
-        return str(path.resolve().relative_to(Path.cwd()))
-    except ValueError:
-        return str(path)
-
-
-def _override(data: dict[str, Any], key: toml.Key, value: Any) -> None:
-    table = data
-    for depth, part in enumerate(key[:-1]):
-        inner = table.setdefault(part, {})
-        if not isinstance(inner, dict):
-            raise InputError(
-                f"{'.'.join(key[: depth + 1])} is a value and not a table",
-                where=f"--set {'.'.join(key)}",
-                remedy=f"Set {'.'.join(key[: depth + 1])} itself",
-            )
-        table = inner
-    table[key[-1]] = value
-
-
-_RIVALS: dict[toml.Key, tuple[str, ...]] = {
-    # what the command line says replaces the file's other way of saying it
-    ("cutoff", "radius"): ("in_sigma", "pairs"),
-    ("cutoff", "in_sigma"): ("radius", "pairs"),
-    ("structure", "file"): ("builder",),
-    ("structure", "builder"): ("file",),
-}
-
-
-def _drop_foreign_keys(data: dict[str, Any], values: Mapping[toml.Key, Any]) -> None:
-    """Keys of the file that an override makes meaningless: of another kind, or a rival of its key."""
-    for key in values:
-        table = data.get(key[0])
-        if not isinstance(table, dict):
-            continue
-        foreign = set(_RIVALS.get(key, ()))
-        if {"radius", "in_sigma"} & foreign & set(table):
-            # the onset was in the unit of the radius that goes
-            foreign.add("onset")
-        if key[0] in messages.TAGGED and key[1:] in (("kind",), ("file",), ("builder",)):
-            rest = {**data, key[0]: {name: value for name, value in table.items() if name not in foreign}}
-            foreign |= messages.keys_of_any_kind(key[0]) - set(messages.known_keys(key[:1], rest))
-        for name in foreign & set(table):
-            if not any(given[:2] == (key[0], name) for given in values):
-                del table[name]
 
 
 def _draw_again(data: dict[str, Any], values: Mapping[toml.Key, Any]) -> None:

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import difflib
-import types
-import typing
+import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
 from mdnum.errors import InputError
-from mdnum.systems import schema
+from mdnum.systems.grammar import Grammar
 from mdnum.systems.toml import Key, line_of
-
-TAGGED = ("structure", "potential", "cutoff", "dynamics")
 
 _EXPECTED = {
     "float_type": "a number",
@@ -29,6 +26,12 @@ _EXPECTED = {
     "tuple_type": "an array",
     "finite_number": "a finite number",
 }
+_BOUNDS = {
+    "greater_than": ("gt", "above"),
+    "greater_than_equal": ("ge", "at least"),
+    "less_than": ("lt", "below"),
+    "less_than_equal": ("le", "at most"),
+}
 
 
 def nearest(word: str, known: Iterable[str]) -> str | None:
@@ -40,7 +43,12 @@ def nearest(word: str, known: Iterable[str]) -> str | None:
 
 
 def explain(
-    error: ValidationError, data: Mapping[str, Any], text: str, where: str | Path, overridden: Iterable[Key]
+    error: ValidationError,
+    data: Mapping[str, Any],
+    text: str,
+    where: str | Path,
+    overridden: Iterable[Key],
+    grammar: Grammar,
 ) -> InputError:
     """One line for the most telling of pydantic's errors.
 
@@ -50,17 +58,19 @@ def explain(
         text: the file's text, to find line numbers in.
         where: the file.
         overridden: keys that came from overrides rather than from the file.
+        grammar: the tables that such a file may hold.
     """
     details = error.errors(include_url=False)
     # a misspelled key is also a missing one: name the misspelling
     details.sort(key=lambda detail: detail["type"] != "extra_forbidden")
     detail = details[0]
-    key = _key(detail["loc"], data)
+    key = grammar.key(detail["loc"], data)
     if detail["type"] == "union_tag_invalid":
-        key = (*key, "kind")
-    if detail["type"] == "value_error" and not key and "[cutoff]" in detail["msg"]:
-        key = ("cutoff",)
-    message, remedy = _sentence(detail, key, data)
+        key = (*key, _tag(detail))
+    if detail["type"] == "value_error" and not key:
+        named = re.search(r"\[(\w+)\]", detail["msg"])
+        key = (named[1],) if named and named[1] in data else ()
+    message, remedy = _sentence(detail, key, data, grammar)
     if len(details) > 1:
         others = len(details) - 1
         remedy += "" if remedy.endswith((".", "?")) else "."
@@ -80,46 +90,55 @@ def place(key: Key, text: str, where: str | Path, overridden: Iterable[Key] = ()
     return f"--set {'.'.join(given)}" if given else str(where)
 
 
-def _key(loc: tuple[int | str, ...], data: Mapping[str, Any]) -> Key:
-    # pydantic puts the tag of a union between the table and the key
-    parts = [part for part in loc if part != "[key]"]
-    if len(parts) > 1 and parts[0] in TAGGED:
-        del parts[1]
-    return tuple(str(part) for part in parts)
+def _tag(detail: Mapping[str, Any]) -> str:
+    # pydantic quotes the name of the key that tells kinds apart
+    return str(detail.get("ctx", {}).get("discriminator", "kind")).strip("'")
 
 
-def _sentence(detail: Mapping[str, Any], key: Key, data: Mapping[str, Any]) -> tuple[str, str]:
+def _sentence(
+    detail: Mapping[str, Any], key: Key, data: Mapping[str, Any], grammar: Grammar
+) -> tuple[str, str]:
     kind = str(detail["type"])
     name = ".".join(key)
     last = key[-1] if key else ""
     seen = detail["input"]
     context = detail.get("ctx", {})
+
+    def meaning(form: str) -> str:
+        said = grammar.meaning(key, data)
+        return form.format(said) if said else ""
+
     if kind == "extra_forbidden":
-        known = known_keys(key[:-1], data)
+        known = grammar.known_keys(key[:-1], data)
         near = nearest(last, known)
         table = f"[{'.'.join(key[:-1])}]" if len(key) > 1 else "a system file"
         remedy = f"Did you mean {near}?" if near else f"Known keys are {', '.join(known)}."
         return f"unknown key {last!r} in {table}", remedy
     if kind == "missing":
         owner = f"[{'.'.join(key[:-1])}]" if len(key) > 1 else "the system file"
-        if not _is_scalar(key, data):
+        if not grammar.is_scalar(key, data):
             return f"table [{name}] missing", f"Add a [{name}] table."
-        return f"key {last!r} missing in {owner}", f"Add `{last} = ...`" + _meaning(key, data, " ({})")
+        return f"key {last!r} missing in {owner}", f"Add `{last} = ...`" + meaning(" ({})")
     if kind == "union_tag_not_found":
-        kinds = _kinds(key[0])
-        return f"key 'kind' missing in [{name}]", f"Known kinds are {', '.join(kinds)}."
+        tag = _tag(detail)
+        return f"key {tag!r} missing in [{name}]", f"Known {tag}s are {', '.join(grammar.kinds(key, data))}."
     if kind == "union_tag_invalid":
-        kinds = _kinds(key[0])
+        kinds = grammar.kinds(key[:-1], data)
         given = str(context.get("tag"))
         near = nearest(given, kinds)
         remedy = f"Did you mean {near}? " if near else ""
-        return f"unknown {key[0]} kind {given!r}", f"{remedy}Known kinds are {', '.join(kinds)}."
+        return (
+            f"unknown {'.'.join(key[:-1])} {last} {given!r}",
+            f"{remedy}Known {last}s are {', '.join(kinds)}.",
+        )
     if kind == "literal_error":
         options = str(context["expected"]).replace("'", '"')
-        return f"{name} = {_show(seen)}; expected {options}", _meaning(key, data, f"{last}: {{}}")
-    if kind in ("greater_than", "greater_than_equal"):
-        bound = f"above {context['gt']:g}" if kind == "greater_than" else f"at least {context['ge']:g}"
-        return f"{name} = {_show(seen)}; expected a number {bound}", _meaning(key, data, f"{last}: {{}}")
+        return f"{name} = {_show(seen)}; expected {options}", meaning(f"{last}: {{}}")
+    if kind in _BOUNDS:
+        limit, word = _BOUNDS[kind]
+        return f"{name} = {_show(seen)}; expected a number {word} {context[limit]:g}", meaning(
+            f"{last}: {{}}"
+        )
     if kind in ("too_short", "too_long", "missing_positional_only_argument"):
         return f"{name} = {_show(seen)}; expected three values", "Give one for each of x, y and z."
     if kind == "value_error":
@@ -149,73 +168,3 @@ def _show(value: Any) -> str:
     if isinstance(value, Mapping):
         return "a table"
     return f'"{value}"' if isinstance(value, str) else repr(value)
-
-
-def _model(key: Key, data: Mapping[str, Any]) -> type[BaseModel] | None:
-    """The model of the table at key, given the kinds the data names; None where a table has free keys."""
-    model: type[BaseModel] | None = schema.SystemSpec
-    table: Any = data
-    for part in key:
-        table = table.get(part, {}) if isinstance(table, Mapping) else {}
-        if model is None or part not in model.model_fields:
-            # pairs."Ni-P": the table of one pair
-            continue
-        options = list(_models_in(model.model_fields[part].rebuild_annotation()))
-        model = _choose(options, table)
-    return model
-
-
-def _choose(options: list[type[BaseModel]], table: Any) -> type[BaseModel] | None:
-    if not options:
-        return None
-    given = table.get("kind") if isinstance(table, Mapping) else None
-    for option in options:
-        if "kind" in option.model_fields and given in typing.get_args(option.model_fields["kind"].annotation):
-            return option
-    builder = isinstance(table, Mapping) and "builder" in table
-    for option in options:
-        if ("builder" in option.model_fields) == builder:
-            return option
-    return options[0]
-
-
-def _models_in(annotation: Any) -> Iterable[type[BaseModel]]:
-    if isinstance(annotation, type) and not isinstance(annotation, types.GenericAlias):
-        if issubclass(annotation, BaseModel):
-            yield annotation
-        return
-    for argument in typing.get_args(annotation):
-        yield from _models_in(argument)
-
-
-def known_keys(key: Key, data: Mapping[str, Any]) -> list[str]:
-    """Keys that the table at key may hold, given the kinds the data names."""
-    model = _model(key, data)
-    return sorted(model.model_fields, key=lambda name: name != "kind") if model else []
-
-
-def keys_of_any_kind(table: str) -> set[str]:
-    """Keys that some kind of this table has."""
-    field = schema.SystemSpec.model_fields[table]
-    return {key for model in _models_in(field.rebuild_annotation()) for key in model.model_fields}
-
-
-def _kinds(table: str) -> list[str]:
-    field = schema.SystemSpec.model_fields[table]
-    return [
-        kind
-        for model in _models_in(field.rebuild_annotation())
-        for kind in typing.get_args(model.model_fields["kind"].annotation)
-    ]
-
-
-def _is_scalar(key: Key, data: Mapping[str, Any]) -> bool:
-    model = _model(key[:-1], data)
-    field = model.model_fields.get(key[-1]) if model else None
-    return field is None or not list(_models_in(field.rebuild_annotation()))
-
-
-def _meaning(key: Key, data: Mapping[str, Any], form: str) -> str:
-    model = _model(key[:-1], data)
-    field = model.model_fields.get(key[-1]) if model else None
-    return form.format(field.description) if field is not None and field.description else ""

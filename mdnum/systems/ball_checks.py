@@ -1,0 +1,402 @@
+"""What the tables of a ball's system file must say together: combinations and ranges that cannot be run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import ml_dtypes
+import numpy as np
+
+from mdnum.systems import ball
+from mdnum.systems.toml import Key
+
+DTYPES = {
+    "float16": np.dtype(np.float16),
+    "bfloat16": np.dtype(ml_dtypes.bfloat16),
+    "float32": np.dtype(np.float32),
+    "float64": np.dtype(np.float64),
+}
+
+#: Parameters that a gradient can be asked for, by contact.
+PARAMETERS = {
+    "penalty": ("k", "damping", "eps"),
+    "projection": ("k", "alpha", "restitution", "tol"),
+    "impact": ("restitution",),
+}
+ALWAYS = ("gravity", "h", "y0", "v0")
+
+
+class Refusal(Exception):
+    """A system that cannot be run, with the key at fault; loading adds the place."""
+
+    def __init__(self, key: str, message: str, remedy: str):
+        super().__init__(message)
+        self.key: Key = tuple(key.split("."))
+        self.message = message
+        self.remedy = remedy
+
+
+@dataclass(frozen=True)
+class Warning:
+    """Something that runs, and is probably not what was meant.
+
+    Attributes:
+        code: a short name of it.
+        title: one line.
+        text: what was seen.
+        remedy: what to do.
+    """
+
+    code: str
+    title: str
+    text: str
+    remedy: str
+
+
+def smallest(name: str) -> float:
+    """The smallest positive number that the ball's arithmetic keeps in a format.
+
+    XLA on a CPU flushes subnormals to zero in every format but float16, whose arithmetic it does in float32.
+    """
+    limits = ml_dtypes.finfo(DTYPES[name])
+    return float(limits.smallest_subnormal if name == "float16" else limits.smallest_normal)
+
+
+def largest(name: str) -> float:
+    """The largest finite number of a format."""
+    return float(ml_dtypes.finfo(DTYPES[name]).max)
+
+
+def spacing(value: float, name: str) -> float:
+    """Distance from the number to the next one of a format."""
+    limits = ml_dtypes.finfo(DTYPES[name])
+    exponent = int(np.floor(np.log2(max(abs(value), float(limits.smallest_normal)))))
+    return float(limits.eps) * 2.0**exponent
+
+
+def rounded(value: float, name: str) -> float:
+    """The number of a format nearest to value."""
+    with np.errstate(over="ignore"):
+        return float(np.asarray(value, DTYPES[name]))
+
+
+def check(spec: ball.BallSpec) -> None:
+    """Refuse what cannot be run.
+
+    Raises:
+        Refusal: names the key at fault.
+    """
+    _start(spec)
+    _combination(spec)
+    _stop(spec)
+    _convergence(spec)
+    _representable(spec)
+    _reduction(spec)
+    _loss_and_gradient(spec)
+
+
+def warnings(spec: ball.BallSpec) -> tuple[Warning, ...]:
+    """What runs, and is worth a word."""
+    return tuple(_warnings(spec))
+
+
+def balls(spec: ball.BallSpec) -> int:
+    """How many balls the file describes."""
+    start = spec.start
+    if start.boundary is not None:
+        return start.boundary.terms + 1
+    lists = [value for value in (start.height, start.velocity) if isinstance(value, tuple)]
+    return len(lists[0]) if lists else start.balls
+
+
+def _start(spec: ball.BallSpec) -> None:
+    start = spec.start
+    if start.boundary is not None:
+        given = [
+            name
+            for name, field in ball.Start.model_fields.items()
+            if name != "boundary" and getattr(start, name) != field.default
+        ]
+        if given:
+            raise Refusal(
+                f"start.{given[0]}",
+                f"[start] has boundary and {', '.join(given)}, but boundary says where every ball is",
+                f"Remove {' and '.join(given)}, or boundary",
+            )
+        if spec.stop is None or isinstance(spec.stop, ball.FixedRule):
+            raise Refusal(
+                "start.boundary",
+                "a batch on the boundary needs a tolerance to be on the boundary of",
+                'Give a [stop] table with rule = "sum" and tol',
+            )
+        low = rounded(spec.stop.tol, start.boundary.format)
+        if low != spec.stop.tol:
+            raise Refusal(
+                "stop.tol",
+                f"stop.tol = {spec.stop.tol!r} is no {start.boundary.format}, so no sum of {start.boundary.format} "
+                "numbers equals it",
+                f"Set it to the nearest one, tol = {low!r}",
+            )
+        share = spacing(np.nextafter(low, 0.0), start.boundary.format) / start.boundary.terms
+        if share < smallest(start.boundary.format):
+            raise Refusal(
+                "start.boundary.terms",
+                f"an ulp of the tolerance in {start.boundary.terms} parts gives {share:g}, below the smallest "
+                f"{start.boundary.format}, {smallest(start.boundary.format):.3g}",
+                "Use fewer terms or a larger stop.tol",
+            )
+        return
+    lists = {
+        name: value for name in ("height", "velocity") if isinstance(value := getattr(start, name), tuple)
+    }
+    for name, value in lists.items():
+        if not value:
+            raise Refusal(f"start.{name}", f"start.{name} is an empty array", "Give one number per ball")
+        if not all(map(np.isfinite, value)):
+            raise Refusal(
+                f"start.{name}", f"start.{name} holds a number that is not finite", f"Correct {name}"
+            )
+    if len({len(value) for value in lists.values()}) > 1:
+        counts = " and ".join(f"{len(value)} in start.{name}" for name, value in lists.items())
+        raise Refusal("start.velocity", f"arrays of different length: {counts}", "Give one number per ball")
+    if lists and start.balls not in (1, balls(spec)):
+        raise Refusal(
+            "start.balls",
+            f"start.balls = {start.balls}, but start.{next(iter(lists))} has {balls(spec)} numbers",
+            "Leave out start.balls",
+        )
+    if "height" in lists and (start.spread or start.spread_ulps):
+        name = "spread" if start.spread else "spread_ulps"
+        raise Refusal(
+            f"start.{name}",
+            f"start.{name} has no meaning where start.height gives every ball its own",
+            f"Remove {name}, or give one height and start.balls",
+        )
+    if start.spread and start.spread_ulps:
+        raise Refusal(
+            "start.spread_ulps", "start.spread and start.spread_ulps both given", "Keep one of them"
+        )
+    if (start.spread or start.spread_ulps) and balls(spec) == 1:
+        name = "spread" if start.spread else "spread_ulps"
+        raise Refusal(f"start.{name}", f"start.{name} of a single ball", "Set start.balls to 2 or more")
+
+
+def _combination(spec: ball.BallSpec) -> None:
+    contact, integrator = spec.contact.kind, spec.integrator.kind
+    if integrator == "event-located" and contact != "impact":
+        raise Refusal(
+            "integrator.kind",
+            f"event-located finds the time of an impact, but the contact is a {contact}",
+            'Set contact.kind to "impact", or integrator.kind to "semi-implicit-euler"',
+        )
+    if contact != "penalty" and spec.contact.hysteresis is not None:
+        raise Refusal(
+            "contact.hysteresis",
+            f"contact.hysteresis has no meaning for {contact}, whose contact ends within the step",
+            'Remove it, or set contact.kind to "penalty"; a solver\'s hysteresis is stop.enter',
+        )
+    control = spec.flight.control
+    if isinstance(control, ball.ValuesControl) and len(control.values) != spec.integrator.steps:
+        raise Refusal(
+            "flight.control.values",
+            f"flight.control.values has {len(control.values)} numbers for {spec.integrator.steps} steps",
+            "Give one per step",
+        )
+    if integrator == "event-located" and control.kind not in ("none", "constant"):
+        raise Refusal(
+            "flight.control.kind",
+            f"the flight between impacts is a parabola only under constant acceleration, not under {control.kind}",
+            'Set flight.control.kind to "none" or "constant", or choose another integrator',
+        )
+
+
+def _stop(spec: ball.BallSpec) -> None:
+    solves = spec.contact.kind == "projection" or spec.integrator.kind == "implicit-midpoint"
+    if spec.stop is None:
+        if solves:
+            what = "a projection" if spec.contact.kind == "projection" else "implicit-midpoint"
+            raise Refusal(
+                "stop",
+                f"table [stop] missing; {what} iterates until it is told to stop",
+                'Add for example [stop] with rule = "sum", tol = 1e-6, max_iter = 100',
+            )
+        return
+    if not solves:
+        raise Refusal(
+            "stop",
+            f"[stop] has no meaning here: {spec.contact.kind} with {spec.integrator.kind} iterates nothing",
+            'Remove the table, or set contact.kind to "projection"',
+        )
+    if isinstance(spec.stop, ball.FixedRule):
+        return
+    if spec.stop.enter is not None and spec.stop.enter < spec.stop.tol:
+        raise Refusal(
+            "stop.enter",
+            f"stop.enter = {spec.stop.enter:g} is below stop.tol = {spec.stop.tol:g}: a solve would start that "
+            "is over before it begins",
+            "Make enter at least tol",
+        )
+    if isinstance(spec.stop, ball.RelativeRule) and spec.stop.tol >= 1:
+        raise Refusal(
+            "stop.tol",
+            f"stop.tol = {spec.stop.tol:g} of the first residual is never above it, so nothing is ever solved",
+            "A relative tolerance is below 1",
+        )
+
+
+def _convergence(spec: ball.BallSpec) -> None:
+    contact = spec.contact
+    if not isinstance(contact, ball.ProjectionContact):
+        return
+    product = contact.alpha * contact.k
+    if product >= 2:
+        raise Refusal(
+            "contact.k",
+            f"alpha k = {contact.alpha:g} × {contact.k:g} = {product:g}: an iteration multiplies the height by "
+            f"1 - alpha k = {1 - product:g}, so the projection cannot converge",
+            f"Make alpha k smaller than 2, with k = {contact.k:g} alpha below {2 / contact.k:.4g}; "
+            "below 1 it does not overshoot either",
+        )
+
+
+def _values(spec: ball.BallSpec) -> Iterator[tuple[str, float, str, str]]:
+    """Every number with a role: key, value, format, and the key of that format."""
+    precision = spec.precision
+    arithmetic = (precision.arithmetic, "precision.arithmetic")
+    state = (precision.state, "precision.state")
+    yield ("integrator.timestep", spec.integrator.timestep, *arithmetic)
+    yield ("flight.gravity", spec.flight.gravity, *arithmetic)
+    for name, value in spec.contact.model_dump(exclude={"kind", "hysteresis"}).items():
+        yield (f"contact.{name}", value, *arithmetic)
+    for name in ("height", "velocity"):
+        value = getattr(spec.start, name)
+        for item in value if isinstance(value, tuple) else (value,):
+            yield (f"start.{name}", item, *state)
+
+
+def _representable(spec: ball.BallSpec) -> None:
+    stop = spec.stop
+    if stop is not None and not isinstance(stop, ball.FixedRule):
+        relative = isinstance(stop, ball.RelativeRule)
+        roles = ["decision"] if relative else ["decision", "accumulate", "state"]
+        if stop.rule in ("per-instance", "maximum"):
+            roles = ["decision", "state"]
+        for role in roles:
+            format = getattr(spec.precision, role)
+            for key, value in (("stop.tol", stop.tol), ("stop.enter", stop.enter)):
+                if value is None or smallest(format) <= value <= largest(format):
+                    continue
+                if value > largest(format):
+                    raise Refusal(
+                        key,
+                        f"{key} = {value:g} is above the largest {format}, {largest(format):.4g}, which "
+                        f"precision.{role} asks for",
+                        f"Make it smaller, or precision.{role} wider",
+                    )
+                raise Refusal(
+                    key,
+                    f"{key} = {value:g} cannot be told from 0 in {format}, which precision.{role} asks for: no "
+                    "residual but 0 would be below it",
+                    f"The smallest usable tolerance is {smallest(format):.3g}; or make precision.{role} wider",
+                )
+    for key, value, format, role in _values(spec):
+        if abs(value) > largest(format):
+            raise Refusal(
+                key,
+                f"{key} = {value:g} is above the largest {format}, {largest(format):.4g}, which {role} asks for",
+                f"Make it smaller, or {role} wider",
+            )
+        if 0 < abs(value) < smallest(format):
+            raise Refusal(
+                key,
+                f"{key} = {value:g} is 0 in {format}, which {role} asks for; the smallest is {smallest(format):.3g}",
+                f"Make it larger, or {role} wider",
+            )
+
+
+def _reduction(spec: ball.BallSpec) -> None:
+    precision = spec.precision
+    if precision.width is not None and precision.reduction != "blocked":
+        raise Refusal(
+            "precision.width",
+            f"precision.width has no meaning for the reduction {precision.reduction}",
+            'Remove it, or set precision.reduction to "blocked"',
+        )
+    if precision.reduction == "blocked" and precision.width is None:
+        raise Refusal(
+            "precision.reduction", "a blocked reduction needs a width", "Add `width = 4`, terms per block"
+        )
+
+
+def _loss_and_gradient(spec: ball.BallSpec) -> None:
+    loss, kind = spec.loss, spec.contact.kind
+    if loss.kind == "residual-penetration" and kind != "projection":
+        raise Refusal(
+            "loss.kind",
+            f"residual-penetration is what a projection's solver leaves, but the contact is a {kind}",
+            'Set loss.kind to "final-height"',
+        )
+    if loss.target is not None and loss.kind != "final-height":
+        raise Refusal(
+            "loss.target", f"loss.target has no meaning for {loss.kind}", 'Remove it, or use "final-height"'
+        )
+    known = (*PARAMETERS[kind], *ALWAYS)
+    for name in spec.gradient.of:
+        if name not in known:
+            raise Refusal(
+                "gradient.of",
+                f"gradient.of names {name}, which {kind} does not have",
+                f"It has {', '.join(known)}",
+            )
+        if name == "tol" and (spec.stop is None or isinstance(spec.stop, ball.FixedRule)):
+            raise Refusal(
+                "gradient.of",
+                "gradient.of names tol, but the rule is fixed",
+                "Remove it, or use another rule",
+            )
+
+
+def _warnings(spec: ball.BallSpec) -> Iterator[Warning]:
+    stop, contact = spec.stop, spec.contact
+    if (
+        isinstance(contact, ball.ProjectionContact)
+        and stop is not None
+        and not isinstance(stop, ball.FixedRule)
+    ):
+        height = (
+            max(map(abs, spec.start.height), default=0.0)
+            if isinstance(spec.start.height, tuple)
+            else abs(spec.start.height)
+        )
+        # a height below the floor comes from a subtraction at the scale of the height a step before
+        speed = np.sqrt(2 * spec.flight.gravity * height)
+        scale = max(float(speed) * spec.integrator.timestep, 0.0)
+        unit = spacing(scale, spec.precision.state) if scale else 0.0
+        if spec.start.boundary is None and stop.rule != "relative" and stop.tol < unit:
+            yield Warning(
+                "tolerance-below-rounding",
+                "The tolerance is below the rounding of the heights",
+                f"stop.tol = {stop.tol:g}, but a height one step of {scale:.2g} m away from the floor is known to "
+                f"{unit:.2g} m in {spec.precision.state}: iterations past that resolve rounding errors.",
+                f"Raise stop.tol to {unit:.1g}, or make precision.state wider",
+            )
+        product = contact.alpha * contact.k
+        if product > 1:
+            yield Warning(
+                "projection-overshoots",
+                "The projection overshoots",
+                f"alpha k = {product:g} is above 1: one iteration lifts a ball to {product - 1:.3g} times its "
+                "penetration above the floor, and the solve ends there.",
+                "Make alpha k at most 1",
+            )
+    if isinstance(contact, ball.PenaltyContact):
+        stiff = spec.integrator.timestep * np.sqrt(contact.k)
+        if stiff > 2 and spec.integrator.kind in ("semi-implicit-euler", "velocity-verlet", "explicit-euler"):
+            yield Warning(
+                "step-beyond-stability",
+                "The time step is beyond the stability limit of the contact",
+                f"h sqrt(k) = {stiff:.3g}; {spec.integrator.kind} is stable in contact up to "
+                f"{'0' if spec.integrator.kind == 'explicit-euler' else '2'}.",
+                f"Make the timestep smaller than {2 / np.sqrt(contact.k):.3g} s, or use implicit-midpoint",
+            )
