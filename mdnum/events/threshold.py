@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from typing import Any
+
 import numpy as np
 
 from mdnum.errors import InputError
@@ -19,12 +21,13 @@ class Threshold:
     and on comparing r or r², and then on pairs that sit at the cutoff.
 
     Attributes:
-        value: the threshold in the quantity's own space, exactly as the program compares it.
+        value: the threshold in the quantity's own space, exactly as the program compares it: a number, or an
+            array that a compiled program is given.
         comparison: "<" or "<=": the decision is yes when `quantity comparison value`.
         space: name of the quantity's space, for example "r", "r2" or "height".
     """
 
-    value: float
+    value: Any
     comparison: str = "<"
     space: str = "r"
 

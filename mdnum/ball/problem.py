@@ -1,0 +1,156 @@
+"""A rollout with a loss: a function of named parameters, and what is differentiated."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from mdnum.ball.losses import FinalHeight, Loss
+from mdnum.ball.rollout import BallRun, simulate
+from mdnum.ball.state import Decisions
+from mdnum.ball.world import World
+
+#: Parameters of the start rather than of the world; a value moves the whole batch.
+START = ("y0", "v0")
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A world, a start, a number of steps and a loss.
+
+    Attributes:
+        world: the program.
+        y0: heights at the start, m, a number or shape (balls,).
+        v0: velocities at the start, m/s, a number or shape (balls,).
+        steps: steps to make.
+        loss: of the rollout.
+    """
+
+    world: World
+    y0: Any
+    v0: Any = 0.0
+    steps: int = 100
+    loss: Loss = field(default_factory=FinalHeight)
+
+    def with_values(self, values: Mapping[str, Any]) -> Problem:
+        """The same problem with other values of named parameters, start values included."""
+        start = {name: values[name] for name in START if name in values}
+        rest = {name: value for name, value in values.items() if name not in START}
+        return replace(self, world=self.world.with_values(rest), **start)
+
+    def values(self, names: Sequence[str]) -> dict[str, Any]:
+        """Current values of named parameters.
+
+        Raises:
+            InputError: there is none of a name.
+        """
+        return {
+            name: jnp.asarray(getattr(self, name)) if name in START else jnp.asarray(self.world.value(name))
+            for name in names
+        }
+
+    def value(self, overrides: Mapping[str, Any] | None = None) -> float:
+        """The loss."""
+        return float(_loss(self._bare(), self.world, *self._start(), dict(overrides or {}), None))
+
+    def function(self, names: Sequence[str]) -> Callable[[Mapping[str, Any]], Float[Array, ""]]:
+        """The loss as a function of the named parameters, to be traced, differentiated and jitted by JAX.
+
+        The world's other numbers are constants of the function. Inside a jit of your own pass them as
+        arguments instead (`loss_of`), or the compiler folds the fences away.
+        """
+        self.values(names)
+        bare, world, start = self._bare(), self.world, self._start()
+
+        def loss(values: Mapping[str, Any]) -> Float[Array, ""]:
+            return _loss(bare, world, *start, dict(values), None)
+
+        return loss
+
+    def value_and_grad(
+        self, names: Sequence[str], told: Decisions | None = None
+    ) -> tuple[float, dict[str, float]]:
+        """Loss and derivative along each named parameter, through the iterations that ran.
+
+        Args:
+            names: a batch moves as a whole along y0 and v0.
+            told: decisions of every step to act on instead of its own, leading axis steps.
+
+        Error: rounding of the reverse pass in the dtypes of the policy.
+        """
+        values = {name: jnp.zeros((), jnp.float64) for name in names if name in START}
+        values |= {name: jnp.asarray(self.world.value(name)) for name in names if name not in START}
+        loss, slopes = _value_and_grad(self._bare(), values, self.world, *self._start(), told)
+        return float(loss), {name: float(slope) for name, slope in slopes.items()}
+
+    def run(self, **options: Any) -> BallRun:
+        """Simulate it; see `simulate`."""
+        return simulate(self.world, self.world.start(self.y0, self.v0), self.steps, **options)
+
+    def _bare(self) -> tuple[int, Loss]:
+        return self.steps, self.loss
+
+    def _start(self) -> tuple[Array, Array]:
+        y = jnp.atleast_1d(jnp.asarray(self.y0))
+        y = y if jnp.issubdtype(y.dtype, jnp.floating) else y.astype(jnp.float64)
+        return y, jnp.asarray(self.v0).astype(y.dtype)
+
+
+def loss_of(
+    world: World,
+    y0: Float[Array, "balls"],
+    v0: Float[Array, "..."],
+    steps: int,
+    loss: Loss,
+    told: Decisions | None = None,
+) -> Float[Array, ""]:
+    """The loss of a rollout, traceable; every argument but steps and loss may be differentiated.
+
+    Args:
+        told: decisions of every step, leading axis steps; its own when None.
+
+    Returns:
+        the loss in the dtype of its role.
+    """
+    dtype = world.policy.dtype("loss")
+
+    def step(carry, given):
+        state, total = carry
+        state, record = world.advance(state, told=given)
+        return (state, total + loss.step(state, record, dtype)), None
+
+    start = (world.start(y0, v0), jnp.zeros((), dtype))
+    (state, total), _ = lax.scan(step, start, told, length=steps)
+    return loss.end(state, steps, total)
+
+
+def _apply(bare, world, y0, v0, values, told, shifts=False):
+    steps, loss = bare
+    rest = {name: value for name, value in values.items() if name not in START}
+    world = world.with_values(rest)
+    for name in START:
+        if name in values:
+            value = jnp.asarray(values[name])
+            old = y0 if name == "y0" else v0
+            new = old + value.astype(old.dtype) if shifts else value.astype(old.dtype)
+            y0, v0 = (new, v0) if name == "y0" else (y0, new)
+    return loss_of(world, jnp.atleast_1d(y0), v0, steps, loss, told)
+
+
+@eqx.filter_jit
+def _loss(bare, world, y0, v0, values, told):
+    return _apply(bare, world, y0, v0, values, told)
+
+
+@eqx.filter_jit
+def _value_and_grad(bare, values, world, y0, v0, told):
+    return jax.value_and_grad(lambda given: _apply(bare, world, y0, v0, given, told, shifts=True))(values)
+
+

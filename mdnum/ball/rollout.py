@@ -1,0 +1,268 @@
+"""Running balls: a compiled loop in chunks, and the record on the host."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+from jax import lax
+from jaxtyping import Bool, Float, Int
+
+from mdnum.ball.contacts import Penalty
+from mdnum.ball.state import BallState, Decisions, Reason
+from mdnum.ball.world import World
+from mdnum.errors import InputError
+from mdnum.events import Ledger, changes_in_time
+from mdnum.precision.bounds import gamma
+
+#: Balls times steps that leave the device at once.
+_CHUNK = 2**21
+#: Of the record, what is kept only with `keep`.
+_STATES = ("y", "v", "height")
+
+
+@dataclass(frozen=True)
+class BallRun:
+    """A finished rollout; row s of what belongs to a step is the step that made state s + 1.
+
+    Attributes:
+        world: the program.
+        steps, balls: of the rollout.
+        y, v: heights (m) and velocities (m/s), shape (steps + 1, balls), in the dtype of the state; only
+            the first and the last row where states were not kept.
+        height: what each contact decision compared with zero, shape (steps, balls), or empty.
+        contact: the decisions, shape (steps, balls).
+        iterations, reason, residual, margin, before: of the step's solver (see `state.Solve`), shape
+            (steps,) where one rule stops all balls, else (steps, balls).
+        history: residual at every stop decision, shape (steps, max_iter + 1), or None.
+        contacts: every contact flip; the subject is the ball, the margin minus the height. Its jump is the
+            change of mechanical energy per mass over the step in which an impact or a projection resets the
+            velocity, and 0 for a penalty, whose energy is continuous.
+    """
+
+    world: World
+    steps: int
+    balls: int
+    y: Float[np.ndarray, "rows balls"]
+    v: Float[np.ndarray, "rows balls"]
+    height: Float[np.ndarray, "kept balls"]
+    contact: Bool[np.ndarray, "steps balls"]
+    iterations: Int[np.ndarray, "steps ..."]
+    reason: Int[np.ndarray, "steps ..."]
+    residual: Float[np.ndarray, "steps ..."]
+    margin: Float[np.ndarray, "steps ..."]
+    before: Float[np.ndarray, "steps ..."]
+    history: Float[np.ndarray, "steps decisions"] | None
+    contacts: Ledger
+
+    @property
+    def kept(self) -> bool:
+        """Whether every state is there."""
+        return len(self.y) == self.steps + 1
+
+    @property
+    def h(self) -> float:
+        """Time step, s."""
+        return float(self.world.integrator.h)
+
+    @cached_property
+    def time(self) -> Float[np.ndarray, "times"]:
+        """Time of each state, s, shape (steps + 1,)."""
+        return np.arange(self.steps + 1) * self.h
+
+    @cached_property
+    def first_contact(self) -> Int[np.ndarray, "balls"]:
+        """The step (from 1) of each ball's first contact decision that was yes; -1 where there was none."""
+        touched = self.contact.any(axis=0)
+        return np.where(touched, self.contact.argmax(axis=0) + 1, -1)
+
+    @property
+    def stop_margin(self) -> Float[np.ndarray, "steps ..."]:
+        """Threshold minus residual at the last stop decision of each step; NaN where nothing is solved."""
+        return self.margin
+
+    @property
+    def final(self) -> tuple[np.ndarray, np.ndarray]:
+        """Height and velocity at the end."""
+        return self.y[-1], self.v[-1]
+
+    @cached_property
+    def energy(self) -> Float[np.ndarray, "rows balls"]:
+        """Mechanical energy per mass, (m/s)², of each state that was kept."""
+        return energy(self.world, self.y, self.v)
+
+    def ended(self) -> dict[str, int]:
+        """How many solves ended for which reason."""
+        codes, counts = np.unique(self.reason, return_counts=True)
+        return {Reason(code).word: int(n) for code, n in zip(codes, counts, strict=True)}
+
+    def told(self) -> Decisions:
+        """The decisions of all steps, to be told to another rollout."""
+        return Decisions(self.contact, self.iterations)  # type: ignore[arg-type]
+
+
+def energy(world: World, y: np.ndarray, v: np.ndarray) -> Float[np.ndarray, "..."]:
+    """Mechanical energy per mass, (m/s)²: kinetic, gravity, and the spring of a penalty contact.
+
+    Error: evaluated in float64; a softplus contact is counted as the spring it approximates.
+    """
+    y, v = np.asarray(y, np.float64), np.asarray(v, np.float64)
+    total = float(world.gravity) * y + 0.5 * v * v
+    if isinstance(world.contact, Penalty):
+        total = total + 0.5 * float(world.contact.k) * np.minimum(y, 0.0) ** 2
+    return total
+
+
+def simulate(
+    world: World,
+    start: BallState,
+    steps: int,
+    *,
+    history: bool = False,
+    keep: bool = True,
+    told: Decisions | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> BallRun:
+    """Advance a batch of balls and record every decision.
+
+    Args:
+        world: the program.
+        start: from `world.start`.
+        steps: steps to make.
+        history: keep the residual of every stop decision too.
+        keep: keep every state; otherwise the first and the last, and the flips.
+        told: decisions of every step to act on instead of the world's own, leading axis steps.
+        progress: called with the steps made and asked for.
+
+    Returns:
+        the record, on the host.
+
+    Raises:
+        InputError: steps below 1.
+    """
+    if steps < 1:
+        raise InputError(f"steps = {steps}; expected at least 1")
+    balls = start.y.shape[0]
+    chunk = max(1, min(steps, _CHUNK // max(balls, 1)))
+    parts: list[dict[str, np.ndarray]] = []
+    ledgers: list[dict[str, np.ndarray]] = []
+    state, made = start, 0
+    before = np.asarray(start.touching)
+    y_rows, v_rows = [np.asarray(start.y)[None]], [np.asarray(start.v)[None]]
+    while made < steps:
+        length = min(chunk, steps - made)
+        given = None if told is None else jax.tree.map(lambda x: x[made : made + length], told)  # noqa: B023
+        state, out = _chunk(world, state, given, length, history)
+        rows = {name: np.asarray(value) for name, value in out.items()}
+        ledgers.append(_flips(world, made, before, y_rows[-1][-1], v_rows[-1][-1], rows))
+        before = rows["contact"][-1]
+        last = slice(None) if keep else slice(-1, None)
+        y_rows.append(rows["y"][last])
+        v_rows.append(rows["v"][last])
+        parts.append({name: value for name, value in rows.items() if keep or name not in _STATES})
+        made += length
+        if progress is not None:
+            progress(made, steps)
+    if not keep:
+        y_rows, v_rows = [y_rows[0], y_rows[-1]], [v_rows[0], v_rows[-1]]
+
+    def whole(name: str) -> np.ndarray:
+        return np.concatenate([part[name] for part in parts])
+
+    return BallRun(
+        world=world,
+        steps=steps,
+        balls=balls,
+        y=np.concatenate(y_rows),
+        v=np.concatenate(v_rows),
+        height=whole("height") if keep else np.zeros((0, balls), y_rows[0].dtype),
+        contact=whole("contact"),
+        iterations=whole("iterations"),
+        reason=whole("reason"),
+        residual=whole("residual"),
+        margin=whole("margin"),
+        before=whole("before"),
+        history=whole("history") if history else None,
+        contacts=Ledger(
+            channel="contact",
+            **{name: np.concatenate([one[name] for one in ledgers]) for name in _LEDGER},
+            extra={"velocity": np.concatenate([one["velocity"] for one in ledgers])},
+        ),
+    )
+
+
+_LEDGER = ("step", "subject", "entered", "margin", "bound", "jump")
+
+
+@eqx.filter_jit
+def _chunk(world: World, state: BallState, told: Any, length: int, history: bool) -> Any:
+    def step(state, given):
+        after, record = world.advance(state, told=given, history=history)
+        solve = record.solve
+        row = {
+            "y": after.y,
+            "v": after.v,
+            "height": record.height,
+            "contact": record.contact,
+            "iterations": solve.iterations,
+            "reason": solve.reason,
+            "residual": solve.residual,
+            "margin": solve.margin,
+            "before": solve.before,
+        }
+        return after, row | ({"history": solve.history} if history else {})
+
+    return lax.scan(step, state, told, length=length)
+
+
+def _flips(
+    world: World,
+    made: int,
+    before: np.ndarray,
+    y: np.ndarray,
+    v: np.ndarray,
+    rows: dict[str, np.ndarray],
+) -> dict[str, np.ndarray]:
+    """The rows of the ledger of one chunk.
+
+    Args:
+        made: steps made before it.
+        before: contact decisions ahead of it.
+        y, v: the state ahead of it.
+        rows: its record.
+    """
+    contact = rows["contact"]
+
+    def packed(bits: np.ndarray) -> np.ndarray:
+        return np.packbits(bits, axis=-1, bitorder="little")[..., None]
+
+    row, ball, _, now = changes_in_time(packed(before), packed(contact))
+    height = rows["height"][row, ball].astype(np.float64)
+    first = row == 0
+    y_old = np.where(first, y[ball], rows["y"][row - 1, ball]).astype(np.float64)
+    v_old = np.where(first, v[ball], rows["v"][row - 1, ball]).astype(np.float64)
+    h = float(world.integrator.h)
+    free = abs(float(world.gravity))
+    # four roundings on the way from the state before to the height that is compared, none cancelling more
+    # than the sum of its parts
+    bound = gamma(4, world.policy.dtype("arithmetic")) * (np.abs(y_old) + h * np.abs(v_old) + h * h * free)
+    entered = now == 1
+    y_new, v_new = rows["y"][row, ball], rows["v"][row, ball]
+    jump = energy(world, y_new, v_new) - energy(world, y_old, v_old)
+    resets = entered & (not isinstance(world.contact, Penalty))
+    lift = 0.0 if world.lift is None else float(world.lift)
+    return {
+        "step": row + made + 1,
+        "subject": ball[:, None],
+        "entered": entered,
+        # a contact that ends was decided against the threshold for leaving
+        "margin": np.where(entered, 0.0, lift) - height,
+        "bound": bound,
+        "jump": np.where(resets, jump, 0.0),
+        "velocity": v_old,
+    }

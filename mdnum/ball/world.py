@@ -1,0 +1,243 @@
+"""The bouncing ball as a program: decide outside, act inside (the contract of mdnum.dynamics)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from mdnum.ball import checks
+from mdnum.ball.contacts import Contact, Motion
+from mdnum.ball.integrators import Balls, Integrator, Rounding
+from mdnum.ball.state import BallState, Decisions, Record
+from mdnum.errors import InputError
+from mdnum.events import Hysteresis, Threshold
+from mdnum.precision.exact import zero_bits
+from mdnum.precision.policy import RolePrecision
+
+#: Where each parameter lives; the first place that a world has is meant.
+_PLACES: Mapping[str, tuple[tuple[str, ...], ...]] = {
+    "k": (("contact", "k"),),
+    "damping": (("contact", "damping"),),
+    "eps": (("contact", "eps"),),
+    "alpha": (("contact", "alpha"),),
+    "restitution": (("contact", "restitution"),),
+    "rest_speed": (("contact", "rest_speed"),),
+    "tol": (("contact", "stop", "tol"), ("contact", "stop", "rule", "tol"), ("integrator", "stop", "tol")),
+    "enter": (("contact", "stop", "enter"),),
+    "h": (("integrator", "h"),),
+    "gravity": (("gravity",),),
+    "lift": (("lift",),),
+}
+#: Compared in the dtype of decisions, so not rounded to the dtype of arithmetic before.
+_DECIDING = ("tol", "enter")
+
+
+class World(eqx.Module):
+    """Balls over a floor at height 0: everything that a step depends on, apart from the state.
+
+    Made by `World.create`, which checks ranges and casts every number to its role's dtype. To be passed
+    into jit as an argument and not closed over: what a compiler knows to be zero it may fold away.
+
+    Attributes:
+        contact: what happens at the floor.
+        integrator: how a step is made.
+        gravity: m/s², downward positive.
+        control: acceleration added in each step, m/s², shape (steps,) or (steps, balls); None for none.
+        lift: height, m, at which a contact ends that began below 0; None for no hysteresis.
+        rounding: the fence.
+        policy: dtype by role.
+    """
+
+    contact: Contact
+    integrator: Integrator
+    gravity: Any
+    control: Any
+    lift: Any
+    rounding: Rounding
+    policy: RolePrecision = eqx.field(static=True)
+
+    @classmethod
+    def create(
+        cls,
+        contact: Contact,
+        integrator: Integrator,
+        gravity: float = 9.81,
+        control: Any = None,
+        policy: RolePrecision | None = None,
+        hysteresis: float | None = None,
+    ) -> World:
+        """A world with its numbers checked and cast.
+
+        Args:
+            contact, integrator: with plain numbers.
+            gravity: m/s².
+            control: shape (steps,) or (steps, balls), m/s².
+            policy: dtype by role; float64 throughout when None.
+            hysteresis: height, m, at which a contact ends; None for 0.
+
+        Raises:
+            InputError: a number out of range, or parts that do not go together.
+        """
+        policy = RolePrecision() if policy is None else policy
+        checks.check(contact, integrator, gravity, control, policy, hysteresis)
+        world = cls(
+            contact, integrator, gravity, control, hysteresis, Rounding(zero_bits(np.float64)), policy
+        )
+        values = {name: world.value(name) for name in _PLACES if world.has(name)}
+        if control is not None:
+            world = eqx.tree_at(lambda w: w.control, world, jnp.asarray(control, policy.dtype("arithmetic")))
+        return world.with_values(values)
+
+    # -- parameters ----------------------------------------------------------------------------------
+
+    def _place(self, name: str) -> tuple[str, ...] | None:
+        for path in _PLACES.get(name, ()):
+            node: Any = self
+            for part in path:
+                node = getattr(node, part, None)
+            if node is not None:
+                return path
+        return None
+
+    def has(self, name: str) -> bool:
+        """Whether this world has a parameter of this name."""
+        return self._place(name) is not None
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the parameters that this world has."""
+        return tuple(name for name in _PLACES if self.has(name))
+
+    def value(self, name: str) -> Any:
+        """A parameter's value.
+
+        Raises:
+            InputError: there is none of that name here.
+        """
+        path = self._place(name)
+        if path is None:
+            raise InputError(
+                f"no parameter called {name!r} here", remedy=f"There are {', '.join(self.parameters)}"
+            )
+        return _get(self, path)
+
+    def with_values(self, values: Mapping[str, Any]) -> World:
+        """The same world with other values; nothing is checked, so values may be traced.
+
+        Raises:
+            InputError: there is no parameter of that name here.
+        """
+        world = self
+        for name, value in values.items():
+            path = self._place(name)
+            if path is None:
+                self.value(name)
+            dtype = np.dtype(np.float64) if name in _DECIDING else self.policy.dtype("arithmetic")
+            cast = jnp.asarray(value).astype(dtype)
+            world = eqx.tree_at(lambda w, path=path: _get(w, path), world, cast)
+        return world
+
+    # -- decide ----------------------------------------------------------------------------------------
+
+    def touches(self, height: Balls, before: Bool[Array, "balls"]) -> Bool[Array, "balls"]:
+        """The contact decision: height < 0, or with hysteresis until height > lift."""
+        height = height.astype(self.policy.dtype("decision"))
+        enter = Threshold(jnp.zeros((), height.dtype), "<", "height")
+        if self.lift is None:
+            return enter.decide(height)
+        leave = Threshold(self.lift.astype(height.dtype), "<=", "height")
+        return Hysteresis(enter, leave).decide(height, before)
+
+    def margins(self, state: BallState) -> Balls:
+        """Signed distances to contact, m: minus the height that the coming step decides on."""
+        return -self.advance(state)[1].height
+
+    def decide(self, state: BallState) -> Decisions:
+        """What the coming step decides."""
+        return self.advance(state)[1].decisions
+
+    # -- act -------------------------------------------------------------------------------------------
+
+    def start(self, y: Any, v: Any = 0.0) -> BallState:
+        """The state at step 0.
+
+        Args:
+            y: heights, m, a number or shape (balls,).
+            v: velocities, m/s, a number or shape (balls,).
+        """
+        dtype, arithmetic = self.policy.dtype("state"), self.policy.dtype("arithmetic")
+        y = jnp.atleast_1d(jnp.asarray(y)).astype(dtype)
+        v = jnp.broadcast_to(jnp.asarray(v).astype(dtype), y.shape)
+        step = jnp.zeros((), jnp.int32)
+        touching = self.touches(y.astype(arithmetic), jnp.zeros(y.shape, bool))
+        a = self.contact.acceleration(
+            y.astype(arithmetic), v.astype(arithmetic), self._free(step, y.shape), touching, self.rounding
+        )
+        return BallState(step, y, v, a, touching)
+
+    def step(self, state: BallState, decisions: Decisions) -> BallState:
+        """The next state, acting on the decisions it is told."""
+        return self.advance(state, told=decisions)[0]
+
+    def advance(
+        self, state: BallState, *, told: Decisions | None = None, history: bool = False
+    ) -> tuple[BallState, Record]:
+        """Decide and act: the bits of `step` with the decisions of `decide`.
+
+        Args:
+            state: at this step.
+            told: decisions to act on instead of its own.
+            history: whether a solver keeps the residual of every decision.
+
+        Returns:
+            the next state, and the record of the step.
+        """
+        arithmetic = self.policy.dtype("arithmetic")
+        moved = self.contact.move(
+            Motion(
+                y=state.y.astype(arithmetic),
+                v=state.v.astype(arithmetic),
+                carried=state.a.astype(arithmetic),
+                free=self._free(state.step, state.y.shape),
+                judge=(lambda height: self.touches(height, state.touching))
+                if told is None
+                else lambda _: told.contact,
+                told=None if told is None else told.iterations,
+                integrator=self.integrator,
+                policy=self.policy,
+                rounding=self.rounding,
+                history=history,
+            )
+        )
+        step = state.step + 1
+        y, v = self._store(moved.y, step, 0), self._store(moved.v, step, 1)
+        record = jax.tree.map(jax.lax.stop_gradient, moved.record)._replace(left=moved.record.left)
+        return BallState(step, y, v, moved.a, moved.record.contact), record
+
+    def _free(self, step: Int[Array, ""], shape: tuple[int, ...]) -> Balls:
+        free = -self.gravity
+        if self.control is not None:
+            # a control that ends before the run does stays at its last value
+            free = self.rounding(self.control[jnp.minimum(step, self.control.shape[0] - 1)] - self.gravity)
+        return jnp.broadcast_to(free, shape)
+
+    def _store(self, x: Balls, step: Int[Array, ""], which: int) -> Balls:
+        dtype = self.policy.dtype("state")
+        if self.policy.rounding == "nearest" or x.dtype == dtype:
+            return self.rounding(x.astype(dtype))
+        from mdnum.precision.formats import stochastic_round
+
+        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(self.policy.seed), step), which)
+        return stochastic_round(x, dtype, key)
+
+
+def _get(node: Any, path: tuple[str, ...]) -> Any:
+    for part in path:
+        node = getattr(node, part)
+    return node
