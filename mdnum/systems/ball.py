@@ -16,10 +16,6 @@ from mdnum.systems.interactions import NonNegative, Table
 
 Positive = Annotated[float, Field(gt=0)]
 FloatName = Literal["float16", "bfloat16", "float32", "float64"]
-ReductionName = Literal[
-    "sequential", "reversed", "permuted", "pairwise", "blocked", "kahan", "neumaier", "sorted", "exact",
-    "fixed-point",
-]  # fmt: skip
 ParameterName = Literal[
     "k", "damping", "eps", "alpha", "tol", "restitution", "gravity", "h", "y0", "v0"
 ]  # fmt: skip
@@ -34,11 +30,31 @@ def _numbers(value: Any) -> Any:
     return tuple(float(item) for item in value) if isinstance(value, list | tuple) else value
 
 
+REDUCTIONS = (
+    "sequential", "reversed", "permuted", "pairwise", "blocked", "kahan", "neumaier", "sorted", "exact",
+    "fixed-point",
+)  # fmt: skip
+NUMBERED = ("permuted", "blocked", "fixed-point")
+"""Reductions that a number may follow, after a colon: the seed, the width of a block, the bits."""
+
+
+def _reduction(value: Any) -> Any:
+    """A reduction in the words of mdnum.precision.reductions.parse, told without importing it (and jax)."""
+    if isinstance(value, str):
+        name, colon, number = value.partition(":")
+        if name in REDUCTIONS and (not colon or (name in NUMBERED and number.isdecimal())):
+            return value
+        shown = ", ".join(f'"{one}:n"' if one in NUMBERED else f'"{one}"' for one in REDUCTIONS)
+        raise PydanticKnownError("literal_error", {"expected": f"one of {shown}"})
+    return value
+
+
 def _tuple(value: Any) -> Any:
     # TOML has arrays only; strict pydantic would refuse a list where a tuple is declared
     return tuple(value) if isinstance(value, list) else value
 
 
+Reduction = Annotated[str, BeforeValidator(_reduction)]
 Numbers = Annotated[float | tuple[float, ...], BeforeValidator(_numbers)]
 
 
@@ -46,7 +62,7 @@ Numbers = Annotated[float | tuple[float, ...], BeforeValidator(_numbers)]
 
 
 class Boundary(Table):
-    """A batch at rest whose penetrations sum to stop.tol exactly: one short of it by an ulp, and many small."""
+    """A batch at rest whose penetrations sum to stop.tol exactly: one an ulp short of it, and many small."""
 
     terms: int = Field(default=8, ge=1, description="how many small penetrations make up the missing ulp")
     format: Literal["float16", "bfloat16", "float32"] = Field(
@@ -155,7 +171,7 @@ class ImpactContact(_Contact):
         default=0.8, description="speed after over speed before an impact (no unit, 0 to 1)"
     )
     rest_speed: NonNegative = Field(
-        default=0.0, description="an impact slower than this leaves the ball at rest (m/s); the Zeno stop"
+        default=1e-6, description="an impact slower than this leaves the ball at rest (m/s); the Zeno stop"
     )
 
 
@@ -201,6 +217,7 @@ class FixedRule(Table):
     count: int = Field(ge=1, description="iterations of every solve")
 
 
+ToleranceRule = SumRule | PerInstanceRule | MaximumRule | RelativeRule
 Stop = Annotated[SumRule | PerInstanceRule | MaximumRule | RelativeRule | FixedRule, Discriminator("rule")]
 
 
@@ -225,9 +242,12 @@ class BallPrecision(Table):
     decision: FloatName = Field(default="float64", description="a residual and the tolerance, where compared")
     accumulate: FloatName = Field(default="float64", description="the sum of the residuals")
     loss: FloatName = Field(default="float64", description="the loss")
-    reduction: ReductionName = Field(default="sequential", description="how the residuals are summed")
-    width: int | None = Field(default=None, ge=2, description="terms per block, for blocked")
-    seed: int = Field(default=0, ge=0, description="of the permuted order and of stochastic rounding")
+    reduction: Reduction = Field(
+        default="sequential",
+        description="how the residuals are summed; a number may follow permuted (its seed), blocked (terms "
+        'per block) and fixed-point (bits): "permuted:3"',
+    )
+    seed: int = Field(default=0, ge=0, description="of stochastic rounding")
     rounding: Literal["nearest", "stochastic"] = Field(
         default="nearest", description="how the state is rounded to its dtype"
     )

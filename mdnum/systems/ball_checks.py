@@ -92,7 +92,6 @@ def check(spec: ball.BallSpec) -> None:
     _stop(spec)
     _convergence(spec)
     _representable(spec)
-    _reduction(spec)
     _loss_and_gradient(spec)
 
 
@@ -134,16 +133,15 @@ def _start(spec: ball.BallSpec) -> None:
         if low != spec.stop.tol:
             raise Refusal(
                 "stop.tol",
-                f"stop.tol = {spec.stop.tol!r} is no {start.boundary.format}, so no sum of {start.boundary.format} "
-                "numbers equals it",
+                f"stop.tol = {spec.stop.tol!r} is no {start.boundary.format}, so no sum of them equals it",
                 f"Set it to the nearest one, tol = {low!r}",
             )
         share = spacing(np.nextafter(low, 0.0), start.boundary.format) / start.boundary.terms
         if share < smallest(start.boundary.format):
             raise Refusal(
                 "start.boundary.terms",
-                f"an ulp of the tolerance in {start.boundary.terms} parts gives {share:g}, below the smallest "
-                f"{start.boundary.format}, {smallest(start.boundary.format):.3g}",
+                f"an ulp of the tolerance in {start.boundary.terms} parts gives {share:g}, below the "
+                f"smallest {start.boundary.format}, {smallest(start.boundary.format):.3g}",
                 "Use fewer terms or a larger stop.tol",
             )
         return
@@ -206,7 +204,7 @@ def _combination(spec: ball.BallSpec) -> None:
     if integrator == "event-located" and control.kind not in ("none", "constant"):
         raise Refusal(
             "flight.control.kind",
-            f"the flight between impacts is a parabola only under constant acceleration, not under {control.kind}",
+            f"the flight between impacts is a parabola under constant acceleration, not under {control.kind}",
             'Set flight.control.kind to "none" or "constant", or choose another integrator',
         )
 
@@ -233,14 +231,14 @@ def _stop(spec: ball.BallSpec) -> None:
     if spec.stop.enter is not None and spec.stop.enter < spec.stop.tol:
         raise Refusal(
             "stop.enter",
-            f"stop.enter = {spec.stop.enter:g} is below stop.tol = {spec.stop.tol:g}: a solve would start that "
-            "is over before it begins",
+            f"stop.enter = {spec.stop.enter:g} is below stop.tol = {spec.stop.tol:g}: a solve would start "
+            "that is over before it begins",
             "Make enter at least tol",
         )
     if isinstance(spec.stop, ball.RelativeRule) and spec.stop.tol >= 1:
         raise Refusal(
             "stop.tol",
-            f"stop.tol = {spec.stop.tol:g} of the first residual is never above it, so nothing is ever solved",
+            f"stop.tol = {spec.stop.tol:g} of the first residual is above that residual: nothing is solved",
             "A relative tolerance is below 1",
         )
 
@@ -253,8 +251,8 @@ def _convergence(spec: ball.BallSpec) -> None:
     if product >= 2:
         raise Refusal(
             "contact.k",
-            f"alpha k = {contact.alpha:g} × {contact.k:g} = {product:g}: an iteration multiplies the height by "
-            f"1 - alpha k = {1 - product:g}, so the projection cannot converge",
+            f"alpha k = {contact.alpha:g} × {contact.k:g} = {product:g}: an iteration multiplies the height "
+            f"by 1 - alpha k = {1 - product:g}, so the projection cannot converge",
             f"Make alpha k smaller than 2, with k = {contact.k:g} alpha below {2 / contact.k:.4g}; "
             "below 1 it does not overshoot either",
         )
@@ -278,55 +276,52 @@ def _values(spec: ball.BallSpec) -> Iterator[tuple[str, float, str, str]]:
 def _representable(spec: ball.BallSpec) -> None:
     stop = spec.stop
     if stop is not None and not isinstance(stop, ball.FixedRule):
-        relative = isinstance(stop, ball.RelativeRule)
-        roles = ["decision"] if relative else ["decision", "accumulate", "state"]
-        if stop.rule in ("per-instance", "maximum"):
-            roles = ["decision", "state"]
-        for role in roles:
-            format = getattr(spec.precision, role)
-            for key, value in (("stop.tol", stop.tol), ("stop.enter", stop.enter)):
-                if value is None or smallest(format) <= value <= largest(format):
-                    continue
-                if value > largest(format):
-                    raise Refusal(
-                        key,
-                        f"{key} = {value:g} is above the largest {format}, {largest(format):.4g}, which "
-                        f"precision.{role} asks for",
-                        f"Make it smaller, or precision.{role} wider",
-                    )
-                raise Refusal(
-                    key,
-                    f"{key} = {value:g} cannot be told from 0 in {format}, which precision.{role} asks for: no "
-                    "residual but 0 would be below it",
-                    f"The smallest usable tolerance is {smallest(format):.3g}; or make precision.{role} wider",
-                )
-    for key, value, format, role in _values(spec):
-        if abs(value) > largest(format):
+        for key, value in (("stop.tol", stop.tol), ("stop.enter", stop.enter)):
+            if value is not None:
+                _tolerance(spec, stop, key, value)
+    for key, value, name, role in _values(spec):
+        if abs(value) > largest(name):
             raise Refusal(
                 key,
-                f"{key} = {value:g} is above the largest {format}, {largest(format):.4g}, which {role} asks for",
+                f"{key} = {value:g} is above the largest {name}, {largest(name):.4g}, which {role} asks for",
                 f"Make it smaller, or {role} wider",
             )
-        if 0 < abs(value) < smallest(format):
+        if 0 < abs(value) < smallest(name):
             raise Refusal(
                 key,
-                f"{key} = {value:g} is 0 in {format}, which {role} asks for; the smallest is {smallest(format):.3g}",
+                f"{key} = {value:g} is 0 in {name}, which {role} asks for; the least is {smallest(name):.3g}",
                 f"Make it larger, or {role} wider",
             )
 
 
-def _reduction(spec: ball.BallSpec) -> None:
-    precision = spec.precision
-    if precision.width is not None and precision.reduction != "blocked":
-        raise Refusal(
-            "precision.width",
-            f"precision.width has no meaning for the reduction {precision.reduction}",
-            'Remove it, or set precision.reduction to "blocked"',
-        )
-    if precision.reduction == "blocked" and precision.width is None:
-        raise Refusal(
-            "precision.reduction", "a blocked reduction needs a width", "Add `width = 4`, terms per block"
-        )
+def _tolerance(spec: ball.BallSpec, stop: ball.ToleranceRule, key: str, value: float) -> None:
+    """Refuse a tolerance that no residual but 0 would be below, or that is no number of a role's format."""
+    gain = 1.0
+    if isinstance(spec.contact, ball.ProjectionContact):
+        gain = min(1.0, spec.contact.alpha * spec.contact.k)
+    roles = ["decision"]
+    if stop.rule == "sum":
+        roles.append("accumulate")
+    if stop.rule != "relative":
+        roles += ["state", "arithmetic"]
+    for role in roles:
+        name = getattr(spec.precision, role)
+        # a penetration whose share alpha k rounds to nothing no longer shrinks
+        least = smallest(name) / (gain if role == "arithmetic" else 1.0)
+        if value > largest(name):
+            raise Refusal(
+                key,
+                f"{key} = {value:g} is above the largest {name}, {largest(name):.4g}, which precision.{role} "
+                "asks for",
+                f"Make it smaller, or precision.{role} wider",
+            )
+        if value < least:
+            raise Refusal(
+                key,
+                f"{key} = {value:g} is too small for {name}, which precision.{role} asks for: no residual "
+                "but 0 would be below it",
+                f"The smallest usable tolerance is {least:.3g}; or make precision.{role} wider",
+            )
 
 
 def _loss_and_gradient(spec: ball.BallSpec) -> None:
@@ -359,25 +354,18 @@ def _loss_and_gradient(spec: ball.BallSpec) -> None:
 
 def _warnings(spec: ball.BallSpec) -> Iterator[Warning]:
     stop, contact = spec.stop, spec.contact
-    if (
-        isinstance(contact, ball.ProjectionContact)
-        and stop is not None
-        and not isinstance(stop, ball.FixedRule)
-    ):
-        height = (
-            max(map(abs, spec.start.height), default=0.0)
-            if isinstance(spec.start.height, tuple)
-            else abs(spec.start.height)
-        )
-        # a height below the floor comes from a subtraction at the scale of the height a step before
-        speed = np.sqrt(2 * spec.flight.gravity * height)
-        scale = max(float(speed) * spec.integrator.timestep, 0.0)
-        unit = spacing(scale, spec.precision.state) if scale else 0.0
-        if spec.start.boundary is None and stop.rule != "relative" and stop.tol < unit:
+    if isinstance(contact, ball.ProjectionContact):
+        # a height just below the floor is the difference of two numbers of the size of one step's fall
+        start = spec.start.height
+        height = max(map(abs, start)) if isinstance(start, tuple) else abs(start)
+        fall = float(np.sqrt(2 * spec.flight.gravity * height)) * spec.integrator.timestep
+        unit = spacing(fall, spec.precision.state) if fall else 0.0
+        absolute = ball.SumRule | ball.PerInstanceRule | ball.MaximumRule
+        if isinstance(stop, absolute) and spec.start.boundary is None and stop.tol < unit:
             yield Warning(
                 "tolerance-below-rounding",
                 "The tolerance is below the rounding of the heights",
-                f"stop.tol = {stop.tol:g}, but a height one step of {scale:.2g} m away from the floor is known to "
+                f"stop.tol = {stop.tol:g}, but after a fall of {fall:.2g} m in a step a height is known to "
                 f"{unit:.2g} m in {spec.precision.state}: iterations past that resolve rounding errors.",
                 f"Raise stop.tol to {unit:.1g}, or make precision.state wider",
             )
@@ -386,17 +374,16 @@ def _warnings(spec: ball.BallSpec) -> Iterator[Warning]:
             yield Warning(
                 "projection-overshoots",
                 "The projection overshoots",
-                f"alpha k = {product:g} is above 1: one iteration lifts a ball to {product - 1:.3g} times its "
-                "penetration above the floor, and the solve ends there.",
+                f"alpha k = {product:g} is above 1: one iteration lifts a ball to {product - 1:.3g} times "
+                "its penetration above the floor, and the solve ends there.",
                 "Make alpha k at most 1",
             )
     if isinstance(contact, ball.PenaltyContact):
-        stiff = spec.integrator.timestep * np.sqrt(contact.k)
-        if stiff > 2 and spec.integrator.kind in ("semi-implicit-euler", "velocity-verlet", "explicit-euler"):
+        stiff = spec.integrator.timestep * float(np.sqrt(contact.k))
+        if stiff > 2 and spec.integrator.kind != "implicit-midpoint":
             yield Warning(
                 "step-beyond-stability",
                 "The time step is beyond the stability limit of the contact",
-                f"h sqrt(k) = {stiff:.3g}; {spec.integrator.kind} is stable in contact up to "
-                f"{'0' if spec.integrator.kind == 'explicit-euler' else '2'}.",
+                f"h sqrt(k) = {stiff:.3g}, and no explicit scheme is stable in contact above 2.",
                 f"Make the timestep smaller than {2 / np.sqrt(contact.k):.3g} s, or use implicit-midpoint",
             )

@@ -143,7 +143,7 @@ def make(source: Source, data: dict[str, Any]) -> BallSystem:
 
 
 def kind_first(spec: Mapping[str, Any]) -> dict[str, Any]:
-    """Put kind (or rule) at the head of each table, where a reader looks for it, and name and about at the top."""
+    """Put kind (or rule) at the head of each table, where readers look for it; name and about at the top."""
     ordered = {key: spec[key] for key in ("name", "about", "world", "units") if key in spec}
     for key, value in spec.items():
         if isinstance(value, Mapping):
