@@ -1,0 +1,275 @@
+"""The closed forms against a ball that mpmath bounces one impact at a time, in 50 digits."""
+
+from __future__ import annotations
+
+import itertools
+
+import mpmath
+import numpy as np
+import pytest
+from mpmath import mp, mpf
+
+from mdnum.ball.exact import ExactImpact, _geometric, _geometric_slope
+from mdnum.ball.exact_penalty import ExactPenalty, _lag, _sine_lag
+from mdnum.errors import InputError
+
+EPS = 2.0**-52
+BALLS = [
+    (1.0, 0.0, 9.81, 0.8),
+    (0.3, -2.5, 9.81, 0.55),
+    (2.0, 3.0, 1.62, 0.95),
+    (0.0, 4.0, 9.81, 0.7),
+    (1e-6, -30.0, 9.81, 0.9),
+    (1.0, 0.5, 9.81, 1.0),
+    (1.0, 0.5, 9.81, 1 - 2.0**-40),
+]
+NAMES = ("y0", "v0", "gravity", "restitution")
+
+
+@pytest.fixture(autouse=True)
+def fifty_digits():
+    with mpmath.workdps(50):
+        yield
+
+
+def bounce(y0, v0, g, e, impacts):
+    """Times and speeds of the impacts, one after another."""
+    speed = mp.sqrt(v0 * v0 + 2 * g * y0)
+    time = (v0 + speed) / g
+    found = [(time, speed)]
+    for _ in range(impacts - 1):
+        speed = e * speed
+        time = time + 2 * speed / g
+        found.append((time, speed))
+    return found
+
+
+def fly(y0, v0, g, e, t, impacts):
+    """Height and velocity at t, which lies after exactly this many impacts."""
+    if impacts == 0:
+        return y0 + v0 * t - g * t * t / 2, v0 - g * t
+    time, speed = bounce(y0, v0, g, e, impacts)[-1]
+    tau = t - time
+    return e * speed * tau - g * tau * tau / 2, e * speed - g * tau
+
+
+def slopes(function, ball):
+    """Derivative with respect to every parameter by mpmath's differences."""
+    exact = [mpf(x) for x in ball]
+    return [
+        mpmath.diff(lambda x, k=k: function(*exact[:k], x, *exact[k + 1 :]), one)
+        for k, one in enumerate(exact)
+    ]
+
+
+def part_of(function, which):
+    """One of the values that a function returns, as a function."""
+    return lambda *p: function(*p)[which]
+
+
+def close(found, exact, ulps, scale=0.0):
+    """Within so many ulps of the exact value, or of a scale where the value itself cancels."""
+    return abs(mpf(float(found)) - exact) <= ulps * EPS * max(abs(exact), mpf(scale))
+
+
+@pytest.mark.parametrize("ball", BALLS)
+@pytest.mark.parametrize("n", [1, 2, 3, 7, 40])
+def test_impacts_and_apexes_with_their_derivatives(ball, n):
+    exact = ExactImpact(*ball)
+    quantities = {
+        "time": (exact.impact_time(n), lambda *p: bounce(*p, n)[-1][0]),
+        "speed": (exact.impact_speed(n), lambda *p: bounce(*p, n)[-1][1]),
+        "apex": (exact.apex(n), lambda *p: (p[3] * bounce(*p, n)[-1][1]) ** 2 / (2 * p[2])),
+    }
+    for what, (found, function) in quantities.items():
+        assert close(found.value, function(*map(mpf, ball)), 10 + 2 * n), what
+        for name, slope in zip(NAMES, slopes(function, ball), strict=True):
+            assert close(found.gradient[name], slope, 20 + 4 * n, scale=1e-40), (what, name)
+
+
+@pytest.mark.parametrize("ball", BALLS[:5])
+def test_the_time_to_rest_is_the_limit_of_the_impact_times(ball):
+    found = ExactImpact(*ball).rest_time()
+
+    def limit(y0, v0, g, e):
+        speed = mp.sqrt(v0 * v0 + 2 * g * y0)
+        return (v0 + speed) / g + mpmath.nsum(lambda n: 2 * speed * e**n / g, [1, mpmath.inf])
+
+    assert close(found.value, limit(*map(mpf, ball)), 20)
+    # by differences of a longer sum than double precision can see
+    long = slopes(lambda *p: bounce(*p, 1500)[-1][0], ball)
+    for name, slope in zip(NAMES, long, strict=True):
+        assert close(found.gradient[name], slope, 40), name
+
+
+@pytest.mark.parametrize("ball", BALLS)
+def test_the_state_between_impacts_with_its_derivatives(ball):
+    exact = ExactImpact(*ball)
+    times = bounce(*map(mpf, ball), 12)
+    starts = [mpf(0)] + [t for t, _ in times]
+    for impacts, (left, right) in enumerate(itertools.pairwise(starts)):
+        for part in (0.13, 0.5, 0.91):
+            t = float(left + part * (right - left))
+            if not left < t < right:  # a flight shorter than an ulp of its time
+                continue
+            assert exact.bounces(t) == impacts
+            y, v = exact.state(t)
+            for found, which, most in ((y, 0, abs(float(v.value))), (v, 1, ball[2])):
+                function = part_of(lambda *p, t=t, n=impacts: fly(*p, mpf(t), n), which)
+                # the promise: the motion at a time some ulps away, and some ulps of the parts summed
+                scale = most * t + abs(float(found.value)) + float(times[0][1]) * (t if which == 0 else 1)
+                assert close(found.value, function(*map(mpf, ball)), 8 + 2 * impacts, scale), (t, which)
+                for name, slope in zip(NAMES, slopes(function, ball), strict=True):
+                    size = scale / max(abs(mpf(ball[NAMES.index(name)])), mpf("1e-3")) * (1 + impacts)
+                    bound = max(abs(slope), size if impacts else 0)
+                    assert close(found.gradient[name], slope, 100 + 10 * impacts, bound), (t, which, name)
+
+
+def test_the_state_is_the_one_after_the_impact_and_rest_is_rest():
+    exact = ExactImpact(1.0, 0.0, 8.0, 0.5)
+    # s = 4, t_1 = 1/2, t_2 = 1, t_3 = 5/4, at rest at 3/2: all exact in binary
+    t = np.array([0.0, 0.5, 1.0, 1.25, 1.375, 1.5, 2.0])
+    assert exact.bounces(t).tolist() == [0, 1, 2, 3, 4, np.inf, np.inf]
+    y, v = exact.state(t)
+    assert y.value.tolist() == [1, 0, 0, 0, 0, 0, 0]
+    assert v.value.tolist() == [0, 2, 1, 0.5, 0.25, 0, 0]
+    assert float(exact.rest_time().value) == 1.5
+    for gradient in (y.gradient, v.gradient):
+        for name in NAMES:
+            assert gradient[name][-2:].tolist() == [0, 0]
+
+
+def test_no_time_is_lost_on_the_way_to_rest():
+    """Whatever the number of impacts, the height stays within the flight and the count grows."""
+    exact = ExactImpact(1.0, 0.0, 9.81, 0.8)
+    rest = float(exact.rest_time().value)
+    t = np.sort(rest * (1 - np.logspace(0, -15.5, 4001)))
+    n = exact.bounces(t)
+    assert np.all(np.diff(n) >= 0) and n[-1] > 100
+    assert np.all(exact.impact_time(np.maximum(n, 1)).value[n > 0] <= t[n > 0])
+    assert np.all(exact.impact_time(n + 1).value >= t)
+    y = exact.height(t).value
+    assert np.all(y >= 0)
+    slack = 4 * EPS * rest * exact.impact_speed(n + 1).value
+    assert np.all(y <= exact.apex(n).value + slack)
+
+
+def test_without_restitution_the_first_impact_is_the_last():
+    exact = ExactImpact(1.0, 0.0, 8.0, 0.0)
+    assert exact.bounces(np.array([0.25, 0.5, 3.0])).tolist() == [0, 1, 1]
+    assert exact.height(np.array([0.25, 0.5, 3.0])).value.tolist() == [0.75, 0, 0]
+    assert float(exact.rest_time().value) == 0.5
+    assert float(exact.rest_time().gradient["restitution"]) == 1.0
+
+
+@pytest.mark.parametrize("e", [0.3, 0.999, 1 - 1e-9, 1 - 2.0**-50])
+@pytest.mark.parametrize("m", [1, 2, 5, 300])
+def test_geometric_sums_next_to_one(e, m):
+    value = sum(mpf(e) ** k for k in range(m))
+    slope = sum(k * mpf(e) ** (k - 1) for k in range(1, m))
+    assert close(_geometric(e, np.float64(m)), value, 8)
+    assert close(_geometric_slope(e, np.float64(m)), slope, 40, scale=1e-40)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [{"y0": -1.0}, {"y0": 0.0}, {"y0": 1.0, "restitution": 1.1}, {"y0": 1.0, "gravity": 0.0}, {"y0": np.nan}],
+)
+def test_what_has_no_exact_motion_is_refused(words):
+    with pytest.raises(InputError):
+        ExactImpact(**words)
+
+
+def test_refusals_name_the_number_and_the_remedy():
+    with pytest.raises(InputError, match="never comes to rest"):
+        ExactImpact(1.0, restitution=1.0).rest_time()
+    with pytest.raises(InputError, match="whole numbers from 1"):
+        ExactImpact(1.0).impact_time(0)
+    with pytest.raises(InputError, match="before the start"):
+        ExactImpact(1.0).height(-0.1)
+    with pytest.raises(InputError, match="k is -1"):
+        ExactPenalty(1.0, k=-1.0)
+
+
+# The spring floor
+
+SPRINGS = [(1.0, 0.0, 9.81, 1e4), (0.3, -2.5, 9.81, 50.0), (2.0, 3.0, 1.62, 1.0), (0.01, 0.0, 9.81, 10.0)]
+SPRING_NAMES = ("y0", "v0", "gravity", "k")
+
+
+def spring(y0, v0, g, k, t):
+    """Height and velocity at t, one arc after another, each from the linear law it obeys."""
+    y, v, now = y0, v0, mpf(0)
+    w = mp.sqrt(k)
+    while True:
+        lasting = (v + mp.sqrt(v * v + 2 * g * y)) / g
+        if now + lasting >= t:
+            tau = t - now
+            return y + v * tau - g * tau * tau / 2, v - g * tau
+        now, y, v = now + lasting, mpf(0), v - g * lasting
+        # height below the floor is A cos(w tau) + B sin(w tau) - g / k; it ends at the next zero
+        a, b = g / k, v / w
+        lasting = (2 * mp.atan2(b, a) + 2 * mp.pi) / w
+        angle = w * min(lasting, t - now)
+        y, v = a * mp.cos(angle) + b * mp.sin(angle) - g / k, v * mp.cos(angle) - a * w * mp.sin(angle)
+        if now + lasting >= t:
+            return y, v
+        now, y = now + lasting, mpf(0)
+
+
+@pytest.mark.parametrize("ball", SPRINGS)
+def test_the_spring_floor_with_its_derivatives(ball):
+    exact = ExactPenalty(*ball)
+    period, lasting = float(exact.period().value), float(exact.duration().value)
+    first = float(exact.contact_time(1).value)
+    begins = [first + m * period for m in range(3)]
+    times = [0.4 * first]
+    for start in begins:
+        times += [start + part * lasting for part in (0.02, 0.4, 0.97)]
+        times += [start + lasting + part * (period - lasting) for part in (0.1, 0.8)]
+    for t in times:
+        y, v = exact.state(t)
+        for found, which in ((y, 0), (v, 1)):
+            function = part_of(lambda *p, t=t: spring(*p, mpf(t)), which)
+            size = 1 + abs(float(found.value))
+            assert close(found.value, function(*map(mpf, ball)), 400, size), (t, which)
+            for name, slope in zip(SPRING_NAMES, slopes(function, ball), strict=True):
+                scale = max(abs(float(g)) for g in (y.gradient[name], v.gradient[name], 0.0))
+                assert close(found.gradient[name], slope, 4000, scale), (t, which, name)
+
+
+@pytest.mark.parametrize("ball", SPRINGS)
+def test_contacts_of_the_spring_floor_with_their_derivatives(ball):
+    exact = ExactPenalty(*ball)
+
+    def speed(y0, v0, g):
+        return mp.sqrt(v0 * v0 + 2 * g * y0)
+
+    def lasting(y0, v0, g, k):
+        """Twice the time to the lowest point, where the tangent of the angle is -s w / g."""
+        return 2 * (mp.pi - mp.atan(speed(y0, v0, g) * mp.sqrt(k) / g)) / mp.sqrt(k)
+
+    def deepest(y0, v0, g, k):
+        return -spring(y0, v0, g, k, (v0 + speed(y0, v0, g)) / g + lasting(y0, v0, g, k) / 2)[0]
+
+    quantities = {
+        "duration": (exact.duration(), lasting),
+        "period": (exact.period(), lambda *p: 2 * speed(*p[:3]) / p[2] + lasting(*p)),
+        "deepest": (exact.deepest(), deepest),
+        "third": (
+            exact.contact_time(3),
+            lambda *p: (p[1] + 5 * speed(*p[:3])) / p[2] + 2 * lasting(*p),
+        ),
+    }
+    for what, (found, function) in quantities.items():
+        assert close(found.value, function(*map(mpf, ball)), 16), what
+        for name, slope in zip(SPRING_NAMES, slopes(function, ball), strict=True):
+            assert close(found.gradient[name], slope, 64, scale=1e-40), (what, name)
+
+
+@pytest.mark.parametrize("x", [1e-12, 1e-3, 0.3, 0.999, 1.001, 3.0])
+def test_small_angles_do_not_cancel(x):
+    with mpmath.workdps(120):
+        z = mpf(x)
+        assert close(_sine_lag(np.float64(x)), mp.sin(z) - z * mp.cos(z), 16)
+        assert close(_lag(np.float64(x)), 1 - mp.cos(z) - z * mp.sin(z) / 2, 64)
