@@ -21,6 +21,7 @@ _CHECKED = [
     "mdnum.precision",
     "mdnum.events",
     "mdnum.md",
+    "mdnum.ball",
     "mdnum.dynamics",
     "mdnum.store",
     "mdnum.systems",

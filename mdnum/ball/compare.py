@@ -61,14 +61,16 @@ def first_difference(a: BallRun, b: BallRun) -> Difference:
     # a rule per ball and a rule for all have counts of other shapes: compare them per ball
     counts = [_per_ball(run) for run in (a, b)]
     stops = counts[0] != counts[1]
-    at = [int(steps.argmax()) if (steps := differ.any(axis=1)).any() else a.steps for differ in (contact, stops)]
+    at = [
+        int(steps.argmax()) if (steps := differ.any(axis=1)).any() else a.steps for differ in (contact, stops)
+    ]
     row = min(at)
     if row == a.steps:
         return Difference(seed, None, "", -1, (np.nan, np.nan), 0, 0, separation)
     channel = "contact" if at[0] <= at[1] else "stop"
     ball = int((contact if channel == "contact" else stops)[row].argmax())
     if channel == "contact":
-        margins = tuple(_contact_margin(run, row, ball) for run in (a, b))
+        margins = _contact_margin(a, row, ball), _contact_margin(b, row, ball)
     else:
         margins = _stop_margins(a, b, row, ball)
         ball = ball if a.iterations.ndim == 2 else -1

@@ -138,9 +138,7 @@ class VelocityVerlet(eqx.Module):
         y, v, half = self._drift(y, v, carried, r)
         contact = push.judge(y)
         a = push.pull(y, v, contact)
-        return Pushed(
-            y, r(v + r(half * a)), a, y, contact, no_solve(push.policy.dtype("decision"))
-        )
+        return Pushed(y, r(v + r(half * a)), a, y, contact, no_solve(push.policy.dtype("decision")))
 
 
 class ImplicitMidpoint(eqx.Module):
@@ -179,7 +177,7 @@ class ImplicitMidpoint(eqx.Module):
             return r(a - value / slope)
 
         free = push.pull(*middle(carried), jnp.zeros(y.shape, bool))
-        free, held = lax.stop_gradient((free, (y, v)))
+        free = lax.stop_gradient(free)
         judge = push.judge
         # which balls touch, and after how many iterations: decided without derivatives
         found, solve = iterate(
@@ -192,7 +190,7 @@ class ImplicitMidpoint(eqx.Module):
             told=push.told,
             history=push.history,
         )
-        contact = judge(middle(lax.stop_gradient(found))[0])
+        contact = judge(middle(found)[0])
         # the same iterations under the decision that was reached: what a step told its decisions does too
         count = solve.iterations if push.told is None else push.told
 
@@ -200,15 +198,12 @@ class ImplicitMidpoint(eqx.Module):
             a, n = carry
             return jnp.where(n < count, lax.stop_gradient(newton(a, contact)), a), n + 1
 
-        a, _ = lax.while_loop(
-            lambda carry: jnp.any(carry[1] < count), body, (free, jnp.zeros((), jnp.int32))
-        )
+        a, _ = lax.while_loop(lambda carry: jnp.any(carry[1] < count), body, (free, jnp.zeros((), jnp.int32)))
         a = lax.stop_gradient(a)
         # one more Newton step has the derivative of the equation; its value is taken off again
         _, slope = jax.jvp(lambda x: defect(x, contact), (a,), (jnp.ones_like(a),))
         more = -defect(a, contact) / lax.stop_gradient(slope)
         a = a + (more - lax.stop_gradient(more))
-        del held
         height, _ = middle(a)
         y, v = self.fly(y, v, a, r)
         return Pushed(y, v, a, height, contact, solve)

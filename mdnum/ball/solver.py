@@ -7,8 +7,8 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
 from jax import lax
+from jaxtyping import Array, Float, Int
 
 from mdnum.ball.state import Reason, Solve
 from mdnum.ball.stopping import Fixed, StopRule, stops

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
 from mdnum.ball import checks
 from mdnum.ball.contacts import Contact, Motion
@@ -114,18 +114,21 @@ class World(eqx.Module):
         """Names of the parameters that this world has."""
         return tuple(name for name in _PLACES if self.has(name))
 
+    def _known(self, name: str) -> tuple[str, ...]:
+        path = self._place(name)
+        if path is None:
+            raise InputError(
+                f"no parameter called {name!r} here", remedy=f"There are {', '.join(self.parameters)}"
+            )
+        return path
+
     def value(self, name: str) -> Any:
         """A parameter's value.
 
         Raises:
             InputError: there is none of that name here.
         """
-        path = self._place(name)
-        if path is None:
-            raise InputError(
-                f"no parameter called {name!r} here", remedy=f"There are {', '.join(self.parameters)}"
-            )
-        return _get(self, path)
+        return _get(self, self._known(name))
 
     def with_values(self, values: Mapping[str, Any]) -> World:
         """The same world with other values; nothing is checked, so values may be traced.
@@ -135,9 +138,7 @@ class World(eqx.Module):
         """
         world = self
         for name, value in values.items():
-            path = self._place(name)
-            if path is None:
-                self.value(name)
+            path = self._known(name)
             dtype = np.dtype(np.float64) if name in _DECIDING else self.policy.dtype("arithmetic")
             cast = jnp.asarray(value).astype(dtype)
             world = eqx.tree_at(lambda w, path=path: _get(w, path), world, cast)
@@ -150,9 +151,9 @@ class World(eqx.Module):
         height = height.astype(self.policy.dtype("decision"))
         enter = Threshold(jnp.zeros((), height.dtype), "<", "height")
         if self.lift is None:
-            return enter.decide(height)
+            return jnp.asarray(enter.decide(height))
         leave = Threshold(self.lift.astype(height.dtype), "<=", "height")
-        return Hysteresis(enter, leave).decide(height, before)
+        return jnp.asarray(Hysteresis(enter, leave).decide(height, before))
 
     def margins(self, state: BallState) -> Balls:
         """Signed distances to contact, m: minus the height that the coming step decides on."""

@@ -85,7 +85,7 @@ class Impact(eqx.Module):
                 return y, v, left, count, still, ahead(y, v, left, count, still)
 
             start = (y, v, left, count, still, ahead(y, v, left, count, still))
-            y, v, left, count, still, hits = lax.while_loop(lambda carry: jnp.any(carry[5]), body, start)
+            y, v, left, count, still, _ = lax.while_loop(lambda carry: jnp.any(carry[5]), body, start)
             # impacts without end inside one step, cut off at the cap: what is left of it is no flight
             capped = (count >= scheme.max_impacts) & (lowest(y, v, a, left, rounding) < 0)
             rise = rounding(left * rounding(v + rounding(rounding(0.5 * left) * a)))

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from mdnum.ball.contacts.base import Motion, Moved
+from mdnum.ball.integrators import Push
 from mdnum.ball.state import Record
 
 
@@ -46,8 +47,6 @@ class Penalty(eqx.Module):
 
     def move(self, motion: Motion) -> Moved:
         """One step of the scheme under this force."""
-        from mdnum.ball.integrators import Push
-
         r = motion.rounding
 
         def pull(y, v, contact):
