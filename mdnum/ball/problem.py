@@ -152,5 +152,3 @@ def _loss(bare, world, y0, v0, values, told):
 @eqx.filter_jit
 def _value_and_grad(bare, values, world, y0, v0, told):
     return jax.value_and_grad(lambda given: _apply(bare, world, y0, v0, given, told, shifts=True))(values)
-
-
