@@ -40,8 +40,8 @@ def _through_integers(x, zero):
 def fence(x: jax.Array, zero: jax.Array) -> jax.Array:
     """x, opaque to fused multiply-add contraction: XLA sees an integer operation with a runtime zero.
 
-    For float16 and bfloat16 it also forces the rounding: between two operations of one fusion XLA keeps
-    float32 values, but an integer operation needs the sixteen bits.
+    It also forces the rounding to float16 and bfloat16: XLA may keep the float32 in which it computed (a
+    bfloat16 product that is widened at once is never rounded on a CPU), but an integer needs the bits.
 
     Source: optimization_barrier and reduce_precision do not stop the contraction on CPU
     (openxla/xla#41579); the exclusive-or with a runtime integer does.

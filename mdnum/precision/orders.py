@@ -13,15 +13,18 @@ The derivative of every reduction is that of the sum: rounding and order have no
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Literal, Protocol
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from mdnum.errors import InputError
+from mdnum.precision.bounds import gamma
 from mdnum.precision.exact import fence, integer_of
 
 Add = Callable[[jax.Array, jax.Array], jax.Array]
@@ -51,6 +54,14 @@ class Reduction(Protocol):
         """
         ...
 
+    def bound(self, terms: Float[np.ndarray, "n ..."]) -> Float[np.ndarray, "..."]:
+        """How far the computed sum can be from the exact one, on the host, in float64.
+
+        Holds as long as no sum overflows or is subnormal (XLA on a CPU flushes subnormals of every dtype but
+        float16 to zero).
+        """
+        ...
+
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _summed(reduction: Whole, terms, zero):
@@ -65,8 +76,12 @@ def _summed_jvp(reduction, primals, tangents):
     return _summed(reduction, terms, zero), jnp.sum(tangents[0], axis=0)
 
 
+# called outside of jit, a sum is one program all the same: operation by operation it would take seconds
+_compiled = partial(jax.jit, static_argnums=0)(_summed)
+
+
 def _data_zero(terms: jax.Array) -> jax.Array:
-    """A zero that the compiler of array operations does not see through: the sign bit of an absolute value."""
+    """A zero that XLA does not see through: the sign bit of an absolute value."""
     integer = integer_of(terms.dtype)
     bits = lax.bitcast_convert_type(jnp.abs(terms.reshape(-1)[0]), integer)
     return lax.shift_right_logical(bits, jnp.asarray(8 * terms.dtype.itemsize - 1, integer))
@@ -89,11 +104,25 @@ class Whole:
         """The sum over the leading axis (see `Reduction`)."""
         if terms.size == 0:
             return jnp.zeros(terms.shape[1:], terms.dtype)
-        return _summed(self, terms, zero)
+        return _compiled(self, terms, zero)
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
         """The sum of at least one term; `add` adds two and rounds."""
         raise NotImplementedError(type(self).__name__)
+
+    def bound(self, terms: Float[np.ndarray, "n ..."]) -> Float[np.ndarray, "..."]:
+        """How far the computed sum can be from the exact one (see `Reduction`)."""
+        depth = self.depth(len(terms))
+        return _chain(depth, terms.dtype) * np.abs(terms.astype(np.float64)).sum(axis=0)
+
+    def depth(self, n: int) -> int:
+        """The most additions that one of n terms goes through."""
+        return max(n - 1, 0)
+
+
+def _chain(depth: int, dtype) -> float:
+    factor = gamma(depth, dtype)
+    return factor if factor >= 0 else np.inf
 
 
 def _adder(zero: jax.Array | None) -> Add:
@@ -123,6 +152,7 @@ class Sequential(Whole):
     order: Literal["forward", "reversed"] = "forward"
 
     def within(self, total, terms):
+        """Forward: add the slots to the carry; reversed: keep them."""
         if self.order == "reversed":
             return super().within(total, terms)
         for term in terms:
@@ -130,9 +160,11 @@ class Sequential(Whole):
         return total, None
 
     def finish(self, total, blocks):
+        """Forward: the carry."""
         return total if self.order == "forward" else super().finish(total, blocks)
 
-    def sum_of(self, terms, add):
+    def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
+        """From zero, one after the other."""
         return in_order(terms[::-1] if self.order == "reversed" else terms, add)
 
 
@@ -163,14 +195,79 @@ def _levels(terms, add, width: int):
 
 
 @dataclass(frozen=True)
-class Pairwise(Whole):
+class Blocked(Whole):
+    """A tree of a given width: each node adds that many neighbors left to right, as a device's blocks do.
+
+    Error: at most gamma_{(width - 1) * levels} * sum |terms|. Width 2 is the balanced tree, a width of at
+    least the number of terms the loop.
+
+    Attributes:
+        width: children of a node, at least 2.
+    """
+
+    width: int = 32
+
+    def __post_init__(self):
+        if self.width < 2:
+            raise InputError(f"a tree of width {self.width} adds nothing", remedy="Give 2 or more.")
+
+    def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
+        """Level by level."""
+        return _levels(terms, add, self.width)
+
+    def depth(self, n: int) -> int:
+        """Width - 1 additions on every level."""
+        levels = 0
+        while n > 1:
+            n, levels = -(-n // self.width), levels + 1
+        return (self.width - 1) * levels
+
+
+@dataclass(frozen=True)
+class Pairwise(Blocked):
     """A balanced tree. Error: at most gamma_{log2 n} * sum |terms| (Higham 2002, 4.6)."""
 
+    width: int = field(default=2, init=False)
+
     def within(self, total, terms):
+        """The tree of the block."""
         return total, _tree(list(terms))
 
     def finish(self, total, blocks):
+        """The tree of the blocks' trees."""
         return _tree(list(jnp.asarray(blocks)))
 
-    def sum_of(self, terms, add):
-        return _levels(terms, add, 2)
+
+@dataclass(frozen=True)
+class Permuted(Whole):
+    """A loop over the terms in a random order: what atomic additions on a device do, made repeatable.
+
+    Attributes:
+        seed: of the order; the same for every sum of as many terms.
+    """
+
+    seed: int = 0
+
+    def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
+        """In the order drawn for this many terms."""
+        order = np.random.default_rng(self.seed).permutation(terms.shape[0])
+        return in_order(terms[order], add)
+
+
+@dataclass(frozen=True)
+class Sorted(Whole):
+    """A loop over the terms by magnitude; equal magnitudes by sign, so no order of arrival matters.
+
+    Smallest first loses least where all terms have one sign (Higham 2002, 4.2), largest first where they
+    cancel.
+
+    Attributes:
+        order: of magnitudes, "ascending" or "descending".
+    """
+
+    order: Literal["ascending", "descending"] = "ascending"
+
+    def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
+        """Sorted along the leading axis, each column by itself."""
+        _, terms = lax.sort((jnp.abs(terms), terms), dimension=0, num_keys=2)
+        return in_order(terms if self.order == "ascending" else terms[::-1], add)

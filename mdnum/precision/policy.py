@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
 
 import ml_dtypes
 import numpy as np
@@ -73,7 +72,7 @@ class RolePrecision:
     decision: str = "float64"
     accumulate: str = "float64"
     loss: str = "float64"
-    rounding: Literal["nearest", "stochastic"] = "nearest"
+    rounding: str = "nearest"
     seed: int = 0
 
     def __post_init__(self):

@@ -1,77 +1,238 @@
-"""The order of a sum, against the same sum written out."""
+"""Every order of a sum, against the same sum written out, rounded after each addition."""
 
 from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import ml_dtypes
 import numpy as np
 import pytest
 from jax import lax
 
 from mdnum.errors import InputError
-from mdnum.precision import PrecisionPolicy
-from mdnum.precision.reductions import BY_NAME, Pairwise, Sequential
+from mdnum.precision.exact import fence, zero_bits
+from mdnum.precision.reductions import (
+    BY_NAME,
+    Blocked,
+    Pairwise,
+    Permuted,
+    Sequential,
+    Sorted,
+    Widened,
+    make,
+    parse,
+)
+
+DTYPES = [np.float64, np.float32, np.float16, ml_dtypes.bfloat16]
 
 
-def tree(values):
-    """A balanced tree written as a recursion over levels: neighbors add, an odd one out waits."""
+def loop(terms):
+    total = np.zeros(terms[0].shape, terms[0].dtype)
+    for term in terms:
+        total = total + term
+    return total
+
+
+def tree(values, width=2):
+    """A tree written as a recursion over levels: neighbors add, a last group may be short."""
     if len(values) == 1:
         return values[0]
-    level = [a + b for a, b in zip(values[0::2], values[1::2], strict=False)]
-    return tree(level + ([values[-1]] if len(values) % 2 else []))
+    level = []
+    for start in range(0, len(values), width):
+        total = values[start]
+        for value in values[start + 1 : start + width]:
+            total = total + value
+        level.append(total)
+    return tree(level, width)
 
 
-def reduce_in_blocks(reduction, terms, block=8):
-    """As the force loop does it: blocks of terms through a scan, inside jit."""
+def kahan(terms):
+    total = lost = np.zeros(terms[0].shape, terms[0].dtype)
+    for term in terms:
+        y = term - lost
+        t = total + y
+        lost = (t - total) - y
+        total = t
+    return total
 
-    def step(total, some):
-        return reduction.within(total, [some[k] for k in range(block)])
+
+def neumaier(terms):
+    total = lost = np.zeros(terms[0].shape, terms[0].dtype)
+    for term in terms:
+        t = total + term
+        lost = lost + np.where(abs(total) >= abs(term), (total - t) + term, (term - t) + total)
+        total = t
+    return total + lost
+
+
+def by_magnitude(terms, descending=False):
+    columns = []
+    for column in terms.reshape(len(terms), -1).T:
+        order = sorted(column, key=lambda v: (abs(float(v)), float(v)), reverse=descending)
+        columns.append(loop(np.array(order, terms.dtype)))
+    return np.array(columns, terms.dtype).reshape(terms.shape[1:])
+
+
+WRITTEN_OUT = [
+    (Sequential(), loop),
+    (Sequential("reversed"), lambda t: loop(t[::-1])),
+    (Permuted(7), lambda t: loop(t[np.random.default_rng(7).permutation(len(t))])),
+    (Pairwise(), lambda t: tree(list(t))),
+    (Blocked(3), lambda t: tree(list(t), 3)),
+    (Blocked(20), lambda t: tree(list(t), 20)),
+    (make("kahan"), kahan),
+    (make("neumaier"), neumaier),
+    (Sorted(), by_magnitude),
+    (Sorted("descending"), lambda t: by_magnitude(t, descending=True)),
+]
+
+
+def wild(count, dtype=np.float64, columns=50, spread=8):
+    rng = np.random.default_rng(11)
+    scale = 10.0 ** rng.integers(-spread, spread, (count, columns))
+    return (rng.normal(size=(count, columns)) * scale).astype(dtype)
+
+
+@jax.jit
+def every_sum(terms):
+    """All reductions in one program, which compiles sooner than ten."""
+    return {name: reduction(terms) for name, reduction in BY_NAME.items()}
+
+
+def spread_of(dtype):
+    return 2 if np.dtype(dtype).itemsize == 2 else 8
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("reduction,written", WRITTEN_OUT, ids=lambda v: str(v) if not callable(v) else "")
+def test_a_sum_of_an_array_has_the_bits_of_the_loop(reduction, written, dtype):
+    terms = wild(43, dtype, spread=spread_of(dtype))
+    expected = written(terms)
+    assert expected.dtype == dtype
+    summed = jax.jit(lambda t, zero: reduction(t, zero))
+    assert np.array_equal(np.asarray(summed(jnp.asarray(terms), zero_bits(dtype))), expected)
+    # also without a zero, and when what the sum enters is fused with it
+    bare = jax.jit(lambda t: reduction(t).astype(jnp.float64) * 2)
+    assert np.array_equal(np.asarray(bare(jnp.asarray(terms))), expected.astype(np.float64) * 2)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_a_product_is_rounded_before_it_is_added(dtype):
+    x, y = wild(20, dtype, spread=1), wild(20, dtype, spread=1)[::-1].copy()
 
     @jax.jit
-    def run(blocks):
-        total, later = lax.scan(step, jnp.zeros(blocks.shape[2:], blocks.dtype), blocks)
-        return reduction.finish(total, later)
+    def run(x, y, zero):
+        def body(count, totals):
+            sums = {name: reduction(x * y, zero) for name, reduction in BY_NAME.items()}
+            return {name: fence(totals[name] + total, zero) for name, total in sums.items()}
 
-    return np.asarray(run(jnp.asarray(terms.reshape(-1, block, *terms.shape[1:]))))
+        return lax.fori_loop(0, 2, body, dict.fromkeys(BY_NAME, jnp.zeros(x.shape[1:], dtype)))
 
-
-def wild(count, dtype=np.float64, columns=50):
-    rng = np.random.default_rng(11)
-    return (rng.normal(size=(count, columns)) * 10.0 ** rng.integers(-8, 8, (count, columns))).astype(dtype)
-
-
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
-@pytest.mark.parametrize("slots", [8, 40, 88])
-def test_sequential_is_a_loop(dtype, slots):
-    terms = wild(slots, dtype)
-    expected = np.zeros(terms.shape[1], dtype)
-    for term in terms:
-        expected = expected + term
-    assert np.array_equal(reduce_in_blocks(Sequential(), terms), expected)
+    seen = run(jnp.asarray(x), jnp.asarray(y), zero_bits(dtype))
+    for name, once in every_sum(jnp.asarray(x * y)).items():
+        assert np.array_equal(np.asarray(seen[name]), np.asarray(once) + np.asarray(once)), name
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
-@pytest.mark.parametrize("blocks", [1, 2, 3, 5, 11])
-def test_pairwise_is_a_tree_of_trees(dtype, blocks):
-    terms = wild(8 * blocks, dtype)
-    expected = tree([tree(list(block)) for block in terms.reshape(blocks, 8, -1)])
-    assert np.array_equal(reduce_in_blocks(Pairwise(), terms), expected)
-
-
-def test_the_two_orders_are_two_programs():
+def test_orders_are_programs_of_their_own():
     terms = wild(88)
-    assert not np.array_equal(reduce_in_blocks(Sequential(), terms), reduce_in_blocks(Pairwise(), terms))
-    assert set(BY_NAME) == {"sequential", "pairwise"}
+    seen = {name: np.asarray(total).tobytes() for name, total in every_sum(jnp.asarray(terms)).items()}
+    orders = ["sequential", "reversed", "permuted", "pairwise", "blocked", "sorted"]
+    assert len({seen[name] for name in orders}) == len(orders)
+    permuted = {np.asarray(Permuted(seed)(jnp.asarray(terms))).tobytes() for seed in range(5)}
+    assert len(permuted) == 5
+
+
+@jax.jit
+def every_stream(terms):
+    """As the force loop does it: blocks of eight terms through a scan."""
+
+    def step(totals, some):
+        taken = {n: BY_NAME[n].within(totals[n], [some[k] for k in range(8)]) for n in BY_NAME}
+        return {n: total for n, (total, _) in taken.items()}, {n: later for n, (_, later) in taken.items()}
+
+    blocks = terms.reshape(-1, 8, *terms.shape[1:])
+    totals, later = lax.scan(step, dict.fromkeys(BY_NAME, jnp.zeros(terms.shape[1:], terms.dtype)), blocks)
+    return {n: BY_NAME[n].finish(totals[n], later[n]) for n in BY_NAME}
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize("slots", [8, 88])
+def test_blocks_that_stream_give_the_sum_of_the_array(slots, dtype):
+    terms = wild(slots, dtype)
+    expected = {name: np.asarray(total) for name, total in every_sum(jnp.asarray(terms)).items()}
+    # these two stream, with the bits that molecular dynamics had before other orders came
+    expected["sequential"] = loop(terms)
+    expected["pairwise"] = tree([tree(list(block)) for block in terms.reshape(-1, 8, terms.shape[1])])
+    for name, streamed in every_stream(jnp.asarray(terms)).items():
+        # slots beyond the range of fixed point are NaN on both sides
+        assert np.array_equal(np.asarray(streamed), expected[name], equal_nan=name == "fixed-point"), name
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_the_derivative_is_that_of_a_sum(dtype):
+    terms = jnp.asarray(wild(9, dtype, columns=4, spread=1))
+    weights = jnp.asarray([1.0, 2.0, 0.5, -3.0], dtype)
+    tangent = jnp.full((9, 4), 0.25, dtype)
+
+    @jax.jit
+    def derivatives(t):
+        return {
+            name: (jax.grad(lambda x, r=r: jnp.sum(weights * r(x)))(t), jax.jvp(r, (t,), (tangent,))[1])
+            for name, r in BY_NAME.items()
+        }
+
+    for backward, forward in derivatives(terms).values():
+        assert np.array_equal(np.asarray(backward), np.broadcast_to(np.asarray(weights), (9, 4)))
+        assert np.array_equal(np.asarray(forward), np.full(4, 9 * 0.25, dtype))
+
+
+@pytest.mark.parametrize("name", ["kahan", "exact", "fixed-point"])
+def test_the_second_derivative_is_that_of_a_sum(name):
+    curvature = jax.jit(jax.hessian(lambda t: BY_NAME[name](t * t)))(jnp.arange(1.0, 4.0))
+    assert np.array_equal(np.asarray(curvature), 2 * np.eye(3))
 
 
 def test_pairwise_keeps_more_of_many_equal_terms():
-    terms = np.full((4096, 1), 0.1, np.float32)
+    terms = jnp.full((4096, 1), 0.1, np.float32)
     exact = 4096 * float(np.float32(0.1))
-    loop, balanced = (float(reduce_in_blocks(r, terms)[0]) for r in (Sequential(), Pairwise()))
-    assert abs(balanced - exact) < 1e-3 < abs(loop - exact)
+    rounded, balanced = (float(r(terms)[0]) for r in (Sequential(), Pairwise()))
+    assert abs(balanced - exact) < 1e-3 < abs(rounded - exact)
 
 
-def test_a_dtype_that_has_no_role_is_refused():
-    assert PrecisionPolicy(state="float32").dtype("state") == np.float32
-    with pytest.raises(InputError, match=r"precision\.force.*float16"):
-        PrecisionPolicy(force="float16")
+def test_a_half_that_counts_stops_counting_in_half_precision():
+    # 2048 + 1 rounds to 2048 in float16: the loop stands still, the others do not
+    ones = jnp.ones(4096, jnp.float16)
+    seen = {name: float(total) for name, total in every_sum(ones).items()}
+    assert {name for name, total in seen.items() if total == 2048} == {
+        "sequential", "reversed", "permuted", "sorted"
+    }  # fmt: skip
+    assert set(seen.values()) == {2048, 4096}
+    assert float(Widened(Sequential())(ones)) == 4096
+    assert Widened(Sequential())(ones).dtype == jnp.float32
+
+
+def test_a_sum_of_nothing_is_zero_and_of_one_term_that_term():
+    for nothing in every_sum(jnp.zeros((0, 3), jnp.float16)).values():
+        assert np.array_equal(np.asarray(nothing), np.zeros(3))
+    for single in every_sum(jnp.asarray([1.5], jnp.float32)).values():
+        assert float(single) == 1.5
+
+
+def test_reductions_have_names_and_options():
+    assert make("blocked", width=8) == Blocked(8)
+    assert make("reversed") == Sequential("reversed")
+    assert parse("permuted:3") == Permuted(3)
+    assert parse("exact") == make("exact")
+    assert parse("fixed-point:30") == make("fixed-point", bits=30)
+    with pytest.raises(InputError, match=r"no reduction called 'kahn'.*Did you mean kahan"):
+        make("kahn")
+    with pytest.raises(InputError, match=r"pairwise has no option 'width'"):
+        make("pairwise", width=3)
+    with pytest.raises(InputError, match="exact takes no number"):
+        parse("exact:3")
+    with pytest.raises(InputError, match="'x' in 'permuted:x' is not a whole number"):
+        parse("permuted:x")
+    with pytest.raises(InputError, match="width 1 adds nothing"):
+        parse("blocked:1")
+    with pytest.raises(InputError, match="unknown dtype 'half'"):
+        Widened(Sequential(), "half")
