@@ -118,12 +118,18 @@ def y_label(axes: Axes, text: str) -> None:
     axes.set_ylabel(text, color=INK)
 
 
-def legend(axes: Axes) -> None:
-    """Labels above the axes, in one line where they fit and below one another where not."""
+def legend(axes: Axes) -> int:
+    """Labels above the axes, in one line where they fit and below one another where not.
+
+    Returns:
+        how many lines they take.
+    """
     handles, labels = axes.get_legend_handles_labels()
     if not handles:
-        return
-    width = 72.0 * axes.get_figure(root=True).get_figwidth() - 40  # type: ignore[union-attr]
+        return 0
+    label = axes.get_ylabel()
+    left = 30 + 11 * (label.count("\n") + 1) * bool(label)
+    width = 72.0 * axes.get_figure(root=True).get_figwidth() - left  # type: ignore[union-attr]
     columns = len(handles)
     while columns > 1 and _legend_width(labels, columns) > width:
         columns -= 1
@@ -132,11 +138,13 @@ def legend(axes: Axes) -> None:
         handles, labels, loc="lower left", bbox_to_anchor=(0, 1.0),
         ncols=columns, frameon=False, handlelength=1.3, columnspacing=1.4, borderaxespad=0.1, fontsize=_SMALL,
     )  # fmt: skip
+    deepest = max(text.count("\n") for text in labels) + 1
+    return deepest * -(-len(labels) // columns)
 
 
 def text_width(text: str, size: float) -> float:
-    """Points that a line of text takes; the page's font is narrower than the one it is measured with."""
-    return 0.93 * text_to_path.get_text_width_height_descent(text, FontProperties(size=size), False)[0]
+    """Points that a line of text takes, in a font as wide as any that a page is shown in."""
+    return text_to_path.get_text_width_height_descent(text, FontProperties(size=size), False)[0]
 
 
 def folded(text: str, width: float, size: float) -> str:

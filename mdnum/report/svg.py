@@ -23,6 +23,10 @@ _ROLES = {
     PAPER: "paper",
 }
 
+#: gid of text that stands on lines: it gets a rim in the color of the paper.
+HALO = "halo"
+_RIM = "paint-order: stroke; stroke: var(--paper); stroke-width: 3px; stroke-linejoin: round;"
+
 LIGHT = {
     "ink": "#1c2430", "muted": "#66707e", "grid": "#e3e6ea", "first": "#2563a8", "second": "#c2661a",
     "third": "#2c7a63", "bad": "#b3261e", "paper": "#ffffff",
@@ -81,6 +85,7 @@ def markup(figure: Figure, name: str) -> str:
         text = text.replace(color, f"var(--{role})")
     # the page's own font instead of the one it was measured with
     text = text.replace("font-family: 'DejaVu Sans'; ", "")
+    text = text.replace(f' id="{HALO}"', f' class="{HALO}"')
     text = re.sub(r' transform="rotate\(-0 [^)]*\)"', "", text)
     referenced = set(re.findall(r"#([\w.-]+)", text))
     text = re.sub(r' id="([^"]+)"', lambda found: found[0] if found[1] in referenced else "", text)
@@ -112,7 +117,7 @@ def standalone(text: str) -> str:
     rules = (
         f"svg {{ {_properties(LIGHT)} }} "
         f"@media (prefers-color-scheme: dark) {{ svg {{ {_properties(DARK)} }} }} "
-        f"text {{ font-family: {FONT}; }}"
+        f"text {{ font-family: {FONT}; }} .{HALO} text {{ {_RIM} }}"
     )
     return re.sub(r"(<svg [^>]*>)", rf"\1<style>{rules}</style>", text, count=1)
 
