@@ -1,0 +1,203 @@
+"""A step acts on what it is told, and its bits are those of plain numpy in every dtype."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+from ball import oracles
+
+from mdnum import ball
+from mdnum.ball.state import Decisions
+from mdnum.errors import InputError
+from mdnum.precision.policy import RolePrecision
+from mdnum.precision.reductions import Sequential
+
+SCHEMES = {
+    "explicit-euler": ball.ExplicitEuler,
+    "semi-implicit-euler": ball.SemiImplicitEuler,
+    "velocity-verlet": ball.VelocityVerlet,
+}
+STEPS = 400
+Y0, V0 = np.array([0.3, 0.45, 0.0078125]), np.array([0.0, -0.7, 1.1])
+
+
+def run_of(contact, integrator, dtype, **options):
+    world = ball.World.create(contact, integrator, policy=RolePrecision.all(dtype))
+    return ball.simulate(world, world.start(Y0, V0), STEPS, **options)
+
+
+def same_bits(run, oracle_rows, index):
+    y = np.array([row[0] for row in oracle_rows]).astype(np.float64)
+    v = np.array([row[1] for row in oracle_rows]).astype(np.float64)
+    np.testing.assert_array_equal(run.y[:, index].astype(np.float64), y)
+    np.testing.assert_array_equal(run.v[:, index].astype(np.float64), v)
+
+
+@pytest.mark.parametrize("dtype", oracles.DTYPES)
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_penalty_has_the_bits_of_numpy(scheme, dtype):
+    kind = oracles.DTYPES[dtype]
+    run = run_of(ball.Penalty(900.0, damping=0.5), SCHEMES[scheme](0.01), dtype)
+    for index in range(len(Y0)):
+        with np.errstate(over="ignore", invalid="ignore"):
+            rows, decided = oracles.penalty(
+                scheme, kind(Y0[index]), kind(V0[index]), kind(0.01), kind(9.81), kind(900), kind(0.5), STEPS
+            )
+        same_bits(run, rows, index)
+        np.testing.assert_array_equal(run.contact[:, index], decided)
+    assert run.contact.any()
+
+
+@pytest.mark.parametrize("dtype", oracles.DTYPES)
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_naive_impact_has_the_bits_of_numpy(scheme, dtype):
+    kind = oracles.DTYPES[dtype]
+    run = run_of(ball.Impact(0.8), SCHEMES[scheme](0.01), dtype)
+    for index in range(len(Y0)):
+        rows, decided = oracles.impact(
+            scheme, kind(Y0[index]), kind(V0[index]), kind(0.01), kind(9.81), kind(0.8), kind(1e-6), STEPS
+        )
+        same_bits(run, rows, index)
+        np.testing.assert_array_equal(run.contact[:, index], decided)
+
+
+@pytest.mark.parametrize("dtype", oracles.DTYPES)
+def test_projection_has_the_bits_and_the_iterations_of_numpy(dtype):
+    kind = oracles.DTYPES[dtype]
+    rule = ball.GlobalSum(1e-3, 50, Sequential())
+    run = run_of(ball.Projection(0.5, 0.5, rule), ball.SemiImplicitEuler(0.01), dtype)
+    rows, decided, counts = oracles.projection(
+        "semi-implicit-euler",
+        [kind(y) for y in Y0],
+        [kind(v) for v in V0],
+        kind(0.01),
+        kind(9.81),
+        kind(0.5),
+        kind(0.5),
+        kind(0.8),
+        kind(1e-3),
+        50,
+        STEPS,
+    )
+    for index in range(len(Y0)):
+        same_bits(run, [(y[index], v[index]) for y, v in rows], index)
+    np.testing.assert_array_equal(run.contact, decided)
+    np.testing.assert_array_equal(run.iterations, counts)
+    assert run.iterations.max() > 3
+
+
+ALL = {
+    "penalty": (ball.Penalty(900.0, damping=0.5), ball.SemiImplicitEuler(0.01)),
+    "smooth penalty": (ball.Penalty(900.0, eps=0.01, smooth=True), ball.VelocityVerlet(0.01)),
+    "implicit midpoint": (ball.Penalty(900.0, damping=0.5), ball.ImplicitMidpoint(0.01)),
+    "projection": (ball.Projection(0.5, 0.5, ball.GlobalSum(1e-6)), ball.ExplicitEuler(0.01)),
+    "projection per ball": (ball.Projection(0.5, 0.5, ball.PerInstance(1e-6)), ball.VelocityVerlet(0.01)),
+    "impact": (ball.Impact(0.8), ball.SemiImplicitEuler(0.01)),
+    "located impact": (ball.Impact(0.8), ball.EventLocated(0.01)),
+}
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_told_its_own_decisions_a_run_is_bit_identical(name):
+    world = ball.World.create(*ALL[name])
+    start = world.start(Y0, V0)
+    free = ball.simulate(world, start, STEPS)
+    told = ball.simulate(world, start, STEPS, told=free.told())
+    np.testing.assert_array_equal(free.y, told.y)
+    np.testing.assert_array_equal(free.v, told.v)
+    assert ball.first_difference(free, told).seed is None
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_one_step_told_is_the_step_that_decides(name):
+    world = ball.World.create(*ALL[name])
+
+    @jax.jit
+    def both(world, state):
+        return world.advance(state)[0], world.step(state, world.decide(state))
+
+    state = world.start(Y0, V0)
+    for _ in range(40):
+        state, told = both(world, state)
+        for own, other in zip(jax.tree.leaves(state), jax.tree.leaves(told), strict=True):
+            np.testing.assert_array_equal(own, other)
+
+
+@pytest.mark.parametrize(("step", "index"), [(26, 0), (100, 1), (301, 2)])
+def test_one_inverted_contact_is_found(step, index):
+    world = ball.World.create(*ALL["penalty"])
+    start = world.start(Y0, V0)
+    free = ball.simulate(world, start, STEPS)
+    contact = free.contact.copy()
+    contact[step - 1, index] ^= True
+    planted = ball.simulate(world, start, STEPS, told=Decisions(contact, free.iterations))
+    seen = ball.first_difference(free, planted)
+    assert (seen.fork, seen.channel, seen.ball) == (step, "contact", index)
+    # semi-implicit Euler acts at once: the state of that very step differs
+    assert seen.seed == step
+
+
+def test_one_more_solver_iteration_is_found():
+    world = ball.World.create(*ALL["projection"])
+    start = world.start(Y0, V0)
+    free = ball.simulate(world, start, STEPS, history=True)
+    step = int(np.flatnonzero(free.iterations > 5)[3]) + 1
+    iterations = free.iterations.copy()
+    iterations[step - 1] += 1
+    planted = ball.simulate(world, start, STEPS, told=Decisions(free.contact, iterations))
+    seen = ball.first_difference(free, planted)
+    assert (seen.fork, seen.channel, seen.ball) == (step, "stop", -1)
+    stopped, went_on = seen.margins
+    assert stopped == went_on > 0
+
+
+def test_margins_are_positive_in_contact():
+    world = ball.World.create(*ALL["impact"])
+    state = world.start(np.array([1e-4, 1.0]), np.array([-1.0, 0.0]))
+    margins = world.margins(state)
+    np.testing.assert_array_equal(margins > 0, world.decide(state).contact)
+    assert list(np.asarray(margins > 0)) == [True, False]
+
+
+def test_a_ball_does_not_feel_the_batch_it_is_in():
+    for name in ("penalty", "projection per ball", "located impact"):
+        world = ball.World.create(*ALL[name])
+        whole = ball.simulate(world, world.start(Y0, V0), STEPS)
+        for index in range(len(Y0)):
+            alone = ball.simulate(world, world.start(Y0[index], V0[index]), STEPS)
+            np.testing.assert_array_equal(whole.y[:, index], alone.y[:, 0])
+
+
+def test_control_is_added_and_ends_at_its_last_value():
+    control = np.array([9.81, 9.81, 19.62])
+    world = ball.World.create(ball.Impact(), ball.SemiImplicitEuler(0.1), control=control)
+    run = ball.simulate(world, world.start(1.0), 5)
+    np.testing.assert_allclose(run.v[:, 0], [0, 0, 0, 0.981, 1.962, 2.943], atol=1e-14)
+
+
+def test_parameters_are_named_and_unknown_ones_refused():
+    world = ball.World.create(*ALL["projection"])
+    assert world.parameters == ("k", "alpha", "restitution", "tol", "h", "gravity")
+    assert float(world.with_values({"k": 0.25}).value("k")) == 0.25
+    with pytest.raises(InputError, match="damping"):
+        world.value("damping")
+
+
+def test_stochastic_rounding_of_the_state_is_reproducible_and_unbiased():
+    policy = RolePrecision(state="bfloat16", arithmetic="float32", rounding="stochastic", seed=3)
+    world = ball.World.create(ball.Impact(), ball.SemiImplicitEuler(1e-3), gravity=0.0, policy=policy)
+    start = world.start(np.full(4000, 1.0), np.full(4000, 0.5))
+    first, second = (ball.simulate(world, start, 64) for _ in range(2))
+    np.testing.assert_array_equal(first.y, second.y)
+    # each step adds 5e-4, a sixteenth of the spacing of bfloat16 above 1: to nearest nothing ever moves
+    moved = first.y[-1].astype(np.float64).mean() - 1.0
+    error = first.y[-1].astype(np.float64).std() / np.sqrt(4000)
+    assert abs(moved - 64 * 5e-4) < 4 * error
+    nearest = ball.World.create(
+        ball.Impact(),
+        ball.SemiImplicitEuler(1e-3),
+        gravity=0.0,
+        policy=RolePrecision(state="bfloat16", arithmetic="float32"),
+    )
+    assert (ball.simulate(nearest, nearest.start(1.0, 0.5), 64).y == 1.0).all()
