@@ -19,6 +19,7 @@ _HOMES = {
     "MdnumCalculator": "mdnum.references:MdnumCalculator",
     "MdnumError": "mdnum.errors:MdnumError",
     "NumericalError": "mdnum.errors:NumericalError",
+    "bounce": "mdnum.workflow:bounce",
     "build": "mdnum.systems:build",
     "diagnose": "mdnum.doctor:diagnose",
     "load": "mdnum.systems:load",
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     from mdnum.references import MdnumCalculator as MdnumCalculator
     from mdnum.systems import build as build
     from mdnum.systems import load as load
+    from mdnum.workflow import bounce as bounce
     from mdnum.workflow import run as run
 
 __all__ = [
@@ -47,6 +49,7 @@ __all__ = [
     "MdnumError",
     "NumericalError",
     "__version__",
+    "bounce",
     "build",
     "diagnose",
     "load",

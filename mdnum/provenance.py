@@ -48,8 +48,6 @@ class _System(Protocol):
     def spec(self) -> Any: ...
     @property
     def path(self) -> Path | None: ...
-    @property
-    def atoms(self) -> Any: ...
 
 
 def collect(system: _System) -> dict[str, Any]:
@@ -152,12 +150,14 @@ def hashes(system: _System) -> dict[str, str | None]:
     that a file in another format with the same atoms has the same hash.
 
     Returns:
-        file (None for a system that did not come from a file) and structure.
+        file (None for a system that did not come from a file) and structure (None without atoms).
     """
     file = None
     if system.path is not None and Path(system.path).is_file():
         file = hashlib.sha256(Path(system.path).read_bytes()).hexdigest()
-    atoms = system.atoms
+    atoms = getattr(system, "atoms", None)
+    if atoms is None:
+        return {"file": file, "structure": None}
     digest = hashlib.sha256()
     for name, array in (
         ("numbers", atoms.get_atomic_numbers()),

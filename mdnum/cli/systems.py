@@ -20,12 +20,12 @@ def list_systems(as_json: bool = output.JSON_OPTION) -> int:
     rows = []
     for name in systems.names():
         system = systems.load(name)
-        rows.append({"name": name, "atoms": len(system.atoms), "about": system.spec.about})
+        rows.append({"name": name, **_size(system), "about": system.spec.about})
     if as_json:
         output.print_json({"systems": rows})
     else:
-        lines = [(row["name"], row["atoms"], row["about"].partition(". ")[0]) for row in rows]
-        output.print_table("", ("name", "atoms", "about"), lines)
+        lines = [(row["name"], _sized(row), row["about"].partition(". ")[0]) for row in rows]
+        output.print_table("", ("name", "size", "about"), lines)
     return output.EXIT_FINE
 
 
@@ -51,11 +51,11 @@ def check(
 ) -> int:
     """Read a system file and its structure, and say whether it can be run."""
     loaded = _load(system, settings)
-    document = {"system": loaded.name, "ok": True, "atoms": len(loaded.atoms), "path": loaded.path}
+    document = {"system": loaded.name, "ok": True, **_size(loaded), "path": loaded.path}
     if as_json:
         output.print_json(document)
     else:
-        typer.echo(f"{loaded.name}: fine, {document['atoms']} atoms")
+        typer.echo(f"{loaded.name}: fine, {_sized(document)}")
     return output.EXIT_FINE
 
 
@@ -73,6 +73,18 @@ def copy(
     else:
         typer.echo(f"wrote {copied}")
     return output.EXIT_FINE
+
+
+def _size(system: Any) -> dict[str, int]:
+    """How many there are of what the system is made of."""
+    atoms = getattr(system, "atoms", None)
+    return {"balls": system.balls} if atoms is None else {"atoms": len(atoms)}
+
+
+def _sized(row: dict[str, Any]) -> str:
+    noun = "atom" if "atoms" in row else "ball"
+    number = row[f"{noun}s"]
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
 def _load(system: str, settings: list[str] | None) -> Any:

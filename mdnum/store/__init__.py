@@ -3,6 +3,6 @@
 from __future__ import annotations
 
 from mdnum.store.folder import RunFolder
-from mdnum.store.tables import COLUMNS
+from mdnum.store.tables import COLUMNS, TABLES
 
-__all__ = ["COLUMNS", "RunFolder"]
+__all__ = ["COLUMNS", "TABLES", "RunFolder"]

@@ -18,7 +18,7 @@ from mdnum.errors import FolderError
 from mdnum.store import checkpoint
 from mdnum.store.atomic import disk_errors, write_text
 from mdnum.store.frames import FrameFile
-from mdnum.store.tables import COLUMNS, TableStream
+from mdnum.store.tables import COLUMNS, TABLES, TableStream
 
 if TYPE_CHECKING:
     from ase import Atoms
@@ -38,10 +38,15 @@ class RunFolder:
     whatever came later and returns the state, so that the run continues as if it had never stopped.
 
     Use `create` for a new run, `open` for one that is there (to read it, or to resume it).
+
+    Attributes:
+        path: the folder.
+        world: "md" or "ball": which tables it has.
     """
 
-    def __init__(self, path: Path):
+    def __init__(self, path: Path, world: str = "md"):
         self.path = path
+        self.world = world
         self._streams: dict[str, TableStream] = {}
         self._frames = FrameFile(path / "trajectory.traj")
         self._log: TextIO | None = None
@@ -52,17 +57,18 @@ class RunFolder:
         self._pending: tuple[dict[str, Any], dict[str, int]] | None = None
 
     @classmethod
-    def create(cls, path: str | os.PathLike[str], overwrite: bool = False) -> RunFolder:
+    def create(cls, path: str | os.PathLike[str], overwrite: bool = False, world: str = "md") -> RunFolder:
         """A new, empty run folder.
 
         Args:
             path: made if missing, parents included.
             overwrite: remove the run that is there. Files that are not a run's are left alone.
+            world: "md" or "ball".
 
         Raises:
             FolderError: the folder holds a run or other files, is a file, or cannot be written.
         """
-        folder = cls(Path(path))
+        folder = cls(Path(path), world)
         if folder.path.exists() and not folder.path.is_dir():
             raise FolderError("is a file, not a folder", remedy="Choose another folder", where=str(path))
         present = sorted(entry.name for entry in folder.path.iterdir()) if folder.path.is_dir() else []
@@ -103,12 +109,14 @@ class RunFolder:
             raise FolderError("no such folder", remedy="Give the folder of a run", where=str(path))
         if not any((folder.path / name).exists() for name in (*_FILES, "parts")):
             raise FolderError("holds no run", remedy="Give the folder of a run", where=str(path))
+        if any((folder.path / f"{name}.parquet").exists() for name in TABLES["ball"]):
+            folder.world = "ball"
         return folder
 
     # -- writing ---------------------------------------------------------------------------------
 
     def append(self, table: str, columns: Mapping[str, Any]) -> None:
-        """Adds rows to a table ("series", "flips", "epochs"); cheap, kept in memory until a checkpoint.
+        """Adds rows to a table (see `TABLES`); cheap, kept in memory until a checkpoint.
 
         Args:
             columns: equally long arrays by column name, at least those in `COLUMNS[table]`.
@@ -164,7 +172,7 @@ class RunFolder:
         """Ends the writing: one parquet file a table, no part files; the folder can still be resumed."""
         if self._pending is not None and self._pending[1] == self._rows():
             self._write_checkpoint(self._pending[0])
-        for name in (*COLUMNS, *self._streams):
+        for name in dict.fromkeys((*TABLES[self.world], *self._streams)):
             self._stream(name).merge()
         parts = self.path / "parts"
         if parts.is_dir() and not any(parts.iterdir()):
@@ -281,7 +289,7 @@ class RunFolder:
             stream.flush()
         log = self.path / "log.txt"
         store = {
-            "rows": {**dict.fromkeys(COLUMNS, 0), **self._rows()},
+            "rows": {**dict.fromkeys(TABLES[self.world], 0), **self._rows()},
             "frames": self._frames.mark(),
             "log": log.stat().st_size if log.exists() else 0,
         }

@@ -23,7 +23,7 @@ def _columns(**columns: pa.DataType) -> Mapping[str, pa.DataType]:
     return MappingProxyType(columns)
 
 
-#: The columns every run folder has, per table; a writer may add more.
+#: The columns of each table; a writer may add more.
 COLUMNS: Mapping[str, Mapping[str, pa.DataType]] = MappingProxyType(
     {
         "series": _columns(
@@ -41,8 +41,27 @@ COLUMNS: Mapping[str, Mapping[str, pa.DataType]] = MappingProxyType(
             lost_pairs=_INT, lost_pair_steps=_INT, first_lost_step=_INT, build_ms=_FLOAT,
             margin=_FLOAT,
         ),
+        "steps": _columns(
+            step=_INT, time=_FLOAT, contacts=_SHORT, entered=_SHORT, left=_SHORT, iterations=_SHORT,
+            reason=_TEXT, residual=_FLOAT, stop_margin=_FLOAT, min_margin=_FLOAT, ambiguous=_SHORT,
+            mean_height=_FLOAT, energy=_FLOAT,
+        ),
+        "contacts": _columns(
+            step=_INT, ball=_SHORT, entered=_BOOL, height=_FLOAT, margin=_FLOAT, velocity=_FLOAT,
+            bound=_FLOAT, ambiguous=_BOOL,
+        ),
+        "solver": _columns(
+            step=_INT, ball=_SHORT, iteration=_SHORT, residual=_FLOAT, margin=_FLOAT, stopped=_BOOL,
+            reason=_TEXT,
+        ),
+        "heights": _columns(step=_INT, ball=_SHORT, y=_FLOAT, v=_FLOAT),
     }
 )  # fmt: skip
+
+#: The tables that the folder of a run has, whether they hold a row or not, by the world that was run.
+TABLES: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {"md": ("series", "flips", "epochs"), "ball": ("steps", "contacts", "solver", "heights")}
+)
 
 # rows held back before a part is written without waiting for a checkpoint: bounds the memory of a run
 _BUFFER_ROWS = 100_000

@@ -17,14 +17,17 @@ from mdnum.systems.schema import SystemSpec
 
 if TYPE_CHECKING:
     from mdnum.systems.build import Simulation, build
+    from mdnum.systems.build_ball import BallSimulation, build_ball
 
 __all__ = [
+    "BallSimulation",
     "BallSpec",
     "BallSystem",
     "Simulation",
     "System",
     "SystemSpec",
     "build",
+    "build_ball",
     "copy",
     "load",
     "names",
@@ -32,13 +35,21 @@ __all__ = [
 ]
 
 
+_LATER = {
+    "build": "mdnum.systems.build",
+    "Simulation": "mdnum.systems.build",
+    "build_ball": "mdnum.systems.build_ball",
+    "BallSimulation": "mdnum.systems.build_ball",
+}
+
+
 class _Package(ModuleType):
-    """This package, in which `build` is the function, whoever imports the file of that name first."""
+    """This package, in which `build` and `build_ball` are the functions, whoever imports their files first."""
 
     def __setattr__(self, name: str, value: Any) -> None:
         # Python binds an imported submodule to its package; here that would hide the function of its name
-        if name == "build" and isinstance(value, ModuleType):
-            value = value.build
+        if name in ("build", "build_ball") and isinstance(value, ModuleType):
+            value = getattr(value, name)
         super().__setattr__(name, value)
 
 
@@ -46,6 +57,7 @@ sys.modules[__name__].__class__ = _Package
 
 
 def __getattr__(name: str) -> Any:
-    if name in ("build", "Simulation"):
-        return getattr(importlib.import_module("mdnum.systems.build"), name)
+    home = _LATER.get(name)
+    if home is not None:
+        return getattr(importlib.import_module(home), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -210,7 +210,8 @@ def _combination(spec: ball.BallSpec) -> None:
 
 
 def _stop(spec: ball.BallSpec) -> None:
-    solves = spec.contact.kind == "projection" or spec.integrator.kind == "implicit-midpoint"
+    implicit = spec.integrator.kind == "implicit-midpoint" and spec.contact.kind == "penalty"
+    solves = spec.contact.kind == "projection" or implicit
     if spec.stop is None:
         if solves:
             what = "a projection" if spec.contact.kind == "projection" else "implicit-midpoint"
@@ -344,6 +345,12 @@ def _loss_and_gradient(spec: ball.BallSpec) -> None:
                 f"gradient.of names {name}, which {kind} does not have",
                 f"It has {', '.join(known)}",
             )
+        if name == "eps" and isinstance(spec.contact, ball.PenaltyContact) and not spec.contact.eps:
+            raise Refusal(
+                "gradient.of",
+                "gradient.of names eps, but contact.eps = 0 is the sharp contact, which no width belongs to",
+                "Set contact.eps above 0",
+            )
         if name == "tol" and (spec.stop is None or isinstance(spec.stop, ball.FixedRule)):
             raise Refusal(
                 "gradient.of",
@@ -360,8 +367,8 @@ def _warnings(spec: ball.BallSpec) -> Iterator[Warning]:
         height = max(map(abs, start)) if isinstance(start, tuple) else abs(start)
         fall = float(np.sqrt(2 * spec.flight.gravity * height)) * spec.integrator.timestep
         unit = spacing(fall, spec.precision.state) if fall else 0.0
-        absolute = ball.SumRule | ball.PerInstanceRule | ball.MaximumRule
-        if isinstance(stop, absolute) and spec.start.boundary is None and stop.tol < unit:
+        absolute = isinstance(stop, ball.SumRule | ball.PerInstanceRule | ball.MaximumRule)
+        if absolute and spec.start.boundary is None and stop.tol < unit:
             yield Warning(
                 "tolerance-below-rounding",
                 "The tolerance is below the rounding of the heights",

@@ -62,6 +62,18 @@ __all__ = [
 ]
 
 FloatName = Literal["float64", "float32"]
+ReductionName = Literal[
+    "sequential",
+    "reversed",
+    "permuted",
+    "pairwise",
+    "blocked",
+    "kahan",
+    "neumaier",
+    "sorted",
+    "exact",
+    "fixed-point",
+]
 
 DEFAULT_SKIN = {"metal": 1.0, "lj": 0.3}
 """Skin when the file gives none: LAMMPS uses 2.0 Å and 0.3 σ; 1.0 Å suits the argon-sized systems here."""
@@ -197,8 +209,9 @@ class Precision(Table):
     force: FloatName = Field(default="float64", description="pair distances, energies and forces")
     decision: FloatName = Field(default="float64", description="the quantity compared with a threshold")
     accumulate: FloatName = Field(default="float64", description="sums over pairs")
-    reduction: Literal["sequential", "pairwise"] = Field(
-        default="sequential", description="order of the sums"
+    reduction: ReductionName = Field(
+        default="sequential",
+        description="order of the sums; exact and fixed-point give the same bits in every order of neighbors",
     )
 
 
