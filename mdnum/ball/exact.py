@@ -68,7 +68,7 @@ def first_flight(y0: float, v0: float, gravity: float) -> tuple[Known, Known]:
     return known(t, time), known(s, speed)
 
 
-def in_flight(tau, rate, v, gravity, start: Mapping[str, np.ndarray], kick: Mapping[str, np.ndarray]):
+def in_flight(tau, rate, v, gravity, start: Mapping[str, Any], kick: Mapping[str, Any]):
     """Derivatives of height and velocity a time tau (s) after leaving height 0.
 
     Args:
@@ -230,7 +230,7 @@ class ExactImpact:
             raise InputError(f"impact number {n!r}", remedy=f"Count in whole numbers from {least}")
         return n
 
-    def _rebound(self, n: Float[np.ndarray, "*counts"]) -> Known:
+    def _rebound(self, n: Counts) -> Known:
         """e^n s: the speed after impact n."""
         _, speed = first_flight(self.y0, self.v0, self.gravity)
         s, power = float(speed.value), self.restitution**n

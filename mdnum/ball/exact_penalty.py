@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from mdnum.ball.exact import Known, Times, first_flight, in_flight, known, later, positive
+from mdnum.ball.exact import Counts, Known, Times, first_flight, in_flight, known, later, positive
 from mdnum.errors import InputError
 
 #: Terms of the two series below, enough for double precision up to an angle of 1.
@@ -76,7 +76,7 @@ class ExactPenalty:
         own = {"gravity": -2 * s**3 * k / (g * g * d), "k": self.duration().gradient["k"]}
         return self._with_speed(2 * s / g + self.duration().value, 2 * s * s * k / (g * d), own)
 
-    def contact_time(self, n: int | Float[np.ndarray, "*counts"]) -> Known:
+    def contact_time(self, n: Counts) -> Known:
         """Time at which contact n begins, s."""
         n = np.asarray(n, np.float64)
         if np.any(n < 1) or np.any(n != np.floor(n)):
