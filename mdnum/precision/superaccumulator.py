@@ -7,8 +7,10 @@ rounds once. The fixed-point sum rounds every term to a coarser unit first and t
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from fractions import Fraction
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -101,6 +103,25 @@ def _rounded(limbs: Int[Array, "limbs columns"], form: _Format) -> UInt64[Array,
     bits = (excess << (form.digits - 1)) + kept + up.astype(jnp.uint64)
     infinity = jnp.uint64(form.top << (form.digits - 1))
     return jnp.where(jnp.any(filled, axis=0), jnp.minimum(bits, infinity), jnp.uint64(0))
+
+
+def nearest(value: Fraction, dtype) -> Any:
+    """The float nearest to a rational number, ties to even, on the host; infinity where none is near."""
+    info = ml_dtypes.finfo(np.dtype(dtype))
+    kind = np.dtype(dtype).type
+    if value == 0:
+        return kind(0)
+    size = abs(value)
+    exponent = size.numerator.bit_length() - size.denominator.bit_length()
+    if size < Fraction(2) ** exponent:
+        exponent -= 1
+    place = max(exponent, int(info.minexp)) - info.nmant
+    digits = round(size / Fraction(2) ** place)
+    rounded = Fraction(digits) * Fraction(2) ** place
+    if rounded > Fraction(float(info.max)):
+        return kind(np.inf if value > 0 else -np.inf)
+    # exact: the rounded number is a float of this dtype, so it is one of float64
+    return kind(math.copysign(float(rounded), value))
 
 
 @dataclass(frozen=True)
