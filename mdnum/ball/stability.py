@@ -198,15 +198,14 @@ def measure(
     if steps % times:
         raise InputError(f"steps = {steps} is no multiple of times = {times}")
     root, ratio = np.meshgrid(z / h, zeta)
-    with jax.enable_x64(True):
-        world = World.create(Penalty(1.0), SCHEMES[scheme](h), gravity)
-        energy, gradient = _follow(
-            world, jnp.asarray(root.ravel() ** 2), jnp.asarray(2 * ratio.ravel() * root.ravel()),
-            jnp.asarray(starts), steps // times, times,
-        )  # fmt: skip
-        shape = (root.size, times)
-        energy = np.asarray(energy).reshape(shape).T.reshape(times, len(zeta), len(z))
-        gradient = np.asarray(gradient).reshape(shape).T.reshape(times, len(zeta), len(z))
+    world = World.create(Penalty(1.0), SCHEMES[scheme](h), gravity)
+    energy, gradient = _follow(
+        world, jnp.asarray(root.ravel() ** 2), jnp.asarray(2 * ratio.ravel() * root.ravel()),
+        jnp.asarray(starts), steps // times, times,
+    )  # fmt: skip
+    shape = (root.size, times)
+    energy = np.asarray(energy).reshape(shape).T.reshape(times, len(zeta), len(z))
+    gradient = np.asarray(gradient).reshape(shape).T.reshape(times, len(zeta), len(z))
     at = steps // times * np.arange(1, times + 1)
     exact = np.max([_exact(y, gravity, (x / h) ** 2, at, h) for x in z for y in starts], axis=0)
     return StabilityMap(scheme, z, zeta, at, energy, gradient, exact, forward_bound, gradient_bound)
@@ -276,21 +275,18 @@ def measured_limit(
         the limit, `most` where there is none below, 0 where there is none above 1e-3.
     """
     low, high = 1e-3, most
-    with jax.enable_x64(True):
-        policy = RolePrecision(
-            **dict.fromkeys(("state", "arithmetic", "decision", "accumulate", "loss"), dtype)
-        )
-        # h is one, so k is z²; without gravity the equilibrium is the floor itself
-        world = World.create(Penalty(1.0), SCHEMES[scheme](1.0), 0.0, policy=policy)
-        for _ in range(4):
-            z = np.linspace(low, high, 33)
-            runs = np.asarray(_held(world, jnp.asarray(z * z), jnp.asarray(2 * zeta * z), steps))
-            if not runs.any():
-                return most if high == most else high
-            first = int(np.argmax(runs))
-            if first == 0:
-                return 0.0
-            low, high = float(z[first - 1]), float(z[first])
+    policy = RolePrecision(**dict.fromkeys(("state", "arithmetic", "decision", "accumulate", "loss"), dtype))
+    # h is one, so k is z²; without gravity the equilibrium is the floor itself
+    world = World.create(Penalty(1.0), SCHEMES[scheme](1.0), 0.0, policy=policy)
+    for _ in range(4):
+        z = np.linspace(low, high, 33)
+        runs = np.asarray(_held(world, jnp.asarray(z * z), jnp.asarray(2 * zeta * z), steps))
+        if not runs.any():
+            return most if high == most else high
+        first = int(np.argmax(runs))
+        if first == 0:
+            return 0.0
+        low, high = float(z[first - 1]), float(z[first])
     return 0.5 * (low + high)
 
 

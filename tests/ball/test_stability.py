@@ -24,12 +24,6 @@ from mdnum.errors import InputError
 EXPLICIT = ("explicit-euler", "semi-implicit-euler", "velocity-verlet")
 
 
-@pytest.fixture(autouse=True)
-def double():
-    with jax.enable_x64(True):
-        yield
-
-
 @pytest.mark.parametrize("scheme", SCHEMES)
 @pytest.mark.parametrize(("z", "zeta"), [(0.1, 0.0), (1.3, 0.0), (0.7, 0.2), (2.5, 0.6)])
 def test_the_matrix_is_the_jacobian_of_a_step_in_contact(scheme, z, zeta):
