@@ -42,7 +42,7 @@ def dynamics(
 def _check(function: str, title: str, name: str, settings: list[str] | None, as_json: bool) -> int:
     from mdnum import systems
 
-    system = systems.load(name, output.parse_overrides(settings))
+    system = systems.load(name, output.parse_overrides(settings), world="md")
     report: Any = getattr(importlib.import_module("mdnum.references.check"), function)(system)
     if as_json:
         output.print_json({"ok": report.ok, **report.to_dict()})

@@ -14,9 +14,14 @@ def report(
     as_json: bool = output.JSON_OPTION,
 ) -> int:
     """Write the report of a run folder again."""
-    from mdnum.report.html import write_report
+    from mdnum.store import RunFolder
 
-    written = write_report(folder)
+    run = RunFolder.open(folder)
+    if run.world == "ball":
+        from mdnum.report.ball.html import write_report
+    else:
+        from mdnum.report.html import write_report
+    written = write_report(run)
     if as_json:
         output.print_json({"folder": folder, "report": written})
     else:

@@ -55,12 +55,16 @@ COLUMNS: Mapping[str, Mapping[str, pa.DataType]] = MappingProxyType(
             reason=_TEXT,
         ),
         "heights": _columns(step=_INT, ball=_SHORT, y=_FLOAT, v=_FLOAT),
+        "separations": _columns(variant=_TEXT, step=_INT, separation=_FLOAT),
     }
 )  # fmt: skip
 
 #: The tables that the folder of a run has, whether they hold a row or not, by the world that was run.
 TABLES: Mapping[str, tuple[str, ...]] = MappingProxyType(
-    {"md": ("series", "flips", "epochs"), "ball": ("steps", "contacts", "solver", "heights")}
+    {
+        "md": ("series", "flips", "epochs"),
+        "ball": ("steps", "contacts", "solver", "heights", "separations"),
+    }
 )
 
 # rows held back before a part is written without waiting for a checkpoint: bounds the memory of a run

@@ -44,7 +44,7 @@ _LATER = {
 
 
 class _Package(ModuleType):
-    """This package, in which `build` and `build_ball` are the functions, whoever imports their files first."""
+    """This package, in which `build` and `build_ball` are the functions, whoever imports their files."""
 
     def __setattr__(self, name: str, value: Any) -> None:
         # Python binds an imported submodule to its package; here that would hide the function of its name

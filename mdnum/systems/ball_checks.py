@@ -370,8 +370,8 @@ def _warnings(spec: ball.BallSpec) -> Iterator[Warning]:
         absolute = isinstance(stop, ball.SumRule | ball.PerInstanceRule | ball.MaximumRule)
         if absolute and spec.start.boundary is None and stop.tol < unit:
             yield Warning(
-                "tolerance-below-rounding",
-                "The tolerance is below the rounding of the heights",
+                "TOLERANCE_BELOW_ROUNDING",
+                "the tolerance is below the rounding of the heights",
                 f"stop.tol = {stop.tol:g}, but after a fall of {fall:.2g} m in a step a height is known to "
                 f"{unit:.2g} m in {spec.precision.state}: iterations past that resolve rounding errors.",
                 f"Raise stop.tol to {unit:.1g}, or make precision.state wider",
@@ -379,8 +379,8 @@ def _warnings(spec: ball.BallSpec) -> Iterator[Warning]:
         product = contact.alpha * contact.k
         if product > 1:
             yield Warning(
-                "projection-overshoots",
-                "The projection overshoots",
+                "PROJECTION_OVERSHOOTS",
+                "the projection overshoots",
                 f"alpha k = {product:g} is above 1: one iteration lifts a ball to {product - 1:.3g} times "
                 "its penetration above the floor, and the solve ends there.",
                 "Make alpha k at most 1",
@@ -389,8 +389,8 @@ def _warnings(spec: ball.BallSpec) -> Iterator[Warning]:
         stiff = spec.integrator.timestep * float(np.sqrt(contact.k))
         if stiff > 2 and spec.integrator.kind != "implicit-midpoint":
             yield Warning(
-                "step-beyond-stability",
-                "The time step is beyond the stability limit of the contact",
+                "STEP_BEYOND_STABILITY",
+                "the time step is beyond the stability limit of the contact",
                 f"h sqrt(k) = {stiff:.3g}, and no explicit scheme is stable in contact above 2.",
                 f"Make the timestep smaller than {2 / np.sqrt(contact.k):.3g} s, or use implicit-midpoint",
             )

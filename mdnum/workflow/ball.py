@@ -123,6 +123,7 @@ def _fill(
     folder: RunFolder, simulation: BallSimulation, progress: Progress | None
 ) -> tuple[BallRun, dict[str, Any]]:
     """Runs base and variants and puts what they say into the folder's tables and the summary."""
+    from mdnum.ball.compare import first_difference
     from mdnum.workflow import ball_record
 
     problem = simulation.problem
@@ -134,9 +135,12 @@ def _fill(
     variants = []
     for variant in simulation.variants:
         _say(progress, run.steps, f"variant {variant.name}")
-        other, _ = _simulate(variant.problem, None)
+        # without histories: the program is then the one that its gradient runs, and is compiled once
+        other = variant.problem.run(keep=run.kept)
+        parted = first_difference(run, other)
+        folder.append("separations", ball_record.separations(variant, parted))
         theirs = gradients(variant.problem, simulation.system.spec.gradient, first=True)
-        found = ball_record.compared(variant, run, other, gradient, theirs)
+        found = ball_record.compared(variant, parted, other, gradient, theirs)
         variants.append({**found, "loss": loss(variant.problem, theirs)})
     summary = ball_record.summarize(simulation, run)
     summary |= {

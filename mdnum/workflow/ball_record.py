@@ -8,7 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from mdnum.ball.compare import first_difference
+from mdnum.ball.compare import Difference
 from mdnum.ball.contacts import Penalty, Projection
 from mdnum.ball.exact import ExactImpact
 from mdnum.ball.exact_penalty import ExactPenalty
@@ -193,9 +193,19 @@ def summarize(simulation: BallSimulation, run: BallRun) -> dict[str, Any]:
     }
 
 
+def separations(variant: BallVariant, found: Difference) -> dict[str, Any]:
+    """A row per step: how far the heights of a variant are from those of the run."""
+    apart = found.separation
+    return {
+        "variant": np.full(len(apart), variant.name),
+        "step": np.arange(len(apart)),
+        "separation": apart,
+    }
+
+
 def compared(
     variant: BallVariant,
-    run: BallRun,
+    found: Difference,
     other: BallRun,
     gradient: Sequence[Mapping[str, Any]],
     theirs: Sequence[Mapping[str, Any]],
@@ -204,10 +214,10 @@ def compared(
 
     Args:
         variant: what was changed.
-        run, other: without and with the change.
+        found: where it parts from the run.
+        other: the run with the change.
         gradient, theirs: derivatives of both, the first method's first.
     """
-    found = first_difference(run, other)
     fork = None if found.fork is None else found.fork
     own, their = (dict(made[0]["gradient"]) if made else {} for made in (gradient, theirs))
     separation = found.separation

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mdnum.errors import NumericalError
+from mdnum.errors import InputError, NumericalError
 from mdnum.store import RunFolder
 
 if TYPE_CHECKING:
@@ -49,6 +49,12 @@ def run(
     """
     from mdnum.rollout.run import run as roll_out
 
+    if resume is not None and Path(resume).is_dir() and RunFolder.open(resume).world == "ball":
+        raise InputError(
+            "is a run of the ball, which takes seconds and leaves nothing to resume",
+            where=str(resume),
+            remedy=f"Run it again with `mdnum ball {resume}`",
+        )
     try:
         result = roll_out(
             system,
