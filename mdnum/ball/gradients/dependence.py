@@ -57,9 +57,10 @@ class Dependence:
 
 
 def dependence(
-    function: Callable[[Mapping[str, Any]], jax.Array],
+    function: Callable[..., jax.Array],
     values: Mapping[str, Any],
     names: Sequence[str] | None = None,
+    rest: Sequence[Any] = (),
     *,
     gradient: Mapping[str, float] | None = None,
     why_unused: str = "nothing that ran used {name}",
@@ -67,9 +68,11 @@ def dependence(
     """Whether a scalar loss depends on its parameters, by the tape of the run at these values.
 
     Args:
-        function: from a dictionary of parameters to a scalar loss; may loop and branch.
+        function: from a dictionary of parameters, and the rest, to a scalar loss; may loop and branch.
         values: the parameters, floating point, of any shape.
         names: those asked about, all by default.
+        rest: further arguments, pytrees of arrays. What must not become a constant of the compiled program
+            (the zero of a fence) is passed here and not closed over.
         gradient: derivatives already known; by default they are taken here in forward mode.
         why_unused: begins the sentence about a parameter that the run did not use.
 
@@ -91,20 +94,28 @@ def dependence(
     # the order in which a dictionary is flattened
     order = sorted(primals)
     leaves = [primals[key] for key in order]
-    program = jax.make_jaxpr(function)(primals)
-    follow = jax.jit(lambda leaves, seeds: _any(_follow(program.jaxpr, program.consts, leaves, seeds)[1]))
-    if gradient is None:
-        slope = jax.jit(lambda at, along: jax.jvp(function, (at,), (along,))[1])
+    program = jax.make_jaxpr(function)(primals, *rest)
+    others = jax.tree.leaves(tuple(rest))
+    never: list[Any] = [None] * len(others)
+
+    @jax.jit
+    def follow(consts: Any, inputs: list[jax.Array], seeds: list[jax.Array]) -> jax.Array:
+        return _any(_follow(program.jaxpr, consts, inputs, [*seeds, *never])[1])
+
+    @jax.jit
+    def slope(at: Any, along: Any, rest: Any) -> jax.Array:
+        return jax.jvp(lambda given: function(given, *rest), (at,), (along,))[1]
+
     answers = {}
     for name in names:
-        (written,) = _reach(program.jaxpr, [key == name for key in order])
+        (written,) = _reach(program.jaxpr, [key == name for key in order] + [False] * len(others))
         seeds = [jnp.full(leaf.shape, key == name) for key, leaf in zip(order, leaves, strict=True)]
-        used = written and bool(follow(leaves, seeds))
+        used = written and bool(follow(program.consts, leaves + others, seeds))
         if gradient is not None:
             derivative = float(gradient[name])
         else:
             along = {key: jnp.full_like(value, key == name) for key, value in primals.items()}
-            derivative = float(slope(primals, along))
+            derivative = float(slope(primals, along, tuple(rest)))
         answers[name] = Dependence(
             name, written, used, derivative, _say(name, written, used, derivative, why_unused)
         )

@@ -1,0 +1,103 @@
+"""Derivatives of the program that ran: through its iterations, or with every decision pinned."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+
+from mdnum.ball.gradients.base import Gradient, differentiate, evaluate, origin, start_of, used
+from mdnum.ball.problem import START, Problem
+
+
+@dataclass(frozen=True)
+class Unrolled:
+    """The derivative of the operations that ran, iteration by iteration.
+
+    Attributes:
+        loss_scale: the loss is multiplied by it before the reverse pass and the derivative divided after, so
+            that a narrow dtype does not lose it below its smallest number; a power of 2 changes no bit of a
+            derivative that was not lost.
+    """
+
+    loss_scale: float = 1.0
+
+    name = "unrolled"
+    says = "The derivative of the iterations that ran; decisions are held, a solver's tolerance is in it."
+
+    def __call__(self, problem: Problem, names: Sequence[str]) -> Gradient:
+        """The derivative, by reverse mode.
+
+        Error: rounding of the reverse pass in the dtypes of the policy.
+        """
+        run = problem.run(keep=False)
+        value, slopes = scaled(problem, names, None, self.loss_scale)
+        depends, why = used(problem, names, slopes, run)
+        details = {"iterations": int(run.iterations.sum()), "loss_scale": self.loss_scale}
+        return Gradient(self.name, self.says, value, slopes, depends, why, details)
+
+
+@dataclass(frozen=True)
+class Frozen:
+    """The derivative of the program whose decisions and iteration counts are told from a recording.
+
+    The pinned program has no branches left, so finite differences of it exist; in float64 they are taken as
+    a check.
+
+    Attributes:
+        check: whether to take them.
+    """
+
+    check: bool = True
+
+    name = "frozen"
+    says = "The derivative of a program without branches, told the decisions and counts of a recorded run."
+
+    def __call__(self, problem: Problem, names: Sequence[str]) -> Gradient:
+        """The derivative, by reverse mode, with central differences of the pinned program beside it.
+
+        Error: of the derivative, rounding; of the differences, about u^(2/3) relative.
+        """
+        run = problem.run(keep=False)
+        told = run.told()
+        told = type(told)(jnp.asarray(told.contact), jnp.asarray(told.iterations))
+        value, slopes = scaled(problem, names, told, 1.0)
+        details: dict = {"decisions": int(run.contact.size), "iterations": int(run.iterations.sum())}
+        if self.check and problem.world.policy.arithmetic == "float64":
+            details["finite_difference"] = pinned_differences(problem, names, told)
+        depends, why = used(problem, names, slopes, run)
+        return Gradient(self.name, self.says, value, slopes, depends, why, details)
+
+
+def scaled(problem: Problem, names: Sequence[str], told, scale: float) -> tuple[float, dict[str, float]]:
+    """Loss and reverse-mode derivative under loss scaling.
+
+    Args:
+        told: decisions to act on, or None.
+        scale: of the loss; representable in its dtype.
+    """
+    factor = jnp.asarray(scale, problem.world.policy.dtype("loss"))
+    values, start = origin(problem, names), start_of(problem)
+    loss, slopes = differentiate(values, problem.world, *start, told, problem.steps, problem.loss, factor)
+    return float(loss) / scale, {name: float(slopes[name]) / scale for name in names}
+
+
+def pinned_differences(problem: Problem, names: Sequence[str], told) -> dict[str, float]:
+    """Central differences of the loss with all decisions told.
+
+    Error: about u^(2/3), relative to the loss over the size of the parameter.
+    """
+    at, start = origin(problem, names), start_of(problem)
+    found = {}
+    for name in names:
+        size = float(np.max(np.abs(getattr(problem, name)))) if name in START else abs(float(at[name]))
+        width = 6e-6 * (size or 1.0)
+
+        def loss(shift: float, name: str = name) -> float:
+            values = at | {name: at[name] + shift}
+            return float(evaluate(values, problem.world, *start, told, problem.steps, problem.loss))
+
+        found[name] = (loss(width) - loss(-width)) / (2 * width)
+    return found
