@@ -95,7 +95,7 @@ def test_the_history_of_the_force_on_an_atom(world):
             )
             if name == "sequential":
                 # it streams, and there XLA contracts the product and the sum into one rounding
-                near = np.abs(terms[0][:, atom]).max() * 8 * np.finfo(terms[0].dtype).eps
+                near = float(np.abs(terms[0][:, atom]).max() * 8 * np.finfo(terms[0].dtype).eps)
                 assert history.result == pytest.approx(float(seen[0, atom]), abs=near, rel=0)
             else:
                 assert history.result == seen[0, atom], name
