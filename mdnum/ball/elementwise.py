@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_derivatives import SymbolicZero
 
 #: function(inputs, rest) -> (outputs, record); inputs and outputs are tuples of arrays of shape (balls,).
 Map = Callable[[tuple, Any], tuple[tuple, Any]]
@@ -37,30 +38,38 @@ def elementwise(function: Map) -> Map:
     def apply(inputs, rest):
         return function(inputs, rest)
 
-    @apply.defjvp
     def rule(primals, tangents):
         inputs, rest = primals
-        count = len(inputs)
+        # an input that nothing differentiated depends on needs no tangent of its own in the loop
+        moving = [k for k, rate in enumerate(tangents[0]) if not isinstance(rate, SymbolicZero)]
+
+        def outputs(*given):
+            every = list(inputs)
+            for k, value in zip(moving, given, strict=True):
+                every[k] = value
+            return function(tuple(every), rest)
+
+        varied = tuple(inputs[k] for k in moving)
+        if not moving:
+            made, record = outputs()
+            return (made, record), (jax.tree.map(jnp.zeros_like, made), jax.tree.map(_no_tangent, record))
         basis = tuple(
-            jnp.stack([jnp.full_like(x, 1.0 if row == column else 0.0) for row in range(count)])
-            for column, x in enumerate(inputs)
+            jnp.stack([jnp.full_like(x, row == column) for row in range(len(moving))])
+            for column, x in enumerate(varied)
         )
 
         def along(direction):
-            def outputs(*given):
-                made, record = function(given, rest)
-                return made, record
-
-            made, tangent, record = jax.jvp(outputs, inputs, direction, has_aux=True)
-            return made, tangent, record
+            return jax.jvp(outputs, varied, direction, has_aux=True)
 
         made, jacobian, record = jax.vmap(along, out_axes=(None, 0, None))(basis)
+        slopes = [tangents[0][k] for k in moving]
         rates = tuple(
-            sum((rows[k] * tangents[0][k] for k in range(1, count)), rows[0] * tangents[0][0])
+            sum((rows[k] * slopes[k] for k in range(1, len(moving))), rows[0] * slopes[0])
             for rows in jacobian
         )
         return (made, record), (rates, jax.tree.map(_no_tangent, record))
 
+    apply.defjvp(rule, symbolic_zeros=True)
     return apply
 
 
