@@ -1,0 +1,121 @@
+"""Every program of the ball against the exact motion: to rounding with located impacts, else by order."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mdnum.ball.contacts import Impact, Penalty, Projection
+from mdnum.ball.convergence import Convergence, converge
+from mdnum.ball.exact import ExactImpact
+from mdnum.ball.exact_penalty import ExactPenalty
+from mdnum.ball.integrators import (
+    EventLocated,
+    ExplicitEuler,
+    ImplicitMidpoint,
+    SemiImplicitEuler,
+    VelocityVerlet,
+)
+from mdnum.ball.rollout import simulate
+from mdnum.ball.stopping import PerInstance
+from mdnum.ball.world import World
+from mdnum.errors import InputError
+
+# three impacts each by the time 2, none of them near it
+STARTS = np.linspace(0.9, 1.1, 32)
+TIME = 2.0
+COUNTS = (400, 800, 1600)
+STIFFNESS = 100.0
+
+
+def spring(y0):
+    return ExactPenalty(y0, k=STIFFNESS)
+
+
+def test_the_order_of_a_power_is_its_exponent():
+    h = np.array([0.1, 0.05, 0.025])
+    found = Convergence(h, 3 * h**2, 0.5 * h, h)
+    assert abs(found.order() - 2) < 1e-12
+    assert abs(found.order("slope") - 1) < 1e-12
+
+
+def test_located_impacts_meet_the_exact_motion_at_every_step():
+    exact = ExactImpact(1.0, -0.5, 9.81, 0.8)
+    world = World.create(Impact(0.8, 0.0), EventLocated(0.01))
+    run = simulate(world, world.start(1.0, -0.5), 340)
+    assert int(run.iterations.sum()) == int(exact.bounces(3.4)) == 8
+    y, v = exact.state(run.time)
+    np.testing.assert_allclose(run.y[:, 0], y.value, atol=2e-14)
+    # next to an impact a rounding of the time moves the velocity across it
+    away = np.abs(run.time[:, None] - exact.impact_time(np.arange(1, 12)).value).min(axis=1) > 1e-9
+    np.testing.assert_allclose(run.v[away, 0], v.value[away], atol=2e-13)
+
+
+@pytest.mark.parametrize("name", ["y0", "v0", "gravity", "restitution"])
+def test_located_impacts_have_the_exact_derivatives(name):
+    world = World.create(Impact(0.8, 0.0), EventLocated(0.01))
+    # 2.9 s: eight impacts of the lowest ball, five of the highest
+    found = converge(world, ExactImpact, np.linspace(0.75, 1.15, 9), 2.9, (29,), name=name)
+    assert np.all(found.value < 5e-15)
+    assert np.all(found.slope < 1e-10)
+    assert np.all(found.largest > 0.1)
+
+
+@pytest.mark.parametrize("scheme", [ExplicitEuler, SemiImplicitEuler, VelocityVerlet])
+def test_impacts_at_the_end_of_a_step_are_of_order_one_and_their_derivative_is_zero(scheme):
+    """The derivative by y0 is exactly 0.0 at every step size: an error that does not shrink."""
+    found = converge(World.create(Impact(), scheme(0.01)), ExactImpact, STARTS, TIME, COUNTS)
+    assert abs(found.order() - 1) < 0.2
+    assert np.all(found.largest == 0.0)
+    assert np.all(found.slope > 0.5)
+
+
+def test_a_projection_is_of_order_one_and_its_derivative_is_zero():
+    world = World.create(Projection(0.5, 0.5, PerInstance(1e-9, 200)), SemiImplicitEuler(0.01))
+    found = converge(world, ExactImpact, STARTS, TIME, COUNTS)
+    assert abs(found.order() - 1) < 0.2
+    assert np.all(found.largest == 0.0)
+
+
+@pytest.mark.parametrize("name", ["y0", "v0"])
+@pytest.mark.parametrize("scheme", [ExplicitEuler, SemiImplicitEuler])
+def test_saltation_restores_the_derivative_to_order_one(scheme, name):
+    world = World.create(Impact(), scheme(0.01))
+    found = converge(world, ExactImpact, STARTS, TIME, COUNTS, name=name, saltation=True)
+    assert abs(found.order("slope") - 1) < 0.2
+    assert found.slope[-1] < 0.2
+
+
+def test_saltation_along_other_parameters_is_refused():
+    world = World.create(Impact(), ExplicitEuler(0.01))
+    with pytest.raises(InputError, match="expected y0 or v0"):
+        converge(world, ExactImpact, STARTS[:1], TIME, (10,), name="restitution", saltation=True)
+
+
+@pytest.mark.parametrize(
+    ("scheme", "order"),
+    [
+        (ExplicitEuler, 1),
+        (SemiImplicitEuler, 1),
+        (VelocityVerlet, 2),
+        (ImplicitMidpoint, 2),
+    ],
+)
+def test_a_penalty_approaches_the_spring_floor(scheme, order):
+    """Values to the scheme's order; derivatives to the first whatever the scheme.
+
+    The force has a kink at the floor. It costs the value an error of h² at each contact, which a scheme of
+    order 2 can afford; the derivative sees a jump in the force's slope there, and is of order 1.
+    """
+    starts, counts = np.linspace(0.8, 1.2, 32), (400, 800, 1600, 3200)
+    found = converge(World.create(Penalty(STIFFNESS), scheme(0.01)), spring, starts, TIME, counts)
+    assert abs(found.order() - order) < 0.2
+    assert abs(found.order("slope") - 1) < 0.2
+
+
+def test_a_stiff_penalty_approaches_the_elastic_impact():
+    """Spring floors of growing stiffness approach restitution 1 as 1/sqrt(k)."""
+    impact = float(ExactImpact(1.0, restitution=1.0).height(1.7).value)
+    k = np.array([1e4, 1e6, 1e8])
+    off = [abs(float(ExactPenalty(1.0, k=one).height(1.7).value) - impact) for one in k]
+    assert abs(np.polyfit(np.log(k), np.log(off), 1)[0] + 0.5) < 0.05
