@@ -24,7 +24,7 @@ class _Compensated(Whole):
         """(2u + 8(n u)²) * sum |terms|: independent of n until n is near 1/u (Higham 2002, 4.3)."""
         u, n = unit_roundoff(terms.dtype), len(terms)
         factor = 2 * u + 8 * (n * u) ** 2 if n * u < 0.1 else np.inf
-        return factor * np.abs(terms.astype(np.float64)).sum(axis=0)
+        return np.asarray(factor * np.abs(terms.astype(np.float64)).sum(axis=0))
 
 
 @dataclass(frozen=True)

@@ -113,7 +113,7 @@ class Whole:
     def bound(self, terms: Float[np.ndarray, "n ..."]) -> Float[np.ndarray, "..."]:
         """How far the computed sum can be from the exact one (see `Reduction`)."""
         depth = self.depth(len(terms))
-        return _chain(depth, terms.dtype) * np.abs(terms.astype(np.float64)).sum(axis=0)
+        return np.asarray(_chain(depth, terms.dtype) * np.abs(terms.astype(np.float64)).sum(axis=0))
 
     def depth(self, n: int) -> int:
         """The most additions that one of n terms goes through."""

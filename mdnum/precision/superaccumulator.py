@@ -156,7 +156,7 @@ class Exact(Whole):
         """u |sum|, where |sum| is itself bounded, since the host adds in float64."""
         wide = terms.astype(np.float64)
         total = np.abs(wide.sum(axis=0)) + gamma(len(terms)) * np.abs(wide).sum(axis=0)
-        return unit_roundoff(terms.dtype) * total
+        return np.asarray(unit_roundoff(terms.dtype) * total)
 
 
 @dataclass(frozen=True)
@@ -188,4 +188,4 @@ class FixedPoint(Whole):
     def bound(self, terms: Float[np.ndarray, "n ..."]) -> Float[np.ndarray, "..."]:
         """Half a unit for each term, and one rounding of the result."""
         size = np.abs(terms.astype(np.float64)).sum(axis=0)
-        return len(terms) * 2.0 ** (-self.bits - 1) + 2 * unit_roundoff(terms.dtype) * size
+        return np.asarray(len(terms) * 2.0 ** (-self.bits - 1) + 2 * unit_roundoff(terms.dtype) * size)

@@ -1,0 +1,92 @@
+"""Sums behind one's back, against loops over the entries."""
+
+from __future__ import annotations
+
+import math
+
+import jax
+import jax.numpy as jnp
+import ml_dtypes
+import numpy as np
+import pytest
+
+from mdnum.errors import InputError
+from mdnum.precision.coalesce import Coordinates, distinct_bits, orders, scatter_add, segment_sum
+from mdnum.precision.reductions import BY_NAME, Exact, FixedPoint, Sequential
+
+
+def entries(count=200, segments=9, dtype=np.float64, seed=1):
+    rng = np.random.default_rng(seed)
+    return rng.integers(0, segments, count), rng.normal(size=count).astype(dtype)
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float16, ml_dtypes.bfloat16])
+def test_segments_are_summed_in_storage_order(dtype):
+    index, values = entries(dtype=dtype)
+    expected = np.zeros(9, dtype)
+    for i, v in zip(index, values, strict=True):
+        expected[i] = expected[i] + v
+    seen = np.asarray(segment_sum(jnp.asarray(values), index, 9))
+    assert seen.dtype == dtype
+    assert np.array_equal(seen, expected)
+    if dtype == np.float64:
+        assert np.array_equal(np.asarray(jax.jit(scatter_add, static_argnums=2)(values, index, 9)), expected)
+
+
+@pytest.mark.parametrize("name", ["reversed", "kahan", "exact", "fixed-point"])
+def test_segments_are_summed_by_any_reduction(name):
+    index, values = entries()
+    seen = np.asarray(segment_sum(jnp.asarray(values), index, 10, BY_NAME[name]))
+    assert seen[9] == 0  # a segment without entries
+    for k in range(9):
+        own = values[index == k]
+        assert seen[k] == float(BY_NAME[name](jnp.asarray(own)))
+        assert abs(seen[k] - math.fsum(own)) <= BY_NAME[name].bound(own)
+
+
+def test_the_derivative_of_a_segment_sum_gathers():
+    index, values = entries(20, 4)
+    weights = jnp.arange(1.0, 5.0)
+    slope = jax.grad(lambda v: jnp.sum(weights * segment_sum(v, index, 4, Exact())))(jnp.asarray(values))
+    assert np.array_equal(np.asarray(slope), np.arange(1.0, 5.0)[index])
+
+
+def sparse(seed=0):
+    rng = np.random.default_rng(seed)
+    count = 60
+    return Coordinates(
+        rng.integers(0, 3, count),
+        rng.integers(0, 2, count),
+        rng.normal(size=count).astype(np.float32),
+        (3, 2),
+    )
+
+
+def test_coalescing_adds_duplicates():
+    matrix = sparse()
+    small = matrix.coalesced()
+    assert len(small.values) == 6 == len(set(zip(small.row.tolist(), small.column.tolist(), strict=True)))
+    assert np.array_equal(small.dense(), matrix.dense())
+    for r, c, value in zip(small.row, small.column, small.values, strict=True):
+        own = matrix.values[(matrix.row == r) & (matrix.column == c)]
+        assert value == pytest.approx(math.fsum(own.astype(float)), abs=1e-5)
+
+
+def test_storage_order_decides_the_bits_unless_the_sum_does_not_care():
+    matrix = sparse()
+    stored = [matrix.stored(order) for order in orders(60, 30)]
+
+    def count(**how):
+        return distinct_bits(lambda m: (m.coalesced(**how).values,), stored)
+
+    assert count(reduction=Sequential()) > 5
+    assert count(reduction=Sequential(), by_value=True) == 1
+    assert count(reduction=Exact()) == 1
+    assert count(reduction=FixedPoint(30)) == 1
+
+
+def test_entries_outside_are_refused():
+    with pytest.raises(InputError, match=r"outside 0 ... 2"):
+        segment_sum(jnp.ones(2), np.array([0, 3]), 3)
+    with pytest.raises(InputError, match=r"row outside 0 ... 2"):
+        Coordinates(np.array([3]), np.array([0]), np.ones(1), (3, 2))
