@@ -112,7 +112,7 @@ class DynamicScale:
     def value_and_grad(
         self, state: ScaleState, function: Callable[..., Any], *args: Any
     ) -> tuple[ScaledGradient, ScaleState]:
-        """The loss, its gradient and the next state; a step whose gradient is not `finite` is to be skipped."""
+        """The loss, its gradient and the next state; skip the step where it is not `finite`."""
         result = _scaled(function, state.scale, args)
         good = jnp.where(result.finite, state.good + 1, 0)
         grow = good >= self.interval

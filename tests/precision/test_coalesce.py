@@ -54,12 +54,8 @@ def test_the_derivative_of_a_segment_sum_gathers():
 def sparse(seed=0):
     rng = np.random.default_rng(seed)
     count = 60
-    return Coordinates(
-        rng.integers(0, 3, count),
-        rng.integers(0, 2, count),
-        rng.normal(size=count).astype(np.float32),
-        (3, 2),
-    )
+    row, column = rng.integers(0, 3, count), rng.integers(0, 2, count)
+    return Coordinates(row, column, rng.normal(size=count).astype(np.float32), (3, 2))
 
 
 def test_coalescing_adds_duplicates():

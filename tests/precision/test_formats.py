@@ -96,7 +96,7 @@ def test_the_ends_of_a_format():
 def test_what_a_format_cannot_hold_is_refused():
     check_representable(1e-4, "float16")
     with pytest.raises(
-        InputError, match=r"the tolerance 1e-06 cannot be held in float16.*smallest usable is 6\.1e-05"
+        InputError, match=r"the tolerance 1e-06 cannot be held in float16.*usable is 6\.1e-05"
     ):
         check_representable(1e-6, "float16", "the tolerance")
     with pytest.raises(InputError, match=r"1e\+06 cannot be held in float16.*largest is 6\.55e\+04"):
@@ -125,10 +125,8 @@ def test_a_tf32_product_is_rounded_inputs_and_float32_sums():
 
 def test_stochastic_rounding_has_the_right_mean():
     x = jnp.asarray([1.0003, -0.7777, 3e-6, 1234.5678, 0.5])
-    draws = jax.vmap(lambda key: stochastic_round(x, "float16", key))(
-        jax.random.split(jax.random.key(3), 40_000)
-    )
-    draws = np.asarray(draws)
+    keys = jax.random.split(jax.random.key(3), 40_000)
+    draws = np.asarray(jax.vmap(lambda key: stochastic_round(x, "float16", key))(keys))
     below = np.asarray(x).astype(np.float16)
     for k in range(5):
         values = np.unique(draws[:, k])
