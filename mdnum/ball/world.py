@@ -18,6 +18,7 @@ from mdnum.ball.state import BallState, Decisions, Record
 from mdnum.errors import InputError
 from mdnum.events import Hysteresis, Threshold
 from mdnum.precision.exact import zero_bits
+from mdnum.precision.formats import stochastic_round
 from mdnum.precision.policy import RolePrecision
 
 #: Where each parameter lives; the first place that a world has is meant.
@@ -232,8 +233,6 @@ class World(eqx.Module):
         dtype = self.policy.dtype("state")
         if self.policy.rounding == "nearest" or x.dtype == dtype:
             return self.rounding(x.astype(dtype))
-        from mdnum.precision.formats import stochastic_round
-
         key = jax.random.fold_in(jax.random.fold_in(jax.random.key(self.policy.seed), step), which)
         return stochastic_round(x, dtype, key)
 
