@@ -234,7 +234,7 @@ class World(eqx.Module):
         if self.policy.rounding == "nearest" or x.dtype == dtype:
             return self.rounding(x.astype(dtype))
         key = jax.random.fold_in(jax.random.fold_in(jax.random.key(self.policy.seed), step), which)
-        return stochastic_round(x, dtype, key)
+        return stochastic_round(x, self.policy.state, key).astype(dtype)
 
 
 def _get(node: Any, path: tuple[str, ...]) -> Any:
