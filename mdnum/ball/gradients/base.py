@@ -119,13 +119,23 @@ def evaluate(values, world, y0, v0, told, steps, loss):
 
 
 @eqx.filter_jit
-def differentiate(values, world, y0, v0, told, steps, loss, scale):
-    """Loss times scale and its reverse-mode derivative, compiled; scale has the dtype of the loss."""
+def differentiate(values, world, y0, v0, told, steps, loss, scaling):
+    """Loss and reverse-mode derivative under loss scaling, compiled."""
 
-    def scaled(values):
-        return moved_loss(values, world, y0, v0, told, steps, loss) * scale
+    def function(values):
+        return moved_loss(values, world, y0, v0, told, steps, loss)
 
-    return jax.value_and_grad(scaled)(values)
+    return scaling.value_and_grad(function, values)
+
+
+class _Rollout(eqx.Module):
+    """`moved_loss` of so many steps: equal for equal problems, so that it is compiled once."""
+
+    steps: int = eqx.field(static=True)
+    loss: Loss
+
+    def __call__(self, values, world, y0, v0, told):
+        return moved_loss(values, world, y0, v0, told, self.steps, self.loss)
 
 
 def used(
@@ -139,10 +149,7 @@ def used(
     """
     run = problem.run(keep=False) if run is None else run
     given = (problem.world, *start_of(problem), None)
-
-    def function(values, world, y0, v0, told):
-        return moved_loss(values, world, y0, v0, told, problem.steps, problem.loss)
-
+    function = _Rollout(problem.steps, problem.loss)
     answers = dependence(
         function, origin(problem, names), names, given, gradient=slopes, why_unused=_why(problem.world, run)
     )

@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -68,7 +69,8 @@ def dependence(
     """Whether a scalar loss depends on its parameters, by the tape of the run at these values.
 
     Args:
-        function: from a dictionary of parameters, and the rest, to a scalar loss; may loop and branch.
+        function: from a dictionary of parameters, and the rest, to a scalar loss; may loop and branch. It is
+            compiled once, as long as it is the same object (or an equal `eqx.Module`).
         values: the parameters, floating point, of any shape.
         names: those asked about, all by default.
         rest: further arguments, pytrees of arrays. What must not become a constant of the compiled program
@@ -96,30 +98,34 @@ def dependence(
     leaves = [primals[key] for key in order]
     program = jax.make_jaxpr(function)(primals, *rest)
     others = jax.tree.leaves(tuple(rest))
-    never: list[Any] = [None] * len(others)
-
-    @jax.jit
-    def follow(consts: Any, inputs: list[jax.Array], seeds: list[jax.Array]) -> jax.Array:
-        return _any(_follow(program.jaxpr, consts, inputs, [*seeds, *never])[1])
-
-    @jax.jit
-    def slope(at: Any, along: Any, rest: Any) -> jax.Array:
-        return jax.jvp(lambda given: function(given, *rest), (at,), (along,))[1]
 
     answers = {}
     for name in names:
         (written,) = _reach(program.jaxpr, [key == name for key in order] + [False] * len(others))
         seeds = [jnp.full(leaf.shape, key == name) for key, leaf in zip(order, leaves, strict=True)]
-        used = written and bool(follow(program.consts, leaves + others, seeds))
+        used = written and bool(_tape(function, primals, tuple(rest), seeds))
         if gradient is not None:
             derivative = float(gradient[name])
         else:
             along = {key: jnp.full_like(value, key == name) for key, value in primals.items()}
-            derivative = float(slope(primals, along, tuple(rest)))
+            derivative = float(_slope(function, primals, tuple(rest), along))
         answers[name] = Dependence(
             name, written, used, derivative, _say(name, written, used, derivative, why_unused)
         )
     return answers
+
+
+@eqx.filter_jit
+def _tape(function: Any, primals: Any, rest: Any, seeds: list[jax.Array]) -> jax.Array:
+    program = jax.make_jaxpr(function)(primals, *rest)
+    leaves = jax.tree.leaves((primals, rest))
+    never = [None] * (len(leaves) - len(seeds))
+    return _any(_follow(program.jaxpr, program.consts, leaves, [*seeds, *never])[1])
+
+
+@eqx.filter_jit
+def _slope(function: Any, primals: Any, rest: Any, along: Any) -> jax.Array:
+    return jax.jvp(lambda given: function(given, *rest), (primals,), (along,))[1]
 
 
 def _any(marks: Sequence[Any]) -> jax.Array:

@@ -10,6 +10,8 @@ import numpy as np
 
 from mdnum.ball.gradients.base import Gradient, differentiate, evaluate, origin, start_of, used
 from mdnum.ball.problem import START, Problem
+from mdnum.ball.rollout import BallRun
+from mdnum.precision.scaling import StaticScale
 
 
 @dataclass(frozen=True)
@@ -17,9 +19,9 @@ class Unrolled:
     """The derivative of the operations that ran, iteration by iteration.
 
     Attributes:
-        loss_scale: the loss is multiplied by it before the reverse pass and the derivative divided after, so
-            that a narrow dtype does not lose it below its smallest number; a power of 2 changes no bit of a
-            derivative that was not lost.
+        loss_scale: the reverse pass starts with it instead of 1 and the derivative is divided by it, so that
+            a narrow dtype does not lose it below its smallest number (`mdnum.precision.scaling`); a power of
+            two.
     """
 
     loss_scale: float = 1.0
@@ -27,12 +29,15 @@ class Unrolled:
     name = "unrolled"
     says = "The derivative of the iterations that ran; decisions are held, a solver's tolerance is in it."
 
-    def __call__(self, problem: Problem, names: Sequence[str]) -> Gradient:
+    def __call__(self, problem: Problem, names: Sequence[str], run: BallRun | None = None) -> Gradient:
         """The derivative, by reverse mode.
+
+        Args:
+            run: of this problem, where there already is one.
 
         Error: rounding of the reverse pass in the dtypes of the policy.
         """
-        run = problem.run(keep=False)
+        run = problem.run(keep=False) if run is None else run
         value, slopes = scaled(problem, names, None, self.loss_scale)
         depends, why = used(problem, names, slopes, run)
         details = {"iterations": int(run.iterations.sum()), "loss_scale": self.loss_scale}
@@ -76,12 +81,11 @@ def scaled(problem: Problem, names: Sequence[str], told, scale: float) -> tuple[
 
     Args:
         told: decisions to act on, or None.
-        scale: of the loss; representable in its dtype.
+        scale: a power of two.
     """
-    factor = jnp.asarray(scale, problem.world.policy.dtype("loss"))
-    values, start = origin(problem, names), start_of(problem)
-    loss, slopes = differentiate(values, problem.world, *start, told, problem.steps, problem.loss, factor)
-    return float(loss) / scale, {name: float(slopes[name]) / scale for name in names}
+    values, start, scaling = origin(problem, names), start_of(problem), StaticScale(scale)
+    made = differentiate(values, problem.world, *start, told, problem.steps, problem.loss, scaling)
+    return float(made.value), {name: float(made.gradient[name]) for name in names}
 
 
 def pinned_differences(problem: Problem, names: Sequence[str], told) -> dict[str, float]:
