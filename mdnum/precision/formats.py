@@ -194,9 +194,9 @@ def stochastic_round(x: Float[Array, "..."], name: str, key: Array) -> Float[Arr
     """x rounded up or down to a neighbor in a format with probabilities that keep its mean.
 
     In the dtype of x; a number of the format stays as it is. Unbiased: the expectation is x (for |x| up to
-    the largest number), with a standard deviation of at most half the spacing; so a long sum of small terms does not stand still.
-    The uniform numbers have 53 bits. Its derivative is 1. Source: Croci et al., R. Soc. Open Sci. 9, 211631
-    (2022).
+    the largest number), with a standard deviation of at most half the spacing; so a long sum of small terms
+    does not stand still. The uniform numbers have 53 bits. Its derivative is 1. Source: Croci et al., R. Soc.
+    Open Sci. 9, 211631 (2022).
     """
     form = get(name)
     if form.significand >= 53:
