@@ -36,6 +36,8 @@ def drawn(draw: Callable[[Figure], None], height: float, width: float = PAGE_WID
         )
         figure.get_layout_engine().set(h_pad=0.05, w_pad=0.02, hspace=0.04)  # type: ignore[union-attr]
         draw(figure)
+        if width != PAGE_WIDTH:
+            _fit_legends(figure)
         figure.align_ylabels()
         for axes in figure.axes:
             axes.grid(True, color=GRID, lw=0.6)
@@ -133,13 +135,40 @@ def legend(axes: Axes) -> int:
     columns = len(handles)
     while columns > 1 and _legend_width(labels, columns) > width:
         columns -= 1
-    labels = [folded(text, width - 20, _SMALL) for text in labels]
+    return _place_legend(axes, columns, width - 20)
+
+
+def _place_legend(axes: Axes, columns: int, width: float) -> int:
+    """Draws the legend in so many columns, its labels folded; returns the lines it takes."""
+    handles, labels = axes.get_legend_handles_labels()
+    labels = [folded(text, width, _SMALL) for text in labels]
     axes.legend(
         handles, labels, loc="lower left", bbox_to_anchor=(0, 1.0),
         ncols=columns, frameon=False, handlelength=1.3, columnspacing=1.4, borderaxespad=0.1, fontsize=_SMALL,
     )  # fmt: skip
     deepest = max(text.count("\n") for text in labels) + 1
     return deepest * -(-len(labels) // columns)
+
+
+def _fit_legends(figure: Figure) -> None:
+    """Takes columns out of legends that are wider than the figure once its axes have their place."""
+    for axes in figure.axes:
+        while (legend := axes.get_legend()) is not None:
+            labels = [text.get_text() for text in legend.get_texts()]
+            columns: int = legend._ncols  # type: ignore[attr-defined]
+            if _legend_width(labels, columns) < 0.7 * 72.0 * figure.get_figwidth():
+                break
+            figure.draw_without_rendering()
+            box = legend.get_window_extent()
+            over = (box.x1 - figure.bbox.x1) * 72 / figure.dpi
+            if over <= 0 or (columns == 1 and all("\n" in text or " " not in text for text in labels)):
+                break
+            before = -(-len(labels) // columns)
+            room = 72.0 * figure.get_figwidth() - box.x0 * 72 / figure.dpi - 24
+            lines = _place_legend(axes, max(1, columns - 1), room)
+            figure.set_figheight(figure.get_figheight() + 0.16 * max(0, lines - before))
+            if columns == 1:
+                break
 
 
 def text_width(text: str, size: float) -> float:

@@ -13,10 +13,10 @@ from matplotlib.patches import PathPatch
 from matplotlib.path import Path
 
 from mdnum.report import thin
-from mdnum.report.axes import PAGE_WIDTH, drawn, folded, legend
+from mdnum.report.axes import PAGE_WIDTH, drawn, folded, legend, text_width
 from mdnum.report.scales import Scale
 from mdnum.report.svg import BAD, FIRST, HALO, INK, MUTED, SECOND, THIRD
-from mdnum.report.words import many
+from mdnum.report.words import listed, many
 
 if TYPE_CHECKING:
     from mdnum.ball.demos.base import Plot, Region, Series
@@ -38,14 +38,15 @@ class _Part:
     covered: int
 
 
-def draw(plot: Plot, width: float = PAGE_WIDTH) -> Figure:
+def draw(plot: Plot, width: float = PAGE_WIDTH, x_range: tuple[float, float] | None = None) -> Figure:
     """A plot as a figure.
 
     Args:
         width: inches, `axes.PAGE_WIDTH` or `axes.PHONE_WIDTH`.
+        x_range: what the horizontal axis shows, where figures are to be compared.
     """
     height = 3.3 if plot.region else 2.9
-    return drawn(lambda figure: _compose(plot, figure), height, width)
+    return drawn(lambda figure: _compose(plot, figure, x_range), height, width)
 
 
 def notes(plot: Plot) -> list[str]:
@@ -57,7 +58,7 @@ def notes(plot: Plot) -> list[str]:
             found.append(f"No value of {name} is positive, so its axis is linear.")
     lost = [series for series in plot.series if scales[1].kind == "log" and _lost(scales, series).any()]
     if lost:
-        which = " and ".join(f"“{series.label}”" for series in lost if series.label)
+        which = listed([f"“{series.label}”" for series in lost if series.label] or [""])
         total = sum(int(_lost(scales, series).sum()) for series in lost)
         negative = any(np.any(np.asarray(series.y).astype(float) < 0) for series in lost)
         found.append(
@@ -94,7 +95,7 @@ def _scales(plot: Plot) -> tuple[Scale, Scale]:
     return Scale.choose(plot.x_scale, x), Scale.choose(plot.y_scale, y)
 
 
-def _compose(plot: Plot, figure: Figure) -> None:
+def _compose(plot: Plot, figure: Figure, x_range: tuple[float, float] | None) -> None:
     axes = figure.subplots()
     x_scale, y_scale = _scales(plot)
     x_scale.apply(axes, "x")
@@ -108,8 +109,11 @@ def _compose(plot: Plot, figure: Figure) -> None:
         axes.axvline(float(x_scale.shown(np.array(value))), color=MUTED, lw=0.9, ls=(0, (4, 3)), zorder=1.6)
     for value, _ in plot.horizontals:
         axes.axhline(float(y_scale.shown(np.array(value))), color=MUTED, lw=0.9, ls=(0, (4, 3)), zorder=1.6)
-    if not any(np.any(np.isfinite(part.x) & np.isfinite(part.y)) for part in parts) and plot.region is None:
+    if not axes.lines and plot.region is None:
         axes.text(0.5, 0.5, "no values", transform=axes.transAxes, color=MUTED, ha="center", va="center")
+    if x_range is not None and x_scale.kind == "linear" and not x_scale.shift and x_range[1] > x_range[0]:
+        room = 0.02 * (x_range[1] - x_range[0])
+        axes.set_xlim(x_range[0] - room, x_range[1] + room)
     wide = figure.get_figwidth() >= PAGE_WIDTH
     x_label = x_scale.label(plot.x_label, x_scale.ticks(axes, "x", 7 if wide else 4))
     y_label = y_scale.label(plot.y_label, y_scale.ticks(axes, "y", 6))
@@ -126,7 +130,18 @@ def _compose(plot: Plot, figure: Figure) -> None:
 def _parts(series: Sequence[Series], x_scale: Scale, y_scale: Scale) -> list[_Part]:
     shown = [(x_scale.shown(item.x), y_scale.shown(item.y)) for item in series]
     return [
-        _Part(item, *shown[n], covered=sum(_same(shown[n], later) for later in shown[n + 1 :]))
+        _Part(
+            item,
+            *shown[n],
+            # a line of the same color hides nothing
+            covered=len(
+                {
+                    (series[later].role, series[later].dashed)
+                    for later in range(n + 1, len(series))
+                    if series[later].role != item.role and _same(shown[n], shown[later])
+                }
+            ),
+        )
         for n, item in enumerate(series)
     ]
 
@@ -163,15 +178,17 @@ def _series(axes: Axes, part: _Part, x_scale: Scale, y_scale: Scale) -> None:
         style |= marker
     elif alone.any():
         axes.plot(x[alone], y[alone], ls="", color=color, zorder=2.0, **marker)
-    axes.plot(x, y, label=item.label or None, **style)
+    if finite.any():
+        axes.plot(x, y, label=item.label or None, **style)
     if y_scale.kind == "log":
         lost = _lost((x_scale, y_scale), item)
         if lost.any():
             at = part.x[lost]
+            hidden = None if finite.any() else item.label or None
             at = at[thin.points(x_scale.flat(at), np.zeros(len(at)), 200)]
             axes.plot(
-                at, np.zeros(len(at)), "v", color=color, mfc="none", mew=1.0, ms=4.5, clip_on=False,
-                transform=axes.get_xaxis_transform(), zorder=3,
+                at, np.zeros(len(at)), "v", label=hidden, color=color, mfc="none", mew=1.0, ms=4.5,
+                clip_on=False, transform=axes.get_xaxis_transform(), zorder=3,
             )  # fmt: skip
 
 
@@ -228,9 +245,10 @@ def _label_lines(axes: Axes, plot: Plot, parts: Sequence[_Part], x_scale: Scale,
         shown = scale.flat(scale.shown(np.array([value for value, _ in marked], float)))
         places = (shown - limits[0]) / (limits[1] - limits[0])
         for place, side, words in _groups(places, [words for _, words in marked], 12 / max(room, 1)):
-            near = cloud[np.abs(cloud[:, along] - place) < 0.05, across]
-            far = np.count_nonzero(near > 0.5) <= np.count_nonzero(near < 0.5)
             text = folded(words, 0.85 * length, _NOTE)
+            takes = min(1.0, max(text_width(line, _NOTE) for line in text.split("\n")) / max(length, 1))
+            near = cloud[np.abs(cloud[:, along] - place) < 14 / max(room, 1), across]
+            far = np.count_nonzero(near > 1 - takes) <= np.count_nonzero(near < takes)
             if which == "x":
                 spot, turn = (place, 0.98 if far else 0.02), dict[str, Any](rotation=90)
                 turn |= {"va": "top" if far else "bottom", "ha": "left" if side > 0 else "right"}

@@ -67,7 +67,7 @@ class Scale:
         if not len(everything):
             return cls("linear")
         low, high = everything.min(), everything.max()
-        whole = bool(np.all(everything == np.round(everything))) and high - low >= 1
+        whole = bool(np.all(everything == np.round(everything))) and (high - low >= 1 or high == low)
         if 0 < high - low < _NEAR * size.max():
             # a value that is there, so that the difference is exact
             return cls("linear", shift=float(np.sort(everything)[len(everything) // 2]), whole=whole)
@@ -130,7 +130,9 @@ class Scale:
         low, high = sorted(axes.get_xlim() if which == "x" else axes.get_ylim())
         axis.set_minor_locator(NullLocator())
         if self.kind == "linear":
-            locator = MaxNLocator(most, integer=self.whole, steps=[1, 2, 2.5, 5, 10])
+            locator = MaxNLocator(
+                most, min_n_ticks=1 if self.whole else 2, integer=self.whole, steps=[1, 2, 2.5, 5, 10]
+            )
             largest = float(np.max(np.abs(locator.tick_values(low, high)), initial=0.0))
             exponent = int(np.floor(np.log10(largest))) if largest > 0 else 0
             exponent = exponent if exponent < -2 or exponent > 4 else 0

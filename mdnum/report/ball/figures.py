@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from mdnum.ball.demos.base import Plot, Series
 from mdnum.report import plots
-from mdnum.report.axes import PAGE_WIDTH, drawn, folded
+from mdnum.report.axes import PAGE_WIDTH, drawn, folded, legend
 from mdnum.report.ball.run import BallFolder
 from mdnum.report.scales import Scale
 from mdnum.report.svg import FIRST, INK, MUTED, SECOND
@@ -39,13 +39,14 @@ def figures(run: BallFolder) -> Iterator[tuple[str, str, Drawer, list[str]]]:
         ("stops", stops(run)), ("margins", margins(run)), ("separation", separation(run)),
     ):  # fmt: skip
         if plot is not None:
-            yield name, plot.title, partial(_draw, plot), plots.notes(plot)
+            span = (float(run.series["time"][0]), float(run.series["time"][-1]))
+            yield name, plot.title, partial(_draw, plot, span), plots.notes(plot)
     if run.parameters:
         yield "gradient", "Derivatives by method", partial(gradient, run), []
 
 
-def _draw(plot: Plot, width: float) -> Figure:
-    return plots.draw(plot, width)
+def _draw(plot: Plot, span: tuple[float, float], width: float) -> Figure:
+    return plots.draw(plot, width, span)
 
 
 def heights(run: BallFolder) -> Plot | None:
@@ -165,7 +166,7 @@ def separation(run: BallFolder) -> Plot | None:
     """How far variants are from the run, by step."""
     rows = run.separations
     names = list(dict.fromkeys(rows["variant"].astype(str).tolist()))
-    if not names:
+    if not names or not np.any(rows["separation"] > 0):
         return None
     roles: tuple[Role, ...] = ("first", "second", "third", "bad", "muted")
     series = []
@@ -188,7 +189,7 @@ def separation(run: BallFolder) -> Plot | None:
 def gradient(run: BallFolder, width: float = PAGE_WIDTH) -> Figure:
     """Each method's derivative on a line, a panel per parameter, with the closed form's where it is known."""
     methods = [str(made["method"]) for made in run.gradient]
-    height = (0.55 + 0.3 * len(methods)) * len(run.parameters) + 0.25
+    height = (0.55 + 0.3 * len(methods)) * len(run.parameters) + 0.3
     # `drawn` lowers a figure on a phone, whose lines need as much room
     scale = 1.0 if width == PAGE_WIDTH else 1 / 0.85
     return drawn(partial(_dots, run, methods), height * scale, width)
@@ -244,12 +245,15 @@ def _dots(run: BallFolder, methods: list[str], figure: Figure) -> None:
             label.set_gid("halo")
         exponent = scale.ticks(axes, "x", 6 if wide else 4)
         axes.set_xlabel(scale.label(f"dloss/d{name}", exponent), color=INK)
+        if axes is panels[0]:
+            legend(axes)
 
 
 def _scale(values: np.ndarray) -> Scale:
     size = np.abs(values[np.isfinite(values) & (values != 0)])
     far = len(size) > 1 and size.max() > 300 * size.min()
-    return Scale.choose("symlog" if far else "linear", [values])
+    # zero is shown too, so that no axis is one of differences
+    return Scale.choose("symlog" if far else "linear", [values, np.zeros(1)])
 
 
 def _value(value: float | None) -> float:

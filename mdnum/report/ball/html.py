@@ -108,7 +108,11 @@ def _key_figures(run: BallFolder) -> Iterator[tuple[str, str, str]]:
         yield "Loss", number(summary.get("loss"), 4), "no derivative was asked for"
     error = run.exact.get("height_error_largest", run.exact.get("height_error"))
     yield "Against closed form", number(error, 2), "m, largest" if error is not None else "there is none"
-    yield "Speed", number(summary.get("steps_per_second")), "steps per second"
+    speed = summary.get("steps_per_second")
+    if speed is None:
+        yield "Took", f"{number(summary.get('seconds'), 2)} s", "compilation, variants and all"
+    else:
+        yield "Speed", number(speed), "steps per second"
 
 
 def _what_was_run(run: BallFolder) -> Iterator[tuple[str, str]]:
@@ -134,14 +138,23 @@ def _what_was_run(run: BallFolder) -> Iterator[tuple[str, str]]:
         if not isinstance(table, Mapping) or not table:
             continue
         # how many steps were made is said above
-        words = {item: _listed(value) for item, value in table.items() if item != "steps"}
+        words = {item: _told(value) for item, value in table.items() if not _idle(item, value)}
         if "rule" in words:
             words = {"kind": words.pop("rule"), **words}
         yield name, page.in_words(words, units)
 
 
-def _listed(value: Any) -> Any:
-    return ", ".join(str(item) for item in value) if isinstance(value, list) else value
+def _idle(key: str, value: Any) -> bool:
+    """Whether a value says nothing, or what is said elsewhere."""
+    return key in ("steps", "balls") or (key.startswith("spread") and not value)
+
+
+def _told(value: Any) -> Any:
+    if isinstance(value, Mapping) and "kind" in value:
+        return page.in_words({key: _told(item) for key, item in value.items()})
+    if isinstance(value, list):
+        return ", ".join(str(_told(item)) for item in value)
+    return value_text(value, 12) if isinstance(value, float) else value
 
 
 def _gradient(run: BallFolder) -> Iterator[dict[str, Any]]:
@@ -157,11 +170,11 @@ def _gradient(run: BallFolder) -> Iterator[dict[str, Any]]:
             small = "does not depend" if not used else ""
             if used and error is not None:
                 small = f"off by {number(error, 2, signed=True)}" if error else "exactly the closed form’s"
-            cells.append((value_text(made["gradient"].get(name), 8), small))
-        yield {"method": made["method"], "says": made["says"], "value": value_text(made.get("value"), 8),
+            cells.append((value_text(made["gradient"].get(name), 6), small))
+        yield {"method": made["method"], "says": made["says"], "value": value_text(made.get("value"), 6),
                "cells": cells}  # fmt: skip
     if exact:
-        cells = [(value_text(exact.get(name), 8), "") for name in run.parameters]
+        cells = [(value_text(exact.get(name), 6), "") for name in run.parameters]
         yield {
             "method": "closed form",
             "says": "The derivative of the exact motion.",
@@ -219,9 +232,7 @@ def _variants(run: BallFolder) -> Iterator[dict[str, Any]]:
         ]
         yield {
             "name": one.get("name"),
-            "changes": ", ".join(
-                f"{key} = {value_text(value)}" for key, value in (one.get("changes") or {}).items()
-            ),
+            "changes": _changes(one.get("changes") or {}),
             "seed": "never" if one.get("seed") is None else count(one["seed"]),
             "fork": "never" if fork is None else count(fork),
             "where": where,
@@ -231,6 +242,17 @@ def _variants(run: BallFolder) -> Iterator[dict[str, Any]]:
             "loss": number(one.get("loss"), 4),
             "gradient": gradient,
         }
+
+
+def _changes(changes: Mapping[str, Any]) -> str:
+    """Keys and values; keys of one table that are set alike are told together."""
+    groups: dict[tuple[str, str], list[str]] = {}
+    for key, value in changes.items():
+        table, _, name = str(key).rpartition(".")
+        groups.setdefault((table, value_text(value, 17)), []).append(name)
+    return "; ".join(
+        f"{table}{'.' if table else ''}{', '.join(names)} = {text}" for (table, text), names in groups.items()
+    )
 
 
 def _contacts(run: BallFolder) -> Browse:

@@ -216,8 +216,10 @@ def _disagree(run: BallFolder) -> Iterator[Finding]:
             "ball in contact is held fixed, and each contact multiplies what that leaves out."
         )
         remedy = "Shorten integrator.timestep, or locate the impacts (integrator event-located)."
-        words = listed([f"dloss/d{name}" for name in off])
-        title = f"{words} {'is' if len(off) == 1 else 'are'} not the closed form’s"
+        several = "s" if len(off) > 1 else ""
+        title = (
+            f"the derivative{several} along {listed(off)} {'are' if several else 'is'} not the closed form’s"
+        )
         yield Finding("OFF_CLOSED_FORM", "warning", title, text, remedy)
 
 
