@@ -19,6 +19,8 @@ from numba import njit
 from vesin import NeighborList
 
 from mdnum import units
+from mdnum.systems import ball
+from mdnum.systems.ball_system import BALL_SCHEMA
 from mdnum.systems.schema import json_schema
 from mdnum.systems.structures import to_extxyz
 
@@ -230,12 +232,12 @@ STRUCTURES: dict[str, Callable[[], Atoms]] = {
 
 
 def main() -> None:
-    """Make the structures named on the command line, or all, and the schema."""
+    """Make the structures named on the command line, or all, and the schemas."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(STRUCTURES)}")
-    parser.add_argument("--schema", action="store_true", help="write schema.json only")
+    parser.add_argument("--schema", action="store_true", help="write the JSON schemas only")
     arguments = parser.parse_args()
     names = [] if arguments.schema else arguments.names or list(STRUCTURES)
     unknown = [name for name in names if name not in STRUCTURES]
@@ -247,7 +249,8 @@ def main() -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(to_extxyz(atoms), encoding="utf-8")
         print(f"{path.relative_to(ROOT.parent)}: {len(atoms)} atoms, {path.stat().st_size / 1024:.0f} kB")
-    (ROOT / "schema.json").write_text(json.dumps(json_schema(), indent=1, ensure_ascii=False) + "\n", "utf-8")
+    for file, schema in (("schema.json", json_schema()), (BALL_SCHEMA, ball.json_schema())):
+        (ROOT / file).write_text(json.dumps(schema, indent=1, ensure_ascii=False) + "\n", "utf-8")
 
 
 if __name__ == "__main__":

@@ -11,7 +11,13 @@ from typing import TYPE_CHECKING, Any, Self, TextIO
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
-_WORDS = {"compile": "compiling", "run": "running", "check": "checking", "report": "writing the report"}
+_WORDS = {
+    "compile": "compiling",
+    "run": "running",
+    "gradient": "differentiating",
+    "check": "checking",
+    "report": "writing the report",
+}
 
 
 class ProgressBar:

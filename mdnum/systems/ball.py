@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Discriminator, Field
+from pydantic import BeforeValidator, Discriminator, Field, WithJsonSchema
 from pydantic_core import PydanticKnownError
 
 from mdnum.systems.interactions import NonNegative, Table
@@ -19,7 +19,7 @@ FloatName = Literal["float16", "bfloat16", "float32", "float64"]
 ParameterName = Literal[
     "k", "damping", "eps", "alpha", "tol", "restitution", "gravity", "h", "y0", "v0"
 ]  # fmt: skip
-MethodName = Literal["unrolled", "implicit", "frozen", "event-aware", "smoothed", "randomized-smoothing"]
+MethodName = Literal["unrolled", "implicit", "frozen", "event-aware", "smoothed", "randomized"]
 
 
 def _numbers(value: Any) -> Any:
@@ -54,7 +54,10 @@ def _tuple(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 
-Reduction = Annotated[str, BeforeValidator(_reduction)]
+_PATTERN = "|".join(rf"{name}(:\d+)?" if name in NUMBERED else name for name in REDUCTIONS)
+Reduction = Annotated[
+    str, BeforeValidator(_reduction), WithJsonSchema({"type": "string", "pattern": f"^({_PATTERN})$"})
+]
 Numbers = Annotated[float | tuple[float, ...], BeforeValidator(_numbers)]
 
 

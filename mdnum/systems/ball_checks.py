@@ -109,6 +109,11 @@ def balls(spec: ball.BallSpec) -> int:
     return len(lists[0]) if lists else start.balls
 
 
+def solves(contact: str | None, integrator: str | None) -> bool:
+    """Whether a step of this kind iterates: a projection, and the implicit equation of a spring."""
+    return contact == "projection" or (integrator == "implicit-midpoint" and contact == "penalty")
+
+
 def _start(spec: ball.BallSpec) -> None:
     start = spec.start
     if start.boundary is not None:
@@ -210,10 +215,9 @@ def _combination(spec: ball.BallSpec) -> None:
 
 
 def _stop(spec: ball.BallSpec) -> None:
-    implicit = spec.integrator.kind == "implicit-midpoint" and spec.contact.kind == "penalty"
-    solves = spec.contact.kind == "projection" or implicit
+    needed = solves(spec.contact.kind, spec.integrator.kind)
     if spec.stop is None:
-        if solves:
+        if needed:
             what = "a projection" if spec.contact.kind == "projection" else "implicit-midpoint"
             raise Refusal(
                 "stop",
@@ -221,7 +225,7 @@ def _stop(spec: ball.BallSpec) -> None:
                 'Add for example [stop] with rule = "sum", tol = 1e-6, max_iter = 100',
             )
         return
-    if not solves:
+    if not needed:
         raise Refusal(
             "stop",
             f"[stop] has no meaning here: {spec.contact.kind} with {spec.integrator.kind} iterates nothing",

@@ -125,6 +125,7 @@ def make(source: Source, data: dict[str, Any]) -> BallSystem:
         InputError: anything that cannot be run, in one line.
     """
     overrides.apply(data, source.values, GRAMMAR)
+    _drop_meaningless(data, source.values)
     try:
         spec = BallSpec.model_validate(data)
     except ValidationError as error:
@@ -140,6 +141,25 @@ def make(source: Source, data: dict[str, Any]) -> BallSystem:
         for name, changes in spec.variants.items()
     )
     return BallSystem(spec.name or source.name, spec, source.path, variants)
+
+
+def _drop_meaningless(data: dict[str, Any], values: Mapping[toml.Key, Any]) -> None:
+    """What the file says of another contact or integrator than the one that is asked for."""
+    if not {("contact", "kind"), ("integrator", "kind")} & set(values):
+        return
+    contact, integrator, gradient = (data.get(key) for key in ("contact", "integrator", "gradient"))
+    if not isinstance(contact, dict) or not isinstance(integrator, dict):
+        return
+    kind = contact.get("kind")
+    solves = ball_checks.solves(kind, integrator.get("kind"))
+    if not solves and not any(key[0] == "stop" for key in values):
+        data.pop("stop", None)
+    known = (*ball_checks.PARAMETERS.get(str(kind), ()), *ball_checks.ALWAYS)
+    if isinstance(gradient, dict) and ("gradient", "of") not in values:
+        asked = gradient.get("of", ())
+        gradient["of"] = (
+            [name for name in asked if name in known] if isinstance(asked, list | tuple) else asked
+        )
 
 
 def kind_first(spec: Mapping[str, Any]) -> dict[str, Any]:
@@ -172,7 +192,7 @@ def _variant(name: str, changes: Mapping[str, Any], base: BallSpec, where: str) 
     """
     if not changes:
         raise InputError(f"variant {name!r} changes nothing", where=where, remedy="Name a key, or remove it")
-    data = copy.deepcopy(base.model_dump(mode="python", exclude_none=True, exclude={"variants"}))
+    data = copy.deepcopy(base.model_dump(mode="python", exclude_none=True, exclude={"variants", "name"}))
     if base.start.boundary is not None:
         data["start"] = {"boundary": data["start"]["boundary"]}
     values = {toml.dotted(key): value for key, value in changes.items()}
@@ -184,6 +204,7 @@ def _variant(name: str, changes: Mapping[str, Any], base: BallSpec, where: str) 
                 remedy="Remove it",
             )
     overrides.apply(data, values, GRAMMAR)
+    _drop_meaningless(data, values)
     try:
         spec = BallSpec.model_validate(data)
         ball_checks.check(spec)

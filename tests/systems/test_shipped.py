@@ -25,8 +25,29 @@ ATOMS = {
 }
 
 
+BALLS = {
+    "ball/batch-on-the-boundary": 9,
+    "ball/drop": 1,
+    "ball/grazing": 1,
+    "ball/stiff": 1,
+    "ball/zeno": 1,
+}
+
+
 def test_all_are_listed():
-    assert systems.names() == list(ATOMS)
+    assert systems.names() == sorted({**ATOMS, **BALLS})
+
+
+@pytest.mark.parametrize("name", list(BALLS))
+def test_each_ball_loads_with_variants_and_a_gradient_to_show(name: str):
+    system = load(name)
+    assert system.balls == BALLS[name]
+    assert system.name == name
+    assert len(system.spec.about) > 100
+    assert system.variants
+    assert system.spec.gradient.of
+    assert len(system.spec.gradient.methods) > 1
+    assert system.warnings == ()
 
 
 @pytest.mark.parametrize("name", list(ATOMS))

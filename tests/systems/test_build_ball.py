@@ -1,0 +1,163 @@
+"""From tables to objects: starts, controls, rules and worlds are those that the file describes."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from typing import Any
+
+import ml_dtypes
+import numpy as np
+import pytest
+
+from mdnum.ball import contacts, integrators, losses, stopping
+from mdnum.errors import InputError
+from mdnum.precision.reductions import Blocked, Permuted
+from mdnum.systems import build_ball, load
+from mdnum.systems.ball import BallSpec
+from mdnum.systems.build_ball import problem, start
+
+IMPACT = {"kind": "impact"}
+SPRING = {"kind": "penalty", "k": 100.0}
+SOLVED = {"kind": "projection", "k": 0.5, "alpha": 0.25, "restitution": 0.75}
+EULER = {"kind": "semi-implicit-euler", "timestep": 0.01, "steps": 8}
+
+
+def spec(contact: dict[str, Any], **tables: Any) -> BallSpec:
+    return BallSpec.model_validate({"world": "ball", "contact": contact, "integrator": EULER, **tables})
+
+
+def test_heights_and_velocities():
+    y, v = start(spec(SPRING, start={"height": [1.0, 2.0], "velocity": 3.0}))
+    assert (y.tolist(), v.tolist()) == ([1.0, 2.0], [3.0, 3.0])
+    y, _ = start(spec(SPRING, start={"height": 1.0, "balls": 5, "spread": 0.5}))
+    assert y.tolist() == [0.5, 0.75, 1.0, 1.25, 1.5]
+
+
+@pytest.mark.parametrize("name", ["float16", "bfloat16", "float32", "float64"])
+def test_adjacent_starts_are_adjacent_in_the_dtype_of_the_state(name: str):
+    # a height that is no float of any of them
+    table = spec(
+        SPRING, start={"height": 1.3, "balls": 4, "spread_ulps": 1}, precision={"state": name}
+    )  # fmt: skip
+    y, _ = start(table)
+    dtype = np.dtype(getattr(ml_dtypes, name)) if name == "bfloat16" else np.dtype(name)
+    held = y.astype(dtype)
+    assert np.array_equal(held.astype(np.float64), y), "each is a float of the dtype"
+    assert np.diff(held.view(f"i{dtype.itemsize}").astype(np.int64)).tolist() == [1, 1, 1]
+
+
+def test_penetrations_on_the_boundary_sum_to_the_tolerance_exactly():
+    system = load("ball/batch-on-the-boundary")
+    y, v = start(system.spec)
+    assert sum((Fraction(p) for p in -y), Fraction(0)) == Fraction(system.spec.stop.tol)
+    assert not v.any()
+    low = np.dtype(ml_dtypes.bfloat16)
+    assert np.array_equal(y.astype(low).astype(np.float64), y)
+    # largest first, each of the small ones is lost in the low format
+    total = np.zeros((), low)
+    for p in (-y).astype(low):
+        total = (total + p).astype(low)
+    assert total < low.type(system.spec.stop.tol)
+
+
+def test_controls():
+    still = {"gravity": 0.0}
+    made = problem(spec(SPRING, flight=still))
+    assert made.world.control is None
+    made = problem(spec(SPRING, flight={**still, "control": {"kind": "constant", "value": 2.0}}))
+    assert np.asarray(made.world.control).tolist() == [2.0] * 8
+    wave = {"kind": "sine", "amplitude": 2.0, "period": 0.04, "phase": 0.0}
+    made = problem(spec(SPRING, flight={**still, "control": wave}))
+    assert np.allclose(made.world.control, [0, 2, 0, -2, 0, 2, 0, -2], atol=1e-14)
+    values = tuple(float(n) for n in range(8))
+    made = problem(spec(SPRING, flight={**still, "control": {"kind": "values", "values": values}}))
+    assert np.asarray(made.world.control).tolist() == list(values)
+
+
+def test_contacts_and_integrators():
+    spring = problem(spec({**SPRING, "damping": 2.0})).world
+    assert isinstance(spring.contact, contacts.Penalty)
+    assert (float(spring.contact.k), float(spring.contact.damping), spring.contact.smooth) == (
+        100.0,
+        2.0,
+        False,
+    )
+    soft = problem(spec({**SPRING, "eps": 0.1})).world.contact
+    assert soft.smooth
+    assert float(soft.eps) == 0.1
+    table = spec(SOLVED, stop={"rule": "sum", "tol": 1e-3, "max_iter": 7})
+    solved = problem(table).world.contact
+    assert isinstance(solved, contacts.Projection)
+    assert (float(solved.k), float(solved.alpha), float(solved.restitution)) == (0.5, 0.25, 0.75)
+    for kind, made in (
+        ("explicit-euler", integrators.ExplicitEuler),
+        ("semi-implicit-euler", integrators.SemiImplicitEuler),
+        ("velocity-verlet", integrators.VelocityVerlet),
+        ("event-located", integrators.EventLocated),
+    ):
+        world = problem(spec(IMPACT, integrator={**EULER, "kind": kind})).world
+        assert type(world.integrator) is made
+        assert float(world.integrator.h) == 0.01
+    implicit = spec(
+        SPRING, integrator={**EULER, "kind": "implicit-midpoint"}, stop={"rule": "maximum", "tol": 1e-9}
+    )
+    assert isinstance(problem(implicit).world.integrator.stop, stopping.Maximum)
+    lifted = problem(spec({**SPRING, "hysteresis": 0.25})).world
+    assert float(lifted.lift) == 0.25
+
+
+@pytest.mark.parametrize(
+    ("rule", "made"),
+    [
+        ("sum", stopping.GlobalSum),
+        ("relative", stopping.Relative),
+        ("per-instance", stopping.PerInstance),
+        ("maximum", stopping.Maximum),
+    ],
+)
+def test_stopping_rules(rule: str, made: type):
+    stop = problem(spec(SOLVED, stop={"rule": rule, "tol": 1e-3, "max_iter": 7})).world.contact.stop
+    assert type(stop) is made
+    assert (float(stop.tol), stop.max_iter) == (1e-3, 7)
+    two = problem(spec(SOLVED, stop={"rule": rule, "tol": 1e-3, "enter": 1e-2})).world.contact.stop
+    assert isinstance(two, stopping.Hysteresis)
+    assert float(two.enter) == 1e-2
+
+
+def test_a_reduction_with_its_number():
+    stop = {"rule": "sum", "tol": 1e-3}
+    for text, made in (("blocked:4", Blocked(4)), ("permuted:3", Permuted(3))):
+        world = problem(spec(SOLVED, stop=stop, precision={"reduction": text})).world
+        assert world.contact.stop.reduction == made
+    fixed = problem(spec(SOLVED, stop={"rule": "fixed", "count": 3})).world.contact.stop
+    assert fixed.count == 3
+
+
+def test_precision_and_loss():
+    low = {"state": "float16", "loss": "float32", "rounding": "stochastic", "seed": 5}
+    made = problem(spec(SPRING, precision=low, loss={"kind": "mean-height"}))
+    policy = made.world.policy
+    assert (policy.state, policy.arithmetic, policy.loss) == ("float16", "float64", "float32")
+    assert (policy.rounding, policy.seed) == ("stochastic", 5)
+    assert isinstance(made.loss, losses.MeanHeight)
+    assert problem(spec(SPRING, loss={"target": 0.5})).loss.target == 0.5
+
+
+def test_build_makes_every_variant_and_takes_other_steps():
+    built = build_ball("ball/drop", {"contact.k": "2e4"}, steps=12)
+    assert built.problem.steps == 12
+    assert float(built.problem.world.contact.k) == 2e4
+    names = [variant.name for variant in built.variants]
+    assert names == ["float32", "velocity-verlet", "explicit-euler"]
+    assert all(variant.problem.steps == 12 for variant in built.variants)
+    assert isinstance(built.variants[1].problem.world.integrator, integrators.VelocityVerlet)
+    assert built.problem.run().steps == 12
+
+
+def test_what_the_world_refuses_names_the_system(monkeypatch: pytest.MonkeyPatch):
+    def refuse(*arguments: Any, **options: Any):
+        raise InputError("no such world")
+
+    monkeypatch.setattr("mdnum.ball.world.World.create", refuse)
+    with pytest.raises(InputError, match="here: no such world"):
+        problem(spec(SPRING), where="here")
