@@ -83,14 +83,16 @@ def converge(
     return Convergence(time / np.asarray(counts, np.float64), *table)
 
 
-@eqx.filter_jit
-def arrive(world: World, y0: Float[Array, "balls"], steps: Any, name: str) -> tuple[Array, Array]:
+def arrive(world: World, y0: Float[Array, "balls"], steps: int, name: str) -> tuple[Array, Array]:
     """Heights after so many steps and the derivative of the program by a parameter, by forward mode.
 
-    The number of steps may be traced: one compilation serves all step sizes.
+    One compilation serves all step sizes and numbers of steps.
     """
-    steps = jnp.asarray(steps)
+    return _arrive(world, y0, jnp.asarray(steps), name)
 
+
+@eqx.filter_jit
+def _arrive(world: World, y0: Array, steps: Array, name: str) -> tuple[Array, Array]:
     def run(value):
         here, start = _at(world, y0, name, value)
         state = lax.fori_loop(0, steps, lambda _, state: here.advance(state)[0], start)
@@ -100,8 +102,7 @@ def arrive(world: World, y0: Float[Array, "balls"], steps: Any, name: str) -> tu
     return jax.jvp(run, (value,), (jnp.ones_like(value),))
 
 
-@eqx.filter_jit
-def saltated(world: World, y0: Float[Array, "balls"], steps: Any, name: str) -> tuple[Array, Array]:
+def saltated(world: World, y0: Float[Array, "balls"], steps: int, name: str) -> tuple[Array, Array]:
     """Heights after so many steps and the derivative of the motion that the steps imitate.
 
     For an impact reset at the end of a step. Between impacts the tangent is that of the flight; at an impact
@@ -112,6 +113,11 @@ def saltated(world: World, y0: Float[Array, "balls"], steps: Any, name: str) -> 
     """
     if name not in ("y0", "v0"):
         raise InputError(f"saltation along {name!r}; expected y0 or v0")
+    return _saltated(world, y0, jnp.asarray(steps), name)
+
+
+@eqx.filter_jit
+def _saltated(world: World, y0: Array, steps: Array, name: str) -> tuple[Array, Array]:
     h, g, e = world.value("h"), world.gravity, world.value("restitution")
     zero, one = jnp.zeros_like(y0), jnp.ones_like(y0)
     reset = jnp.stack([jnp.stack([one, zero], -1), jnp.stack([zero, -e * one], -1)], -2)
@@ -129,7 +135,7 @@ def saltated(world: World, y0: Float[Array, "balls"], steps: Any, name: str) -> 
         return after, tangent[:, 0], tangent[:, 1]
 
     start = (world.start(y0, 0.0), one * float(name == "y0"), one * float(name == "v0"))
-    state, dy, _ = lax.fori_loop(0, jnp.asarray(steps), step, start)
+    state, dy, _ = lax.fori_loop(0, steps, step, start)
     return state.y, dy
 
 
