@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
 import subprocess
@@ -12,7 +13,7 @@ import ase.build
 import pytest
 
 import mdnum
-from mdnum import provenance
+from mdnum import provenance, systems
 
 
 def _system(path: Path | None = None) -> types.SimpleNamespace:
@@ -29,6 +30,17 @@ def test_collect_is_json_and_names_what_decides_bits():
     assert record["jax_settings"]["jax_enable_x64"] is True
     assert record["devices"][0]["platform"]
     assert len(record["fingerprint"]) == 16
+
+
+def test_a_system_without_atoms_has_no_structure():
+    ball = systems.load("ball/zeno", {"precision.state": "float32"})
+    record = provenance.collect(ball)
+    assert record["system"] == "ball/zeno"
+    assert record["hashes"]["structure"] is None
+    assert ball.path is not None
+    assert record["hashes"]["file"] == hashlib.sha256(ball.path.read_bytes()).hexdigest()
+    assert record["dtypes"]["state"] == "float32"
+    assert record["fingerprint"] != provenance.collect(systems.load("ball/zeno"))["fingerprint"]
 
 
 def test_two_records_of_one_system_have_one_fingerprint(monkeypatch: pytest.MonkeyPatch):

@@ -16,7 +16,7 @@ from ase import Atoms
 from ase.io import read as ase_read
 
 from mdnum.errors import FolderError
-from mdnum.store import COLUMNS, RunFolder, atomic, frames, tables
+from mdnum.store import COLUMNS, TABLES, RunFolder, atomic, frames, tables
 
 
 def series_rows(start: int, stop: int) -> dict[str, np.ndarray]:
@@ -239,11 +239,37 @@ def test_row_groups_do_not_depend_on_the_parts(tmp_path, monkeypatch):
     assert (tmp_path / "a/series.parquet").read_bytes() == (tmp_path / "b/series.parquet").read_bytes()
 
 
-def test_empty_run_has_tables_with_columns(tmp_path):
-    folder = RunFolder.create(tmp_path / "run")
+@pytest.mark.parametrize("world", list(TABLES))
+def test_empty_run_has_the_tables_of_its_world_with_columns(tmp_path, world):
+    folder = RunFolder.create(tmp_path / "run", world=world)
+    folder.checkpoint({"step": 0}, force=True)
     folder.finalize()
-    for name, columns in COLUMNS.items():
-        assert list(folder.read(name)) == list(columns)
+    assert sorted(path.stem for path in folder.path.glob("*.parquet")) == sorted(TABLES[world])
+    for name in TABLES[world]:
+        assert list(folder.read(name)) == list(COLUMNS[name])
+    again = RunFolder.open(folder.path)
+    assert again.world == world
+    again.resume()
+    again.finalize()
+    assert sorted(path.stem for path in folder.path.glob("*.parquet")) == sorted(TABLES[world])
+
+
+def test_every_table_belongs_to_one_world():
+    assert sorted(name for names in TABLES.values() for name in names) == sorted(COLUMNS)
+
+
+def test_a_run_of_the_other_world_is_overwritten_whole(tmp_path):
+    ball = RunFolder.create(tmp_path / "run", world="ball")
+    ball.append("heights", {"step": [0, 0], "ball": [0, 1], "y": [1.0, np.pi], "v": [0.0, -0.0]})
+    ball.append("solver", {"step": [1], "ball": [-1], "iteration": [2], "residual": [0.5],
+                           "margin": [-0.25], "stopped": [False], "reason": [""]})  # fmt: skip
+    ball.finalize()
+    read = RunFolder.open(tmp_path / "run").read("heights")
+    assert read["y"].tolist() == [1.0, np.pi]
+    assert np.signbit(read["v"]).tolist() == [False, True]
+    RunFolder.create(tmp_path / "run", overwrite=True).finalize()
+    assert sorted(path.stem for path in (tmp_path / "run").glob("*.parquet")) == sorted(TABLES["md"])
+    assert RunFolder.open(tmp_path / "run").world == "md"
 
 
 def test_rows_that_do_not_fit_are_refused(tmp_path):
