@@ -12,12 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from mdnum.ball.contacts import Projection
-from mdnum.ball.gradients.dependence import dependence
+from mdnum.ball.gradients.dependence import dependence, follow
 from mdnum.ball.losses import Loss
 from mdnum.ball.problem import START, Problem, loss_of
 from mdnum.ball.rollout import BallRun
 from mdnum.ball.state import Decisions
 from mdnum.ball.world import World
+from mdnum.precision.scaling import DynamicScale, ScaleState
 
 
 @dataclass(frozen=True)
@@ -112,22 +113,6 @@ def start_of(problem: Problem) -> tuple[jax.Array, jax.Array]:
     return y, jnp.asarray(problem.v0).astype(y.dtype)
 
 
-@eqx.filter_jit
-def evaluate(values, world, y0, v0, told, steps, loss):
-    """`moved_loss`, compiled."""
-    return moved_loss(values, world, y0, v0, told, steps, loss)
-
-
-@eqx.filter_jit
-def differentiate(values, world, y0, v0, told, steps, loss, scaling):
-    """Loss and reverse-mode derivative under loss scaling, compiled."""
-
-    def function(values):
-        return moved_loss(values, world, y0, v0, told, steps, loss)
-
-    return scaling.value_and_grad(function, values)
-
-
 class _Rollout(eqx.Module):
     """`moved_loss` of so many steps: equal for equal problems, so that it is compiled once."""
 
@@ -138,20 +123,47 @@ class _Rollout(eqx.Module):
         return moved_loss(values, world, y0, v0, told, self.steps, self.loss)
 
 
+@eqx.filter_jit
+def evaluate(values, world, y0, v0, told, steps, loss):
+    """`moved_loss`, compiled."""
+    return moved_loss(values, world, y0, v0, told, steps, loss)
+
+
+@eqx.filter_jit
+def differentiate(values, world, y0, v0, told, steps, loss, names, scale):
+    """Loss and reverse-mode derivative under loss scaling, and what the run used, as one compiled program."""
+    function, rest = _Rollout(steps, loss), (world, y0, v0, told)
+    state = ScaleState(scale, *(jnp.zeros((), jnp.int32),) * 2)
+    # of the dynamic scale, because its factor is an argument of the program and no constant
+    made, _ = DynamicScale().value_and_grad(state, lambda values: function(values, *rest), values)
+    return made, follow(function, values, rest, names)
+
+
 def used(
-    problem: Problem, names: Sequence[str], slopes: Mapping[str, float], run: BallRun | None = None
+    problem: Problem,
+    names: Sequence[str],
+    slopes: Mapping[str, float],
+    run: BallRun | None = None,
+    marks: Any = None,
 ) -> tuple[dict[str, bool], dict[str, str]]:
     """Whether the run used each parameter on the way to the loss, and the answer in words.
 
     Args:
         slopes: derivatives already known.
         run: of this problem, made here when None.
+        marks: what `follow` said of the names, where it was asked already.
     """
     run = problem.run(keep=False) if run is None else run
     given = (problem.world, *start_of(problem), None)
     function = _Rollout(problem.steps, problem.loss)
     answers = dependence(
-        function, origin(problem, names), names, given, gradient=slopes, why_unused=_why(problem.world, run)
+        function,
+        origin(problem, names),
+        names,
+        given,
+        gradient=slopes,
+        marks=marks,
+        why_unused=_why(problem.world, run),
     )
     return (
         {name: answer.used for name, answer in answers.items()},

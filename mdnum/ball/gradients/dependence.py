@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
+from jaxtyping import Array, Bool
 
 from mdnum.errors import InputError
 
@@ -64,6 +65,7 @@ def dependence(
     rest: Sequence[Any] = (),
     *,
     gradient: Mapping[str, float] | None = None,
+    marks: Any = None,
     why_unused: str = "nothing that ran used {name}",
 ) -> dict[str, Dependence]:
     """Whether a scalar loss depends on its parameters, by the tape of the run at these values.
@@ -76,6 +78,7 @@ def dependence(
         rest: further arguments, pytrees of arrays. What must not become a constant of the compiled program
             (the zero of a fence) is passed here and not closed over.
         gradient: derivatives already known; by default they are taken here in forward mode.
+        marks: what `follow` said of the names, where it was asked already.
         why_unused: begins the sentence about a parameter that the run did not use.
 
     Returns:
@@ -93,44 +96,62 @@ def dependence(
         if name not in values:
             raise InputError(f"no parameter {name!r}; there are {', '.join(values)}")
     primals = {name: jnp.asarray(value) for name, value in values.items()}
+    on = _tape(function, primals, tuple(rest), tuple(names)) if marks is None else marks
     # the order in which a dictionary is flattened
     order = sorted(primals)
-    leaves = [primals[key] for key in order]
-    program = jax.make_jaxpr(function)(primals, *rest)
-    others = jax.tree.leaves(tuple(rest))
-
     answers = {}
-    for name in names:
-        (written,) = _reach(program.jaxpr, [key == name for key in order] + [False] * len(others))
-        seeds = [jnp.full(leaf.shape, key == name) for key, leaf in zip(order, leaves, strict=True)]
-        used = written and bool(_tape(function, primals, tuple(rest), seeds))
+    for name, mark in zip(names, np.asarray(on).tolist(), strict=True):
         if gradient is not None:
             derivative = float(gradient[name])
         else:
             along = {key: jnp.full_like(value, key == name) for key, value in primals.items()}
             derivative = float(_slope(function, primals, tuple(rest), along))
+        # what the run used is written; the text is read for the others only
+        written = mark or _written(function, primals, tuple(rest), [key == name for key in order])
         answers[name] = Dependence(
-            name, written, used, derivative, _say(name, written, used, derivative, why_unused)
+            name, written, mark, derivative, _say(name, written, mark, derivative, why_unused)
         )
     return answers
 
 
-@eqx.filter_jit
-def _tape(function: Any, primals: Any, rest: Any, seeds: list[jax.Array]) -> jax.Array:
+def follow(
+    function: Callable[..., jax.Array], primals: Mapping[str, jax.Array], rest: tuple, names: Sequence[str]
+) -> Bool[Array, "names"]:
+    """Whether the run at these values uses each parameter; to be traced, inside a jit of one's own.
+
+    Args:
+        function, rest: as in `dependence`.
+        primals: the parameters.
+        names: those asked about.
+    """
+    primals = dict(primals)
     program = jax.make_jaxpr(function)(primals, *rest)
     leaves = jax.tree.leaves((primals, rest))
-    never = [None] * (len(leaves) - len(seeds))
-    return _any(_follow(program.jaxpr, program.consts, leaves, [*seeds, *never])[1])
+    never = [None] * (len(leaves) - len(primals))
+
+    def one(which: jax.Array) -> jax.Array:
+        seeds = [
+            jnp.broadcast_to(which[place], np.shape(primals[key]))
+            for place, key in enumerate(sorted(primals))
+        ]
+        (mark,) = _follow(program.jaxpr, program.consts, leaves, [*seeds, *never])[1]
+        return jnp.asarray(False) if mark is None else jnp.any(mark)
+
+    return jax.vmap(one)(jnp.array([[key == name for key in sorted(primals)] for name in names]))
+
+
+_tape = eqx.filter_jit(follow)
+
+
+def _written(function: Any, primals: Any, rest: tuple, marked: list[bool]) -> bool:
+    program = jax.make_jaxpr(function)(primals, *rest)
+    (reached,) = _reach(program.jaxpr, marked + [False] * (len(program.jaxpr.invars) - len(marked)))
+    return reached
 
 
 @eqx.filter_jit
 def _slope(function: Any, primals: Any, rest: Any, along: Any) -> jax.Array:
     return jax.jvp(lambda given: function(given, *rest), (primals,), (along,))[1]
-
-
-def _any(marks: Sequence[Any]) -> jax.Array:
-    (mark,) = marks
-    return jnp.asarray(False) if mark is None else jnp.any(mark)
 
 
 def _carries(var: Any) -> bool:

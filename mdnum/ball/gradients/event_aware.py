@@ -54,7 +54,7 @@ class EventAware:
         smooth = isinstance(world.contact, Penalty) and world.contact.smooth
         if located or smooth:
             run = problem.run(keep=False)
-            value, slopes = scaled(problem, names, None, 1.0)
+            value, slopes, marks = scaled(problem, names)
             # the time of an impact without speed has an infinite derivative
             _refuse(0 if np.all(np.isfinite(list(slopes.values()))) else 1)
             events = int(run.iterations.sum()) if located else 0
@@ -63,8 +63,8 @@ class EventAware:
             value, slopes, events, flagged = _tangents(at, world, *start, problem.steps, problem.loss)
             _refuse(int(flagged))
             value, events = float(value), int(events)
-            slopes = {name: float(slopes[name]) for name in names}
-        depends, why = used(problem, names, slopes)
+            slopes, marks = {name: float(slopes[name]) for name in names}, None
+        depends, why = used(problem, names, slopes, marks=marks)
         for name in names:
             if slopes[name] != 0 and not depends[name]:
                 depends[name], why[name] = True, f"the time of a contact depends on {name}"

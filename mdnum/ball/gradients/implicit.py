@@ -185,7 +185,7 @@ class Implicit:
             )
         rule = FixedPoint(self.tolerance, self.regularization, self.max_iter, self.at_iterate)
         attached = _with_contact(problem, replace(contact, derivative=rule))
-        value, slopes = scaled(attached, names, None, 1.0)
+        value, slopes, _ = scaled(attached, names)
         # what the run would be if every solve ended at its fixed point
         ideal = _with_contact(problem, replace(contact, stop=Fixed(0), derivative=_Settled()))
         asked = problem if self.at_iterate else ideal

@@ -99,8 +99,8 @@ class Smoothed:
         )
         here = [name for name in theirs if name not in own]
         problem.values(names)
-        value, slopes = scaled(soft, here, None, 1.0)
-        depends, why = used(soft, here, slopes)
+        value, slopes, marks = scaled(soft, here)
+        depends, why = used(soft, here, slopes, marks=marks)
         for name in names:
             if name not in here:
                 slopes[name], depends[name] = 0.0, False

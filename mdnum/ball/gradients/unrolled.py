@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +12,7 @@ import numpy as np
 from mdnum.ball.gradients.base import Gradient, differentiate, evaluate, origin, start_of, used
 from mdnum.ball.problem import START, Problem
 from mdnum.ball.rollout import BallRun
+from mdnum.ball.state import Decisions
 from mdnum.precision.scaling import StaticScale
 
 
@@ -38,8 +40,8 @@ class Unrolled:
         Error: rounding of the reverse pass in the dtypes of the policy.
         """
         run = problem.run(keep=False) if run is None else run
-        value, slopes = scaled(problem, names, None, self.loss_scale)
-        depends, why = used(problem, names, slopes, run)
+        value, slopes, marks = scaled(problem, names, None, self.loss_scale)
+        depends, why = used(problem, names, slopes, run, marks)
         details = {"iterations": int(run.iterations.sum()), "loss_scale": self.loss_scale}
         return Gradient(self.name, self.says, value, slopes, depends, why, details)
 
@@ -68,24 +70,41 @@ class Frozen:
         run = problem.run(keep=False)
         told = run.told()
         told = type(told)(jnp.asarray(told.contact), jnp.asarray(told.iterations))
-        value, slopes = scaled(problem, names, told, 1.0)
+        value, slopes, marks = scaled(problem, names, told)
         details: dict = {"decisions": int(run.contact.size), "iterations": int(run.iterations.sum())}
         if self.check and problem.world.policy.arithmetic == "float64":
             details["finite_difference"] = pinned_differences(problem, names, told)
-        depends, why = used(problem, names, slopes, run)
+        depends, why = used(problem, names, slopes, run, marks)
         return Gradient(self.name, self.says, value, slopes, depends, why, details)
 
 
-def scaled(problem: Problem, names: Sequence[str], told, scale: float) -> tuple[float, dict[str, float]]:
+class Scaled(NamedTuple):
+    """A loss, its derivative by name, and whether the run used each name."""
+
+    value: float
+    slopes: dict[str, float]
+    marks: np.ndarray
+
+
+def scaled(
+    problem: Problem, names: Sequence[str], told: Decisions | None = None, scale: float = 1.0
+) -> Scaled:
     """Loss and reverse-mode derivative under loss scaling.
 
     Args:
         told: decisions to act on, or None.
         scale: a power of two.
+
+    Raises:
+        InputError: it is not.
     """
-    values, start, scaling = origin(problem, names), start_of(problem), StaticScale(scale)
-    made = differentiate(values, problem.world, *start, told, problem.steps, problem.loss, scaling)
-    return float(made.value), {name: float(made.gradient[name]) for name in names}
+    values, start = origin(problem, names), start_of(problem)
+    factor = jnp.asarray(StaticScale(scale).scale, jnp.float64)
+    made, marks = differentiate(
+        values, problem.world, *start, told, problem.steps, problem.loss, tuple(names), factor
+    )
+    slopes = {name: float(made.gradient[name]) for name in names}
+    return Scaled(float(made.value), slopes, np.asarray(marks))
 
 
 def pinned_differences(problem: Problem, names: Sequence[str], told) -> dict[str, float]:
