@@ -58,7 +58,7 @@ def test_help_imports_nothing_heavy():
     assert not HEAVY & loaded
 
 
-@pytest.mark.parametrize("verb", [["run"], ["check", "pairs"], ["systems"], ["report"], ["doctor"]])
+@pytest.mark.parametrize("verb", [["run"], ["ball"], ["check", "pairs"], ["systems"], ["report"], ["doctor"]])
 def test_help_of_a_verb_imports_nothing_that_it_would_run(verb: list[str]):
     """typer itself imports pydantic to read the options of a verb, in some versions."""
     loaded = _modules_after("from mdnum.cli import main; main()", *verb, "--help")

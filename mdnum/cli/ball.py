@@ -172,14 +172,28 @@ def _list(as_json: bool) -> int:
             loaded = systems.load(name, world="ball")
             rows.append({"name": name, "balls": loaded.balls, "about": loaded.spec.about})
     if as_json:
-        output.print_json({"systems": rows, "demos": list(NAMES)})
+        output.print_json(
+            {"systems": rows, "demos": [{"name": name, "about": _about(name)} for name in NAMES]}
+        )
         return output.EXIT_FINE
     lines = [(row["name"], row["balls"], row["about"].partition(". ")[0]) for row in rows]
     output.print_table("systems: `mdnum ball NAME`", ("name", "balls", "about"), lines)
-    typer.echo("\ndemonstrations: `mdnum ball --demo NAME`, or all")
-    for name in NAMES:
-        typer.echo(f"  {name}")
+    typer.echo("")
+    title = "demonstrations: `mdnum ball --demo NAME`, or all"
+    output.print_table(title, ("name", "about"), [(name, _about(name)) for name in NAMES])
     return output.EXIT_FINE
+
+
+def _about(name: str) -> str:
+    """The first line of a demonstration's file, read without importing it (and jax)."""
+    import ast
+    import importlib.util
+
+    found = importlib.util.find_spec(f"mdnum.ball.demos.{name.replace('-', '_')}")
+    if found is None or found.origin is None:
+        return ""
+    said = ast.get_docstring(ast.parse(Path(found.origin).read_text(encoding="utf-8")))
+    return (said or "").partition("\n")[0].rstrip(".")
 
 
 def _demonstrate(name: str, out: Path | None, no_report: bool, as_json: bool) -> int:
