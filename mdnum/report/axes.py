@@ -172,8 +172,9 @@ def _fit_legends(figure: Figure) -> None:
 
 
 def text_width(text: str, size: float) -> float:
-    """Points that a line of text takes, in a font as wide as any that a page is shown in."""
-    return text_to_path.get_text_width_height_descent(text, FontProperties(size=size), False)[0]
+    """Points that the widest line of a text takes, in a font as wide as any that a page is shown in."""
+    font = FontProperties(size=size)
+    return max(text_to_path.get_text_width_height_descent(line, font, False)[0] for line in text.split("\n"))
 
 
 def folded(text: str, width: float, size: float) -> str:

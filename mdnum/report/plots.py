@@ -16,7 +16,7 @@ from mdnum.report import thin
 from mdnum.report.axes import PAGE_WIDTH, drawn, folded, legend, text_width
 from mdnum.report.scales import Scale
 from mdnum.report.svg import BAD, FIRST, HALO, INK, MUTED, SECOND, THIRD
-from mdnum.report.words import listed, many
+from mdnum.report.words import MINUS, listed, many, typeset
 
 if TYPE_CHECKING:
     from mdnum.ball.demos.base import Plot, Region, Series
@@ -115,8 +115,8 @@ def _compose(plot: Plot, figure: Figure, x_range: tuple[float, float] | None) ->
         room = 0.02 * (x_range[1] - x_range[0])
         axes.set_xlim(x_range[0] - room, x_range[1] + room)
     wide = figure.get_figwidth() >= PAGE_WIDTH
-    x_label = x_scale.label(plot.x_label, x_scale.ticks(axes, "x", 7 if wide else 4))
-    y_label = y_scale.label(plot.y_label, y_scale.ticks(axes, "y", 6))
+    x_label = x_scale.label(_formula(plot.x_label), x_scale.ticks(axes, "x", 7 if wide else 4))
+    y_label = y_scale.label(_formula(plot.y_label), y_scale.ticks(axes, "y", 6))
     points = 72 * figure.get_figwidth()
     axes.set_xlabel(folded(x_label, points - 60, 9), color=INK)
     axes.set_ylabel(folded(y_label, 58 * figure.get_figheight(), 9), color=INK)
@@ -125,6 +125,10 @@ def _compose(plot: Plot, figure: Figure, x_range: tuple[float, float] | None) ->
         lines = legend(axes)
         figure.set_figheight(figure.get_figheight() + 0.16 * max(0, lines - 1))
     _label_lines(axes, plot, parts, x_scale, y_scale)
+
+
+def _formula(label: str) -> str:
+    return typeset(label).replace(" - ", f" {MINUS} ")
 
 
 def _parts(series: Sequence[Series], x_scale: Scale, y_scale: Scale) -> list[_Part]:
@@ -245,8 +249,8 @@ def _label_lines(axes: Axes, plot: Plot, parts: Sequence[_Part], x_scale: Scale,
         shown = scale.flat(scale.shown(np.array([value for value, _ in marked], float)))
         places = (shown - limits[0]) / (limits[1] - limits[0])
         for place, side, words in _groups(places, [words for _, words in marked], 12 / max(room, 1)):
-            text = folded(words, 0.85 * length, _NOTE)
-            takes = min(1.0, max(text_width(line, _NOTE) for line in text.split("\n")) / max(length, 1))
+            text = folded(typeset(words), 0.85 * length, _NOTE)
+            takes = min(1.0, text_width(text, _NOTE) / max(length, 1))
             near = cloud[np.abs(cloud[:, along] - place) < 14 / max(room, 1), across]
             far = np.count_nonzero(near > 1 - takes) <= np.count_nonzero(near < takes)
             if which == "x":

@@ -189,7 +189,7 @@ def _short(value: float) -> str:
     if value == 0:
         return "0"
     size, sign = abs(value), MINUS if value < 0 else ""
-    if 0.01 <= size < 9999:
+    if 0.00099 <= size < 9999:
         return f"{sign}{size:.4g}"
     exponent = int(np.floor(np.log10(size) + 1e-9))
     mantissa = size / 10.0**exponent

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -59,6 +60,20 @@ def percent(share: float) -> str:
     if 0.999 < share < 1:
         return "over 99.9 %"
     return f"{100 * share:.1f} %" if 0 < share < 0.1 else f"{100 * share:.0f} %"
+
+
+def typeset(text: str) -> str:
+    """Words with numbers as programs write them, -1.5e-16 say, as people read them: −1.5 × 10⁻¹⁶."""
+    text = re.sub(r"(?<![\w.])(\d+(?:\.\d+)?)[eE]([+-]?\d+)(?![\w.]*\w)", _scientific, text)
+    text = re.sub(r"(?<![\w.])10\^(-?\d+)", lambda found: power(int(found[1])), text)
+    return re.sub(r"(?<![\w.)\]–-])-(?=[\d.∞])", MINUS, text)
+
+
+def _scientific(found: re.Match[str]) -> str:
+    mantissa, exponent = found[1], int(found[2])
+    if mantissa == "1":
+        return power(exponent)
+    return f"{mantissa}\N{NO-BREAK SPACE}×\N{NO-BREAK SPACE}{power(exponent)}"
 
 
 def listed(items: Sequence[str]) -> str:

@@ -94,7 +94,7 @@ def test_values_as_text(value, text):
 
 
 def test_a_column_has_as_many_digits_as_tell_its_numbers_apart():
-    assert values.cells([1 / 3, 2 / 3]) == ["0.3333", "0.6667"]
+    assert values.cells([1 / 3, 2 / 3]) == ["0.33333", "0.66667"]
     near = [1.0, 1.0 + 2.0**-52]
     assert values.cells(near) == ["1", "1.0000000000000002"]
     assert values.cells([1, None, 2.0, "x", float("nan")]) == ["1", "–", "2", "x", "NaN"]

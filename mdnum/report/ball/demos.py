@@ -159,9 +159,12 @@ def _table(table: Table) -> _Table:
 
 def _numbers(numbers: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str, str]]:
     """(name, text, all digits) of each number; those of nested tables by both names."""
+    first = not prefix
     for name, value in numbers.items():
         words = f"{prefix}{name}".replace("_", " ")
         if isinstance(value, Mapping):
             yield from _numbers(value, f"{words}: ")
         else:
-            yield words, value_text(value), str(json_value(value))
+            # the first is what the demonstration is known by
+            yield words, value_text(value, 10 if first else 6), str(json_value(value))
+        first = False

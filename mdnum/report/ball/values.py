@@ -13,6 +13,8 @@ from mdnum.report.words import MINUS, count, power
 
 #: Members of a list that are told; of longer ones, the first and the last.
 _LISTED = 16
+#: Digits up to which a number is told as it is, because it was chosen or is exact.
+_CHOSEN = 10
 
 
 def is_number(value: Any) -> bool:
@@ -45,10 +47,10 @@ def value_text(value: Any, digits: int = 10) -> str:
 
 
 def cells(column: Sequence[Any]) -> list[str]:
-    """The texts of a table's column: the fewest digits, four at least, that keep its numbers apart."""
+    """The texts of a table's column: the fewest digits, five at least, that keep its numbers apart."""
     host = [_host(value) for value in column]
     floats = {value for value in host if isinstance(value, float) and math.isfinite(value)}
-    digits = 4
+    digits = 5
     while digits < 17 and len({_float_text(value, digits) for value in floats}) < len(floats):
         digits += 1
     return [value_text(value, digits) for value in host]
@@ -98,9 +100,11 @@ def _float_text(value: float, digits: int) -> str:
         text = f"{abs(value):.{max(0, digits - 1 - scale)}f}" if scale < digits else f"{abs(value):.0f}"
         text = text.rstrip("0").rstrip(".") if "." in text else text
         # a number that was chosen is told as it was written
-        plain = re.fullmatch(r"\d+(\.\d+)?", shortest) and len(shortest.lstrip("0.")) <= digits
+        plain = re.fullmatch(r"\d+(\.\d+)?", shortest) and len(shortest.lstrip("0.")) <= _CHOSEN
         return sign + (shortest.removesuffix(".0") if plain else text)
     mantissa = mantissa.rstrip("0").rstrip(".") if "." in mantissa else mantissa
+    if mantissa == "1":
+        return sign + power(scale)
     return f"{sign}{mantissa}\N{NO-BREAK SPACE}×\N{NO-BREAK SPACE}{power(scale)}"
 
 
