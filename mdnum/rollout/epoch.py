@@ -149,6 +149,7 @@ def run_epoch(
     last: Int[Array, ""],
     look_back: Bool[Array, ""],
     record: Record,
+    told: UInt8[Array, "rows words atoms"] | None = None,
 ) -> tuple[Outcome, Record]:
     """Advance with one list until it is used up, the record is full or the last step is done.
 
@@ -161,6 +162,8 @@ def run_epoch(
         last: last step to evaluate.
         look_back: whether to decide the step before with this list too.
         record: rows to fill; donated.
+        told: decisions of each row to act on instead of the list's own, which are recorded all the same;
+            pair potentials only.
     """
     program: Program = jax.tree.unflatten(structure, leaves)
     order = tables.order
@@ -188,7 +191,8 @@ def run_epoch(
 
     def body(carry):
         step, x, v, images, _, heat, row, _, _, _, largest, record = carry
-        made: Forces = program.force(x, tables, decisions=program.record)  # type: ignore[operator]
+        given = {} if told is None else {"given": told[row]}
+        made: Forces = program.force(x, tables, decisions=program.record, **given)  # type: ignore[operator]
         acceleration = made.force.astype(dtype) / mass_row
         # the first step of all starts from full-step velocities
         second_half = jnp.where(step == 0, jnp.zeros((), dtype), half_step)

@@ -1,0 +1,219 @@
+"""Two runs side by side, and counterfactuals that have the arithmetic of one and the decisions of the other.
+
+Each free run is the run that it would be alone, bit for bit: its own lists, its own compiled epochs. What is
+shared is the clock. Decisions are compared through the flips of both runs, so the cost does not depend on
+how many pairs there are, and nothing of the past is kept but the pairs that differ now.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from mdnum.md.cell import HostCell
+from mdnum.rollout.engine import Start
+from mdnum.rollout.frame import Frame
+from mdnum.rollout.handed import Handed
+from mdnum.rollout.tracks import Flip, Rows, Track
+from mdnum.systems.build import Simulation
+
+
+@dataclass(frozen=True)
+class CrossFlip:
+    """A pair that the two runs decide differently from this step on, or no longer.
+
+    Attributes:
+        step: of the flip.
+        i, j: the pair, labels of the first run, i < j.
+        differs: whether the decisions differ now.
+        run: which run flipped at this step: "A" or "B".
+        entered: whether the pair entered its cutoff there.
+        margin, bound: of that run's decision, in the quantity's space.
+    """
+
+    step: int
+    i: int
+    j: int
+    differs: bool
+    run: str
+    entered: bool
+    margin: float
+    bound: float
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Some steps of the runs together.
+
+    Attributes:
+        first: step of the first row.
+        separation: largest distance between an atom of A and the same atom of another run, length, by the
+            run's name ("B", "B|A", "A|B" against B), each of shape (rows,), NaN where a run has ended.
+        bits: whether any bit of the state of A and B differs, shape (rows,).
+        energy: total energy by run, shape (rows,).
+        cross: pairs that A and B decide differently, shape (rows,).
+        flips: cross-run flips of these steps, in order.
+        overridden: by counterfactual: decisions it would have made otherwise, shape (rows,).
+        furthest: by counterfactual: distance of the furthest of them from its cutoff, length, shape (rows,).
+        failed: by run, "blow-up" or "runaway" where it ended that way.
+    """
+
+    first: int
+    separation: dict[str, Float[np.ndarray, "rows"]]
+    bits: np.ndarray
+    energy: dict[str, Float[np.ndarray, "rows"]]
+    cross: Int[np.ndarray, "rows"]
+    flips: tuple[CrossFlip, ...]
+    overridden: dict[str, Float[np.ndarray, "rows"]]
+    furthest: dict[str, Float[np.ndarray, "rows"]]
+    failed: dict[str, str]
+
+    @property
+    def rows(self) -> int:
+        """Number of steps."""
+        return len(self.cross)
+
+
+def lockstep(
+    a: Simulation,
+    b: Simulation,
+    last: int,
+    *,
+    start_a: Start | None = None,
+    start_b: Start | None = None,
+    frame: Frame | None = None,
+    handed: bool = True,
+    guard: float | None = None,
+) -> Iterator[Stretch]:
+    """Advance both runs, and B under A's decisions, a stretch of A's steps at a time.
+
+    Args:
+        a, b: the two programs.
+        last: last step.
+        start_a, start_b: where they begin; default their systems' own starts.
+        frame: how B's atoms and axes are A's.
+        handed: whether to run the counterfactual B|A.
+        guard: length; the counterfactual ends when a decision it is told is further than this from its
+            cutoff: it would no longer be a decision that rounding could have changed.
+
+    Raises:
+        InputError: a counterfactual of many-body potentials was asked for.
+    """
+    frame = frame or Frame.same(a.atoms)
+    leader, follower = Track(a, last, start_a), Track(b, last, start_b, frame)
+    told = Handed(b, a, start_b) if handed else None
+    cell = HostCell(a.cell)
+    differing: set[int] | None = None
+    while (segment := leader.segment()) is not None:
+        rows_a, flips_a = leader.until(segment.last)
+        rows_b, flips_b = follower.until(segment.last)
+        assert rows_a is not None
+        rows_c, note = (None, None) if told is None else told.follow(segment)
+        if differing is None:
+            assert leader.first_pairs is not None and follower.first_pairs is not None
+            differing = set(np.setxor1d(leader.first_pairs, follower.first_pairs).tolist())
+            opening = [_opening(key, a.atoms) for key in sorted(differing)]
+        else:
+            opening = []
+        cross, flips = _cross(differing, rows_a, flips_a, flips_b, a.atoms)
+        separation = {"B": _apart(cell, rows_a, rows_b)}
+        energy = {"A": rows_a.energy, "B": _energy(rows_a, rows_b)}
+        overridden: dict[str, np.ndarray] = {}
+        furthest: dict[str, np.ndarray] = {}
+        failed = {"A": leader.failed, "B": follower.failed}
+        if told is not None and rows_c is not None and note is not None:
+            separation["B|A"] = _apart(cell, rows_a, rows_c)
+            energy["B|A"] = _energy(rows_a, rows_c)
+            overridden["B|A"], furthest["B|A"] = _padded(note.count, rows_a), _padded(note.furthest, rows_a)
+            failed["B|A"] = told.failed
+            if told.failed or (guard is not None and float(np.max(note.furthest, initial=0.0)) > guard):
+                told = None
+        yield Stretch(
+            rows_a.first,
+            separation,
+            _bits_differ(rows_a, rows_b),
+            energy,
+            cross,
+            tuple(opening + flips),
+            overridden,
+            furthest,
+            failed,
+        )
+        if follower.failed or leader.failed:
+            return
+
+
+def _opening(key: int, atoms: int) -> CrossFlip:
+    i, j = divmod(key, atoms)
+    return CrossFlip(0, i, j, True, "B", False, np.nan, np.nan)
+
+
+def _cross(
+    differing: set[int], rows: Rows, flips_a: list[Flip], flips_b: list[Flip], atoms: int
+) -> tuple[np.ndarray, list[CrossFlip]]:
+    """Pairs that differ at each step, and how that came about; updates the set of those that differ."""
+    every = sorted(
+        [(flip.step, flip.key, "A", flip) for flip in flips_a]
+        + [(flip.step, flip.key, "B", flip) for flip in flips_b],
+        key=lambda row: row[:3],
+    )
+    counts = np.full(len(rows), -1, np.int64)
+    before = len(differing)
+    out: list[CrossFlip] = []
+    at = 0
+    while at < len(every):
+        step, key, name, flip = every[at]
+        together = at + 1 < len(every) and every[at + 1][:2] == (step, key)
+        # both runs flipped the pair at one step: what differed still does, and what did not does not
+        if together:
+            at += 2
+            continue
+        differing ^= {key}
+        i, j = divmod(key, atoms)
+        out.append(CrossFlip(step, i, j, key in differing, name, flip.entered, flip.margin, flip.bound))
+        if step >= rows.first:
+            counts[step - rows.first] = len(differing)
+        at += 1
+    last = before
+    for row in range(len(rows)):
+        last = counts[row] if counts[row] >= 0 else last
+        counts[row] = last
+    return counts, out
+
+
+def _apart(cell: HostCell, a: Rows, b: Rows | None) -> Float[np.ndarray, "rows"]:
+    """Largest distance between the same atoms of two runs at each step; NaN where the second has ended."""
+    out = np.full(len(a), np.nan)
+    if b is None:
+        return out
+    count = min(len(a), len(b))
+    shape = (count * a.x.shape[2], 3)
+    start, end = (rows.x[:count].transpose(0, 2, 1).reshape(shape) for rows in (a, b))
+    dx, dy, dz = cell.displacement(start, end)
+    squares = (dx * dx + dy * dy + dz * dz).reshape(count, -1)
+    out[:count] = np.sqrt(squares.max(axis=1))
+    return out
+
+
+def _bits_differ(a: Rows, b: Rows | None) -> np.ndarray:
+    out = np.ones(len(a), bool)
+    if b is None:
+        return out
+    count = min(len(a), len(b))
+    same = (a.x[:count] == b.x[:count]) & (a.v[:count] == b.v[:count])
+    out[:count] = ~same.all(axis=(1, 2))
+    return out
+
+
+def _energy(a: Rows, other: Rows | None) -> Float[np.ndarray, "rows"]:
+    return np.full(len(a), np.nan) if other is None else _padded(other.energy, a)
+
+
+def _padded(values: np.ndarray, rows: Rows) -> np.ndarray:
+    out = np.full(len(rows), np.nan)
+    count = min(len(values), len(rows))
+    out[:count] = values[:count]
+    return out

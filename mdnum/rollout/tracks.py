@@ -1,0 +1,160 @@
+"""Steps of one run in order, in the labels and axes of another, with the flips among them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from mdnum.events import Ledger
+from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, first_state
+from mdnum.rollout.flips import PairRecorder, decided_pairs
+from mdnum.rollout.frame import Frame
+from mdnum.systems.build import Simulation
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Some steps of one run, in the labels and the frame of the first run.
+
+    Attributes:
+        first: step of the first row.
+        x, v: wrapped positions and full-step velocities, shape (rows, 3, atoms), float64.
+        energy: total energy, shape (rows,).
+        failed: "blow-up", "runaway", or "" .
+    """
+
+    first: int
+    x: Float[np.ndarray, "rows 3 atoms"]
+    v: Float[np.ndarray, "rows 3 atoms"]
+    energy: Float[np.ndarray, "rows"]
+    failed: str = ""
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+    def cut(self, count: int) -> tuple[Rows, Rows]:
+        """The first rows, and the rest."""
+        return (
+            Rows(self.first, self.x[:count], self.v[:count], self.energy[:count], ""),
+            Rows(self.first + count, self.x[count:], self.v[count:], self.energy[count:], self.failed),
+        )
+
+
+def joined(parts: list[Rows]) -> Rows:
+    """Consecutive rows as one."""
+    if len(parts) == 1:
+        return parts[0]
+    return Rows(
+        parts[0].first,
+        np.concatenate([part.x for part in parts]),
+        np.concatenate([part.v for part in parts]),
+        np.concatenate([part.energy for part in parts]),
+        parts[-1].failed,
+    )
+
+
+@dataclass(frozen=True)
+class Flip:
+    """A pair whose decision changed in one run: what a comparison needs to know of it."""
+
+    step: int
+    key: int
+    entered: bool
+    margin: float
+    bound: float
+
+
+class Track:
+    """One run, read forward.
+
+    Args:
+        simulation: the run.
+        last: last step.
+        start: where it begins; default the system's own start.
+        frame: how its atoms and axes are those of the first run.
+    """
+
+    def __init__(
+        self, simulation: Simulation, last: int, start: Start | None = None, frame: Frame | None = None
+    ):
+        self.simulation = simulation
+        self.frame = frame or Frame.same(simulation.atoms)
+        self.start = start or first_state(simulation)
+        self._engine = Engine(simulation, last, start=self.start)
+        self._segments = self._engine.segments()
+        self._recorder = PairRecorder(simulation)
+        self._ahead: list[Rows] = []
+        self._flips: list[Ledger] = []
+        self.first_pairs: Int[np.ndarray, "pairs"] | None = None
+        self.failed = ""
+
+    def segment(self) -> Segment | None:
+        """The next stretch of this run, its rows and flips kept for `until`; None at the end."""
+        segment = next(self._segments, None)
+        if segment is None:
+            return None
+        if self.first_pairs is None:
+            self.first_pairs = self.frame.keys(decided_pairs(self.simulation, segment, 0))
+        self._flips.append(self._recorder.flips(segment))
+        failed = segment.closes if segment.closes in FAILURES else ""
+        self.failed = failed or ""
+        self._ahead.append(rows_of(segment, self.frame, self.failed))
+        return segment
+
+    def until(self, last: int) -> tuple[Rows | None, list[Flip]]:
+        """The rows not yet handed out up to a step, and the flips among them; fewer where the run ends."""
+        while not self._ahead or self._ahead[-1].first + len(self._ahead[-1]) - 1 < last:
+            if self.segment() is None:
+                break
+        taken: list[Rows] = []
+        while self._ahead and self._ahead[0].first <= last:
+            rows = self._ahead.pop(0)
+            if rows.first + len(rows) - 1 > last:
+                rows, rest = rows.cut(last - rows.first + 1)
+                self._ahead.insert(0, rest)
+            taken.append(rows)
+        flips: list[Flip] = []
+        kept: list[Ledger] = []
+        for ledger in self._flips:
+            chosen = ledger.step <= last
+            flips += self._plain(ledger, chosen)
+            if not chosen.all():
+                kept.append(_part(ledger, ~chosen))
+        self._flips = kept
+        return (joined(taken) if taken else None), flips
+
+    def _plain(self, ledger: Ledger, chosen: Bool[np.ndarray, "flips"]) -> list[Flip]:
+        keys = self.frame.keys_of(ledger.subject[chosen, 0], ledger.subject[chosen, 1])
+        return [
+            Flip(*row)
+            for row in zip(
+                ledger.step[chosen].tolist(),
+                keys.tolist(),
+                ledger.entered[chosen].tolist(),
+                ledger.margin[chosen].tolist(),
+                ledger.bound[chosen].tolist(),
+                strict=True,
+            )
+        ]
+
+
+def _part(ledger: Ledger, chosen: Bool[np.ndarray, "flips"]) -> Ledger:
+    return Ledger(
+        ledger.channel,
+        ledger.step[chosen],
+        ledger.subject[chosen],
+        ledger.entered[chosen],
+        ledger.margin[chosen],
+        ledger.bound[chosen],
+        ledger.jump[chosen],
+    )
+
+
+def rows_of(segment: Segment, frame: Frame, failed: str) -> Rows:
+    """A segment's rows in the user's order of atoms."""
+    place = np.argsort(segment.table.order)
+    x, v = (segment.rows_of(name).astype(np.float64)[:, :, place] for name in ("x", "v"))
+    energy = segment.rows_of("potential") + segment.rows_of("kinetic")
+    return Rows(segment.first, frame.positions(x), frame.vectors(v), energy, failed)
