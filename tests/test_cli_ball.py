@@ -121,6 +121,9 @@ def test_a_bare_run_prints_too(bounce: Recorder, capsys: pytest.CaptureFixture[s
     assert call("ball", "ball/drop") == 0
     out = capsys.readouterr().out
     assert "nothing solved" in out
+    bounce.summary |= {"integrator": "event-located", "ended": {"rest": 4}}
+    assert call("ball", "ball/drop") == 0
+    assert "30 located; at rest for 4 steps" in capsys.readouterr().out
     assert "closed form" not in out
     assert "variant" not in out
 
@@ -289,7 +292,8 @@ def test_a_real_run_and_its_report(tmp_path: Path, monkeypatch, capsys: pytest.C
     monkeypatch.chdir(tmp_path)
     code = call(
         "ball", "ball/batch-on-the-boundary", "--set", "variants={}",
-        "--set", 'gradient.methods=["unrolled"]', "--against", "precision.reduction=exact", "-o", "here", "--json",
+        "--set", 'gradient.methods=["unrolled"]', "--against", "precision.reduction=exact",
+        "-o", "here", "--json",
     )  # fmt: skip
     assert code == 1, "decisions within rounding are a finding"
     document = json.loads(capsys.readouterr().out)

@@ -83,12 +83,11 @@ def _print_summary(summary: Mapping[str, Any], folder: Path) -> None:
     if verdict := summary.get("verdict"):
         out.print(verdict, style="bold", markup=False)
     balls, steps = summary["balls"], summary["steps"]
-    ended = ", ".join(f"{count:,} {reason}" for reason, count in summary["ended"].items()) or "nothing solved"
     rows = [
         ("system", f"{summary['system']}, {_many(balls, 'ball')}, {_many(steps, 'step')}"),
         ("contacts", f"{summary['flips_entered']:,} entered, {summary['flips_left']:,} left"),
         ("first contact", f"step {summary['first_contact']:,}" if summary["first_contact"] else "none"),
-        ("solver", f"{_many(summary['iterations_total'], 'iteration')}; ended by: {ended}"),
+        _solver(summary),
         ("ambiguous", summary["ambiguous"]),
         ("loss", f"{summary['loss']:.10g}" if summary["loss"] is not None else None),
     ]
@@ -117,6 +116,18 @@ def _print_summary(summary: Mapping[str, Any], folder: Path) -> None:
     output.print_findings(summary.get("findings", ()))
     report = folder / "report.html"
     out.print(f"wrote {report if report.exists() else folder}", markup=False)
+
+
+def _solver(summary: Mapping[str, Any]) -> tuple[str, str]:
+    """What was iterated, or located, and how it ended."""
+    total, ended = summary["iterations_total"], summary["ended"]
+    if summary.get("integrator") == "event-located":
+        rest = f"; at rest for {_many(ended['rest'], 'step')}" if ended.get("rest") else ""
+        return "impacts", f"{total:,} located{rest}"
+    if not ended:
+        return "solver", "nothing solved"
+    ways = ", ".join(f"{count:,} {reason}" for reason, count in ended.items())
+    return "solver", f"{_many(total, 'iteration')}; ended by: {ways}"
 
 
 def _slope(made: Mapping[str, Any], name: str) -> str | None:

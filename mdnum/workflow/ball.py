@@ -123,7 +123,6 @@ def _fill(
     folder: RunFolder, simulation: BallSimulation, progress: Progress | None
 ) -> tuple[BallRun, dict[str, Any]]:
     """Runs base and variants and puts what they say into the folder's tables and the summary."""
-    from mdnum.ball.compare import first_difference
     from mdnum.workflow import ball_record
 
     problem = simulation.problem
@@ -137,7 +136,7 @@ def _fill(
         _say(progress, run.steps, f"variant {variant.name}")
         # without histories: the program is then the one that its gradient runs, and is compiled once
         other = variant.problem.run(keep=run.kept)
-        parted = first_difference(run, other)
+        parted = ball_record.parted(run, other)
         folder.append("separations", ball_record.separations(variant, parted))
         theirs = gradients(variant.problem, simulation.system.spec.gradient, first=True)
         found = ball_record.compared(variant, parted, other, gradient, theirs)

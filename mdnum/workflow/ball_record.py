@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
-from mdnum.ball.compare import Difference
+from mdnum.ball.compare import Difference, first_difference
 from mdnum.ball.contacts import Penalty, Projection
 from mdnum.ball.exact import ExactImpact
 from mdnum.ball.exact_penalty import ExactPenalty
+from mdnum.ball.integrators import EventLocated
 from mdnum.ball.rollout import BallRun
 from mdnum.ball.state import Reason
 from mdnum.ball.stopping import Fixed
@@ -193,6 +195,18 @@ def summarize(simulation: BallSimulation, run: BallRun) -> dict[str, Any]:
     }
 
 
+def parted(run: BallRun, other: BallRun) -> Difference:
+    """Where two runs part.
+
+    Counts that do not count the same (iterations of a solver, impacts inside a step, nothing) are no
+    decisions of one kind: then contacts alone are compared.
+    """
+    if _counted(run) != _counted(other):
+        none = np.zeros(run.steps, np.int32)
+        run, other = (dataclasses.replace(one, iterations=none) for one in (run, other))
+    return first_difference(run, other)
+
+
 def separations(variant: BallVariant, found: Difference) -> dict[str, Any]:
     """A row per step: how far the heights of a variant are from those of the run."""
     apart = found.separation
@@ -289,13 +303,8 @@ def exact(system: BallSystem, run: BallRun, gradient: Sequence[Mapping[str, Any]
     }
     if isinstance(motions[0], ExactImpact) and motions[0].restitution < 1:
         found["rest_time"] = float(motions[0].rest_time().value)
-    if count == run.balls and spec.loss.kind == "final-height" and spec.loss.target is None:
-        end = [motion.height(run.time[-1:]) for motion in motions]
-        slopes = {
-            name: float(np.mean([one.gradient[name][0] for one in end]))
-            for name in motions[0].NAMES
-            if name in spec.gradient.of
-        }
+    slopes = _slopes(spec, motions, run) if count == run.balls else None
+    if slopes is not None:
         found["gradient"] = slopes
         found["gradient_error"] = {
             made["method"]: {name: made["gradient"][name] - slopes[name] for name in slopes}
@@ -303,6 +312,20 @@ def exact(system: BallSystem, run: BallRun, gradient: Sequence[Mapping[str, Any]
             if not made.get("refused")
         }
     return found
+
+
+def _slopes(spec: ball.BallSpec, motions: Sequence[Any], run: BallRun) -> dict[str, float] | None:
+    """Derivatives of the loss of the exact motion, where the loss is a height."""
+    if spec.loss.kind == "residual-penetration" or spec.loss.target is not None:
+        return None
+    # a loss over the steps does not count the start
+    times = run.time[-1:] if spec.loss.kind == "final-height" else run.time[1:]
+    heights = [motion.height(times) for motion in motions]
+    return {
+        name: float(np.mean([one.gradient[name] for one in heights]))
+        for name in motions[0].NAMES
+        if name in spec.gradient.of
+    }
 
 
 # --- parts --------------------------------------------------------------------------------------------
@@ -319,6 +342,13 @@ def _rule(run: BallRun) -> Any:
     if isinstance(contact, Projection):
         return contact.stop
     return getattr(run.world.integrator, "stop", None) if isinstance(contact, Penalty) else None
+
+
+def _counted(run: BallRun) -> str:
+    """What the iterations of a run are."""
+    if _rule(run) is not None:
+        return "iterations"
+    return "impacts" if isinstance(run.world.integrator, EventLocated) else "nothing"
 
 
 def _solved(run: BallRun) -> np.ndarray:

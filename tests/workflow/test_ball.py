@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import mdnum
+from mdnum.ball import first_difference
 from mdnum.errors import FolderError, InputError
 from mdnum.store import TABLES, RunFolder
 from mdnum.systems import build_ball, load
@@ -249,6 +250,19 @@ def test_a_state_that_stops_being_finite_is_a_failed_run(tmp_path: Path):
     assert np.isfinite(made.run.y[:bad].astype(float)).all()
     assert not np.isfinite(made.run.y[bad].astype(float)).all()
     assert "finite" in made.summary["verdict"]
+
+
+def test_counts_of_different_things_are_not_compared():
+    small = {"gradient.of": [], "variants.other.integrator.kind": "semi-implicit-euler"}
+    built = build_ball("ball/zeno", small, steps=60)
+    other = built.variants[-1].problem.run()
+    run = built.problem.run()
+    # one counts the impacts inside a step, the other nothing: both touch once, a step apart
+    assert (run.iterations.sum(), other.iterations.sum()) == (1, 0)
+    assert first_difference(run, other).iterations_differ == 1
+    found = ball_record.parted(run, other)
+    assert (found.iterations_differ, found.channel, found.contacts_differ) == (0, "contact", 2)
+    assert ball_record.parted(run, run).fork is None
 
 
 def test_a_loaded_system_takes_no_overrides(tmp_path: Path):
