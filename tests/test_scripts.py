@@ -14,6 +14,7 @@ import pytest
 SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
 STUDIES = (
     "ase_comparison",
+    "ball_sensitivity",
     "benchmark",
     "cutoff_sensitivity",
     "skin_sensitivity",
@@ -133,3 +134,29 @@ def test_the_benchmark_measures_what_it_names(tmp_path: Path) -> None:
     assert set(made["list_builds_ms"]["500"]) == {"mdnum host", "vesin", "jax-md update"}
     assert made["start_up"]["cpu_seconds"] > 0
     assert is_png(tmp_path / "b.png")
+
+
+def test_a_ball_answers_to_its_knobs(tmp_path: Path) -> None:
+    words = ["--points", "9", "--factors", "0.9", "1", "2"]
+    table = study("ball_sensitivity", *words, "-o", "k.png", cwd=tmp_path)
+    column = ["floor", "knob", "value", "contact", "at", "iterations", "most", "loss", "by_k", "by_y0"].index
+    # twice the step: half as many until the first contact, give or take one
+    one, two = (int(row(table, "spring", "h", h)[column("contact")]) for h in ("0.01", "0.02"))
+    assert abs(one - 2 * two) <= 2
+    # a tolerance that changes no number of iterations changes nothing at all; one that does, the loss
+    near, own, far = (row(table, "projection", "tol", tol)[3:] for tol in ("9e-07", "1e-06", "2e-06"))
+    assert near == own
+    assert int(far[2]) < int(own[2])
+    assert float(far[4]) > 2 * float(own[4])
+    # soft floors have derivatives of the size of the motion's, hard ones of the size of a lost step
+    soft, hard = (
+        abs(float(row(table, name, "k", "3000")[column("by_y0")])) for name in ("softplus", "spring")
+    )
+    assert soft < 5 < 50 < hard
+    assert is_png(tmp_path / "k.png")
+
+
+def test_a_projection_that_cannot_converge_is_refused(tmp_path: Path) -> None:
+    text = study("ball_sensitivity", "--factors", "1", "9", cwd=tmp_path, code=2)
+    assert "overshoots" in text and "below 8" in text
+    assert not list(tmp_path.iterdir())
