@@ -7,8 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from mdnum.rollout.flips import pair_keys
-
 
 @dataclass(frozen=True)
 class Frame:
@@ -41,6 +39,13 @@ class Frame:
             and not self.shift.any()
         )
 
+    @property
+    def inverse(self) -> Frame:
+        """The other run, seen from the labels and axes of this one."""
+        shift = -self.signs * self.shift[self.axes]
+        axes = np.argsort(self.axes)
+        return Frame(np.argsort(self.labels), axes, self.signs[axes], shift)
+
     def positions(self, x: Float[np.ndarray, "rows 3 atoms"]) -> Float[np.ndarray, "rows 3 atoms"]:
         """Positions of this run as the other run would have them, up to lattice vectors."""
         if self.is_same:
@@ -64,6 +69,3 @@ class Frame:
         """As `keys`, for pairs given by their ends, in their order."""
         a, b = self.labels[i], self.labels[j]
         return np.minimum(a, b).astype(np.int64) * len(self.labels) + np.maximum(a, b)
-
-
-__all__ = ["Frame", "pair_keys"]

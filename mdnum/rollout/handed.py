@@ -19,6 +19,7 @@ from mdnum.md.cell import HostCell
 from mdnum.md.verlet import PairTable
 from mdnum.rollout.engine import Engine, Segment, Start
 from mdnum.rollout.epoch import State, empty_record, run_epoch
+from mdnum.rollout.frame import Frame
 from mdnum.rollout.tracks import Rows, joined
 from mdnum.systems.build import Simulation
 
@@ -52,12 +53,19 @@ class Handed:
         simulation: whose arithmetic.
         leader: whose decisions.
         start: where it begins; default the simulation's own start.
+        frame: how its atoms and axes are the leader's.
 
     Raises:
         InputError: many-body potentials decide inside their energy function and cannot be told.
     """
 
-    def __init__(self, simulation: Simulation, leader: Simulation, start: Start | None = None):
+    def __init__(
+        self,
+        simulation: Simulation,
+        leader: Simulation,
+        start: Start | None = None,
+        frame: Frame | None = None,
+    ):
         if not simulation.pairwise or not leader.pairwise:
             raise InputError(
                 "a many-body potential cannot be told its pairs",
@@ -68,7 +76,8 @@ class Handed:
         self.state: State = self._engine.start.state
         rule, led = simulation.rule, leader.rule
         # with the same kind of list the leader's own lists serve, and its rebuilds with them
-        self._shares = (rule, simulation.builder) == (led, leader.builder)
+        self.frame = frame or Frame.same(simulation.atoms)
+        self._shares = self.frame.is_same and (rule, simulation.builder) == (led, leader.builder)
         self._flat = self._program(shared=self._shares)
         self._own: tuple[PairTable, Any, int] | None = None
         self._led: PairTable | None = None
@@ -123,7 +132,7 @@ class Handed:
         x, v = (np.asarray(getattr(record, name))[:count].astype(np.float64)[:, :, order] for name in "xv")
         energy = (np.asarray(record.potential) + np.asarray(record.kinetic))[:count]
         note = self._overridden(table, np.asarray(told)[:count], record, count)
-        return Rows(first, x, v, energy, self.failed), note
+        return Rows(first, self.frame.positions(x), self.frame.vectors(v), energy, self.failed), note
 
     def _program(self, *, shared: bool) -> tuple[tuple[Array, ...], Any]:
         program = self._engine.program
@@ -144,7 +153,7 @@ class Handed:
         table, reference, built = self._own
         if self._led is not segment.table:
             self._led = segment.table
-            self._place = jnp.asarray(_places(table, segment.table, simulation.atoms))
+            self._place = jnp.asarray(_places(table, segment.table, self.frame.labels))
             self._tables = simulation.tables(table)
         return table, reference, built, self._tables, self._place
 
@@ -172,15 +181,22 @@ class Handed:
         return Overridden(counts, furthest)
 
 
-def _places(table: PairTable, led: PairTable, atoms: int) -> Int[np.ndarray, "slots atoms"]:
-    """For each slot of a list where the same directed pair stands in another list; its size for nowhere."""
+def _places(
+    table: PairTable, led: PairTable, labels: Int[np.ndarray, "atoms"]
+) -> Int[np.ndarray, "slots atoms"]:
+    """For each slot of a list where the same directed pair stands in another list; its size for nowhere.
+
+    Args:
+        labels: atom b of the first list is atom labels[b] of the other.
+    """
+    atoms = len(labels)
     slot, column = np.nonzero(led.index < atoms)
     keys = led.order[column].astype(np.int64) * atoms + led.order[led.index[slot, column]]
     flat = slot * atoms + column
     order = np.argsort(keys)
     keys, flat = keys[order], flat[order]
-    padded = np.append(table.order, 0)
-    wanted = table.order[None, :].astype(np.int64) * atoms + padded[table.index]
+    named = labels[table.order].astype(np.int64)
+    wanted = named[None, :] * atoms + np.append(named, 0)[table.index]
     at = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
     found = (keys[at] == wanted) & (table.index < atoms)
     return np.where(found, flat[at], led.index.size).astype(np.int32)

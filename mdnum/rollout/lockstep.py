@@ -7,17 +7,17 @@ how many pairs there are, and nothing of the past is kept but the pairs that dif
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from mdnum.md.cell import HostCell
-from mdnum.rollout.engine import Start
+from mdnum.rollout.engine import Segment, Start
 from mdnum.rollout.frame import Frame
-from mdnum.rollout.handed import Handed
-from mdnum.rollout.tracks import Flip, Rows, Track
+from mdnum.rollout.handed import Handed, Overridden
+from mdnum.rollout.tracks import Flip, Rows, Track, joined
 from mdnum.systems.build import Simulation
 
 
@@ -51,7 +51,7 @@ class Stretch:
     Attributes:
         first: step of the first row.
         separation: largest distance between an atom of A and the same atom of another run, length, by the
-            run's name ("B", "B|A", "A|B" against B), each of shape (rows,), NaN where a run has ended.
+            name ("B", "B|A", "B 1", ...), and of "A|B" from B; shape (rows,), NaN where a run has ended.
         bits: whether any bit of the state of A and B differs, shape (rows,).
         energy: total energy by run, shape (rows,).
         cross: pairs that A and B decide differently, shape (rows,).
@@ -86,51 +86,67 @@ def lockstep(
     start_b: Start | None = None,
     frame: Frame | None = None,
     handed: bool = True,
+    back: bool = False,
+    repeats: Sequence[Start] = (),
     guard: float | None = None,
 ) -> Iterator[Stretch]:
-    """Advance both runs, and B under A's decisions, a stretch of A's steps at a time.
+    """Advance both runs, and what is compared with them, a stretch of A's steps at a time.
 
     Args:
         a, b: the two programs.
         last: last step.
         start_a, start_b: where they begin; default their systems' own starts.
         frame: how B's atoms and axes are A's.
-        handed: whether to run the counterfactual B|A.
-        guard: length; the counterfactual ends when a decision it is told is further than this from its
+        handed: whether to run B's arithmetic under A's decisions, "B|A".
+        back: whether to run A's arithmetic under B's decisions too, "A|B".
+        repeats: other starts of B; these runs are "B 1", "B 2", ...
+        guard: length; a counterfactual ends when a decision it is told is further than this from its
             cutoff: it would no longer be a decision that rounding could have changed.
 
     Raises:
         InputError: a counterfactual of many-body potentials was asked for.
     """
     frame = frame or Frame.same(a.atoms)
-    leader, follower = Track(a, last, start_a), Track(b, last, start_b, frame)
-    told = Handed(b, a, start_b) if handed else None
-    cell = HostCell(a.cell)
+    forward = Counterfactual(Handed(b, a, start_b, frame), guard) if handed else None
+    backward = Counterfactual(Handed(a, b, start_a, frame.inverse), guard) if back else None
+    leader = Track(a, last, start_a, listener=forward)
+    follower = Track(b, last, start_b, frame, listener=backward)
+    others = {f"B {k + 1}": Track(b, last, start, frame, flips=False) for k, start in enumerate(repeats)}
+    cell_a, cell_b = HostCell(a.cell), HostCell(b.cell)
     differing: set[int] | None = None
-    while (segment := leader.segment()) is not None:
-        rows_a, flips_a = leader.until(segment.last)
-        rows_b, flips_b = follower.until(segment.last)
+    while leader.segment() is not None:
+        end = leader.ready
+        rows_a, flips_a = leader.until(end)
+        rows_b, flips_b = follower.until(end)
         assert rows_a is not None
-        rows_c, note = (None, None) if told is None else told.follow(segment)
+        opening = []
         if differing is None:
             assert leader.first_pairs is not None and follower.first_pairs is not None
             differing = set(np.setxor1d(leader.first_pairs, follower.first_pairs).tolist())
             opening = [_opening(key, a.atoms) for key in sorted(differing)]
-        else:
-            opening = []
         cross, flips = _cross(differing, rows_a, flips_a, flips_b, a.atoms)
-        separation = {"B": _apart(cell, rows_a, rows_b)}
+        separation = {"B": _apart(cell_a, rows_a, rows_b)}
         energy = {"A": rows_a.energy, "B": _energy(rows_a, rows_b)}
+        failed = {"A": leader.failed, "B": follower.failed}
         overridden: dict[str, np.ndarray] = {}
         furthest: dict[str, np.ndarray] = {}
-        failed = {"A": leader.failed, "B": follower.failed}
-        if told is not None and rows_c is not None and note is not None:
-            separation["B|A"] = _apart(cell, rows_a, rows_c)
-            energy["B|A"] = _energy(rows_a, rows_c)
-            overridden["B|A"], furthest["B|A"] = _padded(note.count, rows_a), _padded(note.furthest, rows_a)
-            failed["B|A"] = told.failed
-            if told.failed or (guard is not None and float(np.max(note.furthest, initial=0.0)) > guard):
-                told = None
+        for name, told in (("B|A", forward), ("A|B", backward)):
+            if told is None:
+                continue
+            rows, note = told.until(end)
+            if name == "B|A":
+                separation[name] = _apart(cell_a, rows_a, rows)
+            else:
+                # in B's labels and axes: distances do not mind, a row of B's that ended has nothing to give
+                own_b = None if rows_b is None else _in_frame(rows_b, frame.inverse)
+                part = _apart(cell_b, own_b, rows) if own_b is not None else np.zeros(0)
+                separation[name] = _padded(part, rows_a)
+            energy[name] = _energy(rows_a, rows)
+            overridden[name], furthest[name] = (_padded(x, rows_a) for x in (note.count, note.furthest))
+            failed[name] = told.failed
+        for name, track in others.items():
+            rows, _ = track.until(end)
+            separation[name] = _apart(cell_a, rows_a, rows)
         yield Stretch(
             rows_a.first,
             separation,
@@ -144,6 +160,63 @@ def lockstep(
         )
         if follower.failed or leader.failed:
             return
+
+
+class Counterfactual:
+    """A handed run that listens to its leader and keeps what it did until it is asked for.
+
+    Args:
+        run: the handed run.
+        guard: length; it ends when a decision that it is told is further than this from its cutoff.
+    """
+
+    def __init__(self, run: Handed, guard: float | None):
+        self._run = run
+        self._guard = guard
+        self._rows: list[Rows] = []
+        self._notes: list[Overridden] = []
+        self._over = False
+
+    @property
+    def failed(self) -> str:
+        """ "blow-up" or "runaway" where it ended that way."""
+        return self._run.failed
+
+    def __call__(self, segment: Segment) -> None:
+        """Act on the decisions of a stretch of the leader's run."""
+        if self._over:
+            return
+        rows, note = self._run.follow(segment)
+        beyond = note.furthest > self._guard if self._guard is not None else np.zeros(len(rows), bool)
+        if beyond.any() or self._run.failed:
+            self._over = True
+            keep = int(beyond.argmax()) if beyond.any() else len(rows)
+            rows, _ = rows.cut(keep)
+            note = Overridden(note.count[:keep], note.furthest[:keep])
+        self._rows.append(rows)
+        self._notes.append(note)
+
+    def until(self, last: int) -> tuple[Rows | None, Overridden]:
+        """The steps up to one that were not yet asked for; none after it was ended."""
+        taken, notes = [], []
+        while self._rows and self._rows[0].first <= last:
+            rows, note = self._rows.pop(0), self._notes.pop(0)
+            count = min(len(rows), last - rows.first + 1)
+            if count < len(rows):
+                rows, rest = rows.cut(count)
+                self._rows.insert(0, rest)
+                self._notes.insert(0, Overridden(note.count[count:], note.furthest[count:]))
+                note = Overridden(note.count[:count], note.furthest[:count])
+            if len(rows):
+                taken.append(rows)
+                notes.append(note)
+        if not taken:
+            return None, Overridden(np.zeros(0, np.int64), np.zeros(0))
+        return joined(taken), Overridden.joined(notes)
+
+
+def _in_frame(rows: Rows, frame: Frame) -> Rows:
+    return Rows(rows.first, frame.positions(rows.x), frame.vectors(rows.v), rows.energy, rows.failed)
 
 
 def _opening(key: int, atoms: int) -> CrossFlip:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -74,17 +75,27 @@ class Track:
         last: last step.
         start: where it begins; default the system's own start.
         frame: how its atoms and axes are those of the first run.
+        flips: whether to read its flips.
+        listener: called with each segment as it is read, while its decisions are still on the device.
     """
 
     def __init__(
-        self, simulation: Simulation, last: int, start: Start | None = None, frame: Frame | None = None
+        self,
+        simulation: Simulation,
+        last: int,
+        start: Start | None = None,
+        frame: Frame | None = None,
+        *,
+        flips: bool = True,
+        listener: Callable[[Segment], None] | None = None,
     ):
         self.simulation = simulation
         self.frame = frame or Frame.same(simulation.atoms)
         self.start = start or first_state(simulation)
         self._engine = Engine(simulation, last, start=self.start)
         self._segments = self._engine.segments()
-        self._recorder = PairRecorder(simulation)
+        self._recorder = PairRecorder(simulation) if flips else None
+        self._listener = listener
         self._ahead: list[Rows] = []
         self._flips: list[Ledger] = []
         self.first_pairs: Int[np.ndarray, "pairs"] | None = None
@@ -95,13 +106,21 @@ class Track:
         segment = next(self._segments, None)
         if segment is None:
             return None
-        if self.first_pairs is None:
-            self.first_pairs = self.frame.keys(decided_pairs(self.simulation, segment, 0))
-        self._flips.append(self._recorder.flips(segment))
+        if self._listener is not None:
+            self._listener(segment)
+        if self._recorder is not None:
+            if self.first_pairs is None:
+                self.first_pairs = self.frame.keys(decided_pairs(self.simulation, segment, 0))
+            self._flips.append(self._recorder.flips(segment))
         failed = segment.closes if segment.closes in FAILURES else ""
         self.failed = failed or ""
         self._ahead.append(rows_of(segment, self.frame, self.failed))
         return segment
+
+    @property
+    def ready(self) -> int:
+        """The last step that has been read."""
+        return self._ahead[-1].first + len(self._ahead[-1]) - 1
 
     def until(self, last: int) -> tuple[Rows | None, list[Flip]]:
         """The rows not yet handed out up to a step, and the flips among them; fewer where the run ends."""
