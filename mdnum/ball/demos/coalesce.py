@@ -72,8 +72,8 @@ def run() -> Demo:
             f"In {ORDERS} storage orders a scattered addition gives {loose} different vectors, and in "
             f"{yields['scatter-add, storage order']} of them some panel that carries exactly its limit is "
             f"found below it. Sorting by index alone changes nothing ({by_index}): duplicates still come as "
-            "stored. Sorted by value too, summed exactly, or in fixed point, there is 1 answer; only the last "
-            "two are also right."
+            "stored. Sorted by value too, summed exactly, or in fixed point, there is 1 answer; the last two "
+            "are also right."
         ),
         numbers={
             "distinct_scatter_add": loose,
