@@ -14,7 +14,7 @@ from markupsafe import Markup
 
 from mdnum.report import svg
 from mdnum.report.axes import PAGE_WIDTH, PHONE_WIDTH
-from mdnum.report.words import count, many, number, percent, plain, typeset
+from mdnum.report.words import count, heading, many, number, percent, plain, typeset
 from mdnum.store.atomic import disk_errors, write_text
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ def render(template: str, **content: Any) -> str:
         lstrip_blocks=True,
     )
     environment.filters |= {"number": number, "count": count, "percent": percent, "plain": plain}
-    environment.filters["typeset"] = typeset
+    environment.filters |= {"typeset": typeset, "heading": heading}
     environment.globals |= {
         "many": many,
         "style": Markup(_text("report.css")),

@@ -105,6 +105,7 @@ def _compose(plot: Plot, figure: Figure, x_range: tuple[float, float] | None) ->
     parts = _parts(plot.series, x_scale, y_scale)
     for part in parts:
         _series(axes, part, x_scale, y_scale)
+    y_scale.limit(axes)
     for value, _ in plot.verticals:
         axes.axvline(float(x_scale.shown(np.array(value))), color=MUTED, lw=0.9, ls=(0, (4, 3)), zorder=1.6)
     for value, _ in plot.horizontals:
@@ -154,7 +155,7 @@ def _same(first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, np.nda
     """Whether two series would hide one another."""
     if first[0].shape != second[0].shape or not first[0].size or not np.array_equal(first[0], second[0]):
         return False
-    return float(np.mean(np.isclose(first[1], second[1], rtol=1e-3, atol=0, equal_nan=True))) > 0.5
+    return float(np.mean(np.isclose(first[1], second[1], rtol=1e-3, atol=0, equal_nan=True))) > 0.25
 
 
 def _series(axes: Axes, part: _Part, x_scale: Scale, y_scale: Scale) -> None:

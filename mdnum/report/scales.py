@@ -13,8 +13,8 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLoca
 
 from mdnum.report.words import MINUS, number, power
 
-#: Beyond this, the margins around the values on a logarithmic axis overflow.
-_LARGEST = 1e280
+#: Beyond this, there is no room for a margin around the values.
+_LARGEST = 1e304
 #: Linear values that differ by less than this share of their size are shown as differences.
 _NEAR = 1e-5
 #: Decades that a symmetric logarithmic axis shows on each side of zero at most.
@@ -120,6 +120,14 @@ class Scale:
         else:
             setter(self.kind)
 
+    def limit(self, axes: Axes) -> None:
+        """Keeps the margin above the values of a vertical logarithmic axis from overflowing."""
+        top = float(axes.dataLim.y1)
+        if self.kind == "log" and top > 1e200:
+            low = float(axes.dataLim.minposy)
+            axes.set_autoscaley_on(False)
+            axes.set_ylim(max(low / 1e10, 1e-300), top * 1e3)
+
     def ticks(self, axes: Axes, which: Literal["x", "y"], most: int) -> int:
         """Sets ticks; after the limits are final.
 
@@ -138,7 +146,7 @@ class Scale:
             exponent = exponent if exponent < -2 or exponent > 4 else 0
             axis.set_major_locator(locator)
             axis.set_major_formatter(
-                FuncFormatter(lambda value, _: f"{value / 10.0**exponent:.6g}".replace("-", MINUS))
+                FuncFormatter(lambda value, _: f"{value / 10.0**exponent:,.6g}".replace("-", MINUS))
             )
             return exponent
         places = _log_places(low, high, most) if self.kind == "log" else self._signed_places(low, high, most)
@@ -150,7 +158,7 @@ class Scale:
         start = round(np.log10(self.threshold))
         tops = [int(np.floor(np.log10(side))) if side > self.threshold else None for side in (-low, high)]
         below, above = (0 if top is None else top - start + 1 for top in tops)
-        stride = max(1, int(np.ceil((below + above) / max(1, most - 1))))
+        stride = _stride(below + above, max(1, most - 1))
         # from the ends towards zero, whose own label needs its place
         sides = [
             [10.0 ** (start + n) for n in range(side - 1, stride // 2 - 1, -stride)]
@@ -169,8 +177,9 @@ def clean(values: np.ndarray) -> Float[np.ndarray, "..."]:
 def _log_places(low: float, high: float, most: int) -> list[float]:
     first, last = int(np.ceil(np.log10(low) - 1e-9)), int(np.floor(np.log10(high) + 1e-9))
     if last - first >= 1:
-        stride = max(1, int(np.ceil((last - first + 1) / most)))
-        places = [10.0**n for n in range(first, last + 1, stride)]
+        stride = _stride(last - first + 1, most)
+        # at multiples of the stride, as a person would choose them
+        places = [10.0**n for n in range(-(-first // stride) * stride, last + 1, stride)]
         if len(places) > 2 or last - first > 2:
             return places
     for factors in ((1, 3), (1, 2, 5), range(1, 10)):
@@ -183,6 +192,11 @@ def _log_places(low: float, high: float, most: int) -> list[float]:
         if len(places) >= 3:
             return places if len(places) <= most + 1 else places[:: len(places) // most + 1]
     return [place for place in MaxNLocator(3).tick_values(low, high) if low <= place <= high and place > 0]
+
+
+def _stride(decades: int, most: int) -> int:
+    """Decades from one tick to the next."""
+    return next(stride for stride in (1, 2, 3, 5, 10, 20, 50, 100, 200) if decades <= stride * most)
 
 
 def _short(value: float) -> str:

@@ -63,9 +63,10 @@ def percent(share: float) -> str:
 
 
 def typeset(text: str) -> str:
-    """Words with numbers as programs write them, -1.5e-16 say, as people read them: −1.5 × 10⁻¹⁶."""
+    """Numbers of programs in words, -1.5e-16 and 2^15, as people write them: −1.5 × 10⁻¹⁶, 2¹⁵."""
     text = re.sub(r"(?<![\w.])(\d+(?:\.\d+)?)[eE]([+-]?\d+)(?![\w.]*\w)", _scientific, text)
-    text = re.sub(r"(?<![\w.])10\^(-?\d+)", lambda found: power(int(found[1])), text)
+    text = re.sub(r"(?<=\w)(?:\^|\*\*)(-?\d+)", lambda found: found[1].translate(_RAISED), text)
+    text = re.sub(r"\bsqrt\((\w+)\)", r"√\1", text)
     return re.sub(r"(?<![\w.)\]–-])-(?=[\d.∞])", MINUS, text)
 
 
@@ -74,6 +75,12 @@ def _scientific(found: re.Match[str]) -> str:
     if mantissa == "1":
         return power(exponent)
     return f"{mantissa}\N{NO-BREAK SPACE}×\N{NO-BREAK SPACE}{power(exponent)}"
+
+
+def heading(text: str) -> str:
+    """With a capital, unless its first word is a name of a program or a letter of a formula."""
+    first = text.split(" ", 1)[0]
+    return text[:1].upper() + text[1:] if len(first) > 1 and first.isalpha() and first.islower() else text
 
 
 def listed(items: Sequence[str]) -> str:

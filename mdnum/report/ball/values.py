@@ -51,7 +51,7 @@ def cells(column: Sequence[Any]) -> list[str]:
     host = [_host(value) for value in column]
     floats = {value for value in host if isinstance(value, float) and math.isfinite(value)}
     digits = 5
-    while digits < 17 and len({_float_text(value, digits) for value in floats}) < len(floats):
+    while digits < 17 and len({f"{value:.{digits - 1}e}" for value in floats}) < len(floats):
         digits += 1
     return [value_text(value, digits) for value in host]
 
