@@ -15,7 +15,7 @@ from mdnum.ball.losses import FinalHeight, Loss, MeanHeight, ResidualPenetration
 from mdnum.ball.problem import Problem
 from mdnum.ball.world import World
 from mdnum.errors import InputError
-from mdnum.precision import reductions
+from mdnum.precision import neighbor, reductions
 from mdnum.precision.policy import RolePrecision
 from mdnum.systems import ball, ball_checks
 from mdnum.systems.ball_system import BallSystem
@@ -135,8 +135,8 @@ def start(spec: ball.BallSpec) -> tuple[Float[np.ndarray, "balls"], Float[np.nda
         return _on_the_boundary(spec, given.boundary), np.zeros(count)
     height = np.asarray(given.height, np.float64)
     if given.spread_ulps:
-        low = ball_checks.rounded(float(height), spec.precision.state)
-        height = low + np.arange(count) * given.spread_ulps * ball_checks.spacing(low, spec.precision.state)
+        dtype = ball_checks.DTYPES[spec.precision.state]
+        height = np.array([float(neighbor(height, n * given.spread_ulps, dtype)) for n in range(count)])
     elif given.spread:
         height = np.linspace(float(height) - given.spread, float(height) + given.spread, count)
     velocity = np.asarray(given.velocity, np.float64)

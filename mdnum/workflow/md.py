@@ -48,7 +48,10 @@ def run(
         NumericalError: the run blew up; what came before is in the folder, with its report.
     """
     from mdnum.rollout.run import run as roll_out
+    from mdnum.systems import BallSystem
 
+    if isinstance(system, BallSystem):
+        raise InputError("this system is a ball", where=system.name, remedy="Use mdnum.bounce")
     if resume is not None and Path(resume).is_dir() and RunFolder.open(resume).world == "ball":
         raise InputError(
             "is a run of the ball, which takes seconds and leaves nothing to resume",

@@ -33,17 +33,19 @@ def test_heights_and_velocities():
     assert y.tolist() == [0.5, 0.75, 1.0, 1.25, 1.5]
 
 
+@pytest.mark.parametrize("height", [1.3, 0.999, -1.3])
 @pytest.mark.parametrize("name", ["float16", "bfloat16", "float32", "float64"])
-def test_adjacent_starts_are_adjacent_in_the_dtype_of_the_state(name: str):
-    # a height that is no float of any of them
+def test_adjacent_starts_are_adjacent_in_the_dtype_of_the_state(name: str, height: float):
+    # heights that are no floats of any of them, or lie next to where the spacing doubles
     table = spec(
-        SPRING, start={"height": 1.3, "balls": 4, "spread_ulps": 1}, precision={"state": name}
+        SPRING, start={"height": height, "balls": 4, "spread_ulps": 1}, precision={"state": name}
     )  # fmt: skip
     y, _ = start(table)
     dtype = np.dtype(getattr(ml_dtypes, name)) if name == "bfloat16" else np.dtype(name)
     held = y.astype(dtype)
     assert np.array_equal(held.astype(np.float64), y), "each is a float of the dtype"
-    assert np.diff(held.view(f"i{dtype.itemsize}").astype(np.int64)).tolist() == [1, 1, 1]
+    bits = np.diff(held.view(f"i{dtype.itemsize}").astype(np.int64)).tolist()
+    assert bits == ([1, 1, 1] if height > 0 else [-1, -1, -1])
 
 
 def test_penetrations_on_the_boundary_sum_to_the_tolerance_exactly():
