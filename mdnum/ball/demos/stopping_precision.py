@@ -192,9 +192,9 @@ def run() -> Demo:
         answer=(
             "In float32 it makes one iteration and the loss depends on k. Summed in bfloat16 or float16, "
             "largest term first, the small terms are absorbed, the sum stays one ulp below the tolerance, "
-            "and the loop ends before k was used: the derivative is exactly 0 and the loss does not depend on k. "
-            "A float32 sum over the same narrow state restores the path. In float16 the derivative is then "
-            f"still a subnormal, {100 * lost:.0f} % off; with the loss scaled by 2^15 it is right to "
+            "and the loop ends before k was used: the derivative is exactly 0, and the loss does not depend "
+            "on k. A float32 sum over the same narrow state restores the path. In float16 the derivative is "
+            f"then still a subnormal, {100 * lost:.0f} % off; with the loss scaled by 2^15 it is right to "
             f"{restored:.1g}."
         ),
         numbers={

@@ -26,8 +26,8 @@ LIMIT = 1e12
 def solve(
     matvec: Callable[[Any], Any],
     right: Float[Array, "unknowns"],
-    tolerance: float = 1e-12,
-    regularization: float = 0.0,
+    tolerance: float | Float[Array, ""] = 1e-12,
+    regularization: float | Float[Array, ""] = 0.0,
     max_iter: int = 200,
 ) -> Float[Array, "unknowns"]:
     """x of (A + regularization) x = right by conjugate gradients, differentiable both ways.
@@ -47,7 +47,7 @@ def solve(
         return matvec(x) + jnp.asarray(regularization, x.dtype) * x
 
     def conjugate(matvec, b):
-        return cg(matvec, b, tol=tolerance, maxiter=max_iter)[0]
+        return cg(matvec, b, tol=tolerance, maxiter=max_iter)[0]  # type: ignore[arg-type]
 
     return jax.lax.custom_linear_solve(matrix, right, conjugate, symmetric=True)
 
