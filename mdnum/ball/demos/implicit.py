@@ -60,9 +60,9 @@ def run() -> Demo:
             "Not at all: the fixed point is the floor, and its derivative by k is 0. Through the "
             f"{counts[0]}, {counts[1]} and {counts[2]} iterations that run at tolerances of 1e-2, 1e-4 and "
             f"1e-6 it is {unrolled[0]:.2g}, {unrolled[1]:.2g} and {unrolled[2]:.2g}: an artefact that "
-            f"vanishes like the tolerance (power {order:.2f}). Reverse mode over n iterations keeps something "
-            f"of each, {tapes[-1].unrolled / 2**20:.0f} MiB for 1,000 balls and {ITERATIONS[-1]} iterations; "
-            "the linear solve does not grow. But its own tolerance enters the derivative, times the "
+            f"vanishes like the tolerance (power {order:.2f}). Reverse mode over n iterations keeps "
+            f"something of each, {tapes[-1].unrolled / 2**20:.0f} MiB for 1,000 balls and "
+            f"{ITERATIONS[-1]} iterations; the linear solve does not grow. But its own tolerance enters the derivative, times the "
             "condition number."
         ),
         numbers={
