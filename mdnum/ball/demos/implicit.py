@@ -62,8 +62,8 @@ def run() -> Demo:
             f"1e-6 it is {unrolled[0]:.2g}, {unrolled[1]:.2g} and {unrolled[2]:.2g}: an artefact that "
             f"vanishes like the tolerance (power {order:.2f}). Reverse mode over n iterations keeps "
             f"something of each, {tapes[-1].unrolled / 2**20:.0f} MiB for 1,000 balls and "
-            f"{ITERATIONS[-1]} iterations; the linear solve does not grow. But its own tolerance enters the derivative, times the "
-            "condition number."
+            f"{ITERATIONS[-1]} iterations; the linear solve does not grow. But its own "
+            "tolerance enters the derivative, times the condition number."
         ),
         numbers={
             "grad_k_unrolled": unrolled.tolist(),
