@@ -138,7 +138,7 @@ def _against_step(title: str, label: str, lines: list[Series]) -> Plot:
     return Plot(
         title=title,
         x_label="h (s)",
-        y_label=f"{label}, root mean square over 17 starts",
+        y_label=f"{label}, root mean square",
         x_scale="log",
         y_scale="log",
         series=tuple(lines),

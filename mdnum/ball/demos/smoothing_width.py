@@ -84,12 +84,14 @@ def run() -> Demo:
             f"as the width to the power {order:.2f}."
         ),
         numbers={
-            "minima": {f"{eps:g}": one.minima for eps, one in found.items()},
-            "gradient_error": {f"{eps:g}": one.rough for eps, one in found.items()},
-            "minimizer_shift": {f"{eps:g}": value for eps, value in bias.items()},
-            "order_of_bias": order,
+            "minima_hard": found[0.0].minima,
             "one_minimum_from": single,
             "one_minimum_from_in_steps_of_fall": single / travel,
+            "gradient_error_hard": found[0.0].rough,
+            "gradient_error_calmest": found[calm].rough,
+            "calmest_width": calm,
+            "minimizer_shift_at_0.1": bias[0.1],
+            "order_of_bias": order,
         },
         checks=(
             Check(
@@ -173,6 +175,11 @@ def run() -> Demo:
         ),
         in_md="The switching width of a cutoff: wide enough to be resolved by the steps, it makes forces and "
         "gradients smooth; the potential that is simulated is then another one.",
+        data={
+            "minima": {f"{eps:g}": one.minima for eps, one in found.items()},
+            "gradient_error": {f"{eps:g}": one.rough for eps, one in found.items()},
+            "minimizer_shift": {f"{eps:g}": value for eps, value in bias.items()},
+        },
     )
 
 
