@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float
@@ -171,6 +172,7 @@ def _fit_legends(figure: Figure) -> None:
                 break
 
 
+@lru_cache(4096)
 def text_width(text: str, size: float) -> float:
     """Points that the widest line of a text takes, in a font as wide as any that a page is shown in."""
     font = FontProperties(size=size)

@@ -116,7 +116,7 @@ def _compose(plot: Plot, figure: Figure, x_range: tuple[float, float] | None) ->
         room = 0.02 * (x_range[1] - x_range[0])
         axes.set_xlim(x_range[0] - room, x_range[1] + room)
     wide = figure.get_figwidth() >= PAGE_WIDTH
-    x_label = x_scale.label(_formula(plot.x_label), x_scale.ticks(axes, "x", 7 if wide else 4))
+    x_label = x_scale.label(_formula(plot.x_label), x_scale.ticks(axes, "x", 7 if wide else 5))
     y_label = y_scale.label(_formula(plot.y_label), y_scale.ticks(axes, "y", 6))
     points = 72 * figure.get_figwidth()
     axes.set_xlabel(folded(x_label, points - 60, 9), color=INK)
@@ -139,12 +139,12 @@ def _parts(series: Sequence[Series], x_scale: Scale, y_scale: Scale) -> list[_Pa
             item,
             *shown[n],
             # a line of the same color hides nothing
-            covered=len(
-                {
-                    (series[later].role, series[later].dashed)
+            covered=min(
+                2,
+                sum(
+                    series[later].role != item.role and _same(shown[n], shown[later])
                     for later in range(n + 1, len(series))
-                    if series[later].role != item.role and _same(shown[n], shown[later])
-                }
+                ),
             ),
         )
         for n, item in enumerate(series)
@@ -155,7 +155,8 @@ def _same(first: tuple[np.ndarray, np.ndarray], second: tuple[np.ndarray, np.nda
     """Whether two series would hide one another."""
     if first[0].shape != second[0].shape or not first[0].size or not np.array_equal(first[0], second[0]):
         return False
-    return float(np.mean(np.isclose(first[1], second[1], rtol=1e-3, atol=0, equal_nan=True))) > 0.25
+    share = float(np.mean(np.isclose(first[1], second[1], rtol=1e-3, atol=0, equal_nan=True)))
+    return share > (0.25 if len(first[0]) > 20 else 0.5)
 
 
 def _series(axes: Axes, part: _Part, x_scale: Scale, y_scale: Scale) -> None:

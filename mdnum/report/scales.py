@@ -159,9 +159,9 @@ class Scale:
         tops = [int(np.floor(np.log10(side))) if side > self.threshold else None for side in (-low, high)]
         below, above = (0 if top is None else top - start + 1 for top in tops)
         stride = _stride(below + above, max(1, most - 1))
-        # from the ends towards zero, whose own label needs its place
+        # the same on both sides, and none too near to zero, whose own label needs its place
         sides = [
-            [10.0 ** (start + n) for n in range(side - 1, stride // 2 - 1, -stride)]
+            [10.0 ** (start + n) for n in range(side) if (start + n) % stride == 0 and n >= stride // 2]
             for side in (below, above)
         ]
         return [*(-place for place in sides[0]), 0.0, *sides[1]]
