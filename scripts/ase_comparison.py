@@ -125,7 +125,7 @@ def main() -> None:
         help="system whose pairs are compared (default argon/crystal-500)",
     )  # fmt: skip
     chosen = made.parse_args()
-    wanted = chosen.systems or names()
+    wanted = chosen.systems or names("md")
     rows = []
     for name, kind in subjects(wanted, chosen.every_kind or wanted):
         say(f"{name} {kind}")

@@ -46,7 +46,7 @@ QUICK = {"argon/crystal-108", "argon/tilted-500", "pair/at-cutoff"}
 
 @pytest.mark.jax_md
 @pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=() if n in QUICK else pytest.mark.slow) for n in names()]
+    "name", [pytest.param(n, marks=() if n in QUICK else pytest.mark.slow) for n in names("md")]
 )
 def test_flips_are_those_of_the_trajectory(tmp_path, name):
     check(tmp_path, name, STEPS.get(name, 12))
@@ -54,7 +54,7 @@ def test_flips_are_those_of_the_trajectory(tmp_path, name):
 
 @pytest.mark.slow
 @pytest.mark.jax_md
-@pytest.mark.parametrize("name", names())
+@pytest.mark.parametrize("name", names("md"))
 def test_flips_are_those_of_a_longer_trajectory_over_several_lists(tmp_path, name):
     check(tmp_path, name, STEPS.get(name, 100), **{"neighbors.skin": 0.15})
 

@@ -178,10 +178,9 @@ def _list(as_json: bool) -> int:
     from mdnum.ball.demos import NAMES
 
     rows = []
-    for name in systems.names():
-        if name.startswith("ball/"):
-            loaded = systems.load(name, world="ball")
-            rows.append({"name": name, "balls": loaded.balls, "about": loaded.spec.about})
+    for name in systems.names("ball"):
+        loaded = systems.load(name, world="ball")
+        rows.append({"name": name, "balls": loaded.balls, "about": loaded.spec.about})
     if as_json:
         output.print_json(
             {"systems": rows, "demos": [{"name": name, "about": _about(name)} for name in NAMES]}

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib.resources
+import tomllib
 from pathlib import Path
+from typing import Literal
 
 from mdnum.errors import InputError
 from mdnum.systems import messages
@@ -18,10 +20,21 @@ def shipped_folder() -> Path:
     return packaged if packaged.is_dir() else package.parent / "systems"
 
 
-def names() -> list[str]:
-    """Names of the shipped systems, such as "argon/liquid-864"."""
+def names(world: Literal["md", "ball"] | None = None) -> list[str]:
+    """Names of the shipped systems, such as "argon/liquid-864".
+
+    Args:
+        world: only those of this world.
+    """
     root = shipped_folder()
-    return sorted(path.relative_to(root).with_suffix("").as_posix() for path in root.glob("*/*.toml"))
+    found = list(root.glob("*/*.toml"))
+    if world is not None:
+        found = [path for path in found if _world(path) == world]
+    return sorted(path.relative_to(root).with_suffix("").as_posix() for path in found)
+
+
+def _world(path: Path) -> str:
+    return tomllib.loads(path.read_text(encoding="utf-8")).get("world", "md")
 
 
 def find(name: str | Path) -> tuple[str, Path]:

@@ -451,8 +451,9 @@ def test_every_key_of_the_json_schema_says_what_it_means():
 
 
 def test_every_shipped_ball_names_its_schema():
-    for name in systems.names():
-        if name.startswith("ball/"):
-            text = (systems.shipped_folder() / f"{name}.toml").read_text(encoding="utf-8")
-            assert text.startswith(f"#:schema ../{BALL_SCHEMA}\n")
-            assert tomllib.loads(text)["world"] == "ball"
+    assert len(systems.names("ball")) == 5
+    assert sorted(systems.names("ball") + systems.names("md")) == systems.names()
+    for name in systems.names("ball"):
+        text = (systems.shipped_folder() / f"{name}.toml").read_text(encoding="utf-8")
+        assert text.startswith(f"#:schema ../{BALL_SCHEMA}\n")
+        assert tomllib.loads(text)["world"] == "ball"
