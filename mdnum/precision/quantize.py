@@ -18,15 +18,24 @@ from mdnum.precision.exact import fence
 
 
 @jax.custom_jvp
-def _quantize(x, scale, lowest, highest):
+def quantize(
+    x: Float[Array, "..."],
+    scale: Float[Array, ""],
+    lowest: Float[Array, ""],
+    highest: Float[Array, ""],
+) -> Float[Array, "..."]:
+    """The multiple of scale nearest to x, from lowest * scale to highest * scale; all may be traced.
+
+    Derivative 1 inside, 0 where clamped. Error: at most scale/2 inside, plus one rounding.
+    """
     return jnp.clip(jnp.rint(x / jnp.broadcast_to(scale, x.shape)), lowest, highest) * scale
 
 
-@_quantize.defjvp
+@quantize.defjvp
 def _quantize_jvp(primals, tangents):
     x, scale, lowest, highest = primals
     inside = (x >= lowest * scale) & (x <= highest * scale)
-    return _quantize(*primals), jnp.where(inside, tangents[0], jnp.zeros_like(x))
+    return quantize(*primals), jnp.where(inside, tangents[0], jnp.zeros_like(x))
 
 
 @dataclass(frozen=True)
@@ -87,7 +96,7 @@ class Grid:
         """
         low, high = (jnp.asarray(q, x.dtype) for q in self.range)
         scale, offset = jnp.asarray(self.scale, x.dtype), jnp.asarray(self.offset, x.dtype)
-        value = _quantize(x - offset, scale, low, high)
+        value = quantize(x - offset, scale, low, high)
         return offset + (value if zero is None else fence(value, zero))
 
 
