@@ -26,6 +26,7 @@ _CHECKED = [
     "mdnum.store",
     "mdnum.systems",
     "mdnum.rollout",
+    "mdnum.forks",
     "mdnum.doctor",
 ]
 typing_rules.keep_numba_whole()

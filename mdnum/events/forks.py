@@ -20,8 +20,12 @@ Word = Literal["same", "no fork", "open", "cause", "hurried", "bystander"]
 _FIT = (1e-12, 0.1)
 #: Fewer rows than this give no growth rate.
 _FIT_ROWS = 16
-#: Of the horizon must follow a split before "did not split" means anything.
+#: A split must have been followed for so many times its steps before "did not split" means anything.
 _PATIENCE = 1.2
+#: A counterfactual that grows and would split within so many times the free run's steps is late, not saved.
+_SAVED = 5.0
+#: Of a fit that counts as growth.
+_FITS = 0.5
 
 
 @dataclass(frozen=True)
@@ -101,10 +105,10 @@ class Verdict:
     Attributes:
         word: "same" (no bit differs), "no fork" (no decision differs), "open" (no split within the horizon),
             "cause" (without the flips no split), "hurried" (without them later, beyond chance), "bystander"
-            (without them just as early).
+            (without them just as early, or no later than chance).
         free: split of the free run, step.
         handed: split of the run under the other's decisions, step; None where there is none.
-        noise: by how many steps splits scatter when the start is perturbed by an ulp.
+        noise: by how many steps two splits differ by chance: twice the standard deviation of a difference.
         nats: growth rate times the steps gained: how many powers of e the flips were worth; infinite for a
             cause.
         reasons: the criteria, in words with their numbers.
@@ -133,7 +137,7 @@ def judge(
         handed: separation of the counterfactual from the first run, length; NaN after it was ended. None
             where there is no counterfactual.
         tolerance: of the split, length.
-        chance: splits of repeats of the pair with the start perturbed by an ulp, steps.
+        chance: splits of repeats of the pair, the start perturbed by as much as the choice does, steps.
     """
     last = len(free) - 1
     if dates.seed is None:
@@ -154,7 +158,8 @@ def judge(
     if handed is None:
         text = f"split at step {dates.split}; without a counterfactual nothing is said about the cause"
         return Verdict("open", dates.split, None, 0.0, None, (text,))
-    noise = 2.0 * float(np.std([dates.split, *chance], ddof=1)) if chance else 0.0
+    # both dates scatter, the free one and the handed one
+    noise = 2.0 * float(np.sqrt(2) * np.std([dates.split, *chance], ddof=1)) if chance else 0.0
     other = split_of(handed, tolerance)
     seen = int(np.flatnonzero(np.isfinite(handed))[-1]) if np.isfinite(handed).any() else 0
     if other is None:
@@ -168,7 +173,12 @@ def judge(
                 f"only {seen - dates.split} steps follow the split; run longer to tell a cause from a delay"
             )
             return Verdict("open", dates.split, None, noise, None, (text, more))
-        return Verdict("cause", dates.split, None, noise, float("inf"), (text,))
+        late = _expected(handed, tolerance, seen)
+        if late is not None and late < _SAVED * dates.split:
+            nats = rate.rate * (late - dates.split) if np.isfinite(rate.rate) else None
+            more = f"it grows and is expected to split about step {late:.0f}: later, but not saved"
+            return Verdict("hurried", dates.split, None, noise, nats, (text, more))
+        return Verdict("cause", dates.split, None, noise, float("inf"), (text, "and it does not grow"))
     gained = other - dates.split
     nats = rate.rate * gained if np.isfinite(rate.rate) else None
     text = (
@@ -180,3 +190,12 @@ def judge(
     )
     word: Word = "hurried" if gained > max(noise, 0.0) and chance else "bystander"
     return Verdict(word, dates.split, other, noise, nats, (text, scatter))
+
+
+def _expected(separation: Float[np.ndarray, "steps"], tolerance: float, seen: int) -> float | None:
+    """The step at which a separation that has not split yet is expected to; None where it does not grow."""
+    fit = growth(separation[: seen + 1], tolerance)
+    now = float(separation[seen])
+    if not (np.isfinite(fit.rate) and fit.rate > 0 and fit.r_squared > _FITS and now > 0):
+        return None
+    return seen + float(np.log(tolerance / now)) / fit.rate

@@ -1,0 +1,294 @@
+"""A pair of runs, followed until they split: dates, the decision at the fork, and a tested verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from mdnum.errors import InputError
+from mdnum.events.forks import Dates, Growth, Verdict, growth, judge, split_of
+from mdnum.forks.twin import Twin
+from mdnum.md.cell import HostCell
+from mdnum.rollout.engine import Start, first_state
+from mdnum.rollout.lockstep import CrossFlip, Stretch, lockstep
+from mdnum.systems.build import Simulation
+
+#: The split tolerance as a share of the longest cutoff: a tenth of σ at a cutoff of 2.5 σ.
+SPLIT = 0.04
+#: A run is followed for so many times the steps to its split, so that "did not split" means something.
+_BEYOND = 2.0
+#: A counterfactual ends when a decision it is told is so many tolerances from its cutoff.
+_GUARD = 3.0
+#: Cross-run flips that are kept; the counts cover all of them.
+FLIPS_KEPT = 100_000
+
+
+@dataclass(frozen=True)
+class Decision:
+    """The decision at the fork.
+
+    Attributes:
+        step: of the fork.
+        i, j: the pair, labels of A.
+        run: which run flipped there, "A" or "B"; "start" where they differ from the start on.
+        entered: whether the pair entered its cutoff in that run.
+        margin, bound: of that decision, and the bound on its rounding error, in the quantity's space.
+        ambiguous: whether rounding alone could have decided otherwise.
+        separation: largest distance between the runs at the step before, length.
+        also: further pairs that fork at the same step.
+    """
+
+    step: int
+    i: int
+    j: int
+    run: str
+    entered: bool
+    margin: float
+    bound: float
+    ambiguous: bool
+    separation: float
+    also: int
+
+
+@dataclass(frozen=True)
+class Fork:
+    """What became of a pair of runs.
+
+    Attributes:
+        twin: the pair.
+        steps: steps that were followed.
+        asked: steps that were asked for.
+        tolerance: of the split, length.
+        dates: seed, fork and split.
+        decision: at the fork; None without one.
+        series: arrays by step: "step"; separations "B", "B|A", "A|B", "B 1", ... (length); "cross", pairs
+            that differ; "overridden" and "furthest" of B|A; energies "energy A", "energy B", "energy B|A".
+        flips: cross-run flips, the first `FLIPS_KEPT`.
+        flips_total: of all.
+        growth: of the separations "B" and "B|A".
+        splits: first step beyond the tolerance by separation; None where there is none.
+        verdict: on the flips.
+        failed: runs that ended in "blow-up" or "runaway".
+    """
+
+    twin: Twin
+    steps: int
+    asked: int
+    tolerance: float
+    dates: Dates
+    decision: Decision | None
+    series: dict[str, Float[np.ndarray, "steps"]]
+    flips: tuple[CrossFlip, ...]
+    flips_total: int
+    growth: dict[str, Growth]
+    splits: dict[str, int | None]
+    verdict: Verdict
+    failed: dict[str, str]
+
+    @property
+    def repeats(self) -> list[int]:
+        """Splits of the repeats, where they split."""
+        found = [split for name, split in self.splits.items() if name.startswith("B ")]
+        return [split for split in found if split is not None]
+
+
+def fork(
+    twin: Twin,
+    steps: int | None = None,
+    *,
+    split: float | None = None,
+    counterfactual: bool = True,
+    back: bool = False,
+    repeats: int = 2,
+    seed: int = 0,
+    progress: Callable[[int, int, dict[str, Any]], None] | None = None,
+) -> Fork:
+    """Follow two runs until they have split, and judge what the flips had to do with it.
+
+    Args:
+        twin: the pair.
+        steps: last step; default the system's own. Followed to twice the split at most.
+        split: separation that counts as split, length; default 0.04 of the longest cutoff.
+        counterfactual: whether to run B under A's decisions.
+        back: whether to run A under B's decisions too, for the full table of two by two.
+        repeats: runs of B whose start is perturbed as much as the choice perturbs A, to tell a delay from
+            chance.
+        seed: of the perturbations.
+        progress: called with the step reached, the last step, and figures.
+
+    Raises:
+        InputError: steps below 1, or runs of different size.
+    """
+    a, b = twin.a, twin.b
+    if a.atoms != b.atoms:
+        raise InputError(
+            f"the runs have {a.atoms} and {b.atoms} atoms", remedy="Compare runs of one structure"
+        )
+    last = a.system.spec.dynamics.steps if steps is None else steps
+    if last < 1:
+        raise InputError(f"steps = {last}; expected at least 1")
+    tolerance = SPLIT * a.r_cut if split is None else split
+    if not tolerance > 0:
+        raise InputError(f"split = {tolerance:g}; expected a length above 0")
+    counterfactual = counterfactual and a.pairwise and b.pairwise
+    start_b = twin.start_b or first_state(b)
+    starts = []
+    if counterfactual and repeats:
+        starts = nudged(b, start_b, seed_size(twin), repeats, seed)
+    gathered: list[Stretch] = []
+    flips: list[CrossFlip] = []
+    total = 0
+    end = None
+    for stretch in lockstep(
+        a,
+        b,
+        last,
+        start_a=twin.start_a,
+        start_b=start_b,
+        frame=twin.frame,
+        handed=counterfactual,
+        back=back and counterfactual,
+        repeats=starts,
+        guard=_GUARD * tolerance,
+    ):
+        gathered.append(replace(stretch, flips=()))
+        total += len(stretch.flips)
+        flips += stretch.flips[: max(0, FLIPS_KEPT - len(flips))]
+        reached = stretch.first + stretch.rows - 1
+        apart = split_of(stretch.separation["B"], tolerance)
+        if end is None and apart is not None:
+            end = int(_BEYOND * (stretch.first + apart)) + 100
+        if progress is not None:
+            shown = {"phase": "run", "separation": float(np.nanmax(stretch.separation["B"], initial=0.0))}
+            progress(min(reached, last), min(last, end or last), shown)
+        if end is not None and reached >= end:
+            break
+    return _judged(twin, last, tolerance, gathered, tuple(flips), total)
+
+
+def seed_size(twin: Twin, steps: int = 100) -> float:
+    """The largest separation of a pair within its first steps, length: how much the choice perturbs a run.
+
+    A smaller perturbation would leave the rounding errors of both runs the same, and their splits with them.
+    """
+    largest = 0.0
+    for stretch in lockstep(
+        twin.a,
+        twin.b,
+        steps,
+        start_a=twin.start_a,
+        start_b=twin.start_b,
+        frame=twin.frame,
+        handed=False,
+    ):
+        largest = max(largest, float(np.nanmax(stretch.separation["B"], initial=0.0)))
+    return largest
+
+
+def nudged(simulation: Simulation, start: Start, size: float, count: int, seed: int) -> list[Start]:
+    """Starts whose atoms are displaced at random, the furthest by about a given length.
+
+    At least an ulp: a smaller displacement would be lost in the first addition.
+    """
+    rng = np.random.default_rng(seed)
+    x = np.asarray(start.state.x)
+    ulp = float(np.spacing(np.abs(x).max().astype(x.dtype)))
+    starts = []
+    for _ in range(count):
+        noise = rng.standard_normal(x.shape)
+        noise *= max(size, ulp) / np.sqrt((noise**2).sum(axis=0)).max()
+        moved = (x.astype(np.float64) + noise).astype(x.dtype)
+        state = start.state._replace(x=jnp.asarray(moved), x_before=jnp.asarray(moved))
+        starts.append(replace(start, state=state, reference=moved.T.astype(np.float64)))
+    return starts
+
+
+def _judged(
+    twin: Twin,
+    asked: int,
+    tolerance: float,
+    gathered: list[Stretch],
+    flips: tuple[CrossFlip, ...],
+    total: int,
+) -> Fork:
+    series = _series(gathered)
+    bits = np.concatenate([stretch.bits for stretch in gathered])
+    free = series["B"]
+    splits = {name: split_of(series[name], tolerance) for name in series if name[0] in "AB"}
+    first = next((flip.step for flip in flips), None)
+    failed = {name: word for stretch in gathered[-1:] for name, word in stretch.failed.items() if word}
+    dates = Dates(int(bits.argmax()) if bits.any() else None, first, splits["B"])
+    handed = series.get("B|A")
+    rates = {name: growth(series[name], tolerance) for name in ("B", "B|A") if name in series}
+    chance = [split for name, split in splits.items() if name.startswith("B ") and split is not None]
+    verdict = judge(dates, free, handed, tolerance, chance)
+    return Fork(
+        twin,
+        len(free) - 1,
+        asked,
+        tolerance,
+        dates,
+        _decision(twin, flips, series),
+        series,
+        flips,
+        total,
+        rates,
+        splits,
+        verdict,
+        failed,
+    )
+
+
+def _series(gathered: list[Stretch]) -> dict[str, np.ndarray]:
+    series = {"step": np.concatenate([np.arange(s.first, s.first + s.rows) for s in gathered])}
+    for name in gathered[0].separation:
+        series[name] = np.concatenate([s.separation[name] for s in gathered])
+    series["cross"] = np.concatenate([s.cross for s in gathered])
+    for name in gathered[0].energy:
+        series[f"energy {name}"] = np.concatenate([s.energy[name] for s in gathered])
+    if "B|A" in gathered[0].overridden:
+        series["overridden"] = np.concatenate([s.overridden["B|A"] for s in gathered])
+        series["furthest"] = np.concatenate([s.furthest["B|A"] for s in gathered])
+    return series
+
+
+def _decision(twin: Twin, flips: tuple[CrossFlip, ...], series: dict[str, np.ndarray]) -> Decision | None:
+    if not flips:
+        return None
+    step = flips[0].step
+    together = [flip for flip in flips if flip.step == step and flip.differs]
+    chosen = min(together, key=lambda flip: abs(flip.margin) if np.isfinite(flip.margin) else np.inf)
+    before = float(series["B"][max(0, step - 1)])
+    if np.isfinite(chosen.margin):
+        margin, bound, run = chosen.margin, chosen.bound, chosen.run
+    else:
+        margin, bound = _start_margin(twin, chosen)
+        run = "start"
+    return Decision(
+        step,
+        chosen.i,
+        chosen.j,
+        run,
+        chosen.entered,
+        margin,
+        bound,
+        abs(margin) <= bound,
+        before,
+        len(together) - 1,
+    )
+
+
+def _start_margin(twin: Twin, flip: CrossFlip) -> tuple[float, float]:
+    """Margin and bound of a pair in A's start, where no flip came before it."""
+    a = twin.a
+    start = twin.start_a or first_state(a)
+    x = np.asarray(start.state.x).T
+    kind = int(a.type_of(np.array([flip.i]), np.array([flip.j]))[0])
+    d = HostCell(a.cell, a.decider.dtype).displacement(x[[flip.i]], x[[flip.j]])
+    quantity = float(a.decider.host_quantity(*d)[0])
+    return a.decider.thresholds[kind].value - quantity, a.decider.bounds[kind]
