@@ -8,7 +8,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Shaped
 
 from mdnum.errors import InputError
 from mdnum.events.forks import Dates, Growth, Verdict, growth, judge, split_of
@@ -82,7 +82,7 @@ class Fork:
     tolerance: float
     dates: Dates
     decision: Decision | None
-    series: dict[str, Float[np.ndarray, "steps"]]
+    series: dict[str, Shaped[np.ndarray, "steps"]]
     flips: tuple[CrossFlip, ...]
     flips_total: int
     growth: dict[str, Growth]

@@ -1,4 +1,4 @@
-"""Verdicts at both ends: a crystal whose flips are the cause, one without flips, and runs that are the same."""
+"""Verdicts at both ends: a crystal whose flips are the cause, one without flips, a run and itself."""
 
 from __future__ import annotations
 
