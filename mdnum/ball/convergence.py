@@ -18,12 +18,13 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from mdnum.ball.exact import ExactImpact
+from mdnum.ball.exact_damped import ExactDamped
 from mdnum.ball.exact_penalty import ExactPenalty
 from mdnum.ball.world import World
 from mdnum.errors import InputError
 from mdnum.events.saltation import carry
 
-Exact = ExactImpact | ExactPenalty
+Exact = ExactImpact | ExactPenalty | ExactDamped
 
 
 @dataclass(frozen=True)
