@@ -51,6 +51,15 @@ def test_located_impacts_meet_the_exact_motion_at_every_step():
     np.testing.assert_allclose(run.v[away, 0], v.value[away], atol=2e-13)
 
 
+def test_each_located_impact_keeps_the_restitution_squared_of_the_energy():
+    e = 0.7
+    world = World.create(Impact(e, 0.0), EventLocated(0.01))
+    run = simulate(world, world.start(1.0), 200)
+    bounces = np.concatenate([[0], np.cumsum(run.iterations[:, 0])])
+    assert bounces[-1] == 4
+    np.testing.assert_allclose(run.energy[:, 0], 9.81 * e ** (2 * bounces), rtol=1e-12)
+
+
 @pytest.mark.parametrize("name", ["y0", "v0", "gravity", "restitution"])
 def test_located_impacts_have_the_exact_derivatives(name):
     world = World.create(Impact(0.8, 0.0), EventLocated(0.01))
