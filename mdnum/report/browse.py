@@ -66,6 +66,7 @@ class Browse:
         words: word typed into the search box: (column, value) that a row must have.
         ranges: "step" for `step:10..20`: column.
         subjects: columns in which a bare number is looked for; two of them make `3-7` a pair.
+        nouns: what may stand before such a number.
         ambiguous: column of a ratio that is ambiguous at 1 and below.
     """
 
@@ -78,6 +79,7 @@ class Browse:
     words: Mapping[str, tuple[int, Any]] = field(default_factory=dict)
     ranges: Mapping[str, int] = field(default_factory=dict)
     subjects: tuple[int, ...] = ()
+    nouns: tuple[str, ...] = ()
     ambiguous: int | None = None
 
     @property
@@ -105,6 +107,7 @@ class Browse:
                 "words": {word: list(value) for word, value in self.words.items()},
                 "ranges": dict(self.ranges),
                 "subjects": self.subjects,
+                "nouns": self.nouns,
                 "ambiguous": self.ambiguous,
             }
         )  # fmt: skip

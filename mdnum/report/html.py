@@ -234,5 +234,6 @@ def _browsed(run: Run) -> Browse:
         words={"entered": (3, 1), "in": (3, 1), "left": (3, 0), "out": (3, 0)},
         ranges={"step": 0},
         subjects=(1, 2),
+        nouns=("atom", "pair"),
         ambiguous=8,
     )

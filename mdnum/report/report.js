@@ -42,6 +42,7 @@
         const [column, value] = spec.words[word];
         return (row) => row[column] === value;
       }
+      if (spec.nouns.includes(word)) return () => true;
       if (word === "ambiguous" && spec.ambiguous !== null) return ambiguous;
       if ((match = word.match(/^([a-z]+):(\d+)?(\.\.)?(\d+)?$/)) && Object.hasOwn(spec.ranges, match[1])) {
         const column = spec.ranges[match[1]];

@@ -103,7 +103,7 @@ def test_a_gradient_that_is_zero_because_nothing_depends_is_told_apart(good):
     fragile = variant("fragile", depends={"k": False, "y0": True}, gradient={"k": 0.0, "y0": 0.75})
     finding = found(good, **summary(good, gradient=[unrolled], variants=[fragile]))["LOSS_INDEPENDENT"]
     assert finding.title == "the loss does not depend on k in variant fragile"
-    assert "no operation that ran used it" in finding.text
+    assert "no operation that ran carries the parameter" in finding.text
     implicit = made("implicit", "", {"k": 0.0}, {"k": False})
     finding = found(good, **summary(good, gradient=[implicit]))["LOSS_INDEPENDENT"]
     assert finding.title == "the loss does not depend on k"

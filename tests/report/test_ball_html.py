@@ -211,9 +211,10 @@ for (const name of ["contacts", "stops"]) {
     return place.querySelector("output").textContent;
   };
   const last = place.querySelectorAll("thead th").length - 1;
-  seen[name] = {all: type(""), entered: type("entered"), ball: type("ball:2"), number: type("2"),
+  seen[name] = {all: type(""), entered: type("entered"), ball: type("ball:2"), number: type("ball 2"),
     stopped: type("stopped"), steps: type("step:30..60"), first: type("iteration:0"), words: cells(last)};
 }
+seen.width = document.documentElement.scrollWidth;
 const result = document.createElement("pre");
 result.id = "result";
 result.textContent = JSON.stringify(seen);
@@ -249,4 +250,5 @@ def test_both_tables_can_be_searched(folder, page, tmp_path):
     assert seen["stops"]["stopped"] == rows("solver", solver["stopped"])
     assert seen["stops"]["first"] == rows("solver", solver["iteration"] == 0)
     assert seen["stops"]["entered"] == "“entered” is not understood"
+    assert seen["width"] <= 500
     assert set(seen["stops"]["words"]) <= {"", "tolerance"}

@@ -37,7 +37,7 @@ document.querySelectorAll(".browse .pager button")[1].click(); seen.second_page 
 seen.pages = document.querySelector(".browse .pager span").textContent;
 seen.entered = type("entered"); seen.entered_words = cells(2);
 seen.pair = type(PAIR); seen.pairs = cells(1);
-seen.atom = type(ATOM); seen.atoms = cells(1);
+seen.atom = type("atom " + ATOM); seen.atoms = cells(1);
 seen.steps = type("step:10..12"); seen.step_cells = cells(0);
 seen.none = type("step:10 left entered");
 seen.unknown = type("colour");

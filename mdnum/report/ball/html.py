@@ -284,6 +284,7 @@ def _contacts(run: BallFolder) -> Browse:
         words={"entered": (2, 1), "in": (2, 1), "left": (2, 0), "out": (2, 0)},
         ranges={"step": 0, "ball": 1},
         subjects=(1,),
+        nouns=("ball",),
         ambiguous=6,
     )
 

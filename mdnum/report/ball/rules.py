@@ -113,36 +113,30 @@ def _ambiguous(run: BallFolder) -> Iterator[Finding]:
 
 
 def _independent(run: BallFolder) -> Iterator[Finding]:
-    unused: dict[str, list[str]] = {}
-    for made in run.gradient:
-        for name in _unused(made):
-            unused.setdefault(f"by {made['method']}", []).append(name)
-    for variant in run.variants:
-        for name in _unused(variant):
-            unused.setdefault(f"in variant {variant['name']}", []).append(name)
-    groups: dict[tuple[str, ...], list[str]] = {}
-    for place, names in unused.items():
-        groups.setdefault(tuple(names), []).append(place)
-    for names, places in groups.items():
-        words = listed(names)
-        them = "it" if len(names) == 1 else "them"
-        text = f"The derivative along {words} is exactly zero {listed(places)}. This is not a flat loss: "
-        ran = [place for place in places if place != "by implicit"]
+    own = {f"by {made['method']}": _unused(made) for made in run.gradient}
+    theirs = {f"in variant {variant['name']}": _unused(variant) for variant in run.variants}
+    unused = {place: names for place, names in (own | theirs).items() if names}
+    if unused:
+        groups: dict[tuple[str, ...], list[str]] = {}
+        for place, names in unused.items():
+            groups.setdefault(tuple(names), []).append(place)
+        told = "; ".join(f"along {listed(names)} {listed(places)}" for names, places in groups.items())
+        text = f"The derivative is exactly zero {told}. That is not a minimum: "
         parts = []
-        if ran:
+        if any(place != "by implicit" for place in unused):
             parts.append(
-                f"no operation that ran used {them}, because the branch in which {words} "
-                f"{'acts' if len(names) == 1 else 'act'} was not taken, as when a loop stops before its "
-                "first iteration"
+                "no operation that ran carries the parameter to the loss, because the branch in which it "
+                "acts was not taken, as when a loop stops before its first iteration, or because a clamp or "
+                "a reset overwrites what it gave"
             )
-        if "by implicit" in places:
-            parts.append(f"the fixed point that the implicit derivative is of does not depend on {words}")
-        remedy = "Do not train on it; look at the decision that skipped the branch, and at its margin."
-        own = any(place.startswith("by ") for place in places)
-        title = f"the loss does not depend on {words}" + ("" if own else f" {listed(places)}")
-        yield Finding(
-            "LOSS_INDEPENDENT", "warning", title, text + "; ".join(parts) + ".", remedy if ran else ""
-        )
+        if "by implicit" in unused:
+            parts.append("the fixed point of which the implicit derivative is taken does not depend on it")
+        words = listed(list(dict.fromkeys(name for names in unused.values() for name in names)))
+        title = f"the loss does not depend on {words}"
+        if not any(unused.get(place) for place in own):
+            title += f" {listed(list(unused))}"
+        remedy = "Do not train on it; look at the decision that skipped or overwrote it, and at its margin."
+        yield Finding("LOSS_INDEPENDENT", "warning", title, text + "; ".join(parts) + ".", remedy)
     zero = [
         (made["method"], name)
         for made in run.gradient
