@@ -193,6 +193,14 @@ def test_a_rule_per_ball_records_each_ball(file: Path, tmp_path: Path):
     stopped = solver["stopped"]
     where = solver["step"][stopped] - 1, solver["ball"][stopped]
     assert np.array_equal(counts[where], solver["iteration"][stopped])
+    before = solver["step"][~stopped] - 1, solver["ball"][~stopped]
+    assert np.array_equal(counts[before] - 1, solver["iteration"][~stopped])
+    last = {
+        (step, ball): residual
+        for step, ball, residual in zip(*where, solver["residual"][stopped], strict=True)
+    }
+    for step, ball, residual in zip(*before, solver["residual"][~stopped], strict=True):
+        assert residual * 0.75 == pytest.approx(last[step, ball], rel=1e-9)
     # 1 - alpha k = 3/4 of the penetration is left by an iteration
     for step, ball in np.argwhere(touched):
         depth = -float(made.run.height[step, ball])
