@@ -18,6 +18,7 @@ STUDIES = (
     "benchmark",
     "cutoff_sensitivity",
     "skin_sensitivity",
+    "termination_precision",
     "topology_flip_report",
 )
 
@@ -160,3 +161,30 @@ def test_a_projection_that_cannot_converge_is_refused(tmp_path: Path) -> None:
     text = study("ball_sensitivity", "--factors", "1", "9", cwd=tmp_path, code=2)
     assert "overshoots" in text and "below 8" in text
     assert not list(tmp_path.iterdir())
+
+
+def test_a_narrow_sequential_sum_stops_early_and_a_tree_mends_it(tmp_path: Path) -> None:
+    words = ["--sums", "bfloat16", "--orders", "sequential", "pairwise", "--steps", "60", "-o", "p.png"]
+    table = study("termination_precision", *words, cwd=tmp_path)
+    column = [
+        "sum",
+        "order",
+        "iterations",
+        "early",
+        "late",
+        "capped",
+        "first",
+        "loss",
+        "slope",
+        "change",
+    ].index
+    wide, narrow, tree = (
+        row(table, *name)
+        for name in (("float64", "sequential"), ("bfloat16", "sequential"), ("bfloat16", "pairwise"))
+    )
+    assert int(narrow[column("early")]) > 0 == int(narrow[column("late")])
+    lost = int(wide[column("iterations")]) - int(narrow[column("iterations")])
+    assert lost == int(narrow[column("early")])
+    assert float(narrow[column("change")]) > 1e-3
+    assert tree[2:] == wide[2:]
+    assert is_png(tmp_path / "p.png")
