@@ -80,7 +80,8 @@ def _scientific(found: re.Match[str]) -> str:
 def heading(text: str) -> str:
     """With a capital, unless its first word is a name of a program or a letter of a formula."""
     first = text.split(" ", 1)[0]
-    return text[:1].upper() + text[1:] if len(first) > 1 and first.isalpha() and first.islower() else text
+    plain = first == "a" or (len(first) > 1 and first.isalpha() and first.islower())
+    return text[:1].upper() + text[1:] if plain else text
 
 
 def listed(items: Sequence[str]) -> str:

@@ -53,6 +53,13 @@ def cells(column: Sequence[Any]) -> list[str]:
     digits = 5
     while digits < 17 and len({f"{value:.{digits - 1}e}" for value in floats}) < len(floats):
         digits += 1
+    whole = [value for value in host if isinstance(value, int) and not isinstance(value, bool)]
+    if any(abs(value) >= 10_000 for value in whole):
+        # thousands are set apart in all of a column or in none
+        host = [
+            count(value) if isinstance(value, int) and not isinstance(value, bool) else value
+            for value in host
+        ]
     return [value_text(value, digits) for value in host]
 
 
