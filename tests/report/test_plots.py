@@ -98,8 +98,8 @@ def test_many_points_become_few_that_cover_the_same_places():
 
 
 def test_a_region_covers_its_cells_and_nothing_else():
-    x, y = np.array([1.0, 2.0, 4.0]), np.array([0.0, 1.0])
-    value = np.array([[0, 1, 1], [0, 0, 1]])
+    x, y = np.array([1.0, 2.0, 4.0]), np.array([0.0, 1.0, 2.0])
+    value = np.array([[0, 1, 1], [0, 1, 1], [0, 0, 1]])
     plot = Plot("t", "x", "y", region=Region(x, y, value, ("fine", "not", "never")), x_scale="log")
     (axes,) = plots.draw(plot).axes
     assert [patch.get_label() for patch in axes.patches] == ["fine", "not"]
@@ -108,7 +108,7 @@ def test_a_region_covers_its_cells_and_nothing_else():
             inside = [patch.get_path().contains_point((place, height)) for patch in axes.patches]
             assert inside == [value[row, column] == 0, value[row, column] == 1]
     assert axes.get_xlim() == pytest.approx((2**-0.5, 2**2.5))
-    assert axes.get_ylim() == (-0.5, 1.5)
+    assert axes.get_ylim() == (-0.5, 2.5)
 
 
 def test_coinciding_series_are_drawn_one_upon_the_other():
