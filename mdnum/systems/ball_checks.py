@@ -5,18 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-import ml_dtypes
 import numpy as np
 
 from mdnum.systems import ball
+from mdnum.systems.formats import largest, rounded, smallest, spacing
 from mdnum.systems.toml import Key
-
-DTYPES = {
-    "float16": np.dtype(np.float16),
-    "bfloat16": np.dtype(ml_dtypes.bfloat16),
-    "float32": np.dtype(np.float32),
-    "float64": np.dtype(np.float64),
-}
 
 #: Parameters that a gradient can be asked for, by contact.
 PARAMETERS = {
@@ -38,7 +31,7 @@ class Refusal(Exception):
 
 
 @dataclass(frozen=True)
-class Warning:
+class Remark:
     """Something that runs, and is probably not what was meant.
 
     Attributes:
@@ -52,33 +45,6 @@ class Warning:
     title: str
     text: str
     remedy: str
-
-
-def smallest(name: str) -> float:
-    """The smallest positive number that the ball's arithmetic keeps in a format.
-
-    XLA on a CPU flushes subnormals to zero in every format but float16, whose arithmetic it does in float32.
-    """
-    limits = ml_dtypes.finfo(DTYPES[name])
-    return float(limits.smallest_subnormal if name == "float16" else limits.smallest_normal)
-
-
-def largest(name: str) -> float:
-    """The largest finite number of a format."""
-    return float(ml_dtypes.finfo(DTYPES[name]).max)
-
-
-def spacing(value: float, name: str) -> float:
-    """Distance from the number to the next one of a format."""
-    limits = ml_dtypes.finfo(DTYPES[name])
-    exponent = int(np.floor(np.log2(max(abs(value), float(limits.smallest_normal)))))
-    return float(limits.eps) * 2.0**exponent
-
-
-def rounded(value: float, name: str) -> float:
-    """The number of a format nearest to value."""
-    with np.errstate(over="ignore"):
-        return float(np.asarray(value, DTYPES[name]))
 
 
 def check(spec: ball.BallSpec) -> None:
@@ -95,7 +61,7 @@ def check(spec: ball.BallSpec) -> None:
     _loss_and_gradient(spec)
 
 
-def warnings(spec: ball.BallSpec) -> tuple[Warning, ...]:
+def warnings(spec: ball.BallSpec) -> tuple[Remark, ...]:
     """What runs, and is worth a word."""
     return tuple(_warnings(spec))
 
@@ -363,7 +329,7 @@ def _loss_and_gradient(spec: ball.BallSpec) -> None:
             )
 
 
-def _warnings(spec: ball.BallSpec) -> Iterator[Warning]:
+def _warnings(spec: ball.BallSpec) -> Iterator[Remark]:
     stop, contact = spec.stop, spec.contact
     if isinstance(contact, ball.ProjectionContact):
         # a height just below the floor is the difference of two numbers of the size of one step's fall
@@ -373,7 +339,7 @@ def _warnings(spec: ball.BallSpec) -> Iterator[Warning]:
         unit = spacing(fall, spec.precision.state) if fall else 0.0
         absolute = isinstance(stop, ball.SumRule | ball.PerInstanceRule | ball.MaximumRule)
         if absolute and spec.start.boundary is None and stop.tol < unit:
-            yield Warning(
+            yield Remark(
                 "TOLERANCE_BELOW_ROUNDING",
                 "the tolerance is below the rounding of the heights",
                 f"stop.tol = {stop.tol:g}, but after a fall of {fall:.2g} m in a step a height is known to "
@@ -382,7 +348,7 @@ def _warnings(spec: ball.BallSpec) -> Iterator[Warning]:
             )
         product = contact.alpha * contact.k
         if product > 1:
-            yield Warning(
+            yield Remark(
                 "PROJECTION_OVERSHOOTS",
                 "the projection overshoots",
                 f"alpha k = {product:g} is above 1: one iteration lifts a ball to {product - 1:.3g} times "
@@ -392,7 +358,7 @@ def _warnings(spec: ball.BallSpec) -> Iterator[Warning]:
     if isinstance(contact, ball.PenaltyContact):
         stiff = spec.integrator.timestep * float(np.sqrt(contact.k))
         if stiff > 2 and spec.integrator.kind != "implicit-midpoint":
-            yield Warning(
+            yield Remark(
                 "STEP_BEYOND_STABILITY",
                 "the time step is beyond the stability limit of the contact",
                 f"h sqrt(k) = {stiff:.3g}, and no explicit scheme is stable in contact above 2.",

@@ -77,7 +77,7 @@ class BallSystem:
         return ball_checks.balls(self.spec)
 
     @property
-    def warnings(self) -> tuple[ball_checks.Warning, ...]:
+    def warnings(self) -> tuple[ball_checks.Remark, ...]:
         """What runs, and is probably not what was meant."""
         return ball_checks.warnings(self.spec)
 

@@ -123,12 +123,12 @@ def _fill(
     folder: RunFolder, simulation: BallSimulation, progress: Progress | None
 ) -> tuple[BallRun, dict[str, Any]]:
     """Runs base and variants and puts what they say into the folder's tables and the summary."""
-    from mdnum.workflow import ball_record
+    from mdnum.workflow import ball_exact, ball_record, ball_tables
 
     problem = simulation.problem
     began = time.perf_counter()
     run, rate = _simulate(problem, progress)
-    ball_record.write(folder, run)
+    ball_tables.write(folder, run)
     _say(progress, run.steps, "gradient")
     gradient = gradients(problem, simulation.system.spec.gradient)
     variants = []
@@ -137,7 +137,7 @@ def _fill(
         # without histories: the program is then the one that its gradient runs, and is compiled once
         other = variant.problem.run(keep=run.kept)
         parted = ball_record.parted(run, other)
-        folder.append("separations", ball_record.separations(variant, parted))
+        folder.append("separations", ball_tables.separations(variant, parted))
         theirs = gradients(variant.problem, simulation.system.spec.gradient, first=True)
         found = ball_record.compared(variant, parted, other, gradient, theirs)
         variants.append({**found, "loss": loss(variant.problem, theirs)})
@@ -145,7 +145,7 @@ def _fill(
     summary |= {
         "loss": loss(problem, gradient),
         "gradient": gradient,
-        "exact": ball_record.exact(simulation.system, run, gradient),
+        "exact": ball_exact.exact(simulation.system, run, gradient),
         "variants": variants,
         "steps_per_second": rate,
         "seconds": time.perf_counter() - began,

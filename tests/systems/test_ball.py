@@ -14,7 +14,7 @@ import pytest
 from mdnum import systems
 from mdnum.errors import InputError
 from mdnum.precision import reductions
-from mdnum.systems import BallSystem, System, ball, ball_checks, load
+from mdnum.systems import BallSystem, System, ball, formats, load
 from mdnum.systems.ball_system import BALL_SCHEMA
 
 PENALTY = """\
@@ -311,7 +311,7 @@ def test_the_smallest_usable_numbers_are_what_the_arithmetic_keeps():
     import jax.numpy as jnp
 
     for name in ("float16", "bfloat16", "float32", "float64"):
-        least = jnp.asarray(ball_checks.smallest(name), name)
+        least = jnp.asarray(formats.smallest(name), name)
         assert bool(jax.jit(lambda x: x > 0)(least)), name
         limits = ml_dtypes.finfo(name)
         if name != "float16" and jax.default_backend() == "cpu":

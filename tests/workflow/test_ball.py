@@ -14,7 +14,7 @@ from mdnum.ball import first_difference
 from mdnum.errors import FolderError, InputError
 from mdnum.store import TABLES, RunFolder
 from mdnum.systems import build_ball, load
-from mdnum.workflow import BallResult, ball_record, bounce, run
+from mdnum.workflow import BallResult, ball_exact, ball_record, bounce, run
 
 PROJECTION = """\
 world = "ball"
@@ -229,7 +229,7 @@ def test_where_there_is_no_closed_form_none_is_claimed():
     def exact(**changes: Any) -> dict[str, Any] | None:
         given = {key.replace("__", "."): value for key, value in changes.items()}
         built = build_ball("ball/drop", {"gradient.of": [], "variants": {}, **given}, steps=20)
-        return ball_record.exact(built.system, built.problem.run(), [])
+        return ball_exact.exact(built.system, built.problem.run(), [])
 
     wave = {"flight__control__amplitude": 1.0, "flight__control__period": 1.0}
     assert exact(contact__damping=1.0) is None
