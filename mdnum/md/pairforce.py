@@ -92,6 +92,7 @@ class PairForce(eqx.Module):
         *,
         decisions: bool,
         given: UInt8[Array, "words atoms"] | None = None,
+        where: UInt8[Array, "words atoms"] | None = None,
     ) -> Forces:
         """Forces at sorted, wrapped positions.
 
@@ -101,6 +102,7 @@ class PairForce(eqx.Module):
             decisions: whether to return them too; forces have the same bits either way.
             given: decisions to act on instead of the list's own (packed as those returned). The ones returned
                 are its own all the same, so that the two can be compared.
+            where: act on those given only at the slots whose bit is set here, and on its own elsewhere.
         """
         judge = SlotJudge(self.decider, self.cell, self.zero, positions)
         force_dtype, accumulate = self.policy.dtype("force"), self.policy.dtype("accumulate")
@@ -111,13 +113,15 @@ class PairForce(eqx.Module):
 
         def block(carry, listed):
             totals, nearest = carry
-            (j, types), told = listed
+            (j, types), told, pinned = listed
             d, quantity, inside, threshold = judge.group(j, types)
             bits = None
             if decisions:
                 bits, nearest = judge.tally(nearest, quantity, inside, threshold)
             if told is not None:
-                inside = unpacked(told)
+                inside = (
+                    unpacked(told) if pinned is None else jnp.where(unpacked(pinned), unpacked(told), inside)
+                )
             d = d if same else displacements(components, cell, j)
             if same and self.decider.space == "r2":
                 r2 = quantity
@@ -136,9 +140,8 @@ class PairForce(eqx.Module):
             return (totals, nearest), (bits, tuple(later for _, later in summed))
 
         start = ((jnp.zeros(judge.atoms, accumulate),) * 5, judge.start())
-        (totals, nearest), (halves, later) = lax.scan(
-            block, start, (tables.groups(), None if given is None else halves_of(given))
-        )
+        told, pinned = (None if bits is None else halves_of(bits) for bits in (given, where))
+        (totals, nearest), (halves, later) = lax.scan(block, start, (tables.groups(), told, pinned))
         fx, fy, fz, energy, virial = (
             self.reduction.finish(total, blocks) for total, blocks in zip(totals, later, strict=True)
         )

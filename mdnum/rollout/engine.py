@@ -18,6 +18,7 @@ from jaxtyping import Float, Int, UInt8
 from mdnum.md.cell import wrap_positions
 from mdnum.md.verlet import PairTable, VerletList
 from mdnum.rollout.epoch import Program, Record, State, empty_record, run_epoch
+from mdnum.rollout.pins import Pins
 from mdnum.systems.build import Simulation
 
 # bytes that the rows of one epoch's record may take, and the most rows; both bound memory, not accuracy
@@ -144,12 +145,22 @@ class Engine:
         start: where to begin; default the system's own start.
         record: whether decisions and positions leave the loop. Energies do in any case, and trajectories
             have the same bits either way.
+        pins: decisions to act on instead of the run's own. The record holds its own all the same.
     """
 
-    def __init__(self, simulation: Simulation, last: int, *, start: Start | None = None, record: bool = True):
+    def __init__(
+        self,
+        simulation: Simulation,
+        last: int,
+        *,
+        start: Start | None = None,
+        record: bool = True,
+        pins: Pins | None = None,
+    ):
         self.simulation = simulation
         self.last = last
         self.record = record
+        self.pins = pins
         self.start = start or first_state(simulation)
         self.verlet: VerletList = simulation.verlet_list()
         self.verlet.slots = self.start.slots
@@ -208,6 +219,7 @@ class Engine:
                 jnp.asarray(self.last, jnp.int64),
                 jnp.asarray(before is None),
                 self._take(turn, words),
+                *self._pinned(table, first, words),
             )
             if waiting is not None:
                 # the device is at work: the caller may read the record before this one
@@ -242,6 +254,12 @@ class Engine:
                 home, built, epoch, opens, before = state.x, first, epoch + 1, True, None
                 table = self.verlet.build(reference, cell)
                 tables = self.simulation.tables(table)
+
+    def _pinned(self, table: PairTable, first: int, words: int) -> tuple[UInt8[np.ndarray, "..."], ...]:
+        """What the rows of the next epoch are told, and where; nothing without pins."""
+        if self.pins is None:
+            return ()
+        return self.pins.rows(table, first, self._room(words))
 
     def _closes(self, next_step: int, *, rebuild: int, finite: int, runaway: int) -> str | None:
         if not finite:

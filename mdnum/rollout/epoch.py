@@ -150,6 +150,7 @@ def run_epoch(
     look_back: Bool[Array, ""],
     record: Record,
     told: UInt8[Array, "rows words atoms"] | None = None,
+    pinned: UInt8[Array, "rows words atoms"] | None = None,
 ) -> tuple[Outcome, Record]:
     """Advance with one list until it is used up, the record is full or the last step is done.
 
@@ -164,6 +165,7 @@ def run_epoch(
         record: rows to fill; donated.
         told: decisions of each row to act on instead of the list's own, which are recorded all the same;
             pair potentials only.
+        pinned: the slots of each row at which it acts on what it is told; everywhere when None.
     """
     program: Program = jax.tree.unflatten(structure, leaves)
     order = tables.order
@@ -192,6 +194,8 @@ def run_epoch(
     def body(carry):
         step, x, v, images, _, heat, row, _, _, _, largest, record = carry
         given = {} if told is None else {"given": told[row]}
+        if pinned is not None:
+            given["where"] = pinned[row]
         made: Forces = program.force(x, tables, decisions=program.record, **given)  # type: ignore[operator]
         acceleration = made.force.astype(dtype) / mass_row
         # the first step of all starts from full-step velocities
