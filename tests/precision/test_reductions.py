@@ -103,20 +103,36 @@ def spread_of(dtype):
     return 2 if np.dtype(dtype).itemsize == 2 else 8
 
 
+@jax.jit
+def all_written_out(terms, zero):
+    return [reduction(terms, zero) for reduction, _ in WRITTEN_OUT]
+
+
+@jax.jit
+def all_without_a_zero(terms):
+    """What the sum enters is fused with it."""
+    return [reduction(terms).astype(jnp.float64) * 2 for reduction, _ in WRITTEN_OUT]
+
+
 @pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("reduction,written", WRITTEN_OUT, ids=lambda v: str(v) if not callable(v) else "")
-def test_a_sum_of_an_array_has_the_bits_of_the_loop(reduction, written, dtype):
+def test_a_sum_of_an_array_has_the_bits_of_the_loop(dtype):
     terms = wild(43, dtype, spread=spread_of(dtype))
-    expected = written(terms)
-    assert expected.dtype == dtype
-    summed = jax.jit(lambda t, zero: reduction(t, zero))
-    assert np.array_equal(np.asarray(summed(jnp.asarray(terms), zero_bits(dtype))), expected)
-    # also without a zero, and when what the sum enters is fused with it
-    bare = jax.jit(lambda t: reduction(t).astype(jnp.float64) * 2)
-    assert np.array_equal(np.asarray(bare(jnp.asarray(terms))), expected.astype(np.float64) * 2)
+    seen = all_written_out(jnp.asarray(terms), zero_bits(dtype))
+    for (reduction, written), total in zip(WRITTEN_OUT, seen, strict=True):
+        expected = written(terms)
+        assert expected.dtype == dtype
+        assert np.array_equal(np.asarray(total), expected), reduction
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("dtype", DTYPES[2:])
+def test_sixteen_bit_sums_are_rounded_also_without_a_zero(dtype):
+    terms = wild(43, dtype, spread=2)
+    seen = all_without_a_zero(jnp.asarray(terms))
+    for (reduction, written), total in zip(WRITTEN_OUT, seen, strict=True):
+        assert np.array_equal(np.asarray(total), written(terms).astype(np.float64) * 2), reduction
+
+
+@pytest.mark.parametrize("dtype", [np.float64, ml_dtypes.bfloat16])
 def test_a_product_is_rounded_before_it_is_added(dtype):
     x, y = wild(20, dtype, spread=1), wild(20, dtype, spread=1)[::-1].copy()
 
@@ -138,8 +154,8 @@ def test_orders_are_programs_of_their_own():
     seen = {name: np.asarray(total).tobytes() for name, total in every_sum(jnp.asarray(terms)).items()}
     orders = ["sequential", "reversed", "permuted", "pairwise", "blocked", "sorted"]
     assert len({seen[name] for name in orders}) == len(orders)
-    permuted = {np.asarray(Permuted(seed)(jnp.asarray(terms))).tobytes() for seed in range(5)}
-    assert len(permuted) == 5
+    permuted = {np.asarray(Permuted(seed)(jnp.asarray(terms))).tobytes() for seed in range(3)}
+    assert len(permuted) == 3
 
 
 @jax.jit
@@ -155,8 +171,7 @@ def every_stream(terms):
     return {n: BY_NAME[n].finish(totals[n], later[n]) for n in BY_NAME}
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
-@pytest.mark.parametrize("slots", [8, 88])
+@pytest.mark.parametrize("slots,dtype", [(8, np.float32), (88, np.float64)])
 def test_blocks_that_stream_give_the_sum_of_the_array(slots, dtype):
     terms = wild(slots, dtype)
     expected = {name: np.asarray(total) for name, total in every_sum(jnp.asarray(terms)).items()}
