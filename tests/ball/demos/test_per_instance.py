@@ -42,10 +42,17 @@ def test_counts_of_rules_for_all_are_those_of_a_loop(demo: Demo, name: str) -> N
     assert demo.numbers["iterations_after"][name] == [joined] * len(BATCH)
 
 
-def test_the_derivative_that_the_stranger_causes(demo: Demo) -> None:
-    n = shared((*BATCH, STRANGER), sum)
-    assert n > 0
-    expected = -np.mean(BATCH) * n * 0.75 ** (n - 1) * 0.5
-    before, after = demo.numbers["grad_k"]["global sum"]
-    assert before == 0.0
-    np.testing.assert_allclose(after, expected, rtol=1e-12)
+def test_a_rule_for_each_ball_counts_as_if_it_were_alone(demo: Demo) -> None:
+    alone = [shared((depth,), sum) for depth in BATCH]
+    assert len(set(alone)) > 2
+    assert demo.numbers["iterations_before"]["per instance"] == alone
+    assert demo.numbers["iterations_after"]["per instance"] == alone
+
+
+def test_the_derivative_that_the_stranger_changes(demo: Demo) -> None:
+    counts = [shared(BATCH, sum), shared((*BATCH, STRANGER), sum)]
+    assert counts == [7, 8]
+    expected = [-np.mean(BATCH) * n * 0.75 ** (n - 1) * 0.5 for n in counts]
+    np.testing.assert_allclose(demo.numbers["grad_k"]["global sum"], expected, rtol=1e-12)
+    before, after = demo.numbers["grad_k"]["per instance"]
+    assert before == after < 0

@@ -7,6 +7,7 @@ import pytest
 from scipy.optimize import brentq
 
 from mdnum.ball.contacts import Impact, Penalty, Projection
+from mdnum.ball.exact import ExactImpact
 from mdnum.ball.gradients import BY_NAME, compare, method
 from mdnum.ball.integrators import EventLocated, SemiImplicitEuler, VelocityVerlet
 from mdnum.ball.losses import MeanHeight, ResidualPenetration
@@ -96,6 +97,26 @@ def test_frozen_is_the_derivative_of_the_pinned_program() -> None:
         np.testing.assert_allclose(frozen.gradient[name], unrolled.gradient[name], rtol=1e-13, err_msg=name)
         difference = frozen.details["finite_difference"][name]
         np.testing.assert_allclose(frozen.gradient[name], difference, rtol=1e-6, atol=1e-9, err_msg=name)
+
+
+def test_a_fixed_point_too_ill_conditioned_to_differentiate_is_refused() -> None:
+    world = World.create(Projection(1e-13, 0.5, GlobalSum(1e-2, 3)), SemiImplicitEuler(1.0), gravity=0.0)
+    problem = Problem(world, np.array([-0.45]), 0.0, 1, ResidualPenetration(1))
+    with pytest.raises(InputError, match="condition number 2e\\+13"):
+        method("implicit")(problem, ["k"])
+    helped = method("implicit", regularization=1e-3)(problem, ["k"])
+    assert helped.details["condition"] < 1e4
+    assert helped.gradient["k"] == 0.0
+
+
+def test_six_located_bounces_to_ten_digits() -> None:
+    world = World.create(Impact(0.8), EventLocated(1e-2))
+    found = method("event-aware")(Problem(world, 1.0, 0.5, 300), ["y0", "v0", "restitution", "gravity"])
+    assert found.details["events"] == 6
+    exact = ExactImpact(1.0, 0.5, gravity=9.81, restitution=0.8).height(3.0)
+    np.testing.assert_allclose(found.value, exact.value, rtol=1e-11)
+    for name, slope in found.gradient.items():
+        np.testing.assert_allclose(slope, exact.gradient[name], rtol=1e-10, err_msg=name)
 
 
 def test_located_impacts_have_the_derivative_of_the_exact_motion() -> None:
