@@ -1,0 +1,274 @@
+"""When real runs leave the exact history, and which precision policy keeps them on it longest."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from mdnum.errors import InputError
+from mdnum.events.forks import Growth, growth
+from mdnum.forks.exact.program import Exact, ExactProgram, why_not, with_policy
+from mdnum.forks.exact.tape import Difference, Tape, first_difference
+from mdnum.md.cell import HostCell
+from mdnum.precision import PrecisionPolicy
+from mdnum.rollout.engine import FAILURES, Engine, Start, first_state
+from mdnum.rollout.flips import PairRecorder, decided_pairs
+from mdnum.rollout.frame import Frame
+from mdnum.rollout.tracks import rows_of
+from mdnum.systems.build import Simulation
+
+_NARROW = PrecisionPolicy("float32", "float32", "float32", "float32")
+
+#: Precision policies that are ranked, from none to all in double precision.
+POLICIES: Mapping[str, PrecisionPolicy] = {
+    "float32": _NARROW,
+    "float32, decision float64": replace(_NARROW, decision="float64"),
+    "float32, accumulate float64": replace(_NARROW, accumulate="float64"),
+    "float32, decision and accumulate float64": replace(_NARROW, decision="float64", accumulate="float64"),
+    "float32, state float64": replace(_NARROW, state="float64"),
+    "float64, force float32": PrecisionPolicy("float64", "float32", "float64", "float64"),
+    "float64": PrecisionPolicy(),
+}
+
+#: A share of what double precision gains that counts as nothing, and as a little.
+_NOTHING, _LITTLE = 0.05, 0.25
+#: Separation from the exact run up to which its growth is fitted, as a share of the longest cutoff.
+_SATURATED = 0.04
+
+
+@dataclass(frozen=True)
+class Taped:
+    """A real run as the tape of its decisions.
+
+    Attributes:
+        tape: what it decided.
+        x: wrapped positions, length, shape (rows, 3, atoms).
+        failed: "blow-up", "runaway", or "".
+    """
+
+    tape: Tape
+    x: Float[np.ndarray, "rows 3 atoms"]
+    failed: str
+
+
+@dataclass(frozen=True)
+class PolicyHorizon:
+    """How long a real run keeps to the exact history.
+
+    Attributes:
+        name: of the policy.
+        policy: dtype by role.
+        horizon: first step with a decision other than the exact one; None where there is none.
+        difference: that decision (exact first, run second).
+        margin: of the decision at fault in the exact run (threshold - r²), length²; NaN without one.
+        separation: largest distance of an atom from its exact place at each step, length.
+        growth: of that separation.
+        failed: how the run ended, where badly.
+        gain: share of what double precision gains over single that this policy gains; NaN where unknown.
+    """
+
+    name: str
+    policy: PrecisionPolicy
+    horizon: int | None
+    difference: Difference | None
+    margin: float
+    separation: Float[np.ndarray, "rows"]
+    growth: Growth
+    failed: str
+    gain: float = float("nan")
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """The exact history of a system, and the horizons of real runs against it.
+
+    Attributes:
+        steps: last step.
+        timestep: in the user's units of time.
+        exact: the history.
+        ranking: policies, longest horizon first.
+        same_start: whether all runs begin at single-precision positions and velocities, so that rounding
+            the start is no part of the comparison.
+        says: what follows, in sentences.
+    """
+
+    steps: int
+    timestep: float
+    exact: Exact
+    ranking: tuple[PolicyHorizon, ...]
+    same_start: bool
+    says: tuple[str, ...]
+
+    def of(self, name: str) -> PolicyHorizon:
+        """The row of a policy.
+
+        Raises:
+            KeyError: it was not asked for.
+        """
+        for row in self.ranking:
+            if row.name == name:
+                return row
+        raise KeyError(name)
+
+
+def taped(simulation: Simulation, steps: int, start: Start | None = None) -> Taped:
+    """Run a simulation and keep every decision and position up to a step."""
+    engine, recorder = Engine(simulation, steps, start=start), PairRecorder(simulation)
+    frame = Frame.same(simulation.atoms)
+    first, failed, last = np.empty(0, np.int64), "", 0
+    rows, at, keys, entered = [], [], [], []
+    for segment in engine.segments():
+        if not rows:
+            first = decided_pairs(simulation, segment, 0)
+        ledger = recorder.flips(segment)
+        at.append(ledger.step)
+        keys.append(ledger.subject[:, 0].astype(np.int64) * simulation.atoms + ledger.subject[:, 1])
+        entered.append(ledger.entered)
+        failed = segment.closes if segment.closes in FAILURES else ""
+        rows.append(rows_of(segment, frame, failed).x)
+        last = segment.last
+    step, key, now = np.concatenate(at).astype(np.int64), np.concatenate(keys), np.concatenate(entered)
+    order = np.lexsort((key, step))
+    tape = Tape(simulation.atoms, last, first, step[order], key[order], now[order])
+    return Taped(tape, np.concatenate(rows), failed)
+
+
+def rounded_start(simulation: Simulation, policy: PrecisionPolicy, bits: int = 24) -> Start:
+    """The system's start with every number rounded to so many bits, in the dtype of the policy's state.
+
+    Args:
+        bits: of the significand; at most 24 where the state is single precision.
+    """
+    begin = first_state(with_policy(simulation, PrecisionPolicy()))
+    dtype = policy.dtype("state")
+
+    def cut(a):
+        mantissa, exponent = np.frexp(np.asarray(a, np.float64))
+        return jnp.asarray(np.ldexp(np.rint(np.ldexp(mantissa, bits)), exponent - bits).astype(dtype))
+
+    x = cut(begin.state.x)
+    state = begin.state._replace(x=x, v=cut(begin.state.v), x_before=x)
+    return replace(begin, state=state, reference=np.asarray(x, np.float64).T.copy())
+
+
+def compare(name: str, policy: PrecisionPolicy, simulation: Simulation, exact: Exact, run: Taped):
+    """A real run against the exact history."""
+    difference = first_difference(exact.tape, run.tape)
+    rows = min(len(exact.x), len(run.x))
+    found = np.moveaxis(run.x[:rows], 1, 2)
+    d = HostCell(simulation.cell).displacement(_reduced(simulation, exact.x[:rows]), found)
+    separation = np.sqrt(np.max(d[0] ** 2 + d[1] ** 2 + d[2] ** 2, axis=1))
+    margin = float("nan")
+    if difference is not None:
+        place = _reduced(simulation, exact.x[difference.step])
+        dx, dy, dz = HostCell(simulation.cell).displacement(place[difference.i], place[difference.j])
+        kind = int(simulation.type_of(np.array([difference.i]), np.array([difference.j]))[0])
+        margin = simulation.decider.r_cut[kind] ** 2 - float(dx * dx + dy * dy + dz * dz)
+    return PolicyHorizon(
+        name,
+        policy,
+        None if difference is None else difference.step,
+        difference,
+        margin,
+        separation,
+        growth(separation, _SATURATED * simulation.r_cut),
+        run.failed,
+    )
+
+
+def _reduced(simulation: Simulation, x: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3"]:
+    """Positions within a box of the origin: a displacement takes off one lattice vector at most."""
+    fraction = np.floor(x @ np.asarray(simulation.cell.inverse))
+    return x - fraction @ np.where(np.array(simulation.pbc)[:, None], np.asarray(simulation.cell.matrix), 0.0)
+
+
+def certify(
+    simulation: Simulation,
+    steps: int | None = None,
+    *,
+    policies: Mapping[str, PrecisionPolicy] | None = None,
+    same_start: bool = False,
+    bits: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Certificate:
+    """The exact history of a system, and the step at which a run under each precision policy leaves it.
+
+    Args:
+        simulation: Lennard-Jones, NVE, at most 108 atoms.
+        steps: last step; default the system's own.
+        policies: to compare, by name; default `POLICIES`.
+        same_start: let all runs, and the exact one, begin at the start rounded to 24 bits.
+        bits: precision of the exact run's first attempt.
+        progress: called with the exact run's step and the last one.
+
+    Raises:
+        InputError: the system cannot be certified, or steps below 1.
+    """
+    refused = why_not(simulation)
+    if refused is not None:
+        raise refused
+    last = simulation.system.spec.dynamics.steps if steps is None else steps
+    if last < 1:
+        raise InputError(f"steps = {last}; expected at least 1", remedy="Ask for one step or more")
+    chosen = POLICIES if policies is None else policies
+
+    def start(policy: PrecisionPolicy) -> Start | None:
+        return rounded_start(simulation, policy) if same_start else None
+
+    exact = ExactProgram(simulation, start(PrecisionPolicy())).run(last, bits=bits, progress=progress)
+    rows = []
+    for name, policy in chosen.items():
+        under = with_policy(simulation, policy)
+        rows.append(compare(name, policy, simulation, exact, taped(under, last, start(policy))))
+    rows = _with_gains(rows, last)
+    rows.sort(key=lambda row: -(last + 1 if row.horizon is None else row.horizon))
+    timestep = float(simulation.system.spec.dynamics.timestep)
+    return Certificate(last, timestep, exact, tuple(rows), same_start, _says(rows, last))
+
+
+def _with_gains(rows: list[PolicyHorizon], last: int) -> list[PolicyHorizon]:
+    """Gains relative to single and double precision throughout, where both horizons are known."""
+    by_policy = {row.policy: row for row in rows}
+    low, high = by_policy.get(_NARROW), by_policy.get(PrecisionPolicy())
+    if low is None or high is None or low.horizon is None:
+        return rows
+    # a horizon beyond the last step counts as that step: a lower bound on the gain of double precision
+    reach = last if high.horizon is None else high.horizon
+    span = reach - low.horizon
+    if span <= 0:
+        return rows
+    return [
+        replace(row, gain=((last if row.horizon is None else row.horizon) - low.horizon) / span)
+        for row in rows
+    ]
+
+
+def _says(rows: list[PolicyHorizon], last: int) -> tuple[str, ...]:
+    """What the ranking means, plainly; rows in any order."""
+    sentences = []
+    base = next((row for row in rows if row.policy == _NARROW), None)
+    for row in rows:
+        kept = (
+            f"keeps every decision of the exact history up to step {last}"
+            if row.horizon is None
+            else f"leaves the exact history at step {row.horizon}"
+        )
+        sentence = f"{row.name} {kept}"
+        if row.failed:
+            sentence += f" (its run ended in a {row.failed})"
+        promoted = row.policy not in (_NARROW, PrecisionPolicy())
+        if promoted and base is not None and base.horizon is not None and np.isfinite(row.gain):
+            steps = (last if row.horizon is None else row.horizon) - base.horizon
+            share = f"{steps:+d} steps, {row.gain:.0%} of what double precision throughout gains"
+            if row.gain < _NOTHING:
+                sentence += f": the promotion gains nothing ({share})"
+            elif row.gain < _LITTLE:
+                sentence += f": the promotion gains little ({share})"
+            else:
+                sentence += f": the promotion gains {share}"
+        sentences.append(sentence + ".")
+    return tuple(sentences)

@@ -1,0 +1,367 @@
+"""The discrete map of a rollout in exact real arithmetic, enclosed by balls (Arb) that prove every decision.
+
+The start and all constants are the doubles that the program holds, taken as the dyadic rationals that they
+are. Positions and velocities are balls of many bits; a decision counts when its ball lies on one side of the
+threshold, and where it does not, the run is repeated with more bits. What results is the history that the
+program would have without any rounding.
+
+Source: Johansson, Arb, IEEE Transactions on Computers 66 (2017) 1281.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from mdnum.errors import InputError
+from mdnum.forks.exact.laws import Undecided, pull_of
+from mdnum.forks.exact.tape import Tape
+from mdnum.md.cell import complete
+from mdnum.md.integrators import VelocityVerlet
+from mdnum.md.potentials import LennardJones
+from mdnum.precision import PrecisionPolicy, gamma
+from mdnum.rollout.engine import Start, first_state
+from mdnum.systems.build import Simulation
+
+#: All pairs are looked at in every step.
+MOST_ATOMS = 108
+#: Bits that a step loses about, of an LJ liquid at the usual time step, and what must be left at the end.
+_BITS_PER_STEP, _BITS_LEFT = 0.35, 60
+#: Restarts before a decision is called undecidable.
+_RESTARTS = 5
+#: Bits carried beyond those that the ball's radius leaves meaningful.
+_GUARD_BITS = 32
+_U = 2.0**-53
+
+
+@dataclass(frozen=True)
+class Exact:
+    """The certified history.
+
+    Attributes:
+        tape: every decision, proven.
+        margin: smallest |threshold - r²| of any pair at each step, length², shape (steps + 1,); good to about
+            ten digits.
+        radius: binary logarithm of the largest radius of a coordinate's ball at each step (length), shape
+            (steps + 1,); minus infinity where all are exact.
+        x: centers of the coordinates as doubles, not wrapped, length, shape (steps + 1, atoms, 3).
+        bits: precision that proved it.
+        restarts: runs given up because a decision was not proven.
+        close: decisions that needed the balls; all others were proven by a bound in double precision.
+        seconds: of the run that succeeded.
+    """
+
+    tape: Tape
+    margin: Float[np.ndarray, "rows"]
+    radius: Float[np.ndarray, "rows"]
+    x: Float[np.ndarray, "rows atoms 3"]
+    bits: int
+    restarts: int
+    close: int
+    seconds: float
+
+
+def installed() -> bool:
+    """Whether the ball arithmetic (python-flint) is there."""
+    from importlib.util import find_spec
+
+    return find_spec("flint") is not None
+
+
+def why_not(simulation: Simulation) -> InputError | None:
+    """What keeps a system from being certified, with a remedy; None where nothing does."""
+    where = "system"
+    if not simulation.pairwise or not isinstance(simulation.potential, LennardJones):
+        return InputError(
+            f"the exact program serves Lennard-Jones potentials, not {simulation.potential.name!r}",
+            remedy="Use a lennard-jones system",
+            where="potential.kind",
+        )
+    if not isinstance(simulation.integrator, VelocityVerlet):
+        return InputError(
+            f"the exact program serves NVE dynamics, not {simulation.integrator.name!r}: its noise is "
+            "defined by its rounding",
+            remedy="Use --set dynamics.kind=nve",
+            where="dynamics.kind",
+        )
+    if simulation.atoms > MOST_ATOMS:
+        return InputError(
+            f"{simulation.atoms} atoms; the exact program follows all pairs of at most {MOST_ATOMS}",
+            remedy="Use a smaller structure, e.g. argon/crystal-108",
+            where=where,
+        )
+    half = float(np.min(simulation.cell.widths)) / 2
+    if simulation.r_cut > half * (1 - 1e-5):
+        return InputError(
+            f"r_cut = {simulation.r_cut:g} is half the box ({half:g}): the nearest image cannot be proven",
+            remedy="Use a slightly smaller cutoff or a larger box",
+            where="cutoff.radius",
+        )
+    if not installed():
+        return InputError(
+            "exact runs need python-flint, which is not installed", remedy="pip install python-flint"
+        )
+    return None
+
+
+class ExactProgram:
+    """A simulation's map in ball arithmetic.
+
+    Args:
+        simulation: its constants are taken as doubles, whatever the precision policy.
+        start: where it begins; default the system's own start in double precision.
+
+    Raises:
+        InputError: the system cannot be certified.
+    """
+
+    def __init__(self, simulation: Simulation, start: Start | None = None):
+        refused = why_not(simulation)
+        if refused is not None:
+            raise refused
+        begin = start or first_state(_wide(simulation))
+        if int(begin.state.step) != 0:
+            raise InputError(f"the start is at step {int(begin.state.step)}; an exact run begins at step 0")
+        self._x = np.asarray(begin.state.x, np.float64).T.copy()
+        self._v = np.asarray(begin.state.v, np.float64).T.copy()
+        self.simulation = simulation
+        self.atoms = atoms = simulation.atoms
+        model = simulation.model
+        self._constants = [
+            tuple(float(value) for value in row)
+            for row in zip(
+                *(
+                    np.asarray(leaf, np.float64)
+                    for leaf in (model.potential.sigma, model.potential.epsilon, model.r_cut, model.r_onset)
+                ),
+                strict=True,
+            )
+        ]
+        self._timestep = float(simulation.integrator.timestep)
+        self._i, self._j = np.triu_indices(atoms, 1)
+        self._kind = np.asarray(simulation.type_of(self._i, self._j))
+        decider = _wide(simulation).decider
+        self._inclusive, self._space = decider.compare.endswith("<="), decider.space
+        self._held = [t.value for t in decider.thresholds]
+        squared = [value * value if self._space == "r" else value for value in self._held]
+        self._threshold = np.array(squared)[self._kind]
+        cell = simulation.cell
+        self._matrix = np.where(np.array(cell.pbc)[:, None], np.asarray(cell.matrix, np.float64), 0.0)
+        inverse = np.linalg.inv(complete(np.asarray(cell.matrix), np.array(cell.pbc)))
+        self._inverse = np.where(np.array(cell.pbc), inverse, 0.0)
+
+    def run(
+        self,
+        steps: int,
+        *,
+        bits: int | None = None,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> Exact:
+        """Every decision up to a step, proven; with more bits where the first ones did not do.
+
+        Args:
+            steps: last step.
+            bits: precision to begin with; default 0.35 a step and 60.
+            progress: called with the step reached and the last one.
+
+        Raises:
+            InputError: a pair sits on its threshold to all bits that were tried.
+        """
+        if steps < 0:
+            raise InputError(f"steps = {steps}; expected at least 0")
+        bits = math.ceil(_BITS_PER_STEP * steps) + _BITS_LEFT if bits is None else bits
+        for restarts in range(_RESTARTS + 1):
+            run = _Run(self, steps, bits)
+            try:
+                return run.all(progress, restarts)
+            except Undecided:
+                more = run.bits_needed()
+                failed = run.step
+            bits = max(more, bits + bits // 2)
+        raise InputError(
+            f"a pair at step {failed} cannot be told from its cutoff with {bits} bits: it may be exactly there",
+            remedy="Change the start by one ulp",
+        )
+
+
+class _Run:
+    """One attempt with a fixed number of bits at the start."""
+
+    def __init__(self, program: ExactProgram, steps: int, bits: int):
+        self.program, self.steps, self.bits, self.step = program, steps, bits, 0
+        self._radius = np.full(steps + 1, -np.inf)
+        self._margin = np.empty(steps + 1)
+        self._x = np.empty((steps + 1, program.atoms, 3))
+        self._flips: list[tuple[int, np.ndarray, np.ndarray]] = []
+        self._close = 0
+
+    def bits_needed(self) -> int:
+        """Bits that the growth of the balls so far asks for."""
+        grown = self._radius[: self.step + 1]
+        known = np.flatnonzero(np.isfinite(grown))
+        if len(known) < 50:
+            return 2 * self.bits
+        rate = (grown[known[-1]] - grown[known[len(known) // 4]]) / (known[-1] - known[len(known) // 4])
+        return math.ceil(1.1 * rate * self.steps) + 2 * _BITS_LEFT
+
+    def all(self, progress, restarts: int) -> Exact:
+        """The whole run."""
+        from flint import ctx
+
+        begin, before = time.perf_counter(), ctx.prec
+        try:
+            ctx.prec = self.bits
+            first = self._all(progress)
+        finally:
+            ctx.prec = before
+        program = self.program
+        keys = program._i.astype(np.int64) * program.atoms + program._j
+        rows = [np.empty(0, np.int64)]
+        tape = Tape(
+            program.atoms,
+            self.steps,
+            keys[first],
+            np.concatenate(rows + [np.full(len(at), step, np.int64) for step, at, _ in self._flips]),
+            np.concatenate(rows + [keys[at] for _, at, _ in self._flips]),
+            np.concatenate([np.empty(0, bool)] + [now for _, _, now in self._flips]),
+        )
+        seconds = time.perf_counter() - begin
+        return Exact(
+            tape, self._margin, self._radius, self._x, self.bits, restarts, self._close, seconds
+        )
+
+    def _all(self, progress) -> Bool[np.ndarray, "all_pairs"]:
+        from flint import arb, ctx
+
+        program, atoms = self.program, self.program.atoms
+        dt = arb(program._timestep)
+        kick = [dt * dt / arb(float(mass)) for mass in program.simulation.masses]
+        pulls = [pull_of(program.simulation.cutoff.name, *row) for row in program._constants]
+        held = [arb(value) for value in program._held]
+        thresholds = [value * value if program._space == "r" else value for value in held]
+        self._lattice = [[arb(float(c)) for c in row] for row in program._matrix]
+        self._shifts: dict[tuple[int, int, int], tuple[Any, Any, Any]] = {}
+        # component by component; w is dt * v
+        x = [[arb(float(c)) for c in program._x[:, k]] for k in range(3)]
+        w = [[dt * arb(float(c)) for c in program._v[:, k]] for k in range(3)]
+        kinds, every_i, every_j = program._kind.tolist(), program._i.tolist(), program._j.tolist()
+        first = before = None
+        for step in range(self.steps + 1):
+            self.step = step
+            centers = self._x[step]
+            for k in range(3):
+                centers[:, k] = [float(c) for c in x[k]]
+            self._radius[step] = radius = max(_log2_radius(c) for row in x for c in row)
+            size = math.log2(max(1e-300, float(np.abs(centers).max())))
+            if np.isfinite(radius):
+                ctx.prec = max(64, min(self.bits, math.ceil(size - radius) + _GUARD_BITS))
+            inside, images, r2 = self._decide(x, centers, radius, thresholds)
+            self._margin[step] = np.min(np.abs(program._threshold - r2), initial=np.inf)
+            if before is None:
+                first = inside
+            else:
+                changed = np.flatnonzero(inside != before)
+                if len(changed):
+                    self._flips.append((step, changed, inside[changed]))
+            before = inside
+            if progress is not None and step % 50 == 0:
+                progress(step, self.steps)
+            if step == self.steps:
+                break
+            force = [[arb(0)] * atoms for _ in range(3)]
+            fx, fy, fz = force
+            xs, ys, zs = x
+            chosen = np.flatnonzero(inside)
+            for p, n in zip(chosen.tolist(), images[chosen].tolist(), strict=True):
+                i, j = every_i[p], every_j[p]
+                dx, dy, dz = xs[j] - xs[i], ys[j] - ys[i], zs[j] - zs[i]
+                if n != [0, 0, 0]:
+                    sx, sy, sz = self._shift(n)
+                    dx, dy, dz = dx - sx, dy - sy, dz - sz
+                pull = pulls[kinds[p]](dx * dx + dy * dy + dz * dz)
+                dx, dy, dz = pull * dx, pull * dy, pull * dz
+                fx[i] += dx
+                fy[i] += dy
+                fz[i] += dz
+                fx[j] -= dx
+                fy[j] -= dy
+                fz[j] -= dz
+            # both half kicks in one; only a half one starts the run
+            factors = [c / 2 for c in kick] if step == 0 else kick
+            for k in range(3):
+                w[k] = [a + c * f for a, c, f in zip(w[k], factors, force[k], strict=True)]
+                x[k] = [a + b for a, b in zip(x[k], w[k], strict=True)]
+        assert first is not None
+        return first
+
+    def _shift(self, n: list[int]) -> tuple[Any, Any, Any]:
+        """n lattice vectors, exact products of small integers and doubles."""
+        key = (n[0], n[1], n[2])
+        if key not in self._shifts:
+            rows = self._lattice
+            x, y, z = (n[0] * rows[0][c] + n[1] * rows[1][c] + n[2] * rows[2][c] for c in range(3))
+            self._shifts[key] = x, y, z
+        return self._shifts[key]
+
+    def _decide(
+        self, x, centers: Float[np.ndarray, "atoms 3"], radius: float, thresholds: list
+    ) -> tuple[
+        Bool[np.ndarray, "all_pairs"], Int[np.ndarray, "all_pairs 3"], Float[np.ndarray, "all_pairs"]
+    ]:
+        """All decisions of a step: by a bound in double precision, or by the balls where that is too coarse.
+
+        The image that is nearest in double precision is the exact one, or the pair is further away than
+        r_cut in either image, because r_cut is below half the box by more than rounding.
+        """
+        program = self.program
+        i, j, matrix = program._i, program._j, program._matrix
+        d = centers[j] - centers[i]
+        n = np.rint(d @ program._inverse)
+        d = d - n @ matrix
+        r2 = (d * d).sum(axis=1)
+        # error of a component: of both centers, their difference and the lattice vectors taken off
+        largest = 4 * np.abs(centers).max() + (np.abs(n).max(initial=0.0) + 1) * np.abs(matrix).sum()
+        if not np.isfinite(largest):
+            raise InputError(f"the exact run blows up at step {self.step}", remedy="Use a smaller time step")
+        component = 8 * _U * largest + 4 * 2.0 ** min(max(radius, -1000.0), 500.0)
+        r = np.sqrt(r2)
+        bound = 4 * (r + component) * component * math.sqrt(3) + 4 * gamma(8) * (r2 + program._threshold)
+        inside = r2 < program._threshold
+        for p in np.flatnonzero(~(np.abs(r2 - program._threshold) > bound)).tolist():
+            self._close += 1
+            a, b = int(i[p]), int(j[p])
+            shift = self._shift([int(c) for c in n[p]])
+            dx, dy, dz = (x[k][b] - x[k][a] - shift[k] for k in range(3))
+            ball, threshold = dx * dx + dy * dy + dz * dz, thresholds[program._kind[p]]
+            if ball < threshold or (program._inclusive and ball <= threshold):
+                inside[p] = True
+            elif ball > threshold or (not program._inclusive and ball >= threshold):
+                inside[p] = False
+            else:
+                raise Undecided
+            r2[p] = program._threshold[p] - float(threshold - ball)
+        return inside, n.astype(np.int64), r2
+
+
+def _log2_radius(ball) -> float:
+    """An upper bound on the binary logarithm of a ball's radius, which a double may not hold."""
+    if ball.is_exact():
+        return -math.inf
+    mantissa, exponent = ball.rad().man_exp()
+    return float(int(exponent) + int(mantissa).bit_length())
+
+
+def _wide(simulation: Simulation) -> Simulation:
+    """The same system with every role in double precision."""
+    return with_policy(simulation, PrecisionPolicy())
+
+
+def with_policy(simulation: Simulation, policy: PrecisionPolicy) -> Simulation:
+    """The same system under another precision policy."""
+    return replace(simulation, policy=policy, decider=replace(simulation.decider, dtype=policy.decision))
