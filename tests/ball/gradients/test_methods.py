@@ -154,6 +154,14 @@ def test_steps_alone_never_learn_of_the_start_and_saltation_does_to_order_h() ->
     np.testing.assert_allclose(np.log2(relative[0] / relative[-1]) / 3, 1.0, atol=0.2)
 
 
+@pytest.mark.parametrize(("h", "known"), [(1e-2, 0.39), (1e-3, 9.9e-3), (1e-4, 1.4e-3)])
+def test_the_known_errors_of_saltation_on_plain_steps(h: float, known: float) -> None:
+    problem = bouncing(SemiImplicitEuler(h))
+    assert problem.value_and_grad(["y0"])[1]["y0"] == 0.0
+    found = method("event-aware")(problem, ["y0"]).gradient["y0"]
+    np.testing.assert_allclose(abs(found - 0.4266108641634107), known, rtol=0.03)
+
+
 def damped(y0, k, damping, g=9.81, end=1.0):
     """A ball on a damped spring floor: flight, one contact by the roots of the oscillator, flight."""
     speed, time = np.sqrt(2 * g * y0), np.sqrt(2 * y0 / g)
