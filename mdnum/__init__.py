@@ -22,6 +22,7 @@ _HOMES = {
     "bounce": "mdnum.workflow:bounce",
     "build": "mdnum.systems:build",
     "diagnose": "mdnum.doctor:diagnose",
+    "fork": "mdnum.workflow:fork",
     "load": "mdnum.systems:load",
     "run": "mdnum.workflow:run",
     "systems": "mdnum.systems",
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from mdnum.systems import build as build
     from mdnum.systems import load as load
     from mdnum.workflow import bounce as bounce
+    from mdnum.workflow import fork as fork
     from mdnum.workflow import run as run
 
 __all__ = [
@@ -52,6 +54,7 @@ __all__ = [
     "bounce",
     "build",
     "diagnose",
+    "fork",
     "load",
     "run",
     "systems",

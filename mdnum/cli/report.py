@@ -19,6 +19,8 @@ def report(
     run = RunFolder.open(folder)
     if run.world == "ball":
         from mdnum.report.ball.html import write_report
+    elif run.world == "fork":
+        from mdnum.report.fork.html import write_report
     else:
         from mdnum.report.html import write_report
     written = write_report(run)

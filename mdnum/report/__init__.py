@@ -20,8 +20,11 @@ def write(folder: RunFolder | str | Path) -> Path:
     Raises:
         FolderError: no run in the folder, or it cannot be written.
     """
-    if _world(folder) == "ball":
+    world = _world(folder)
+    if world == "ball":
         from mdnum.report.ball.html import write_report
+    elif world == "fork":
+        from mdnum.report.fork.html import write_report
     else:
         from mdnum.report.html import write_report
 
@@ -34,8 +37,11 @@ def judge(folder: RunFolder | str | Path) -> None:
     Raises:
         FolderError: no run in the folder, or it cannot be written.
     """
-    if _world(folder) == "ball":
+    world = _world(folder)
+    if world == "ball":
         from mdnum.report.ball.findings import record
+    elif world == "fork":
+        from mdnum.report.fork.findings import record
     else:
         from mdnum.report.findings import record
 
@@ -43,7 +49,7 @@ def judge(folder: RunFolder | str | Path) -> None:
 
 
 def _world(folder: RunFolder | str | Path) -> str:
-    """ "ball" or "md"; folders from before there were two worlds do not say."""
+    """ "ball", "fork" or "md"; folders from before there were two worlds do not say."""
     from mdnum.store import RunFolder
 
     folder = folder if isinstance(folder, RunFolder) else RunFolder.open(folder)

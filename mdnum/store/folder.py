@@ -41,7 +41,7 @@ class RunFolder:
 
     Attributes:
         path: the folder.
-        world: "md" or "ball": which tables it has.
+        world: "md", "ball" or "fork": which tables it has.
     """
 
     def __init__(self, path: Path, world: str = "md"):
@@ -63,7 +63,7 @@ class RunFolder:
         Args:
             path: made if missing, parents included.
             overwrite: remove the run that is there. Files that are not a run's are left alone.
-            world: "md" or "ball".
+            world: "md", "ball" or "fork".
 
         Raises:
             FolderError: the folder holds a run or other files, is a file, or cannot be written.
@@ -109,8 +109,9 @@ class RunFolder:
             raise FolderError("no such folder", remedy="Give the folder of a run", where=str(path))
         if not any((folder.path / name).exists() for name in (*_FILES, "parts")):
             raise FolderError("holds no run", remedy="Give the folder of a run", where=str(path))
-        if any((folder.path / f"{name}.parquet").exists() for name in TABLES["ball"]):
-            folder.world = "ball"
+        for world in ("ball", "fork"):
+            if any((folder.path / f"{name}.parquet").exists() for name in TABLES[world]):
+                folder.world = world
         return folder
 
     # -- writing ---------------------------------------------------------------------------------

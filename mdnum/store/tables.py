@@ -56,6 +56,17 @@ COLUMNS: Mapping[str, Mapping[str, pa.DataType]] = MappingProxyType(
         ),
         "heights": _columns(step=_INT, ball=_SHORT, y=_FLOAT, v=_FLOAT),
         "separations": _columns(variant=_TEXT, step=_INT, separation=_FLOAT),
+        "separation": _columns(
+            step=_INT, time=_FLOAT, free=_FLOAT, handed=_FLOAT, back=_FLOAT, cross=_INT, overridden=_FLOAT,
+            furthest=_FLOAT, energy_a=_FLOAT, energy_b=_FLOAT, energy_handed=_FLOAT,
+        ),
+        "cross_flips": _columns(
+            step=_INT, i=_SHORT, j=_SHORT, differs=_BOOL, run=_TEXT, entered=_BOOL, margin=_FLOAT,
+            bound=_FLOAT,
+        ),
+        "neighborhood": _columns(
+            atom=_SHORT, x=_FLOAT, y=_FLOAT, z=_FLOAT, dx=_FLOAT, dy=_FLOAT, dz=_FLOAT,
+        ),
     }
 )  # fmt: skip
 
@@ -64,6 +75,7 @@ TABLES: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         "md": ("series", "flips", "epochs"),
         "ball": ("steps", "contacts", "solver", "heights", "separations"),
+        "fork": ("separation", "cross_flips", "neighborhood"),
     }
 )
 

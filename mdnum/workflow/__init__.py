@@ -1,8 +1,9 @@
-"""The verbs as functions: `mdnum run` and `mdnum ball`."""
+"""The verbs as functions: `mdnum run`, `mdnum ball` and `mdnum fork`."""
 
 from __future__ import annotations
 
 from mdnum.workflow.ball import BallResult, bounce
+from mdnum.workflow.fork import ForkResult, fork
 from mdnum.workflow.md import run
 
-__all__ = ["BallResult", "bounce", "run"]
+__all__ = ["BallResult", "ForkResult", "bounce", "fork", "run"]

@@ -1,0 +1,199 @@
+"""`mdnum fork`: where two runs that differ in one choice part, and what a flip had to do with it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from mdnum.cli import output
+from mdnum.cli.progress import ProgressBar
+from mdnum.errors import InputError
+
+#: Runs of a comparison, in words: arithmetic, and whose decisions it acts on.
+_RUNS = {"B": ("B", "its own"), "B|A": ("B", "A's"), "A|B": ("A", "B's")}
+
+
+def fork(
+    system: str | None = typer.Argument(
+        None, metavar="SYSTEM", help="A name from `mdnum systems list`, or the path of a TOML file."
+    ),
+    vary: str | None = typer.Option(
+        None,
+        metavar="CHOICE",
+        help="What to vary: precision, reduction=exact, ...; all screens every choice.",
+    ),
+    steps: int | None = typer.Option(None, min=1, help="Steps to follow, instead of the system's own."),
+    split: float | None = typer.Option(
+        None, metavar="LENGTH", help="The separation that counts as split; 0.04 of the cutoff by default."
+    ),
+    repeats: int = typer.Option(
+        2, min=0, metavar="K", help="Runs with perturbed starts, to tell a delay from chance."
+    ),
+    settings: list[str] | None = output.SET_OPTION,
+    no_counterfactual: bool = typer.Option(
+        False, "--no-counterfactual", help="Do not run B under A's decisions: dates, but no cause."
+    ),
+    back: bool = typer.Option(False, "--back", help="Run A under B's decisions too."),
+    out: Path | None = typer.Option(
+        None, "-o", "--out", metavar="DIR", help="The fork folder; runs/fork-NAME-N by default."
+    ),
+    no_report: bool = typer.Option(False, "--no-report", help="Do not write report.html."),
+    as_json: bool = output.JSON_OPTION,
+) -> int:
+    """Follow two runs that differ in one numerical choice, and judge the flip that parted them."""
+    overrides = output.parse_overrides(settings)
+    if system is None or vary is None:
+        return _choices(system, as_json)
+    from mdnum.workflow import fork as compare
+
+    try:
+        with ProgressBar() as progress:
+            result = compare(
+                system,
+                vary,
+                steps=steps,
+                split=split,
+                repeats=repeats,
+                counterfactual=not no_counterfactual,
+                back=back,
+                out=out,
+                overrides=overrides,
+                report=not no_report,
+                progress=progress,
+            )
+    except KeyboardInterrupt:
+        raise output.Stopped("stopped") from None
+    summary = dict(result.summary)
+    if as_json:
+        output.print_json({"folder": result.folder, **summary})
+    else:
+        _print(summary, result.folder)
+    return output.exit_code(summary.get("findings", ()), ok=summary.get("status") == "complete")
+
+
+def _choices(system: str | None, as_json: bool) -> int:
+    """What can be varied, for somebody who did not say."""
+    if system is not None and not as_json:
+        typer.echo("Say what to vary: --vary CHOICE. The choices are:\n")
+    from mdnum.forks.choices import BY_NAME
+
+    rows = [
+        {"name": name, "about": choice.about, "must_hold": bool(choice.must_hold)}
+        for name, choice in BY_NAME.items()
+    ]
+    if as_json:
+        output.print_json({"choices": rows})
+    else:
+        lines = [
+            (row["name"], "a fork is a finding" if row["must_hold"] else "", row["about"]) for row in rows
+        ]
+        output.print_table("choices: `mdnum fork SYSTEM --vary CHOICE`", ("choice", "", "about"), lines)
+    if system is not None:
+        raise InputError("nothing to vary", remedy="Add --vary CHOICE, or --vary all")
+    return output.EXIT_FINE
+
+
+def _print(summary: Mapping[str, Any], folder: Path) -> None:
+    out = output.console()
+    if headline := summary.get("headline"):
+        out.print(headline, style="bold", markup=False)
+    if "ranking" in summary:
+        _print_ranking(summary)
+    else:
+        _print_fork(summary)
+    output.print_findings(summary.get("findings", ()))
+    report = folder / "report.html"
+    out.print(f"wrote {report if report.exists() else folder}", markup=False)
+
+
+def _print_fork(summary: Mapping[str, Any]) -> None:
+    out = output.console()
+    for reason in summary.get("reasons") or ():
+        out.print(f"  {reason}", markup=False)
+    rows = [
+        ("system", f"{summary['system']}, {summary['atoms']:,} atoms, {summary['steps']:,} steps"),
+        ("differs in", summary["difference"]),
+    ]
+    for name, what in (
+        ("seed", "first bit differs"),
+        ("fork", "first decision differs"),
+        ("split", f"further apart than {summary['tolerance']:.3g}"),
+    ):
+        rows.append((name, _date(summary, name, what)))
+    rows += list(_decision(summary.get("decision")))
+    rate = summary.get("growth_rate")
+    if rate is not None:
+        fits = f"r² {summary['r_squared']:.3f}" if summary.get("r_squared") is not None else ""
+        rows.append(
+            ("growth", f"{rate:.3g} a step, {summary['growth_rate_time']:.3g} a unit of time, {fits}")
+        )
+    if summary.get("predicted_split") is not None:
+        rows.append(("predicted split", f"about step {summary['predicted_split']:,}"))
+    rows.append(("flips in one run only", f"{summary['cross_flips']:,}"))
+    output.print_table("", ("", ""), rows)
+    splits = summary.get("splits") or {}
+    if len(splits) > 1:
+        lines = [(*_RUNS[name], _split(splits[name])) for name in splits]
+        lines += [("B, start perturbed", "its own", f"{split:,}") for split in summary.get("repeats") or ()]
+        output.print_table("splits from the first run", ("arithmetic", "decisions", "step"), lines)
+
+
+def _date(summary: Mapping[str, Any], name: str, what: str) -> str:
+    step = summary.get(name)
+    if step is None:
+        return f"none in {summary['steps']:,} steps ({what})"
+    return f"step {step:,}, time {summary[f'{name}_time']:.6g} ({what})"
+
+
+def _split(step: int | None) -> str:
+    return "none" if step is None else f"{step:,}"
+
+
+def _decision(made: Mapping[str, Any] | None) -> list[tuple[str, str]]:
+    if made is None:
+        return []
+    where = {"A": " in A only", "B": " in B only"}.get(str(made["run"]), " differs at the start")
+    way = "" if made["run"] == "start" else "entered" if made["entered"] else "left"
+    also = f", with {made['also']:,} more at this step" if made.get("also") else ""
+    space = {"r2": "r²", "r": "r"}.get(str(made.get("space")), "")
+    if made["ambiguous"]:
+        rounding = "rounding alone could have decided otherwise"
+    else:
+        rounding = "more than rounding"
+    rows = [
+        ("deciding pair", f"{made['i']}–{made['j']} {way}{where}{also}".replace("  ", " ")),
+        ("margin", f"{made['margin']:.3g} in {space}; rounding bound {made['bound']:.3g}: {rounding}"),
+    ]
+    if made.get("protected") is not None:
+        rows.append(
+            (
+                "apart the step before",
+                f"{made['separation_before']:.3g}; the margin is {made['protected']:.3g} of it",
+            )
+        )
+    return rows
+
+
+def _print_ranking(summary: Mapping[str, Any]) -> None:
+    rows = []
+    for one in summary["ranking"]:
+        must = "must not fork" if one.get("must_hold") else ""
+        rows.append(
+            (
+                one["choice"],
+                _split(one.get("seed")),
+                _split(one.get("fork")),
+                _split(one.get("split")),
+                one.get("verdict") or "-",
+                must,
+                one.get("difference") or "",
+            )
+        )
+    output.print_table(
+        "choices by fork", ("choice", "seed", "fork", "split", "verdict", "", "difference"), rows
+    )
+    if left := summary.get("not_applicable"):
+        output.print_table("do not apply", ("choice", "why"), [(one["choice"], one["why"]) for one in left])

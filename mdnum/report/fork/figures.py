@@ -1,0 +1,214 @@
+"""The figures of a comparison: how two runs part, and what their flips had to do with it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Literal
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from mdnum.ball.demos.base import Plot, Series
+from mdnum.report import plots, thin
+from mdnum.report.axes import PAGE_WIDTH
+from mdnum.report.fork import atoms, choices
+from mdnum.report.fork.run import ForkFolder
+from mdnum.report.svg import MUTED
+from mdnum.report.words import many, plain
+
+Drawer = Callable[[float], Figure]
+Role = Literal["first", "second", "third", "bad", "muted", "ink"]
+
+#: Flips that are drawn as ticks.
+_TICKS = 1_500
+#: A fit is drawn on where it predicts a split, for at most so many times the steps that were followed.
+_BEYOND = 2.0
+
+
+def figures(run: ForkFolder) -> Iterator[tuple[str, str, Drawer, list[str]]]:
+    """(name, title, what draws it at a width, notes) of every figure that the folder has numbers for."""
+    if run.screened:
+        if run.ranking:
+            yield "ranking", "Choices by the step at which they fork", partial(choices.ranking, run), []
+        return
+    plot = separation(run)
+    if plot is not None:
+        yield "separation", plot.title, partial(_separation, run, plot), []
+    if len(run.around.get("atom", ())) > 1:
+        yield "atoms", "The atoms around the deciding pair at the fork", partial(atoms.draw, run), []
+    for name, plot in (("cross", cross(run)), ("overridden", overridden(run)), ("furthest", furthest(run)),
+                       ("energy", energy(run))):  # fmt: skip
+        if plot is not None:
+            yield name, plot.title, partial(plots.draw, plot), plots.notes(plot)
+
+
+def separation(run: ForkFolder) -> Plot | None:
+    """The separation of A from B and from B under A's decisions, with the three dates."""
+    step = run.series.get("step", np.zeros(0))
+    if not run.has("free") or not np.any(run.series["free"] > 0):
+        return None
+    series = []
+    for number, name in enumerate(run.repeats):
+        # a repeat is close to the run that it repeats and must not hide it: it comes first
+        label = "" if number else "B again, start perturbed"
+        series.append(Series(label, step, _positive(run.series[name]), role="muted"))
+    named: tuple[tuple[str, str, Role], ...] = (
+        ("free", "A and B, free", "first"),
+        ("handed", "A and B under A’s decisions", "second"),
+        ("back", "B and A under B’s decisions", "third"),
+    )
+    for name, label, role in named:
+        if run.has(name):
+            series.append(Series(label, step, _positive(run.series[name]), role=role))
+    fit = _fit(run)
+    if fit is not None:
+        series.append(Series("growth, fitted", *fit, role="ink", dashed=True))
+    verticals = tuple((float(at), f"{name} {at:,}") for name, at in run.dates.items())
+    guess = run.summary.get("predicted_split")
+    if guess is not None and guess <= _BEYOND * run.steps:
+        verticals += ((float(guess), f"split expected {guess:,}"),)
+    tolerance = float(run.summary["tolerance"])
+    return Plot(
+        "Separation of the two runs",
+        f"step (of {plain(run.summary.get('timestep'))} {run.units.time})",
+        f"largest distance of an atom from itself ({run.units.length})",
+        tuple(series),
+        y_scale="log",
+        verticals=verticals,
+        horizontals=((tolerance, "split"),),
+    )
+
+
+def _positive(values: np.ndarray) -> np.ndarray:
+    """Without the zeros before the seed, which a logarithmic axis has no place for."""
+    return np.where(values > 0, values, np.nan)
+
+
+def _fit(run: ForkFolder) -> tuple[np.ndarray, np.ndarray] | None:
+    """The fitted growth as a line, drawn on to a predicted split that is near enough."""
+    fit = (run.summary.get("growth") or {}).get("B") or {}
+    if fit.get("rate") is None:
+        return None
+    end = float(fit["last"])
+    guess = run.summary.get("predicted_split")
+    if guess is not None and guess <= _BEYOND * run.steps:
+        end = float(guess)
+    at = np.linspace(fit["first"], end, 60)
+    return at, np.exp(fit["intercept"] + fit["rate"] * at)
+
+
+def _separation(run: ForkFolder, plot: Plot, width: float) -> Figure:
+    figure = plots.draw(plot, width)
+    figure.set_figheight(figure.get_figheight() + (1.5 if width >= PAGE_WIDTH else 0.9))
+    axes = figure.axes[0]
+    for line in axes.lines:
+        if line.get_color() == MUTED and line.get_linestyle() == "-":
+            line.set_linewidth(0.7)
+    _ticks(axes, run)
+    return figure
+
+
+def _ticks(axes: Axes, run: ForkFolder) -> None:
+    """A tick at the lower edge for each flip that one run made and the other did not."""
+    step = np.unique(run.flips.get("step", np.zeros(0)))
+    if not len(step):
+        return
+    step = step[thin.points(step.astype(float), np.zeros(len(step)), _TICKS)]
+    axes.vlines(
+        step, 0.0, 0.035, transform=axes.get_xaxis_transform(), color=plots.COLORS["bad"], lw=0.6, alpha=0.8
+    )
+
+
+def cross(run: ForkFolder) -> Plot | None:
+    """How many pairs the two runs decide differently."""
+    values = run.series.get("cross", np.zeros(0))
+    if not np.any(values):
+        return None
+    shown = np.where(values > 0, values.astype(float), np.nan)
+    series = (Series("pairs that differ", run.series["step"], shown, mark="steps"),)
+    wide = np.nanmax(shown) > 30
+    return Plot(
+        "Pairs that the two runs decide differently", "step", "pairs", series,
+        y_scale="log" if wide else "linear", verticals=_dates(run),
+    )  # fmt: skip
+
+
+def overridden(run: ForkFolder) -> Plot | None:
+    """How many of its own decisions the counterfactual was not allowed."""
+    values = run.series.get("overridden", np.zeros(0))
+    if not np.any(np.nan_to_num(values)):
+        return None
+    series = (Series("overridden", run.series["step"], values, mark="steps", role="second"),)
+    return Plot(
+        "Decisions overridden in the run under A’s decisions", "step", "decisions overridden", series,
+        verticals=_dates(run),
+    )  # fmt: skip
+
+
+def furthest(run: ForkFolder) -> Plot | None:
+    """How far from its cutoff the furthest overridden pair was."""
+    values = run.series.get("furthest", np.zeros(0))
+    if not np.any(np.nan_to_num(values) > 0):
+        return None
+    series = (Series("", run.series["step"], _positive(values), mark="points", role="second"),)
+    return Plot(
+        "Distance of overridden pairs from their cutoff", "step",
+        f"furthest from its cutoff ({run.units.length})", series, y_scale="log",
+        verticals=_dates(run), horizontals=((float(run.summary["tolerance"]), "split tolerance"),),
+    )  # fmt: skip
+
+
+def energy(run: ForkFolder) -> Plot | None:
+    """How far apart the energies of the runs are."""
+    if not run.has("energy_b"):
+        return None
+    first = run.series["energy_a"]
+    series = []
+    named: tuple[tuple[str, str, Role], ...] = (
+        ("energy_b", "B, free", "first"),
+        ("energy_handed", "B under A’s decisions", "second"),
+    )
+    for name, label, role in named:
+        off = np.abs(run.series[name] - first)
+        if np.any(off[np.isfinite(off)] > 0):
+            series.append(Series(label, run.series["step"], _positive(off), role=role))
+    if not series:
+        return None
+    return Plot(
+        "Difference of total energies", "step", f"|energy − energy of A| ({run.units.energy})",
+        tuple(series), y_scale="log", verticals=_dates(run),
+    )  # fmt: skip
+
+
+def _dates(run: ForkFolder) -> tuple[tuple[float, str], ...]:
+    return tuple((float(at), name) for name, at in run.dates.items() if name != "seed")
+
+
+def captions(run: ForkFolder) -> dict[str, str]:
+    """What stands below the figures."""
+    ticks = "; a tick at the lower edge for each step at which only one run flips a pair" if len(
+        run.flips.get("step", ())
+    ) else ""  # fmt: skip
+    handed = (
+        " Under A’s decisions B keeps its own arithmetic, and is told which pairs are inside: "
+        "what the second line does not do, the flips did."
+        if run.has("handed")
+        else ""
+    )
+    made = run.decision or {}
+    also = f" ({many(made['also'], 'more pair')} at this step)" if made.get("also") else ""
+    return {
+        "separation": f"Largest distance between an atom in A and the same atom in B{ticks}.{handed}",
+        "atoms": "Seen with the deciding pair in the plane"
+        f"{also}; the circle is the cutoff around its first atom. Paler atoms are further "
+        "behind or in front. Arrows: where B’s atoms are off A’s, magnified.",
+        "cross": "From the fork on; a pair counts as long as the two runs disagree about it.",
+        "overridden": "Decisions that the run under A’s decisions would have made otherwise, by step.",
+        "furthest": "An overridden decision far from its threshold is no longer one that rounding "
+        "could have changed; the run under A’s decisions is ended there.",
+        "energy": "Total energies of both runs, one minus the other.",
+        "ranking": "A filled mark where the first decision differs, an open one where the first bit does; "
+        "a cross where the runs have split.",
+    }

@@ -1,0 +1,252 @@
+"""A verdict in words on a pair of runs, with the criteria it was tested by; from the folder alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from mdnum.report.fork.run import ForkFolder, load
+from mdnum.report.verdict import Finding, restore
+from mdnum.report.words import count, listed, many, number, typeset
+from mdnum.store import RunFolder
+
+#: Codes that are decided anew each time.
+CODES = frozenset({
+    "MUST_HOLD_FORKED", "RUN_FAILED", "AMBIGUOUS_FORK", "HORIZON_SHORT", "GUARD", "NO_REPEATS",
+})  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What to think of a comparison.
+
+    Attributes:
+        tone: "good" where the choice changes nothing that was decided, "info" for a fork that is understood,
+            "warning" or "error" for the worst finding.
+        headline: one sentence.
+        evidence: what it rests on, a sentence each.
+        findings: errors first.
+    """
+
+    tone: Literal["good", "info", "warning", "error"]
+    headline: str
+    evidence: tuple[str, ...]
+    findings: tuple[Finding, ...]
+
+    def store(self, folder: RunFolder, summary: Mapping[str, Any]) -> None:
+        """Writes headline and findings into a folder's summary.json, beside what summary holds."""
+        findings = [asdict(finding) for finding in self.findings]
+        folder.write_summary({**summary, "findings": findings, "headline": self.headline})
+
+
+def record(folder: RunFolder | str | Path) -> Verdict:
+    """Judges a fork folder and writes headline and findings into its summary.json."""
+    folder = folder if isinstance(folder, RunFolder) else RunFolder.open(folder)
+    run = load(folder)
+    verdict = judge(run)
+    verdict.store(folder, run.summary)
+    return verdict
+
+
+def judge(run: ForkFolder) -> Verdict:
+    """Headline, evidence and findings of a comparison.
+
+    Findings that others left in summary.json are kept.
+    """
+    found = list(_screened(run) if run.screened else _findings(run))
+    found += [restore(kept) for kept in run.summary.get("findings") or () if kept.get("code") not in CODES]
+    order = ("error", "warning", "info")
+    found.sort(key=lambda finding: order.index(finding.severity))
+    worst = found[0].severity if found else "info"
+    forks = any(one.get("fork") is not None for one in run.ranking) if run.screened else "fork" in run.dates
+    tone = worst if worst != "info" else "info" if forks else "good"
+    headline = _ranked(run) if run.screened else _headline(run)
+    return Verdict(tone, headline, () if run.screened else tuple(_evidence(run)), tuple(found))
+
+
+# --- one choice ---------------------------------------------------------------------------------------
+
+
+def _headline(run: ForkFolder) -> str:
+    summary, dates = run.summary, run.dates
+    steps = many(run.steps, "step")
+    if run.summary.get("failed"):
+        names = listed([f"{name} ended in a {word}" for name, word in run.summary["failed"].items()])
+        at = f"they fork at step {count(dates['fork'])}" if "fork" in dates else "no decision differs before"
+        return f"Run {names} at step {count(run.steps)}; {at}."
+    if run.word == "same":
+        return f"The same trajectory: no bit differs in {steps}."
+    if run.word == "no fork":
+        if "split" in dates:
+            return f"The runs split at step {count(dates['split'])} without a single decision that differs."
+        return f"No fork: bits differ from step {count(dates['seed'])} on, but no decision does in {steps}."
+    fork, split = count(dates.get("fork")), count(dates.get("split"))
+    if run.word == "cause":
+        return (
+            f"The flip at step {fork} is the cause: free, the runs split at step {split}; "
+            "under A’s decisions they stay together."
+        )
+    if run.word == "hurried":
+        other = (summary.get("splits") or {}).get("B|A")
+        later = (
+            f"{many(other - dates['split'], 'step')} later"
+            if other is not None
+            else "later than they were followed"
+        )
+        return (
+            f"The flips hurried the split: free, the runs split at step {split}; under A’s decisions {later}."
+        )
+    if run.word == "bystander":
+        return (
+            f"The flip at step {fork} is a bystander: under A’s decisions the runs split as early, "
+            f"about step {split}."
+        )
+    if "split" in dates:
+        return f"The runs fork at step {fork} and split at step {split}; what the flips did to it is open."
+    guess = summary.get("predicted_split")
+    tail = f"; the growth so far puts it at about step {count(guess)}" if guess is not None else ""
+    return f"The runs fork at step {fork} and have not split in {steps}{tail}."
+
+
+def _evidence(run: ForkFolder) -> Iterator[str]:
+    length = run.units.length
+    for reason in run.summary.get("reasons") or ():
+        yield _sentence(typeset(str(reason)))
+    made = run.decision
+    if made is not None:
+        yield decided(made, length)
+    rate = run.summary.get("growth_rate")
+    if rate is not None:
+        fits = number(run.summary.get("r_squared"), 3)
+        yield (
+            f"The separation grows by {number(rate, 2)} of itself a step, "
+            f"{number(run.summary.get('growth_rate_time'), 2)} per {run.units.time} (r² {fits})."
+        )
+
+
+def decided(made: Mapping[str, Any], length: str) -> str:
+    """The decision at the fork, in a sentence or two."""
+    pair = f"{made['i']}–{made['j']}"
+    if made["run"] == "start":
+        what = f"Pair {pair} is decided differently from the start on"
+    else:
+        way = "enters its cutoff" if made["entered"] else "leaves its cutoff"
+        what = f"Pair {pair} {way} in run {made['run']} alone at step {count(made['step'])}"
+    margin, bound = abs(made["margin_length"]), made["bound_length"]
+    near = f"{number(margin, 2)} {length} from it"
+    if made["ambiguous"]:
+        rounding = f"within rounding ({number(bound, 2)} {length}): either answer was as good"
+    else:
+        times = number(margin / bound, 2) if bound else "∞"
+        rounding = f"{times} times the bound on rounding, so not ambiguous"
+    text = f"{what}, {near}, {rounding}."
+    if made.get("protected") is not None:
+        text += (
+            f" The step before, the runs were {number(made['separation_before'], 2)} {length} apart: "
+            f"the margin is {number(made['protected'], 2)} of that."
+        )
+    return text
+
+
+def _findings(run: ForkFolder) -> Iterator[Finding]:
+    summary, dates = run.summary, run.dates
+    if summary.get("must_hold") and "seed" in dates:
+        yield _broken(summary, "Report it with this folder.")
+    for name, word in (summary.get("failed") or {}).items():
+        yield Finding(
+            "RUN_FAILED",
+            "warning",
+            f"run {name} ended in a {word} at step {count(run.steps)}",
+            f"The comparison ends there, {count(summary.get('steps_asked'))} steps were asked for. "
+            "Where only one run ends so, that is the fork.",
+            "Use a smaller time step, or look at the decisions before it.",
+        )
+    made = run.decision
+    if made is not None and made["ambiguous"]:
+        yield Finding(
+            "AMBIGUOUS_FORK",
+            "info",
+            f"the decision at the fork is ambiguous: pair {made['i']}–{made['j']}",
+            f"Its margin {number(abs(made['margin']), 2)} is within the rounding bound "
+            f"{number(made['bound'], 2)} of the computed quantity.",
+        )
+    if "fork" in dates and "split" not in dates and not summary.get("failed"):
+        guess = summary.get("predicted_split")
+        text = (
+            f"After {many(run.steps, 'step')} the runs are {number(summary.get('separation_end'), 2)} "
+            f"{run.units.length} apart, the tolerance is {number(summary.get('tolerance'), 2)}."
+        )
+        more = f"Follow about {count(guess)} steps." if guess else "Follow more steps."
+        yield Finding("HORIZON_SHORT", "info", "the horizon is too short for a split", text, more)
+    until = summary.get("handed_until")
+    if until is not None and until < run.steps and not summary.get("failed"):
+        yield Finding(
+            "GUARD",
+            "info",
+            f"the run under A’s decisions was ended at step {count(until)}",
+            "A decision that it was told was no longer near its threshold in its own positions: "
+            "nothing that rounding could have changed.",
+        )
+    if run.word in ("hurried", "bystander") and not summary.get("repeats_run"):
+        yield Finding(
+            "NO_REPEATS",
+            "info",
+            "no repeats were run",
+            "Without them a delay cannot be told from chance.",
+            "Add --repeats 4.",
+        )
+
+
+def _broken(one: Mapping[str, Any], remedy: str) -> Finding:
+    """A choice that cannot change a bit by design, and did."""
+    fork = one.get("fork")
+    what = (
+        f"forks at step {count(fork)}" if fork is not None else f"differs from step {count(one['seed'])} on"
+    )
+    return Finding(
+        "MUST_HOLD_FORKED",
+        "error",
+        f"{one['choice']} must not change a bit, and {what}",
+        f"This choice ({one.get('difference')}) is one that arithmetic cannot notice by design: "
+        "a promise is broken.",
+        remedy,
+    )
+
+
+def _sentence(text: str) -> str:
+    text = text[:1].upper() + text[1:]
+    return text if text.endswith((".", "!", "?")) else text + "."
+
+
+# --- all choices --------------------------------------------------------------------------------------
+
+
+def _ranked(run: ForkFolder) -> str:
+    rows = run.ranking
+    forked = [one for one in rows if one.get("fork") is not None]
+    bad = [one for one in rows if one.get("must_hold") and one.get("seed") is not None]
+    if bad:
+        names = listed([str(one["choice"]) for one in bad])
+        return f"{names} must not change a bit, and {'does' if len(bad) == 1 else 'do'}."
+    if not forked:
+        return f"None of {many(len(rows), 'choice')} forks in {many(run.steps, 'step')}."
+    first = forked[0]
+    return (
+        f"{len(forked)} of {many(len(rows), 'choice')} fork in {many(run.steps, 'step')}; "
+        f"{first['choice']} first, at step {count(first['fork'])}."
+    )
+
+
+def _screened(run: ForkFolder) -> Iterator[Finding]:
+    for one in run.ranking:
+        if one.get("must_hold") and one.get("seed") is not None:
+            yield _broken(one, f"Follow it alone: --vary {one['choice']}.")
+        if one.get("failed"):
+            yield Finding(
+                "RUN_FAILED",
+                "warning",
+                f"{one['choice']}: {one['failed']}",
+                f"At step {count(one.get('steps'))}, which is where its comparison ends.",
+            )

@@ -1,0 +1,197 @@
+"""`mdnum fork` as a function: vary one numerical choice, follow both runs, judge the flips, report."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mdnum.errors import InputError
+from mdnum.store import RunFolder
+from mdnum.store.naming import default_folder
+
+if TYPE_CHECKING:
+    from mdnum.forks import Fork
+    from mdnum.systems.load import System
+
+Progress = Callable[[int, int, dict[str, Any]], None]
+
+#: Screens every choice that there is.
+ALL = "all"
+_LOG_LINES = 50
+
+
+@dataclass(frozen=True)
+class ForkResult:
+    """A finished comparison.
+
+    Attributes:
+        folder: the fork folder.
+        fork: dates, series and verdict; None where all choices were screened.
+        summary: what summary.json says, findings included.
+    """
+
+    folder: Path
+    fork: Fork | None
+    summary: dict[str, Any]
+
+
+def fork(
+    system: System | str | Path,
+    vary: str,
+    *,
+    steps: int | None = None,
+    split: float | None = None,
+    repeats: int = 2,
+    counterfactual: bool = True,
+    back: bool = False,
+    out: str | Path | None = None,
+    overrides: Mapping[str, Any] | None = None,
+    report: bool = True,
+    progress: Progress | None = None,
+) -> ForkResult:
+    """Run a system and its twin that differs in one choice, and say where, why and whether they part.
+
+    Args:
+        system: a loaded system, a shipped name or the path of a system file.
+        vary: the choice, such as "precision" or "reduction=exact"; "all" screens every choice.
+        steps: last step; default the system's own.
+        split: separation that counts as split, length; default 0.04 of the longest cutoff.
+        repeats: further runs with perturbed starts, to tell a delay from chance.
+        counterfactual: whether to run B's arithmetic under A's decisions, which the verdict rests on.
+        back: whether to run A's arithmetic under B's decisions too.
+        out: the new fork folder; default runs/fork-<name>-<n>.
+        overrides: dotted keys to values, such as {"cutoff.kind": "switched"}.
+        report: write report.html.
+        progress: called now and then with step, steps and a dictionary of figures.
+
+    Raises:
+        InputError: the system cannot be run, or the choice is unknown or does not apply to it.
+        FolderError: the folder cannot be used.
+    """
+    system = _loaded(system, overrides)
+    _check(steps, split, repeats)
+    if vary == ALL:
+        from mdnum.workflow.fork_screen import screen
+
+        return screen(system, steps, out=out, report=report, progress=progress)
+    options = {
+        "steps": steps,
+        "split": split,
+        "repeats": repeats,
+        "counterfactual": counterfactual,
+        "back": back,
+    }
+    return _one(system, vary, options, out, report, progress)
+
+
+def _one(
+    system: System,
+    vary: str,
+    options: dict[str, Any],
+    out: str | Path | None,
+    report: bool,
+    progress: Progress | None,
+) -> ForkResult:
+    from mdnum.forks import fork as follow
+    from mdnum.forks.choices import parse
+    from mdnum.forks.neighborhood import neighborhood
+    from mdnum.workflow import fork_record
+
+    choice = parse(vary)
+    began = time.perf_counter()
+    say(progress, 0, "compile")
+    twin = choice.make(system)
+    folder = new_folder(system, out)
+    try:
+        made = follow(twin, progress=_logged(folder, progress), **options)
+        say(progress, made.steps, "the atoms at the fork")
+        around = neighborhood(made)
+        fork_record.write(folder, made, around)
+        folder.finalize()
+        seconds = time.perf_counter() - began
+        folder.write_summary(fork_record.summarize(made, vary, choice, seconds))
+    except BaseException:
+        folder.close()
+        raise
+    say(progress, made.steps, "report" if report else "check")
+    judge(folder, report)
+    return ForkResult(folder.path, made, folder.summary)
+
+
+def new_folder(system: System, out: str | Path | None) -> RunFolder:
+    """An empty fork folder with the system and its provenance."""
+    from mdnum.provenance import collect
+
+    folder = RunFolder.create(default_folder(f"fork-{system.name}") if out is None else out, world="fork")
+    try:
+        system.write(folder.path)
+        folder.write_provenance(collect(system))
+    except BaseException:
+        folder.close()
+        raise
+    return folder
+
+
+def judge(folder: RunFolder, report: bool) -> None:
+    """Puts headline and findings into the summary, and writes the report where it is wanted."""
+    if report:
+        from mdnum.report.fork.html import write_report
+
+        write_report(folder)
+    else:
+        from mdnum.report.fork.findings import record
+
+        record(folder)
+
+
+def say(progress: Progress | None, step: int, phase: str) -> None:
+    """Tells the phase."""
+    if progress is not None:
+        progress(step, 0, {"phase": phase})
+
+
+def _loaded(system: System | str | Path, overrides: Mapping[str, Any] | None) -> System:
+    from mdnum.systems import BallSystem, System, load
+
+    if isinstance(system, BallSystem):
+        raise InputError(
+            "this system is a ball", where=system.name, remedy="Compare variants of it with mdnum.bounce"
+        )
+    if isinstance(system, System):
+        if overrides:
+            raise InputError(
+                "overrides change a system while it is loaded",
+                remedy="Load it with the overrides, or give its name",
+                where=system.name,
+            )
+        return system
+    return load(system, overrides, world="md")
+
+
+def _check(steps: int | None, split: float | None, repeats: int) -> None:
+    """Refuses what cannot be, before a folder is made."""
+    if steps is not None and steps < 1:
+        raise InputError(f"steps = {steps}; expected at least 1")
+    if split is not None and not 0 < split < float("inf"):
+        raise InputError(f"split = {split:g}; expected a length above 0")
+    if repeats < 0:
+        raise InputError(f"repeats = {repeats}; expected 0 or more")
+
+
+def _logged(folder: RunFolder, progress: Progress | None) -> Progress:
+    """Passes progress on, and writes a line of log.txt now and then."""
+    folder.log("    step    largest separation of A and B")
+    last = -1.0
+
+    def note(step: int, steps: int, info: dict[str, Any]) -> None:
+        nonlocal last
+        if step - last >= steps / _LOG_LINES or step == steps:
+            folder.log(f"{step:8d}    {info.get('separation', float('nan')):.6e}")
+            last = step
+        if progress is not None:
+            progress(step, steps, info)
+
+    return note

@@ -1,0 +1,203 @@
+"""What a fork folder holds: its tables, and summary.json."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from mdnum.events.forks import Growth
+from mdnum.forks.neighborhood import Neighborhood
+from mdnum.forks.pair import FLIPS_KEPT, Fork
+from mdnum.store import RunFolder
+from mdnum.systems.build import Simulation
+
+#: Columns of separation.parquet by the series that they hold.
+_SERIES = {
+    "free": "B", "handed": "B|A", "back": "A|B", "cross": "cross", "overridden": "overridden",
+    "furthest": "furthest", "energy_a": "energy A", "energy_b": "energy B", "energy_handed": "energy B|A",
+}  # fmt: skip
+#: r² of a fit that counts as growth.
+_FITS = 0.5
+
+
+def write(folder: RunFolder, fork: Fork, around: Neighborhood | None) -> None:
+    """Puts the series, the cross-run flips and the atoms at the fork into a folder's tables."""
+    series = fork.series
+    rows = len(series["step"])
+    columns = {name: series.get(key, np.full(rows, np.nan)) for name, key in _SERIES.items()}
+    columns |= {"step": series["step"], "time": series["step"] * timestep(fork.twin.a)}
+    columns |= {f"repeat_{name[2:]}": series[name] for name in series if name.startswith("B ")}
+    folder.append("separation", columns)
+    if fork.flips:
+        names = ("step", "i", "j", "differs", "run", "entered", "margin", "bound")
+        folder.append(
+            "cross_flips", {name: np.array([getattr(flip, name) for flip in fork.flips]) for name in names}
+        )
+    if around is not None:
+        vectors = {name: around.positions[:, k] for k, name in enumerate("xyz")}
+        vectors |= {f"d{name}": around.moved[:, k] for k, name in enumerate("xyz")}
+        folder.append("neighborhood", {"atom": around.atoms, **vectors})
+
+
+def summarize(fork: Fork, vary: str, choice: Any, seconds: float) -> dict[str, Any]:
+    """The content of summary.json, without headline and findings."""
+    a = fork.twin.a
+    step = timestep(a)
+    dates, verdict, rate = fork.dates, fork.verdict, fork.growth["B"]
+    when = {name: getattr(dates, name) for name in ("seed", "fork", "split")}
+    free = fork.series["B"]
+    return {
+        "world": "fork",
+        "system": a.system.name,
+        "about": a.system.spec.about,
+        "choice": vary,
+        "choice_about": getattr(choice, "about", ""),
+        "must_hold": bool(getattr(choice, "must_hold", False)),
+        "difference": fork.twin.difference,
+        "changes": changes(fork.twin.a, fork.twin.b),
+        "atoms": a.atoms,
+        "steps": fork.steps,
+        "steps_asked": fork.asked,
+        "timestep": step,
+        "units": a.units.name,
+        "r_cut": a.r_cut,
+        **when,
+        **{f"{name}_time": None if at is None else at * step for name, at in when.items()},
+        "tolerance": fork.tolerance,
+        "decision": _decision(fork),
+        "verdict": verdict.word,
+        "reasons": list(verdict.reasons),
+        "growth_rate": _plain(rate.rate),
+        "growth_rate_time": _plain(rate.rate / step),
+        "r_squared": _plain(rate.r_squared),
+        "growth": {name: _growth(fork, name) for name in fork.growth},
+        "predicted_split": predicted(fork),
+        "splits": {name: fork.splits.get(name) for name in ("B", "B|A", "A|B") if name in fork.splits},
+        "nats": verdict.nats,
+        "noise": verdict.noise,
+        "repeats": fork.repeats,
+        "repeats_run": sum(name.startswith("B ") for name in fork.splits),
+        "handed_until": _until(fork, "B|A"),
+        "handed_largest": _largest(fork, "B|A"),
+        "separation_end": _plain(free[np.isfinite(free)][-1]) if np.isfinite(free).any() else None,
+        "separation_largest": _largest(fork, "B"),
+        "overridden": _total(fork, "overridden"),
+        "cross_flips": fork.flips_total,
+        "cross_flips_kept": min(fork.flips_total, FLIPS_KEPT),
+        "certified_horizon": None,
+        "lyapunov": None,
+        "failed": dict(fork.failed),
+        "findings": [],
+        "status": "failed" if fork.failed else "complete",
+        "seconds": seconds,
+    }
+
+
+def timestep(simulation: Simulation) -> float:
+    """The time step, the user's unit of time."""
+    return float(simulation.system.spec.dynamics.timestep)
+
+
+def predicted(fork: Fork) -> int | None:
+    """The step at which runs that have not split are expected to; None where nothing grows plainly."""
+    free = fork.series["B"]
+    seen = free[np.isfinite(free)]
+    fit = fork.growth["B"]
+    # a line through noise predicts nothing
+    if fork.dates.split is not None or not len(seen) or not fit.r_squared > _FITS:
+        return None
+    more = fit.steps_to(float(seen[-1]), fork.tolerance)
+    return None if more is None else round(fork.steps + more)
+
+
+def changes(a: Simulation, b: Simulation) -> dict[str, list[Any]]:
+    """Keys of the system file whose values differ between the runs, with both values."""
+    first, second = (dict(_flat(one.system.spec.model_dump(mode="json"))) for one in (a, b))
+    return {
+        key: [first.get(key), second.get(key)]
+        for key in dict.fromkeys((*first, *second))
+        if first.get(key) != second.get(key)
+    }
+
+
+def _flat(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in table.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{prefix}{key}.")
+        else:
+            yield prefix + str(key), value
+
+
+def _decision(fork: Fork) -> dict[str, Any] | None:
+    made = fork.decision
+    if made is None:
+        return None
+    run = fork.twin.b if made.run == "B" else fork.twin.a
+    kind = int(fork.twin.a.type_of(np.array([made.i]), np.array([made.j]))[0])
+    threshold, space = run.decider.thresholds[kind].value, run.decider.space
+    quantity = threshold - made.margin
+    distance = float(np.sqrt(quantity)) if space == "r2" else quantity
+    # the margin of r² is so many times that of r
+    slope = 2.0 * run.decider.r_cut[kind] if space == "r2" else 1.0
+    length = made.margin / slope
+    return {
+        "channel": "pair",
+        "step": made.step,
+        "run": made.run,
+        "i": made.i,
+        "j": made.j,
+        "entered": made.entered,
+        "space": space,
+        "margin": made.margin,
+        "bound": made.bound,
+        "ambiguous": made.ambiguous,
+        "r_cut": run.decider.r_cut[kind],
+        "distance": distance,
+        "margin_length": length,
+        "bound_length": made.bound / slope,
+        "separation_before": made.separation,
+        "protected": abs(length) / made.separation if made.separation > 0 else None,
+        "also": made.also,
+    }
+
+
+def _growth(fork: Fork, name: str) -> dict[str, Any]:
+    """The fit as a line: separation = exp(intercept + rate * step) between first and last."""
+    fit: Growth = fork.growth[name]
+    if not np.isfinite(fit.rate):
+        return {"rate": None, "r_squared": None, "first": None, "last": None, "intercept": None}
+    step = np.arange(fit.first, fit.last + 1)
+    values = fork.series[name][fit.first : fit.last + 1]
+    usable = np.isfinite(values) & (values > 0)
+    intercept = float(np.mean(np.log(values[usable]) - fit.rate * step[usable]))
+    return {
+        "rate": fit.rate,
+        "r_squared": fit.r_squared,
+        "first": fit.first,
+        "last": fit.last,
+        "intercept": intercept,
+    }
+
+
+def _until(fork: Fork, name: str) -> int | None:
+    """The last step of a counterfactual; None where there is none."""
+    if name not in fork.series:
+        return None
+    seen = np.flatnonzero(np.isfinite(fork.series[name]))
+    return int(fork.series["step"][seen[-1]]) if len(seen) else None
+
+
+def _largest(fork: Fork, name: str) -> float | None:
+    values = fork.series.get(name)
+    return float(np.nanmax(values)) if values is not None and np.isfinite(values).any() else None
+
+
+def _total(fork: Fork, name: str) -> int | None:
+    values = fork.series.get(name)
+    return int(np.nansum(values)) if values is not None else None
+
+
+def _plain(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
