@@ -1,0 +1,249 @@
+"""Choices that physics cannot tell: other labels, another origin, other axes, other images of the atoms."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from mdnum.errors import InputError
+from mdnum.forks.choices.arithmetic import orderless
+from mdnum.forks.choices.base import built, check, is_langevin, no_sums, suffix, summing
+from mdnum.forks.twin import Twin
+from mdnum.md.cell import Cell, wrap_positions
+from mdnum.rollout.frame import Frame
+from mdnum.systems.build import Simulation, build
+from mdnum.systems.load import System
+
+
+@dataclass(frozen=True)
+class Relabel:
+    """The atoms in another order of the file.
+
+    Attributes:
+        seed: of the permutation.
+        both: reduction of both runs.
+    """
+
+    seed: int = 1
+    both: str | None = None
+
+    @property
+    def name(self) -> str:
+        """Such as "relabel" or "relabel=3@exact"."""
+        return ("relabel" if self.seed == 1 else f"relabel={self.seed}") + suffix(self.both)
+
+    @property
+    def about(self) -> str:
+        """One line."""
+        return "atoms in another order" + summing(self.both)
+
+    @property
+    def must_hold(self) -> bool:
+        """Sums without an order cannot tell."""
+        return orderless(self.both)
+
+    def why_not(self, system: System) -> str | None:
+        """A thermostat's noise goes by label."""
+        if is_langevin(system):
+            return "the thermostat's noise belongs to labels: other atoms would get it"
+        return no_sums(system, self.both)
+
+    def make(self, system: System) -> Twin:
+        """The system, and with its atoms permuted."""
+        check(self, system)
+        a = built(system, self.both)
+        labels = np.random.default_rng(self.seed).permutation(a.atoms)
+        b = built(replace(system, atoms=system.atoms[labels]), self.both)
+        # drawn velocities would go by label, and a drift taken out would be rounded in another order
+        b = replace(b, positions=a.positions[labels], velocities=a.velocities[labels])
+        same = Frame.same(a.atoms)
+        words = f"atoms in another order, seed {self.seed}{summing(self.both)}"
+        return Twin(a, b, words, frame=replace(same, labels=labels))
+
+
+@dataclass(frozen=True)
+class Translate:
+    """Everything moved by a share of the lattice vectors.
+
+    Attributes:
+        share: of each periodic lattice vector.
+        both: reduction of both runs.
+    """
+
+    share: float = 0.25
+    both: str | None = None
+
+    def __post_init__(self):
+        if not np.isfinite(self.share) or self.share == 0:
+            raise InputError(f"a share of {self.share:g}; expected a number other than 0", where="translate")
+
+    @property
+    def name(self) -> str:
+        """Such as "translate=0.25"."""
+        return f"translate={self.share:g}{suffix(self.both)}"
+
+    @property
+    def about(self) -> str:
+        """One line."""
+        return f"moved by {self.share:g} of each lattice vector{summing(self.both)}"
+
+    @property
+    def must_hold(self) -> bool:
+        """Coordinates of another size are rounded otherwise."""
+        return False
+
+    def why_not(self, system: System) -> str | None:
+        """A cluster has no lattice vectors."""
+        if not any(system.atoms.pbc):
+            return "no axis is periodic"
+        return no_sums(system, self.both)
+
+    def make(self, system: System) -> Twin:
+        """The system, and elsewhere."""
+        check(self, system)
+        a = built(system, self.both)
+        shift = self.share * np.asarray(a.cell.matrix)[list(a.cell.pbc)].sum(axis=0)
+        frame = replace(Frame.same(a.atoms), shift=shift)
+        return Twin(a, replace(a, positions=a.positions + shift), self.about, frame=frame)
+
+
+@dataclass(frozen=True)
+class Images:
+    """Atoms started in other images of the box.
+
+    Positions are wrapped before the first step, so this cannot change a bit, as long as the images can be
+    written down: the sum of a position and a lattice vector is rounded. Both runs start where that sum is
+    exact, within an ulp of a lattice vector from the file's positions.
+
+    Attributes:
+        seed: of a random image of each atom, one lattice vector away at most; None: every atom one lattice
+            vector further along every periodic axis.
+    """
+
+    seed: int | None = None
+
+    @property
+    def name(self) -> str:
+        """ "translate=lattice", "unwrapped" or "unwrapped=3"."""
+        if self.seed is None:
+            return "translate=lattice"
+        return "unwrapped" if self.seed == 1 else f"unwrapped={self.seed}"
+
+    @property
+    def about(self) -> str:
+        """One line."""
+        if self.seed is None:
+            return "moved by every lattice vector, exactly"
+        return "started from unwrapped positions, exactly"
+
+    @property
+    def must_hold(self) -> bool:
+        """Wrapping takes off what was added."""
+        return True
+
+    def why_not(self, system: System) -> str | None:
+        """A cluster has no images; in a tilted box a sum of lattice vectors may not be exact."""
+        if not any(system.atoms.pbc):
+            return "no axis is periodic"
+        _, _, lost = self._starts(build(system))
+        if lost:
+            return f"{lost} atoms have no position near theirs whose image is exact in float64"
+        return None
+
+    def _starts(self, a: Simulation) -> tuple[np.ndarray, np.ndarray, int]:
+        if self.seed is None:
+            images = np.ones(a.positions.shape, np.int64)
+        else:
+            images = np.random.default_rng(self.seed).integers(-1, 2, a.positions.shape)
+        return exact_images(a.cell, a.positions, images * np.array(a.cell.pbc))
+
+    def make(self, system: System) -> Twin:
+        """Both from positions whose images are exact: wrapped, and not."""
+        check(self, system)
+        a = build(system)
+        wrapped, elsewhere, _ = self._starts(a)
+        return Twin(replace(a, positions=wrapped), replace(a, positions=elsewhere), self.about)
+
+
+def exact_images(
+    cell: Cell, positions: Float[np.ndarray, "atoms 3"], images: Int[np.ndarray, "atoms 3"]
+) -> tuple[Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"], int]:
+    """Wrapped positions near given ones, the same in other images, and how many atoms have none.
+
+    Wrapping the second gives the first, bit for bit. In a box along the axes a position whose image was
+    rounded has an exact one (Sterbenz's lemma: the lattice vector is taken off again without rounding); a
+    second turn is needed only where the first crosses a face.
+    """
+    wrapped, _ = wrap_positions(cell, positions)
+    moved = images @ np.asarray(cell.matrix)
+    elsewhere = wrapped + moved
+    for _ in range(4):
+        wrapped, _ = wrap_positions(cell, elsewhere)
+        elsewhere = wrapped + moved
+    again, _ = wrap_positions(cell, elsewhere)
+    return wrapped, elsewhere, int((again != wrapped).any(axis=1).sum())
+
+
+@dataclass(frozen=True)
+class Rotate:
+    """The axes of the box exchanged.
+
+    Attributes:
+        axes: axis k of the second run is axis axes[k] of the first; None: the first exchange that leaves the
+            box as it is, all three in turn where it can be.
+        both: reduction of both runs.
+    """
+
+    axes: str | None = None
+    both: str | None = None
+
+    def __post_init__(self):
+        if self.axes is not None and (sorted(self.axes) != list("xyz") or self.axes == "xyz"):
+            raise InputError(
+                f"axes {self.axes!r}; expected another order of xyz, such as yzx", where="rotate"
+            )
+
+    @property
+    def name(self) -> str:
+        """Such as "rotate" or "rotate=yzx"."""
+        return ("rotate" if self.axes is None else f"rotate={self.axes}") + suffix(self.both)
+
+    @property
+    def about(self) -> str:
+        """One line."""
+        return "axes of the box exchanged" + summing(self.both)
+
+    @property
+    def must_hold(self) -> bool:
+        """Squares of components are added in another order."""
+        return False
+
+    def _asked(self, system: System) -> str | None:
+        asked = ("yzx", "yxz", "xzy", "zyx") if self.axes is None else (self.axes,)
+        matrix, pbc = np.asarray(system.atoms.cell), np.asarray(system.atoms.pbc)
+        for word in asked:
+            axes = ["xyz".index(one) for one in word]
+            if (matrix[axes][:, axes] == matrix).all() and (pbc[axes] == pbc).all():
+                return word
+        return None
+
+    def why_not(self, system: System) -> str | None:
+        """The box may have no such symmetry, and a thermostat's noise goes by axis."""
+        if is_langevin(system):
+            return "the thermostat's noise belongs to axes: others would get it"
+        if self._asked(system) is None:
+            return "the box is not the same with its axes exchanged"
+        return no_sums(system, self.both)
+
+    def make(self, system: System) -> Twin:
+        """The system, and turned."""
+        check(self, system)
+        word = self._asked(system)
+        assert word is not None
+        a = built(system, self.both)
+        axes = np.array(["xyz".index(one) for one in word])
+        b = replace(a, positions=a.positions[:, axes], velocities=a.velocities[:, axes])
+        frame = replace(Frame.same(a.atoms), axes=np.argsort(axes))
+        return Twin(a, b, f"axes {word} in place of xyz{summing(self.both)}", frame=frame)
