@@ -1,0 +1,325 @@
+"""The bouncing ball's program in exact rationals, and when runs of few bits leave its history."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from mdnum.ball.contacts import Impact, Penalty, Projection
+from mdnum.ball.integrators import ExplicitEuler, SemiImplicitEuler, VelocityVerlet
+from mdnum.ball.rollout import BallRun, simulate
+from mdnum.ball.state import BallState
+from mdnum.ball.stopping import Fixed, GlobalSum, Hysteresis, Maximum, PerInstance, Relative
+from mdnum.ball.world import World
+from mdnum.errors import InputError
+from mdnum.forks.exact.dyadic import HALF, ZERO, Dyadic
+from mdnum.precision import RolePrecision
+
+Balls = list[Dyadic]
+
+
+@dataclass(frozen=True)
+class BallHistory:
+    """What a world does in exact arithmetic; row s of a decision belongs to the step that makes state s + 1.
+
+    Attributes:
+        steps, balls: of the rollout.
+        y, v: heights (m) and velocities (m/s) as doubles, shape (steps + 1, balls).
+        height: what each contact decision compared with zero, as doubles, shape (steps, balls).
+        contact: the decisions, shape (steps, balls).
+        iterations: of the step's solver, by ball (one count for all is repeated), shape (steps, balls).
+        bits: of the longest number in the end.
+    """
+
+    steps: int
+    balls: int
+    y: Float[np.ndarray, "rows balls"]
+    v: Float[np.ndarray, "rows balls"]
+    height: Float[np.ndarray, "steps balls"]
+    contact: Bool[np.ndarray, "steps balls"]
+    iterations: Int[np.ndarray, "steps balls"]
+    bits: int
+
+
+@dataclass(frozen=True)
+class BallHorizon:
+    """How long a run keeps to the exact history.
+
+    Attributes:
+        dtype: of every role of the run.
+        horizon: first step (from 1) with another decision; None where there is none.
+        channel: "contact" or "stop"; "" without a difference.
+        ball: the first ball that it concerns; -1 without one.
+        height: that ball's exact height at the decision, m; NaN without one.
+        separation: largest |height - exact height| at each step, m, shape (steps + 1,).
+    """
+
+    dtype: str
+    horizon: int | None
+    channel: str
+    ball: int
+    height: float
+    separation: Float[np.ndarray, "rows"]
+
+
+def ball_history(world: World, start: BallState, steps: int) -> BallHistory:
+    """A world's rollout in exact rationals: constants and start are the numbers that it holds.
+
+    Error: none; only the doubles of the record are rounded.
+
+    Raises:
+        InputError: steps below 1, or a world whose steps are not sums and products.
+    """
+    if steps < 1:
+        raise InputError(f"steps = {steps}; expected at least 1")
+    program = _ExactBall(world, start)
+    rows = [program.step(index) for index in range(steps)]
+    first = np.array([[float(c) for c in program.first[0]]]), np.array([[float(c) for c in program.first[1]]])
+    return BallHistory(
+        steps,
+        len(program.y),
+        np.concatenate([first[0], np.array([row[0] for row in rows])]),
+        np.concatenate([first[1], np.array([row[1] for row in rows])]),
+        np.array([row[2] for row in rows]),
+        np.array([row[3] for row in rows], bool),
+        np.array([row[4] for row in rows], np.int64),
+        max(c.mantissa.bit_length() for c in (*program.y, *program.v)),
+    )
+
+
+def ball_horizon(history: BallHistory, run: BallRun) -> BallHorizon:
+    """When a run first decides otherwise than the exact history, and how far it was from it.
+
+    Raises:
+        InputError: a run of another length or batch, or without its states.
+    """
+    if (run.steps, run.balls) != (history.steps, history.balls) or not run.kept:
+        raise InputError(
+            f"a run of {run.steps} steps of {run.balls} balls against {history.steps} of {history.balls}",
+            remedy="Compare runs of equal size with every state kept",
+        )
+    counts = run.iterations if run.iterations.ndim == 2 else run.iterations[:, None]
+    located = isinstance(run.world.contact, Projection)
+    stops = (counts != history.iterations) & located
+    contact = run.contact != history.contact
+    apart = np.abs(run.y.astype(np.float64) - history.y).max(axis=1)
+    dtype = run.world.policy.state
+    rows = np.flatnonzero((stops | contact).any(axis=1))
+    if not len(rows):
+        return BallHorizon(dtype, None, "", -1, float("nan"), apart)
+    row = int(rows[0])
+    channel = "contact" if contact[row].any() else "stop"
+    ball = int((contact if channel == "contact" else stops)[row].argmax())
+    return BallHorizon(dtype, row + 1, channel, ball, float(history.height[row, ball]), apart)
+
+
+def certify_ball(
+    world: World,
+    y: Any,
+    v: Any,
+    steps: int,
+    dtypes: Sequence[str] = ("float64", "float32", "float16", "bfloat16"),
+    *,
+    own: bool = False,
+) -> tuple[BallHistory, tuple[BallHorizon, ...]]:
+    """The exact history of a ball, and the horizon of the same program in narrower numbers.
+
+    Args:
+        world: in double precision.
+        y, v: the start, m and m/s.
+        steps: to make.
+        dtypes: one run each, every role in it.
+        own: compare each run with the exact history from its own rounded constants and start, so that only
+            the rounding of its steps counts.
+
+    Returns:
+        the history of `world`, and a horizon for each dtype.
+    """
+    history = ball_history(world, world.start(y, v), steps)
+    horizons = []
+    for dtype in dtypes:
+        narrow = in_dtype(world, dtype)
+        begin = narrow.start(y, v)
+        against = ball_history(narrow, begin, steps) if own else history
+        horizons.append(ball_horizon(against, simulate(narrow, begin, steps)))
+    return history, tuple(horizons)
+
+
+def in_dtype(world: World, dtype: str) -> World:
+    """The same world with every role in one dtype, its constants rounded to it."""
+    policy = RolePrecision.all(dtype)
+    control = None if world.control is None else world.control.astype(policy.dtype("arithmetic"))
+    values = {name: world.value(name) for name in world.parameters}
+    return replace(world, policy=policy, control=control).with_values(values)
+
+
+class _ExactBall:
+    """State and step in exact numbers."""
+
+    def __init__(self, world: World, start: BallState):
+        contact, scheme = world.contact, world.integrator
+        served = isinstance(contact, Penalty | Projection | Impact) and isinstance(
+            scheme, ExplicitEuler | SemiImplicitEuler | VelocityVerlet
+        )
+        if not served or getattr(contact, "smooth", False):
+            raise InputError(
+                f"{type(contact).__name__} with {type(scheme).__name__} takes more than sums and products",
+                remedy="Use explicit Euler, semi-implicit Euler or velocity Verlet, and a contact that is "
+                "not smooth",
+            )
+        self.world, self.contact_model, self.scheme = world, contact, scheme
+        self.value = {name: Dyadic.of(world.value(name)) for name in world.parameters}
+        self.h = self.value["h"]
+        self.half = HALF * self.h
+        self.y = [Dyadic.of(c) for c in np.asarray(start.y)]
+        self.v = [Dyadic.of(c) for c in np.asarray(start.v)]
+        self.first = list(self.y), list(self.v)
+        self.touching = self._judge(self.y, [False] * len(self.y))
+        self.carried = self._pull(self.y, self.v, self._free(0), self.touching)
+
+    def _free(self, step: int) -> Balls:
+        gravity, control = self.value["gravity"], self.world.control
+        if control is None:
+            return [-gravity] * len(self.y)
+        row = np.asarray(control)[min(step, len(control) - 1)]
+        return [Dyadic.of(c) - gravity for c in np.broadcast_to(row, len(self.y))]
+
+    def _judge(self, heights: Balls, before: list[bool]) -> list[bool]:
+        lift = self.value.get("lift")
+        if lift is None:
+            return [y.negative for y in heights]
+        return [y <= lift if was else y.negative for y, was in zip(heights, before, strict=True)]
+
+    def _pull(self, ys: Balls, vs: Balls, free: Balls, touching: list[bool]) -> Balls:
+        if not isinstance(self.contact_model, Penalty):
+            return free
+        k, damping = self.value["k"], self.value["damping"]
+        return [
+            a + k * -y - damping * v if touches else a
+            for y, v, a, touches in zip(ys, vs, free, touching, strict=True)
+        ]
+
+    def _fly(self, ys: Balls, vs: Balls, a: Balls) -> tuple[Balls, Balls]:
+        h = self.h
+        if isinstance(self.scheme, ExplicitEuler):
+            return _plus(ys, h, vs), _plus(vs, h, a)
+        if isinstance(self.scheme, SemiImplicitEuler):
+            vs = _plus(vs, h, a)
+            return _plus(ys, h, vs), vs
+        vs = _plus(vs, self.half, a)
+        return _plus(ys, h, vs), _plus(vs, self.half, a)
+
+    def step(self, index: int):
+        """One step: heights and velocities after it, decided heights, contacts, iterations, as plain rows."""
+        free, counts = self._free(index), [0] * len(self.y)
+        if isinstance(self.contact_model, Penalty):
+            heights = self._push(free)
+        else:
+            ys, vs = self._fly(self.y, self.v, free)
+            heights = ys
+            self.touching = self._judge(heights, self.touching)
+            reset = self._project if isinstance(self.contact_model, Projection) else self._bounce
+            self.y, self.v, counts = reset(ys, vs)
+        plain = ([float(c) for c in row] for row in (self.y, self.v, heights))
+        return *plain, list(self.touching), counts
+
+    def _push(self, free: Balls) -> Balls:
+        if isinstance(self.scheme, VelocityVerlet):
+            vs = _plus(self.v, self.half, self.carried)
+            self.y = heights = _plus(self.y, self.h, vs)
+            self.touching = self._judge(heights, self.touching)
+            self.carried = self._pull(heights, vs, free, self.touching)
+            self.v = _plus(vs, self.half, self.carried)
+            return heights
+        heights = self.y
+        self.touching = self._judge(heights, self.touching)
+        self.y, self.v = self._fly(self.y, self.v, self._pull(self.y, self.v, free, self.touching))
+        return heights
+
+    def _bounce(self, ys: Balls, vs: Balls):
+        e, rest = self.value["restitution"], self.value["rest_speed"]
+        for ball, touches in enumerate(self.touching):
+            if touches:
+                rebound = -(e * vs[ball]) if vs[ball].negative else ZERO
+                ys[ball], vs[ball] = ZERO, ZERO if rebound <= rest else rebound
+        return ys, vs, [0] * len(ys)
+
+    def _project(self, ys: Balls, vs: Balls):
+        ys = list(ys)
+        gain, touching = self.value["alpha"] * self.value["k"], self.touching
+
+        def depths() -> Balls:
+            return [-y if t and y.negative else ZERO for y, t in zip(ys, touching, strict=True)]
+
+        rule = _Rule(self.world)
+        residual = first = rule.measure(depths())
+        counts = [0] * len(residual)
+        while True:
+            on = [
+                not rule.stops(r, f, count) and count < rule.max_iter
+                for r, f, count in zip(residual, first, counts, strict=True)
+            ]
+            if not any(on):
+                break
+            moves = on if len(on) == len(ys) else on * len(ys)
+            ys = [y + gain * p if go else y for y, p, go in zip(ys, depths(), moves, strict=True)]
+            counts = [count + go for count, go in zip(counts, on, strict=True)]
+            now = rule.measure(depths())
+            residual = [new if go else old for new, old, go in zip(now, residual, on, strict=True)]
+        e = self.value["restitution"]
+        for ball, touches in enumerate(touching):
+            if touches:
+                ys[ball] = ZERO if ys[ball].negative else ys[ball]
+                vs[ball] = -(e * vs[ball]) if vs[ball].negative else ZERO
+        return ys, vs, counts if len(counts) == len(ys) else counts * len(ys)
+
+
+class _Rule:
+    """A stopping rule in exact numbers: residuals and thresholds, one for the batch or one for each ball."""
+
+    def __init__(self, world: World):
+        rule: Any = world.contact.stop  # type: ignore[attr-defined]
+        self.enter = None
+        if isinstance(rule, Hysteresis):
+            self.enter, rule = _held(world, rule.enter), rule.rule
+        if type(rule) not in (GlobalSum, PerInstance, Maximum, Relative, Fixed):
+            raise InputError(f"the exact ball knows no stopping rule {type(rule).__name__}")
+        self.rule, self.max_iter = rule, rule.max_iter
+        self.tol = None if isinstance(rule, Fixed) else _held(world, rule.tol)
+
+    def measure(self, depths: Balls) -> Balls:
+        """The residual, or one for each ball."""
+        if isinstance(self.rule, PerInstance):
+            return depths
+        if isinstance(self.rule, GlobalSum):
+            total = ZERO
+            for depth in depths:
+                total = total + depth
+            return [total]
+        largest = depths[0]
+        for depth in depths[1:]:
+            largest = depth if largest < depth else largest
+        return [largest]
+
+    def stops(self, residual: Dyadic, first: Dyadic, iteration: int) -> bool:
+        """Whether it is below its threshold."""
+        if self.enter is not None and iteration == 0:
+            return residual < self.enter
+        if self.tol is None:
+            return iteration >= self.max_iter
+        if isinstance(self.rule, Relative):
+            return residual < (Dyadic.of(float(np.finfo(np.float32).tiny)) if first.zero else self.tol * first)
+        return residual < self.tol
+
+
+def _held(world: World, value: Any) -> Dyadic:
+    """A threshold as the decision's dtype holds it."""
+    return Dyadic.of(float(np.asarray(value).astype(world.policy.dtype("decision"))))
+
+
+def _plus(values: Balls, factor: Dyadic, rates: Balls) -> Balls:
+    return [value + factor * rate for value, rate in zip(values, rates, strict=True)]

@@ -1,0 +1,290 @@
+"""Decisions of a run, given its own states: which of them rounding could have decided otherwise.
+
+This looks at one step at a time. A decision that is right given the state is right for this run, which may
+have left the exact history long before (that is what `horizon` dates).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from fractions import Fraction
+
+import numpy as np
+from jaxtyping import Float
+
+from mdnum.errors import InputError
+from mdnum.forks.exact.horizon import taped
+from mdnum.forks.exact.program import ExactProgram, why_not, with_policy
+from mdnum.forks.exact.tape import Difference, Tape, first_difference
+from mdnum.md.cell import Cell, HostCell
+from mdnum.md.decide import PairDecider
+from mdnum.precision import PrecisionPolicy, gamma, unit_roundoff
+from mdnum.rollout.engine import Engine, Segment, Start, first_state
+from mdnum.systems.build import Simulation
+
+#: Ambiguous decisions that are listed; the count covers all of them.
+LISTED = 10_000
+#: Binary digits behind the point to which the square root of an exact squared distance is taken.
+_ROOT_BITS = 400
+
+
+@dataclass(frozen=True)
+class Ambiguous:
+    """A decision closer to its threshold than its rounding bound.
+
+    Attributes:
+        step, i, j: which decision; i < j.
+        inside: as the program decided.
+        margin: threshold - quantity as it computed it, in the quantity's space.
+        bound: on the rounding error of that margin.
+        exact: the margin of the same state without any rounding.
+        wrong: whether the exact margin asks for the other decision.
+    """
+
+    step: int
+    i: int
+    j: int
+    inside: bool
+    margin: float
+    bound: float
+    exact: float
+    wrong: bool
+
+
+@dataclass(frozen=True)
+class CertifiedHorizon:
+    """What is certain about the decisions of one run, from its own states.
+
+    Attributes:
+        steps: last step that was looked at.
+        horizon: first step with an ambiguous decision; every decision before it would have come out the same
+            in exact arithmetic from the same states. None where there is none.
+        wrong: first step with a decision that exact arithmetic decides otherwise; None where there is none.
+        total: ambiguous decisions.
+        decisions: the first of them.
+        bounds: of the margin, by pair type, in the quantity's space.
+        closest: smallest |margin| of any pair at each step, in the quantity's space, shape (steps + 1,).
+    """
+
+    steps: int
+    horizon: int | None
+    wrong: int | None
+    total: int
+    decisions: tuple[Ambiguous, ...]
+    bounds: tuple[float, ...]
+    closest: Float[np.ndarray, "rows"]
+
+
+@dataclass(frozen=True)
+class ShadowHorizon:
+    """How long a run and its shadow, of higher precision and from the same start, agree on every decision.
+
+    Attributes:
+        steps: last step that was compared.
+        shadow: "float64" or "exact".
+        difference: the first decision that differs (run first, shadow second); None where there is none.
+    """
+
+    steps: int
+    shadow: str
+    difference: Difference | None
+
+    @property
+    def horizon(self) -> int | None:
+        """Its step."""
+        return None if self.difference is None else self.difference.step
+
+
+def margin_bounds(
+    decider: PairDecider, state: str = "float64", largest: float | Float[np.ndarray, "3"] = 0.0
+) -> tuple[float, ...]:
+    """Bound on |computed margin - exact margin| given the state, by pair type.
+
+    Positions that are narrowed for the decision are off by u |x| each; the rest is the analysis of
+    `precision.squared_distance_bound`: u per subtraction of a component and of up to three lattice vectors,
+    gamma_3 for squares and sums. A square root halves the relative error and adds one rounding. Evaluated a
+    thousandth beyond r_cut: it holds for every pair up to there.
+
+    Args:
+        decider: the convention and the dtype of the decision.
+        state: dtype of the positions.
+        largest: largest |coordinate| per axis of the state, length; only where the state is the wider one.
+    """
+    dtype = np.dtype(decider.dtype)
+    u = unit_roundoff(dtype)
+    component = gamma(7, dtype) * float(np.linalg.norm(decider.extent))
+    if unit_roundoff(state) < u:
+        component += 2 * u * (1 + u) * float(np.linalg.norm(np.broadcast_to(largest, 3)))
+    bounds = []
+    for r_cut in decider.r_cut:
+        radius = 1.001 * r_cut
+        bound = 2 * radius * component + component**2 + gamma(3, dtype) * (radius + component) ** 2
+        if decider.space == "r":
+            bound = bound / r_cut + u * radius
+        bounds.append(float(bound))
+    return tuple(bounds)
+
+
+def exact_margin(
+    decider: PairDecider,
+    cell: Cell,
+    start: Float[np.ndarray, "3"],
+    end: Float[np.ndarray, "3"],
+    kind: int = 0,
+) -> tuple[Fraction, bool]:
+    """The margin of a pair without rounding, and the decision that it asks for.
+
+    Positions are the floats of the state; the threshold and the lattice vectors are those that the decision
+    holds in its dtype. In the space of r the margin is good to 400 binary digits, the decision exact.
+
+    Args:
+        start, end: positions, length.
+        kind: pair type.
+    """
+    held = np.asarray(cell.matrix, decider.dtype)
+    inverse = [[Fraction(float(c)) for c in row] for row in np.asarray(cell.inverse)]
+    d = [Fraction(float(b)) - Fraction(float(a)) for a, b in zip(start, end, strict=True)]
+    n = [round(sum((d[c] * inverse[c][k] for c in range(3)), start=Fraction(0))) for k in range(3)]
+    for k in range(3):
+        if cell.pbc[k]:
+            d = [d[c] - n[k] * Fraction(float(held[k, c])) for c in range(3)]
+    squared = sum((c * c for c in d), start=Fraction(0))
+    value = Fraction(decider.thresholds[kind].value)
+    against = value * value if decider.space == "r" else value
+    inside = squared <= against if decider.compare.endswith("<=") else squared < against
+    quantity = _root(squared) if decider.space == "r" else squared
+    return value - quantity, inside
+
+
+def _root(x: Fraction) -> Fraction:
+    scaled = (x.numerator << (2 * _ROOT_BITS)) // x.denominator
+    return Fraction(math.isqrt(scaled), 1 << _ROOT_BITS)
+
+
+def certified_horizon(
+    simulation: Simulation,
+    steps: int | None = None,
+    *,
+    start: Start | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> CertifiedHorizon:
+    """Every decision of a run against its rounding bound, and the ambiguous ones in exact arithmetic.
+
+    Args:
+        simulation: a pair potential.
+        steps: last step; default the system's own.
+        start: where it begins; default the system's own start.
+        progress: called with the step reached and the last one.
+
+    Raises:
+        InputError: a many-body potential, or a rebuild rule that may miss pairs.
+    """
+    _check(simulation)
+    last = simulation.system.spec.dynamics.steps if steps is None else steps
+    listed: list[Ambiguous] = []
+    closest: list[np.ndarray] = []
+    total, reached = 0, 0
+    horizon = wrong = None
+    bounds: tuple[float, ...] = ()
+    for segment in Engine(simulation, last, start=start).segments():
+        x = segment.rows_of("x")
+        with np.errstate(invalid="ignore"):
+            largest = np.abs(x.astype(np.float64)).max(axis=(0, 2))
+        # atoms may leave the region in which they started along a free axis
+        extent = np.where(simulation.pbc, simulation.decider.extent, 2 * largest)
+        wide = replace(simulation.decider, extent=tuple(float(c) for c in extent))
+        bounds = margin_bounds(wide, simulation.policy.state, largest)
+        nearest = segment.rows_of("nearest")
+        closest.append(nearest)
+        for row in np.flatnonzero(nearest <= max(bounds)):
+            found = _ambiguous(simulation, segment, int(row), bounds)
+            total += len(found)
+            if found and horizon is None:
+                horizon = segment.first + int(row)
+            if wrong is None and any(one.wrong for one in found):
+                wrong = segment.first + int(row)
+            listed += found[: max(0, LISTED - len(listed))]
+        reached = segment.last
+        if progress is not None:
+            progress(reached, last)
+    return CertifiedHorizon(reached, horizon, wrong, total, tuple(listed), bounds, np.concatenate(closest))
+
+
+def _check(simulation: Simulation) -> None:
+    if not simulation.pairwise:
+        raise InputError(
+            f"{simulation.potential.name!r} decides inside jax-md's own list, without a rounding bound",
+            remedy="Use a pair potential",
+            where="potential.kind",
+        )
+    if not simulation.rule.safe:
+        raise InputError(
+            "this rebuild rule may leave pairs out of the list, and then nothing is decided about them",
+            remedy="Use --set neighbors.rebuild.every=1 with check = true",
+            where="neighbors.rebuild",
+        )
+
+
+def _ambiguous(
+    simulation: Simulation, segment: Segment, row: int, bounds: tuple[float, ...]
+) -> list[Ambiguous]:
+    table, decider = segment.table, simulation.decider
+    x = segment.unsorted("x", row)
+    slot, column = np.nonzero(table.index < simulation.atoms)
+    i, j = table.order[column], table.order[table.index[slot, column]]
+    i, j = i[i < j], j[i < j]
+    kind = simulation.type_of(i, j)
+    d = HostCell(simulation.cell, decider.dtype).displacement(x[i], x[j])
+    quantity = decider.host_quantity(*d)
+    value = np.array([t.value for t in decider.thresholds])[kind]
+    margin = value - quantity.astype(np.float64)
+    decided = decider.inside(quantity.astype(np.float64), value)
+    found = []
+    for p in np.flatnonzero(np.abs(margin) <= np.array(bounds)[kind]).tolist():
+        exact, inside = exact_margin(decider, simulation.cell, x[i[p]], x[j[p]], int(kind[p]))
+        found.append(
+            Ambiguous(
+                segment.first + row,
+                int(i[p]),
+                int(j[p]),
+                bool(decided[p]),
+                float(margin[p]),
+                bounds[int(kind[p])],
+                float(exact),
+                bool(decided[p]) != inside,
+            )
+        )
+    return sorted(found, key=lambda one: (one.i, one.j))
+
+
+def shadow_horizon(simulation: Simulation, steps: int | None = None) -> ShadowHorizon:
+    """Until when a shadow agrees with a run on every decision.
+
+    The shadow of a run with any role in single precision is the same system in double precision, from the
+    run's own start. That of a run in double precision is the exact program.
+
+    Raises:
+        InputError: double precision throughout, and the exact program cannot follow the system.
+    """
+    _check(simulation)
+    last = simulation.system.spec.dynamics.steps if steps is None else steps
+    run = taped(simulation, last).tape
+    if simulation.policy == PrecisionPolicy():
+        refused = why_not(simulation)
+        if refused is not None:
+            raise refused
+        shadow, tape = "exact", ExactProgram(simulation).run(last).tape
+    else:
+        shadow, tape = "float64", _shadow(simulation, last)
+    difference = first_difference(run, tape)
+    return ShadowHorizon(min(run.steps, tape.steps), shadow, difference)
+
+
+def _shadow(simulation: Simulation, last: int) -> Tape:
+    begin = first_state(simulation)
+    state = begin.state
+    wide = state._replace(**{name: getattr(state, name).astype(np.float64) for name in ("x", "v", "x_before")})
+    start = Start(wide, begin.reference)
+    return taped(with_policy(simulation, PrecisionPolicy()), last, start).tape

@@ -1,0 +1,255 @@
+"""The exact program against rationals and another library, at two precisions, and against real runs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from fractions import Fraction
+
+import mpmath
+import numpy as np
+import pytest
+import small_systems
+from ase import Atoms
+
+from mdnum.errors import InputError
+from mdnum.forks.exact.program import ExactProgram, _Run, why_not
+from mdnum.forks.exact.tape import Tape, first_difference
+from mdnum.rollout.engine import first_state
+from mdnum.systems.build import Simulation, build
+
+pytest.importorskip("flint", reason="exact runs need python-flint")
+
+
+def liquid(kind: str = "hard", cells: int = 2, radius: float = 1.55, **tables) -> Simulation:
+    """32 atoms (by default) at density 0.84, hot enough to melt."""
+    cutoff = {"kind": kind, "radius": radius}
+    if kind in ("switched", "quintic", "cosine"):
+        cutoff["onset"] = 1.3
+    cutoff |= tables.pop("cutoff", {})
+    tables.setdefault("dynamics", {"kind": "nve", "timestep": 0.004, "temperature": 2.9, "seed": 3})
+    atoms = small_systems.crystal(cells, 0.02, 1.68)
+    return build(
+        small_systems.make(
+            atoms, small_systems.LENNARD_JONES, cutoff, **({"neighbors": {"skin": 0.1}} | tables)
+        )
+    )
+
+
+def rational_flips(simulation: Simulation, steps: int, digits: int = 400):
+    """A hard-cutoff run in Fractions, one pair at a time, rounded to so many bits between steps."""
+    begin = first_state(simulation)
+    x = [[Fraction(float(c)) for c in row] for row in np.asarray(begin.state.x).T]
+    v = [[Fraction(float(c)) for c in row] for row in np.asarray(begin.state.v).T]
+    box = [Fraction(float(simulation.cell.matrix[k, k])) for k in range(3)]
+    dt = Fraction(float(simulation.integrator.timestep))
+    threshold = Fraction(simulation.decider.thresholds[0].value)
+    inside, flips = {}, []
+
+    def short(q):
+        return Fraction(round(q * 2**digits), 2**digits)
+
+    for step in range(steps + 1):
+        force = [[Fraction(0)] * 3 for _ in x]
+        for i in range(len(x)):
+            for j in range(i + 1, len(x)):
+                d = [b - a for a, b in zip(x[i], x[j], strict=True)]
+                d = [c - round(c / side) * side for c, side in zip(d, box, strict=True)]
+                r2 = sum(c * c for c in d)
+                now = r2 < threshold
+                if step and now != inside[i, j]:
+                    flips.append((step, i, j, now))
+                inside[i, j] = now
+                if now:
+                    s6 = 1 / r2**3
+                    slope = short(-12 * s6 * (2 * s6 - 1) / r2)
+                    for k in range(3):
+                        force[i][k] += 2 * slope * d[k]
+                        force[j][k] -= 2 * slope * d[k]
+        half = dt / 2
+        for i in range(len(x)):
+            for k in range(3):
+                v[i][k] += (half if step == 0 else dt) * force[i][k]
+                x[i][k] = short(x[i][k] + dt * v[i][k])
+    return flips
+
+
+def rows(tape: Tape) -> list[tuple[int, int, int, bool]]:
+    return [
+        (step, *tape.pair(key), entered)
+        for step, key, entered in zip(
+            tape.step.tolist(), tape.key.tolist(), tape.entered.tolist(), strict=True
+        )
+    ]
+
+
+def test_twenty_steps_of_rationals():
+    simulation = liquid()
+    tape = ExactProgram(simulation).run(20).tape
+    assert rows(tape) == rational_flips(simulation, 20)
+    assert tape.flips > 5
+
+
+@pytest.mark.parametrize("kind", ["force-shifted", "switched", "quintic", "cosine"])
+def test_positions_against_another_library(kind: str):
+    """The same steps in mpmath at 60 digits, forces as numerical derivatives of the energy's definition."""
+    simulation = liquid(kind)
+    steps = 3
+    exact = ExactProgram(simulation).run(steps, bits=256)
+    mpmath.mp.dps = 60
+    rc, ro = mpmath.mpf(1.55), mpmath.mpf(1.3)
+
+    def bare(r):
+        return 4 * (r**-12 - r**-6)
+
+    def energy(r):
+        if kind == "force-shifted":
+            return bare(r) - bare(rc) - (r - rc) * mpmath.diff(bare, rc)
+        if r <= ro:
+            return bare(r)
+        t = (r - ro) / (rc - ro)
+        if kind == "quintic":
+            return bare(r) * (1 - 10 * t**3 + 15 * t**4 - 6 * t**5)
+        if kind == "cosine":
+            return bare(r) * (1 + mpmath.cos(mpmath.pi * t)) / 2
+        return bare(r) * (rc**2 - r**2) ** 2 * (rc**2 + 2 * r**2 - 3 * ro**2) / (rc**2 - ro**2) ** 3
+
+    begin = first_state(simulation)
+    x = [[mpmath.mpf(float(c)) for c in row] for row in np.asarray(begin.state.x).T]
+    v = [[mpmath.mpf(float(c)) for c in row] for row in np.asarray(begin.state.v).T]
+    side, dt = mpmath.mpf(float(simulation.cell.matrix[0, 0])), mpmath.mpf(float(simulation.integrator.timestep))
+    for step in range(steps):
+        force = [[mpmath.mpf(0)] * 3 for _ in x]
+        for i in range(len(x)):
+            for j in range(i):
+                d = [b - a for a, b in zip(x[i], x[j], strict=True)]
+                d = [c - mpmath.nint(c / side) * side for c in d]
+                r = mpmath.sqrt(sum(c * c for c in d))
+                if r < rc:
+                    slope = mpmath.diff(energy, r)
+                    for k in range(3):
+                        force[i][k] += slope * d[k] / r
+                        force[j][k] -= slope * d[k] / r
+        for i in range(len(x)):
+            for k in range(3):
+                v[i][k] += (dt / 2 if step == 0 else dt) * force[i][k]
+                x[i][k] += dt * v[i][k]
+    found = np.array([[float(c) for c in row] for row in x])
+    np.testing.assert_allclose(exact.x[steps], found, rtol=1e-15, atol=1e-15)
+
+
+def test_two_precisions_agree_and_a_small_one_is_raised():
+    simulation = liquid()
+    low, high = ExactProgram(simulation).run(80), ExactProgram(simulation).run(80, bits=600)
+    assert first_difference(low.tape, high.tape) is None
+    np.testing.assert_array_equal(low.x, high.x)
+    raised = ExactProgram(simulation).run(80, bits=24)
+    assert raised.restarts > 0 and raised.bits > 24
+    assert first_difference(raised.tape, high.tape) is None
+    # a ball holds the other's center, and grows
+    assert np.all(np.diff(low.radius[1:]) > -1) and high.radius[-1] < low.radius[-1] - 300
+    assert low.margin.min() > 0
+
+
+def test_a_real_run_starts_on_the_exact_history():
+    from mdnum.forks.exact.horizon import taped
+
+    simulation = liquid()
+    exact = ExactProgram(simulation).run(60)
+    run = taped(simulation, 60)
+    assert first_difference(exact.tape, run.tape) is None
+    np.testing.assert_array_equal(exact.tape.inside(60), run.tape.inside(60))
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_a_planted_wrong_decision_is_found(seed: int):
+    rng = np.random.default_rng(seed)
+    atoms = 20
+    step = np.sort(rng.integers(1, 500, 80))
+    key = rng.choice(atoms * atoms, 80, replace=False)
+    entered = rng.random(80) < 0.5
+    first = np.sort(key[~entered])
+    tape = Tape(atoms, 500, first, step, key, entered)
+    row = int(rng.integers(80))
+    # one decision that comes a step late, one that never comes, one that is not there
+    late = replace(tape, step=np.where(np.arange(80) == row, step + 1, step))
+    kept = np.arange(80) != row
+    never = replace(tape, step=step[kept], key=key[kept], entered=entered[kept])
+    extra_key = int(np.setdiff1d(np.arange(atoms * atoms), key)[seed])
+    place = int(np.searchsorted(step, 250))
+    extra = replace(
+        tape,
+        step=np.insert(step, place, 250),
+        key=np.insert(key, place, extra_key),
+        entered=np.insert(entered, place, True),
+    )
+    for other in (late, never):
+        found = first_difference(tape, other)
+        assert found is not None and (found.step, found.i, found.j) == (step[row], *divmod(key[row], atoms))
+        assert found.inside == (bool(entered[row]), not entered[row])
+    found = first_difference(tape, extra)
+    assert found is not None and (found.step, found.i * atoms + found.j) == (250, extra_key)
+    assert found.inside == (False, True)
+    assert first_difference(tape, tape) is None
+    start = first_difference(tape, replace(tape, first=first[1:]))
+    assert start is not None and start.step == 0 and start.i * atoms + start.j == first[0]
+
+
+def test_a_pair_exactly_at_the_cutoff_is_decided_by_the_convention():
+    """At rest and beyond reach of each other: the distance is the cutoff, exactly, at every step."""
+    counts = {}
+    for compare in ("r2 <", "r2 <=", "r <", "r <="):
+        atoms = Atoms("Ar2", [[1, 1, 1], [2.5, 1, 1]], cell=[8, 8, 8], pbc=True)
+        atoms.set_masses([1.0, 1.0])
+        atoms.set_velocities(np.zeros((2, 3)))
+        dynamics = {"kind": "nve", "timestep": 0.004, "temperature": 0.0}
+        simulation = build(
+            small_systems.make(
+                atoms,
+                small_systems.LENNARD_JONES,
+                {"kind": "hard", "radius": 1.5, "compare": compare},
+                dynamics=dynamics,
+            )
+        )
+        exact = ExactProgram(simulation).run(0)
+        counts[compare] = len(exact.tape.first)
+        assert exact.close == 1 and exact.margin[0] == 0.0
+    assert counts == {"r2 <": 0, "r2 <=": 1, "r <": 0, "r <=": 1}
+
+
+def test_species_masses_and_a_tilted_box():
+    """Pair types, unequal masses and lattice vectors off the axes, against the real run."""
+    from mdnum.forks.exact.horizon import taped
+
+    atoms = small_systems.mixture()
+    matrix = np.array(atoms.cell)
+    matrix[1, 0], matrix[2, 1] = 0.7, -0.4
+    atoms.set_cell(matrix, scale_atoms=True)
+    atoms.set_masses(np.linspace(0.8, 1.3, len(atoms)))
+    simulation = build(
+        small_systems.make(atoms, small_systems.KOB_ANDERSEN, {"kind": "hard", "radius": 1.6})
+    )
+    exact, run = ExactProgram(simulation).run(12), taped(simulation, 12)
+    assert first_difference(exact.tape, run.tape) is None and exact.tape.flips > 10
+
+
+def test_what_cannot_be_certified_is_refused():
+    morse = {"kind": "morse", "depth": 1.0, "alpha": 5.0, "r0": 1.1}
+    simulation = build(small_systems.make(small_systems.crystal(), morse, {"kind": "hard", "radius": 1.6}))
+    with pytest.raises(InputError, match=r"Lennard-Jones potentials, not 'morse'.*Use a lennard-jones"):
+        ExactProgram(simulation)
+    langevin = {"kind": "langevin", "timestep": 0.004, "temperature": 1.0, "friction": 1.0, "seed": 1}
+    refused = why_not(liquid(dynamics=langevin))
+    assert refused is not None and refused.where == "dynamics.kind"
+    refused = why_not(build("argon/liquid-864"))
+    assert refused is not None and "864 atoms" in str(refused)
+    assert why_not(liquid()) is None
+    with pytest.raises(InputError, match="steps = -1"):
+        ExactProgram(liquid()).run(-1)
+
+
+def test_bits_follow_the_growth_of_the_balls():
+    simulation = liquid()
+    run = _Run(ExactProgram(simulation), 100, 400)
+    run.all(None, 0)
+    rate = (run._radius[100] - run._radius[25]) / 75
+    assert run.bits_needed() == pytest.approx(1.1 * rate * 100 + 120, abs=1.5)
