@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
@@ -127,11 +128,12 @@ class DynamicScale:
         Raises:
             NumericalError: not finite even with the smallest factor.
         """
-        compiled = jax.jit(lambda scale: _scaled(function, scale, args))
+        # arguments and not constants: what a compiler knows it folds, fences with it
+        compiled = eqx.filter_jit(lambda scale, args: _scaled(function, scale, args))
         scale, best = self.initial, None
         skipped = 0
         while self.smallest <= scale <= self.largest:
-            result = compiled(jnp.asarray(scale, jnp.float64))
+            result = compiled(jnp.asarray(scale, jnp.float64), args)
             if bool(result.finite):
                 if skipped or scale == self.largest:
                     best = result
