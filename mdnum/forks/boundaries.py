@@ -1,0 +1,375 @@
+"""Where along a number of a system the decisions of a run change, to the last bit.
+
+Between two boundaries a run is one smooth function of the number. At a boundary a pair is decided otherwise
+between two adjacent floats, and everything after it may jump.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from mdnum.errors import InputError
+from mdnum.forks.confirm import digests_elsewhere
+from mdnum.forks.dials import Dial, checked, dial
+from mdnum.forks.histories import History, Look, Loss, history, look, margin, squared_displacement
+from mdnum.precision.ulp import neighbor, ordinal
+from mdnum.systems.build import Simulation, build
+from mdnum.systems.load import System, load
+
+
+@dataclass(frozen=True)
+class Side:
+    """A run on one side of a boundary.
+
+    Attributes:
+        at: the number, as the float next to the boundary.
+        digest: of its decisions.
+        loss, energy: at its last step.
+        margin: of the pair whose decision changes, at that step, in the quantity's space.
+        inside: that decision.
+    """
+
+    at: float
+    digest: str
+    loss: float
+    energy: float
+    margin: float
+    inside: bool
+
+
+@dataclass(frozen=True)
+class Boundary:
+    """Two adjacent floats with different histories, and the decision that makes the difference.
+
+    Attributes:
+        below, above: the two sides; above.at is the float after below.at.
+        step: of the first decision that differs.
+        i, j: its pair, i < j.
+        bound: on the rounding error of its margin.
+        also: further pairs that differ first at this step.
+        apart: largest distance of an atom between the two final states, length.
+        confirmed: whether a fresh process found the same history on either side; None where none was asked.
+    """
+
+    below: Side
+    above: Side
+    step: int
+    i: int
+    j: int
+    bound: float
+    also: int
+    apart: float
+    confirmed: bool | None
+
+    @property
+    def jump(self) -> float:
+        """Loss above minus loss below."""
+        return self.above.loss - self.below.loss
+
+    @property
+    def words(self) -> str:
+        """The boundary in one sentence."""
+        verb = "is inside" if self.above.inside else "is outside"
+        return f"from {self.above.at!r} on pair {self.i}-{self.j} {verb} at step {self.step}"
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A stretch of the number on which every run made had one history.
+
+    Attributes:
+        low, high: its ends; both were run.
+        history: a number for each distinct history of a map, in order of appearance.
+        digest: of it.
+        loss_low, loss_high: at the ends.
+        runs: how many were made here.
+        gap: the longest stretch between two of them: two boundaries closer than this may hide there. One ulp
+            where every float was run.
+    """
+
+    low: float
+    high: float
+    history: int
+    digest: str
+    loss_low: float
+    loss_high: float
+    runs: int
+    gap: float
+
+
+@dataclass(frozen=True)
+class BoundaryMap:
+    """A run as a piecewise function of a number.
+
+    Attributes:
+        key: the number.
+        steps: last step of every run.
+        low, high: the interval that was searched.
+        intervals: with one history each, in order.
+        boundaries: between them, in order.
+        unresolved: stretches whose ends have different histories but were not searched to the last bit.
+        complete: whether every float of the interval was run, so that nothing can hide.
+        resolution: the longest stretch between two runs of one history; a pair of boundaries within it that
+            cancel each other may be missed.
+        evaluations: runs made to find them.
+        at, loss: of every run made, in order.
+    """
+
+    key: str
+    steps: int
+    low: float
+    high: float
+    intervals: tuple[Interval, ...]
+    boundaries: tuple[Boundary, ...]
+    unresolved: tuple[tuple[float, float], ...]
+    complete: bool
+    resolution: float
+    evaluations: int
+    at: np.ndarray
+    loss: np.ndarray
+
+    @property
+    def histories(self) -> int:
+        """How many distinct histories were seen."""
+        return len({interval.digest for interval in self.intervals})
+
+    @property
+    def words(self) -> str:
+        """The map in one sentence, with what it cannot know."""
+        text = (
+            f"{len(self.boundaries)} boundaries and {self.histories} histories of {self.steps} steps between "
+            f"{self.key} = {self.low!r} and {self.high!r}"
+        )
+        if self.unresolved:
+            text += f"; {len(self.unresolved)} more stretches hold boundaries that were not searched for"
+        if self.complete:
+            return text + "; every float was run"
+        return text + f"; pairs of boundaries closer than {self.resolution:.2g} may be missed"
+
+
+def boundaries(
+    system: System | str,
+    key: str,
+    low: float,
+    high: float,
+    steps: int | None = None,
+    *,
+    overrides: Mapping[str, Any] | None = None,
+    cells: int = 64,
+    most: int = 64,
+    loss: Loss = squared_displacement,
+    confirm: bool = True,
+    progress: Callable[[int, int, dict[str, Any]], None] | None = None,
+) -> BoundaryMap:
+    """Changes of history along a number, as far as a grid can tell, each to adjacent floats.
+
+    The interval is run on a grid. A cell whose ends differ is bisected until its ends are adjacent floats; a
+    half that differs too is searched as well, widest first. All runs are by the program that a user runs
+    (for the cutoff radius: by its twin that is given the radius), and both sides of every boundary are run
+    again by a fresh process.
+
+    Args:
+        system: a loaded system, or a name or path to load.
+        key: the number (see dials.dial).
+        low, high: the interval, in the units of the system's file; both belong to it.
+        steps: last step; default the system's own.
+        overrides: as for `load`, where a name or path is given.
+        cells: of the grid. With at least as many as there are floats, all are run.
+        most: stop after this many boundaries; what is left is told as unresolved.
+        loss: of the final state, called with the simulation, unwrapped positions and velocities.
+        confirm: whether to run both sides of every boundary in a fresh process.
+        progress: called with boundaries found, `most`, and figures.
+
+    Raises:
+        InputError: no such number, an empty interval, or values that make no sense.
+
+    Error: none in a boundary: its sides are adjacent floats, and their runs decided differently.
+    """
+    if not isinstance(system, System):
+        system = load(system, overrides, world="md")
+    if cells < 1 or most < 1:
+        raise InputError(f"cells = {cells} and most = {most}; expected at least 1")
+    simulation = build(system)
+    last = system.spec.dynamics.steps if steps is None else steps
+    if last < 1:
+        raise InputError(f"steps = {last}; expected at least 1")
+    one = dial(simulation, key)
+    checked(one, low, high)
+    for end in (low, high):
+        one.turn(simulation, end)
+    line = _Line(simulation, one, last, loss)
+    places = _grid(low, high, cells)
+    pending: list[tuple[int, int, int]] = []
+    for k, place in enumerate(places):
+        line.digest(place)
+        _tell(progress, 0, most, line, f"grid {k + 1}/{len(places)}")
+    for a, b in pairwise(places):
+        if line.digest(a) != line.digest(b):
+            heapq.heappush(pending, (a - b, a, b))
+    found: list[tuple[int, int]] = []
+    while pending and len(found) < most:
+        _, a, b = heapq.heappop(pending)
+        found.append(_bisect(line, a, b, pending))
+        _tell(progress, len(found), most, line, "bisection")
+    found.sort()
+    sides = [float(line.value(place)) for pair in found for place in pair]
+    elsewhere = digests_elsewhere(system, one.key, last, sides) if confirm and sides else None
+    bounds = [
+        _annotated(line, pair, None if elsewhere is None else elsewhere[2 * k : 2 * k + 2])
+        for k, pair in enumerate(found)
+    ]
+    return _mapped(line, bounds)
+
+
+def _tell(progress, found: int, most: int, line: _Line, phase: str) -> None:
+    if progress is not None:
+        progress(found, most, {"phase": phase, "runs": len(line.known)})
+
+
+def _grid(low: float, high: float, cells: int) -> list[int]:
+    """Ordinals of the grid's floats: evenly spread, or all of them."""
+    first, final = (int(place) for place in ordinal(np.array([low, high])))
+    if final - first <= cells:
+        return list(range(first, final + 1))
+    return sorted({int(place) for place in ordinal(np.linspace(low, high, cells + 1))})
+
+
+@dataclass(frozen=True)
+class _Point:
+    digest: str
+    loss: float
+    energy: float
+
+
+class _Line:
+    """Runs of one system along one number, addressed by the ordinal of a float."""
+
+    def __init__(self, simulation: Simulation, one: Dial, steps: int, loss: Loss):
+        self.simulation, self.dial, self.steps, self.loss = simulation, one, steps, loss
+        self.known: dict[int, _Point] = {}
+
+    def value(self, place: int) -> float:
+        """The float of an ordinal."""
+        return float(neighbor(0.0, place))
+
+    def at(self, place: int) -> Simulation:
+        """The simulation at a float."""
+        return self.dial.turn(self.simulation, self.value(place))
+
+    def run(self, place: int) -> History:
+        """The run at a float; what it decided is remembered."""
+        simulation = self.at(place)
+        made = history(simulation, self.steps)
+        self.known[place] = _Point(made.digest, float(self.loss(simulation, made.x, made.v)), made.energy)
+        return made
+
+    def digest(self, place: int) -> str:
+        """What the run at a float decided."""
+        if place not in self.known:
+            self.run(place)
+        return self.known[place].digest
+
+    def look(self, place: int, step: int) -> Look:
+        """One step of the run at a float."""
+        return look(self.at(place), self.steps, step)
+
+
+def _bisect(line: _Line, a: int, b: int, pending: list[tuple[int, int, int]]) -> tuple[int, int]:
+    """Adjacent ordinals between two whose histories differ; the halves not followed go to `pending`."""
+    while b - a > 1:
+        middle = (a + b) // 2
+        here = line.digest(middle)
+        if here == line.digest(a):
+            a = middle
+            continue
+        if here != line.digest(b):
+            heapq.heappush(pending, (middle - b, middle, b))
+        b = middle
+    return a, b
+
+
+def _annotated(line: _Line, pair: tuple[int, int], elsewhere: list[str] | None) -> Boundary:
+    """What differs between two adjacent floats."""
+    runs = [line.run(place) for place in pair]
+    step = runs[0].first_difference(runs[1])
+    assert step is not None  # their digests differ
+    if any(len(run.marks) <= step for run in runs):
+        raise InputError(
+            f"a run fails at step {step} where {line.dial.key} = {line.value(pair[1])!r}",
+            remedy="Search an interval of values that can be run, or fewer steps",
+        )
+    looks = [line.look(place, step) for place in pair]
+    simulations = [line.at(place) for place in pair]
+    atoms = line.simulation.atoms
+    differing = np.setxor1d(looks[0].pairs, looks[1].pairs, assume_unique=True)
+    pairs = [divmod(int(key), atoms) for key in differing]
+    margins = [
+        [margin(simulation, seen.x, i, j) for simulation, seen in zip(simulations, looks, strict=True)]
+        for i, j in pairs
+    ]
+    nearest = min(range(len(pairs)), key=lambda k: max(abs(m) for m in margins[k]))
+    i, j = pairs[nearest]
+    sides = [
+        Side(
+            line.value(place),
+            run.digest,
+            line.known[place].loss,
+            run.energy,
+            margins[nearest][k],
+            bool(np.isin(differing[nearest], looks[k].pairs)),
+        )
+        for k, (place, run) in enumerate(zip(pair, runs, strict=True))
+    ]
+    kind = int(line.simulation.type_of(np.array([i]), np.array([j]))[0])
+    apart = float(np.sqrt(np.max(np.sum((runs[1].x - runs[0].x) ** 2, axis=1))))
+    confirmed = None if elsewhere is None else elsewhere == [side.digest for side in sides]
+    below, above = sides
+    bound = simulations[0].decider.bounds[kind]
+    return Boundary(below, above, step, i, j, bound, len(pairs) - 1, apart, confirmed)
+
+
+def _mapped(line: _Line, found: list[Boundary]) -> BoundaryMap:
+    """Everything that was run, put in order."""
+    places = sorted(line.known)
+    values = [line.value(place) for place in places]
+    points = [line.known[place] for place in places]
+    numbers: dict[str, int] = {}
+    edges = [k for k in range(1, len(places)) if points[k].digest != points[k - 1].digest]
+    intervals = []
+    for first, end in zip([0, *edges], [*edges, len(places)], strict=True):
+        digest = points[first].digest
+        inner = np.diff(values[first:end])
+        gap = float(inner.max()) if len(inner) else float(np.spacing(values[first]))
+        intervals.append(
+            Interval(
+                values[first],
+                values[end - 1],
+                numbers.setdefault(digest, len(numbers)),
+                digest,
+                points[first].loss,
+                points[end - 1].loss,
+                end - first,
+                gap,
+            )
+        )
+    unresolved = tuple((values[k - 1], values[k]) for k in edges if places[k] - places[k - 1] > 1)
+    return BoundaryMap(
+        line.dial.key,
+        line.steps,
+        values[0],
+        values[-1],
+        tuple(intervals),
+        tuple(found),
+        unresolved,
+        len(places) == places[-1] - places[0] + 1,
+        max(interval.gap for interval in intervals),
+        len(line.known),
+        np.array(values),
+        np.array([point.loss for point in points]),
+    )

@@ -1,0 +1,157 @@
+"""Boundaries in a parameter: where closed form and brute force put them, and in another process."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from ase import Atoms
+from small_systems import LENNARD_JONES, crystal, make
+
+from mdnum.errors import InputError
+from mdnum.forks.boundaries import boundaries
+from mdnum.forks.confirm import digests, digests_elsewhere
+from mdnum.forks.dials import dial, names
+from mdnum.rollout.engine import Engine
+from mdnum.systems.build import build
+
+APART, RADIUS, SPEED = 3.0, 2.5, 1.25
+
+
+def meeting(steps: int = 20):
+    """Two free atoms that fly towards each other and feel nothing before they are inside."""
+    atoms = Atoms("Ar2", positions=[[0, 0, 0], [APART, 0, 0]], masses=[1.0, 1.0])
+    atoms.set_velocities([[0, 0, 0], [-SPEED, 0, 0]])
+    cutoff = {"kind": "hard", "radius": RADIUS, "compare": "r2 <"}
+    tables = {"kind": "nve", "timestep": 0.05, "steps": steps}
+    return make(atoms, LENNARD_JONES, cutoff, dynamics=tables)
+
+
+def solid():
+    """A warm crystal whose third shell flickers across a hard cutoff."""
+    cutoff = {"kind": "hard", "radius": 2.2, "compare": "r2 <"}
+    return make(crystal(), LENNARD_JONES, cutoff)
+
+
+def brute(system, key: str, steps: int, values: np.ndarray) -> list[tuple[float, float]]:
+    """Adjacent values whose runs hold different sets of pairs at some step, by sets of pairs."""
+    simulation = build(system)
+    one = dial(simulation, key)
+    held = []
+    for value in values:
+        sets = []
+        for segment in Engine(one.turn(simulation, float(value)), steps).segments():
+            for bits in segment.rows_of("bits"):
+                i, j = segment.table.decided(bits)
+                sets.append(frozenset(zip(i.tolist(), j.tolist(), strict=True)))
+        held.append(tuple(sets))
+    return [
+        (float(a), float(b))
+        for a, b, left, right in zip(values, values[1:], held, held[1:], strict=False)
+        if left != right
+    ]
+
+
+@pytest.fixture(scope="module")
+def crossings():
+    return boundaries(meeting(), "timestep", 0.04, 0.105, 9, cells=32)
+
+
+def test_a_crossing_in_closed_form_is_found_where_it_is(crossings):
+    steps, found = 9, crossings
+    # inside from the first step k on with APART - SPEED k dt < RADIUS: the boundaries of dt are (1/2)/(5/4)/k
+    closed = sorted((APART - RADIUS) / SPEED / k for k in range(4, steps + 1))
+    assert len(found.boundaries) == len(closed) == 6
+    for boundary, expected, k in zip(found.boundaries, closed, range(steps, 3, -1), strict=True):
+        # k additions of a rounded product: each half an ulp of a position below 4
+        assert abs(boundary.above.at - expected) <= (k + 1) * 2.0**-52 * 4 / SPEED / k
+        assert boundary.above.at == np.nextafter(boundary.below.at, 1.0)
+        assert (boundary.step, boundary.i, boundary.j, boundary.also) == (k, 0, 1, 0)
+        assert boundary.above.inside and not boundary.below.inside
+        # at rest is not inside: the comparison is `<`
+        assert boundary.above.margin > 0 >= boundary.below.margin
+        assert boundary.confirmed is True
+    assert found.histories == 7 and not found.unresolved and not found.complete
+
+
+def test_the_last_step_alone_makes_no_jump_and_an_earlier_one_does(crossings):
+    last, *earlier = crossings.boundaries
+    # the force of a pair acts on positions one step later; what entered at the last step has moved nothing
+    assert last.step == 9 and last.apart < 1e-14
+    slope = 24 * (RADIUS**-7 - 2 * RADIUS**-13)
+    for boundary in earlier:
+        # one kick more on one side: both atoms get dt² F per step since
+        dt, since = boundary.above.at, 9 - boundary.step
+        assert boundary.apart == pytest.approx(slope * dt * dt * since, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("key", "at", "width"),
+    [("sigma", 1.0, 1e-3), ("velocity.scale", 1.0, 1e-2), ("position.17.y", None, 1e-2)],
+)
+def test_brute_force_over_all_floats_finds_the_same(key, at, width):
+    system, steps = solid(), 40
+    at = dial(build(system), key).value if at is None else at
+    coarse = boundaries(system, key, at, at + width, steps, cells=8, most=1, confirm=False)
+    (one,) = coarse.boundaries
+    ulp = np.spacing(one.below.at)
+    window = one.below.at + ulp * np.arange(-20, 22)
+    truth = brute(system, key, steps, window)
+    assert truth
+    every = boundaries(system, key, window[0], window[-1], steps, cells=len(window), confirm=False)
+    assert every.complete and every.resolution <= ulp
+    assert [(b.below.at, b.above.at) for b in every.boundaries] == truth
+    # bisection meets an odd number of them, and none that is not there
+    few = boundaries(system, key, window[0], window[-1], steps, cells=1, confirm=False)
+    met = [(b.below.at, b.above.at) for b in few.boundaries]
+    assert set(met) <= set(truth) and (len(truth) > 1 or met == truth)
+
+
+def test_both_sides_differ_in_a_fresh_process():
+    system, steps = solid(), 60
+    found = boundaries(system, "epsilon", 1.0, 1.01, steps, cells=4, most=2)
+    assert found.boundaries
+    values = [side.at for b in found.boundaries for side in (b.below, b.above)]
+    elsewhere = digests_elsewhere(system, "epsilon", steps, values)
+    for k, boundary in enumerate(found.boundaries):
+        below, above = elsewhere[2 * k : 2 * k + 2]
+        assert below != above and np.nextafter(values[2 * k], 2.0) == values[2 * k + 1]
+        assert boundary.confirmed is ([below, above] == [boundary.below.digest, boundary.above.digest])
+        assert boundary.confirmed
+
+
+def test_the_radius_is_turned_without_compiling_and_agrees_with_the_program_proper():
+    found = boundaries(meeting(), "cutoff.radius", 2.26, 2.30, 12, cells=2)
+    # the distance after k steps of 1/20 is 3 - k/16: 2.3125, 2.25 from the pair's own motion alone up to
+    # its entry; both atoms then fall faster, so a boundary between is where a later step meets the radius
+    simulation = build(meeting())
+    one = dial(simulation, "radius")
+    assert one.compiles
+    for value in (2.27, 2.29):
+        assert digests(meeting(), "radius", 12, [value]) == [_digest(one.turn(simulation, value), 12)]
+    assert all(boundary.confirmed for boundary in found.boundaries)
+
+
+def _digest(simulation, steps: int) -> str:
+    from mdnum.forks.histories import history
+
+    return history(simulation, steps).digest
+
+
+def test_what_is_left_is_told():
+    found = boundaries(meeting(), "timestep", 0.04, 0.105, 9, cells=32, most=2, confirm=False)
+    assert len(found.boundaries) == 2 and len(found.unresolved) == 4
+    assert "4 more stretches" in found.words
+    assert found.boundaries[0].confirmed is None
+
+
+def test_bad_input_is_refused():
+    system = meeting()
+    with pytest.raises(InputError, match="no number that can be turned") as error:
+        boundaries(system, "sgima", 1.0, 2.0)
+    assert all(name in str(error.value) for name in names(build(system)))
+    with pytest.raises(InputError, match="nothing between"):
+        boundaries(system, "sigma", 2.0, 1.0)
+    with pytest.raises(InputError, match="above 0"):
+        boundaries(system, "timestep", -1.0, 1.0)
+    with pytest.raises(InputError, match="no atom 7"):
+        boundaries(system, "position.7.x", 0.0, 1.0)
