@@ -1,0 +1,370 @@
+"""One system, several programs: compiled or not, in a batch, inside a gradient, for other processors.
+
+They compute the same formulas, and the compiler is free to round them otherwise. XLA's flags belong to a
+process, so each variant runs in one of its own and hands back a hash of every step. Variants whose hashes
+are equal are one program as far as numbers go; where they are not, the pattern of who agrees with whom
+tells the cause.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from mdnum.errors import InputError, MdnumError
+from mdnum.forks.choices.base import is_pairwise, varied
+from mdnum.md.cell import Cell, displacement
+from mdnum.systems.load import System, load
+
+Program = Literal["scan", "rollout", "vmap", "grad", "eager"]
+
+#: Steps of the eager program: operation by operation, a step takes a hundred times as long.
+_EAGER_STEPS = 12
+#: Copies in a batch.
+_BATCH = 4
+_PROCESSES = 2
+_TIMEOUT = 600
+_NO_FMA = ("--xla_cpu_max_isa=AVX",)
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A way to run the same steps.
+
+    Attributes:
+        name: what to call it.
+        program: "scan" (one compiled loop), "rollout" (mdnum's own), "vmap" (the first of a batch of equal
+            copies), "grad" (the primal inside value_and_grad) or "eager" (operation by operation).
+        flags: of XLA.
+        reduction: order of the force sums; None for the system's own.
+    """
+
+    name: str
+    program: Program = "scan"
+    flags: tuple[str, ...] = ()
+    reduction: str | None = None
+
+
+REFERENCE = Variant("scan")
+VARIANTS: tuple[Variant, ...] = (
+    REFERENCE,
+    Variant("rollout", "rollout"),
+    Variant("vmap", "vmap"),
+    Variant("grad", "grad"),
+    Variant("eager", "eager"),
+    Variant("AVX", flags=_NO_FMA),
+    Variant("SSE4.2", flags=("--xla_cpu_max_isa=SSE4_2",)),
+    Variant("unoptimized", flags=("--xla_backend_optimization_level=0",)),
+    Variant("rollout, AVX", "rollout", _NO_FMA),
+    Variant("vmap, AVX", "vmap", _NO_FMA),
+    Variant("grad, AVX", "grad", _NO_FMA),
+    Variant("reversed", reduction="reversed"),
+)
+
+
+@dataclass(frozen=True)
+class Ran:
+    """What became of a variant.
+
+    Attributes:
+        variant: which.
+        hashes: of the positions at steps 1, 2, ..., hexadecimal; empty where it failed.
+        cluster: number of the variants that agree with it, from 0; -1 where it failed.
+        seed: first step whose positions are not those of the reference; None where all are.
+        separation: largest distance from the reference's atoms at the last common step, length.
+        seconds: of its process.
+        failed: the last line that a failed process said.
+    """
+
+    variant: Variant
+    hashes: tuple[str, ...]
+    cluster: int
+    seed: int | None
+    separation: float
+    seconds: float
+    failed: str = ""
+
+
+@dataclass(frozen=True)
+class Variants:
+    """Variants of one system, by what they compute.
+
+    Attributes:
+        rows: one a variant, the reference first.
+        steps: that every program but the eager one ran.
+        causes: what tells the clusters apart, sentence by sentence.
+    """
+
+    rows: tuple[Ran, ...]
+    steps: int
+    causes: tuple[str, ...]
+
+    @property
+    def clusters(self) -> list[list[str]]:
+        """Names of the variants that agree with each other to the last bit, the reference's first."""
+        count = max(row.cluster for row in self.rows) + 1
+        return [[row.variant.name for row in self.rows if row.cluster == k] for k in range(count)]
+
+
+def variants(
+    system: System,
+    steps: int = 200,
+    which: Sequence[Variant] = VARIANTS,
+    progress: Callable[[int, int, str], None] | None = None,
+) -> Variants:
+    """Run a system in several programs, two processes at a time, and tell which agree.
+
+    All use one list, as wide as twice the skin where the box has room, and stop before it is used up. On
+    another machine the clusters may be others: a processor without fused multiply-add has nothing to fuse.
+
+    Args:
+        system: as loaded; pair potentials only.
+        steps: of each program; the eager one takes a dozen.
+        which: the first one is what the others are compared with.
+        progress: called with how many have ended, how many there are, and the name of the last.
+
+    Raises:
+        InputError: a many-body potential, no steps, or no variant.
+        MdnumError: the reference did not run.
+    """
+    if not is_pairwise(system):
+        raise InputError("variants of a many-body potential are not there", where=system.name)
+    if steps < 1 or not which:
+        raise InputError("expected at least one step and one variant", where=f"steps = {steps}")
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        # a system changed in memory is on no disk; what is written loads bit for bit
+        system.write(folder / "system")
+        done = 0
+
+        def ran(k: int) -> tuple[Ran, Float[np.ndarray, "steps 3 atoms"] | None]:
+            nonlocal done
+            got = _process(which[k], folder, k, steps)
+            done += 1
+            if progress is not None:
+                progress(done, len(which), which[k].name)
+            return got
+
+        with ThreadPoolExecutor(_PROCESSES) as pool:
+            found = list(pool.map(ran, range(len(which))))
+    reference, x = found[0]
+    if x is None:
+        raise MdnumError(f"the variant {reference.variant.name!r} did not run: {reference.failed}")
+    cell = Cell.create(np.asarray(system.atoms.cell), system.atoms.pbc)
+    rows = _clustered([_dated(row, other, reference, x, cell) for row, other in found])
+    return Variants(tuple(rows), len(reference.hashes), tuple(_causes(rows)))
+
+
+def _process(variant: Variant, folder: Path, k: int, steps: int) -> tuple[Ran, np.ndarray | None]:
+    task = {
+        "system": str(folder / "system"),
+        "steps": steps,
+        "program": variant.program,
+        "reduction": variant.reduction,
+        "out": str(folder / f"{k}.npy"),
+    }
+    flags = " ".join([os.environ.get("XLA_FLAGS", ""), *variant.flags]).strip()
+    # a program cached by another variant must not answer for this one; these flags are a CPU's
+    told = {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "JAX_ENABLE_COMPILATION_CACHE": "false"}
+    begin = time.perf_counter()
+    done = subprocess.run(
+        [sys.executable, "-c", "from mdnum.forks.variants import child; child()", json.dumps(task)],
+        env={**os.environ, **told},
+        stderr=subprocess.PIPE,
+        stdin=subprocess.DEVNULL,
+        text=True,
+        timeout=_TIMEOUT,
+    )
+    seconds = time.perf_counter() - begin
+    if done.returncode:
+        said = [line for line in done.stderr.splitlines() if line.strip()]
+        words = said[-1].strip() if said else f"exit code {done.returncode}"
+        return Ran(variant, (), -1, None, float("nan"), seconds, words), None
+    x = np.load(task["out"])
+    hashes = tuple(hashlib.sha256(np.ascontiguousarray(row).tobytes()).hexdigest() for row in x)
+    return Ran(variant, hashes, -1, None, 0.0, seconds), x
+
+
+def _dated(row: Ran, x: np.ndarray | None, reference: Ran, x_reference: np.ndarray, cell: Cell) -> Ran:
+    if x is None:
+        return row
+    common = min(len(row.hashes), len(reference.hashes))
+    pairs = zip(row.hashes[:common], reference.hashes[:common], strict=True)
+    seed = next((step for step, (one, other) in enumerate(pairs, 1) if one != other), None)
+    dx, dy, dz = displacement(cell, x_reference[common - 1].T, x[common - 1].T)
+    return replace(row, seed=seed, separation=float(np.sqrt((dx * dx + dy * dy + dz * dz).max())))
+
+
+def _agree(one: Ran, other: Ran) -> bool:
+    common = min(len(one.hashes), len(other.hashes))
+    return common > 0 and one.hashes[:common] == other.hashes[:common]
+
+
+def _clustered(rows: list[Ran]) -> list[Ran]:
+    # the longest of each cluster stands for it, so that a short run joins whom it agrees with
+    heads: list[Ran] = []
+    numbers: dict[str, int] = {}
+    for row in sorted(rows, key=lambda row: -len(row.hashes)):
+        if row.failed:
+            continue
+        at = next((k for k, head in enumerate(heads) if _agree(row, head)), len(heads))
+        if at == len(heads):
+            heads.append(row)
+        numbers[row.variant.name] = at
+    return [replace(row, cluster=numbers.get(row.variant.name, -1)) for row in rows]
+
+
+def _causes(rows: Sequence[Ran]) -> list[str]:
+    """What the pattern of agreement says; nothing is said of variants that were not run."""
+    by_name = {row.variant.name: row for row in rows if not row.failed}
+    reference = rows[0]
+    told = []
+
+    def same(one: str, other: str) -> bool | None:
+        if one not in by_name or other not in by_name:
+            return None
+        return _agree(by_name[one], by_name[other])
+
+    plain = [name for name in ("AVX", "SSE4.2", "unoptimized") if name in by_name]
+    fused = [name for name in plain if not _agree(by_name[name], reference)]
+    if len(plain) > 1 and fused == plain:
+        if all(same(plain[0], name) for name in plain[1:]):
+            told.append(
+                f"Fused multiply-add: {', '.join(plain)} cannot fuse or do not, agree with one another, and "
+                f"leave the reference at step {by_name[plain[0]].seed}."
+            )
+        else:
+            told.append(f"{', '.join(plain)} differ from the reference and among each other.")
+    elif plain and not fused:
+        told.append(f"{', '.join(plain)} agree with the reference: no fused multiply-add shows in it.")
+    alike, without = same("eager", "scan"), same("eager", "AVX")
+    if alike and without:
+        told.append("The eager program ran too few steps to tell which of the others it agrees with.")
+    elif alike:
+        told.append("The eager program has the reference's bits as far as it ran.")
+    elif without:
+        told.append("Operation by operation there is nothing to fuse: the eager program agrees with AVX.")
+    elif alike is False:
+        told.append(f"The eager program leaves the reference at step {by_name['eager'].seed}.")
+    for name, what in (
+        ("rollout", "The rollout's loop"),
+        ("vmap", "A batch"),
+        ("grad", "The primal inside value_and_grad"),
+    ):
+        alike, without = same(name, "scan"), same(f"{name}, AVX", "AVX")
+        if alike:
+            told.append(f"{what} has the reference's bits.")
+        elif alike is False and without:
+            told.append(
+                f"{what} leaves the reference at step {by_name[name].seed} because it fuses other products: "
+                "without fused multiply-add the two agree."
+            )
+        elif alike is False and without is False:
+            told.append(
+                f"{what} leaves the reference at step {by_name[name].seed}, without fused multiply-add too: "
+                "the compiler orders its operations otherwise."
+            )
+        elif alike is False:
+            told.append(f"{what} leaves the reference at step {by_name[name].seed}.")
+    if same("reversed", "scan") is False:
+        told.append(f"Order: sums in reverse leave the reference at step {by_name['reversed'].seed}.")
+    return told
+
+
+# --- the process of one variant -----------------------------------------------------------------------------
+
+
+def child() -> None:
+    """Run one variant, told by the last argument, and write its positions; called by `variants` alone."""
+    task: dict[str, Any] = json.loads(sys.argv[-1])
+    system = load(task["system"], world="md")
+    if task["reduction"]:
+        system = varied(system, {"precision.reduction": task["reduction"]})
+    np.save(task["out"], positions_of(system, task["steps"], task["program"]))
+
+
+def positions_of(system: System, steps: int, program: Program) -> Float[np.ndarray, "steps 3 atoms"]:
+    """Wrapped positions at steps 1, 2, ... in the user's order, as one program computes them in this process.
+
+    Ends before an atom has moved by half the skin of the one list.
+    """
+    from mdnum.rollout.engine import Engine, first_state
+    from mdnum.systems.build import build
+
+    simulation = build(system)
+    room = float(np.min(simulation.cell.widths)) / 2 - simulation.r_cut
+    skin = min(2 * simulation.rule.skin, room)
+    simulation = replace(simulation, rule=replace(simulation.rule, skin=skin, check=True))
+    home = first_state(simulation).reference
+    if program == "rollout":
+        parts = []
+        for segment in Engine(simulation, steps).segments():
+            parts += [segment.unsorted("x", row).T for row in range(segment.rows)]
+        x = np.array(parts[1:])
+    else:
+        x = _stepped(simulation, steps, program)
+    moved = [np.max(sum(c * c for c in displacement(simulation.cell, home, row.T))) for row in x]
+    used = np.flatnonzero(np.sqrt(moved) > skin / 2)
+    return x[: used[0]] if len(used) else x
+
+
+def _stepped(simulation: Any, steps: int, program: Program) -> np.ndarray:
+    import jax
+    import jax.numpy as jnp
+    from jax import lax
+
+    from mdnum.md.stepper import MdState, PairDynamics
+    from mdnum.rollout.engine import first_state
+
+    start = first_state(simulation)
+    table = simulation.verlet_list().build(start.reference, simulation.cell)
+    dynamics = PairDynamics(
+        simulation.force,
+        simulation.integrator,
+        jnp.asarray(simulation.masses[table.order]),
+        simulation.tables(table),
+    )
+    state = MdState(jnp.zeros((), jnp.int64), start.state.x[:, table.order], start.state.v[:, table.order])
+    leaves, structure = jax.tree.flatten(dynamics)
+
+    # the dynamics comes in as an argument: its fence is a number that the compiler must not know
+    def trajectory(leaves, x, v, count):
+        dynamics = jax.tree.unflatten(structure, leaves)
+
+        def body(state, _):
+            state = dynamics.step(state, dynamics.decide(state))
+            return state, state.x
+
+        return lax.scan(body, MdState(state.step, x, v), None, length=count)[1]
+
+    def loss(x, v, leaves):
+        path = trajectory(leaves, x, v, steps)
+        return jnp.mean(jnp.square(path[-1])), path
+
+    if program == "eager":
+        with jax.disable_jit():
+            x = trajectory(leaves, state.x, state.v, min(steps, _EAGER_STEPS))
+    elif program == "vmap":
+        copies = (jnp.stack([q] * _BATCH) for q in (state.x, state.v))
+        batched = jax.jit(jax.vmap(lambda leaves, x, v: trajectory(leaves, x, v, steps), (None, 0, 0)))
+        x = batched(leaves, *copies)[0]
+    elif program == "grad":
+        (_, x), _ = jax.jit(jax.value_and_grad(loss, has_aux=True))(state.x, state.v, leaves)
+    else:
+        x = jax.jit(trajectory, static_argnums=3)(leaves, state.x, state.v, steps)
+    ours = np.empty(x.shape, np.asarray(x).dtype)
+    ours[:, :, table.order] = np.asarray(x)
+    return ours
