@@ -159,14 +159,11 @@ def _decision(made: Mapping[str, Any] | None) -> list[tuple[str, str]]:
     way = "" if made["run"] == "start" else "entered" if made["entered"] else "left"
     also = f", with {made['also']:,} more at this step" if made.get("also") else ""
     space = {"r2": "r²", "r": "r"}.get(str(made.get("space")), "")
-    if made["ambiguous"]:
-        rounding = "rounding alone could have decided otherwise"
-    else:
-        rounding = "more than rounding"
-    rows = [
-        ("deciding pair", f"{made['i']}–{made['j']} {way}{where}{also}".replace("  ", " ")),
-        ("margin", f"{made['margin']:.3g} in {space}; rounding bound {made['bound']:.3g}: {rounding}"),
-    ]
+    rows = [("deciding pair", f"{made['i']}–{made['j']} {way}{where}{also}".replace("  ", " "))]
+    for name, margin in (made.get("margins") or {made["run"]: made["margin"]}).items():
+        bound = (made.get("bounds") or {}).get(name, made["bound"])
+        word = "ambiguous" if abs(margin) <= bound else "not ambiguous"
+        rows.append((f"margin in {name}", f"{margin:.3g} in {space}; rounding bound {bound:.3g}: {word}"))
     if made.get("protected") is not None:
         rows.append(
             (
@@ -178,22 +175,15 @@ def _decision(made: Mapping[str, Any] | None) -> list[tuple[str, str]]:
 
 
 def _print_ranking(summary: Mapping[str, Any]) -> None:
-    rows = []
-    for one in summary["ranking"]:
-        must = "must not fork" if one.get("must_hold") else ""
-        rows.append(
-            (
-                one["choice"],
-                _split(one.get("seed")),
-                _split(one.get("fork")),
-                _split(one.get("split")),
-                one.get("verdict") or "-",
-                must,
-                one.get("difference") or "",
-            )
+    rows = [
+        (
+            one["choice"],
+            *(_split(one.get(name)) for name in ("seed", "fork", "split")),
+            "must hold" if one.get("must_hold") else "",
+            one.get("failed") or one.get("difference") or "",
         )
-    output.print_table(
-        "choices by fork", ("choice", "seed", "fork", "split", "verdict", "", "difference"), rows
-    )
+        for one in summary["ranking"]
+    ]
+    output.print_table("choices by fork", ("choice", "seed", "fork", "split", "", "difference"), rows)
     if left := summary.get("not_applicable"):
         output.print_table("do not apply", ("choice", "why"), [(one["choice"], one["why"]) for one in left])

@@ -26,11 +26,13 @@ class Neighborhood:
         atoms: labels of A; the pair first, the others by their distance from its middle, shape (near,).
         positions: in A, from the middle of the pair, length, shape (near, 3).
         moved: B's positions minus A's, length, shape (near, 3).
+        margins: of the deciding pair in A and in B, as each program computes it, in the quantity's space.
     """
 
     atoms: Int[np.ndarray, "near"]
     positions: Float[np.ndarray, "near 3"]
     moved: Float[np.ndarray, "near 3"]
+    margins: tuple[float, float]
 
 
 def neighborhood(fork: Fork, reach: float = REACH) -> Neighborhood | None:
@@ -48,7 +50,7 @@ def neighborhood(fork: Fork, reach: float = REACH) -> Neighborhood | None:
         return None
     cell = HostCell(twin.a.cell)
     i, j = decision.i, decision.j
-    across = np.array(cell.displacement(x_a[i], x_a[j]))
+    across = np.stack(cell.displacement(x_a[[i]], x_a[[j]]), axis=-1)[0]
     from_i = np.stack(cell.displacement(np.broadcast_to(x_a[i], x_a.shape), x_a), axis=-1)
     # the nearest image of i may be another than that of the middle, so both ends are asked
     from_j = np.stack(cell.displacement(np.broadcast_to(x_a[j], x_a.shape), x_a), axis=-1)
@@ -62,7 +64,15 @@ def neighborhood(fork: Fork, reach: float = REACH) -> Neighborhood | None:
     chosen = order[distance[order] <= reach * twin.a.r_cut]
     chosen = np.concatenate([[i, j], chosen[(chosen != i) & (chosen != j)]])
     moved = np.stack(cell.displacement(x_a[chosen], x_b[chosen]), axis=-1)
-    return Neighborhood(chosen, from_middle[chosen], moved)
+    margins = _margin(twin.a, twin.a, x_a, i, j), _margin(twin.a, twin.b, x_b, i, j)
+    return Neighborhood(chosen, from_middle[chosen], moved, margins)
+
+
+def _margin(labels: Simulation, run: Simulation, x: Float[np.ndarray, "atoms 3"], i: int, j: int) -> float:
+    """Threshold minus quantity of a pair, in the dtype in which a run decides."""
+    kind = int(labels.type_of(np.array([i]), np.array([j]))[0])
+    quantity = run.decider.host_quantity(*HostCell(run.cell, run.decider.dtype).displacement(x[[i]], x[[j]]))
+    return run.decider.thresholds[kind].value - float(quantity[0])
 
 
 def positions_at(

@@ -112,7 +112,7 @@ def _one(
         fork_record.write(folder, made, around)
         folder.finalize()
         seconds = time.perf_counter() - began
-        folder.write_summary(fork_record.summarize(made, vary, choice, seconds))
+        folder.write_summary(fork_record.summarize(made, around, vary, choice, seconds))
     except BaseException:
         folder.close()
         raise

@@ -41,7 +41,9 @@ def write(folder: RunFolder, fork: Fork, around: Neighborhood | None) -> None:
         folder.append("neighborhood", {"atom": around.atoms, **vectors})
 
 
-def summarize(fork: Fork, vary: str, choice: Any, seconds: float) -> dict[str, Any]:
+def summarize(
+    fork: Fork, around: Neighborhood | None, vary: str, choice: Any, seconds: float
+) -> dict[str, Any]:
     """The content of summary.json, without headline and findings."""
     a = fork.twin.a
     step = timestep(a)
@@ -66,7 +68,7 @@ def summarize(fork: Fork, vary: str, choice: Any, seconds: float) -> dict[str, A
         **when,
         **{f"{name}_time": None if at is None else at * step for name, at in when.items()},
         "tolerance": fork.tolerance,
-        "decision": _decision(fork),
+        "decision": _decision(fork, around),
         "verdict": verdict.word,
         "reasons": list(verdict.reasons),
         "growth_rate": _plain(rate.rate),
@@ -130,18 +132,20 @@ def _flat(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any
             yield prefix + str(key), value
 
 
-def _decision(fork: Fork) -> dict[str, Any] | None:
+def _decision(fork: Fork, around: Neighborhood | None) -> dict[str, Any] | None:
     made = fork.decision
     if made is None:
         return None
     run = fork.twin.b if made.run == "B" else fork.twin.a
-    kind = int(fork.twin.a.type_of(np.array([made.i]), np.array([made.j]))[0])
+    kind = _kind(fork.twin.a, made.i, made.j)
     threshold, space = run.decider.thresholds[kind].value, run.decider.space
     quantity = threshold - made.margin
     distance = float(np.sqrt(quantity)) if space == "r2" else quantity
     # the margin of r² is so many times that of r
     slope = 2.0 * run.decider.r_cut[kind] if space == "r2" else 1.0
     length = made.margin / slope
+    bounds = {name: one.decider.bounds[kind] for name, one in (("A", fork.twin.a), ("B", fork.twin.b))}
+    margins = dict(zip("AB", around.margins, strict=True)) if around is not None else {}
     return {
         "channel": "pair",
         "step": made.step,
@@ -153,7 +157,10 @@ def _decision(fork: Fork) -> dict[str, Any] | None:
         "margin": made.margin,
         "bound": made.bound,
         "ambiguous": made.ambiguous,
-        "r_cut": run.decider.r_cut[kind],
+        "margins": margins,
+        "bounds": bounds,
+        "ambiguous_in": [name for name, margin in margins.items() if abs(margin) <= bounds[name]],
+        "cutoffs": {"A": _cutoff(fork.twin.a, made.i, made.j), "B": _cutoff(fork.twin.b, made.i, made.j)},
         "distance": distance,
         "margin_length": length,
         "bound_length": made.bound / slope,
@@ -161,6 +168,17 @@ def _decision(fork: Fork) -> dict[str, Any] | None:
         "protected": abs(length) / made.separation if made.separation > 0 else None,
         "also": made.also,
     }
+
+
+def _kind(simulation: Simulation, i: int, j: int) -> int:
+    return int(simulation.type_of(np.array([i]), np.array([j]))[0])
+
+
+def _cutoff(simulation: Simulation, i: int, j: int) -> float:
+    """The cutoff that a program compares with: the threshold in its own dtype, as a distance."""
+    decider = simulation.decider
+    value = decider.thresholds[_kind(simulation, i, j)].value
+    return float(np.sqrt(value)) if decider.space == "r2" else value
 
 
 def _growth(fork: Fork, name: str) -> dict[str, Any]:

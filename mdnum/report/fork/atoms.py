@@ -35,12 +35,13 @@ def _compose(run: ForkFolder, wide: bool, figure: Figure) -> None:
     made = run.decision or {}
     basis = projection(positions)
     flat, shift = positions @ basis.T, moved @ basis.T
-    factor = magnification(shift[:, :2], float(made["r_cut"]))
+    factor = magnification(shift[:, :2], float(made["cutoffs"]["A"]))
     inside = decided_inside(run)
     panels = figure.subplots(1 if wide else 2, 2 if wide else 1, squeeze=False).ravel()
     for axes, name in zip(panels, "AB", strict=True):
         offset = shift if name == "B" else np.zeros_like(shift)
-        _panel(axes, run, flat, inside[name], gap(positions, moved, float(made["r_cut"]), name), name)
+        cutoff = float(made["cutoffs"][name])
+        _panel(axes, run, flat, inside[name], cutoff, gap(positions, moved, cutoff, name), name)
         if name == "B" and factor:
             axes.quiver(
                 flat[:, 0], flat[:, 1], factor * offset[:, 0], factor * offset[:, 1], angles="xy",
@@ -52,13 +53,14 @@ def _compose(run: ForkFolder, wide: bool, figure: Figure) -> None:
             )  # fmt: skip
 
 
-def _panel(axes: Axes, run: ForkFolder, flat: np.ndarray, inside: bool, gap: float, name: str) -> None:
-    made = run.decision or {}
-    r_cut = float(made["r_cut"])
+def _panel(
+    axes: Axes, run: ForkFolder, flat: np.ndarray, inside: bool, r_cut: float, beyond: float, name: str
+) -> None:
     depth = np.abs(flat[:, 2]) / max(float(np.abs(flat[:, 2]).max()), 1e-300)
     # an opacity for each atom, which the stubs do not know
     shade: Any = np.clip(1.0 - 0.8 * depth, 0.15, 1.0)
-    axes.scatter(flat[2:, 0], flat[2:, 1], s=26, c=MUTED, alpha=shade[2:], lw=0, zorder=2)
+    if len(flat) > 2:
+        axes.scatter(flat[2:, 0], flat[2:, 1], s=26, c=MUTED, alpha=shade[2:], lw=0, zorder=2)
     axes.add_patch(Circle(tuple(flat[0, :2]), r_cut, fill=False, ec=SECOND, lw=1.2, zorder=1.5))
     axes.plot(
         flat[:2, 0], flat[:2, 1], color=FIRST if inside else MUTED, lw=2.4 if inside else 1.2,
@@ -72,13 +74,14 @@ def _panel(axes: Axes, run: ForkFolder, flat: np.ndarray, inside: bool, gap: flo
         )  # fmt: skip
         label.set_gid("halo")
     word = "inside" if inside else "outside"
-    axes.set_title(
-        f"{name}: {word}, r − cutoff = {number(gap, 3, signed=True)} {run.units.length}",
-        fontsize=9, color=INK, loc="left",
+    said = axes.annotate(
+        f"{name}: {word}, r − cutoff = {number(beyond, 3, signed=True)} {run.units.length}", (0.01, 0.99),
+        xycoords="axes fraction", va="top", fontsize=9, color=INK, zorder=5,
     )  # fmt: skip
+    said.set_gid("halo")
     reach = 1.12 * max(float(np.abs(flat[:, :2]).max()), r_cut / 2 + r_cut)
     axes.set_xlim(-reach, reach)
-    axes.set_ylim(-reach, reach)
+    axes.set_ylim(-reach, 1.12 * reach)
     axes.set_aspect("equal")
     axes.set_xlabel(f"along the pair ({run.units.length})", color=INK)
 

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from mdnum.report.axes import PAGE_WIDTH, drawn, folded, legend
+from mdnum.report.axes import PAGE_WIDTH, drawn
 from mdnum.report.fork.run import ForkFolder
-from mdnum.report.svg import BAD, FIRST, INK, MUTED, SECOND
+from mdnum.report.svg import BAD, FIRST, HALO, INK, MUTED, SECOND
 
 
 def ranking(run: ForkFolder, width: float = PAGE_WIDTH) -> Figure:
@@ -34,10 +34,11 @@ def _ranking(run: ForkFolder, figure: Figure) -> None:
             axes.plot([min(known), max(known)], [at, at], color=MUTED, lw=0.8, zorder=1.5)
         if one.get("fork") is None:
             word = "no bit differs" if one.get("seed") is None else "no fork"
-            axes.annotate(
+            label = axes.annotate(
                 word, (one.get("seed") or 0, at), (8, 0), textcoords="offset points", fontsize=8, color=MUTED,
                 va="center",
             )  # fmt: skip
+            label.set_gid(HALO)
     for name, label, marker, color, style in marks:
         rows = [
             (one[name], at, one)
@@ -57,7 +58,21 @@ def _ranking(run: ForkFolder, figure: Figure) -> None:
     axes.set_xscale("symlog", linthresh=10, linscale=0.6)
     axes.set_xlim(-1.5, 1.5 * max(run.steps, 10))
     axes.xaxis.set_major_formatter(lambda value, _: f"{value:,.0f}")
-    axes.set_yticks(place, [folded(str(one["choice"]), 150 if wide else 90, 8.5) for one in run.ranking])
+    names = [str(one["choice"]) for one in run.ranking]
+    axes.set_yticks(
+        place, names if wide else [_broken(name) for name in names], fontsize=8.5 if wide else 7.5
+    )
     axes.set_ylim(-0.7, len(run.ranking) - 0.3)
     axes.set_xlabel("step", color=INK)
-    legend(axes)
+    handles, labels = axes.get_legend_handles_labels()
+    if handles:
+        axes.legend(
+            handles, labels, loc="lower left", bbox_to_anchor=(0, 1.0), ncols=len(labels) if wide else 1,
+            frameon=False, handlelength=1.3, borderaxespad=0.1, fontsize=8.5,
+        )  # fmt: skip
+
+
+def _broken(name: str) -> str:
+    """A long name in two lines."""
+    head, equals, tail = name.partition("=")
+    return f"{head}=\n{tail}" if equals and len(name) > 18 else name

@@ -14,9 +14,10 @@ from mdnum.ball.demos.base import Plot, Series
 from mdnum.report import plots, thin
 from mdnum.report.axes import PAGE_WIDTH
 from mdnum.report.fork import atoms, choices
+from mdnum.report.fork.findings import FITS
 from mdnum.report.fork.run import ForkFolder
-from mdnum.report.svg import MUTED
-from mdnum.report.words import many, plain
+from mdnum.report.svg import BAD, HALO, MUTED
+from mdnum.report.words import many, number, plain
 
 Drawer = Callable[[float], Figure]
 Role = Literal["first", "second", "third", "bad", "muted", "ink"]
@@ -50,9 +51,9 @@ def separation(run: ForkFolder) -> Plot | None:
     if not run.has("free") or not np.any(run.series["free"] > 0):
         return None
     series = []
-    for number, name in enumerate(run.repeats):
+    for k, name in enumerate(run.repeats):
         # a repeat is close to the run that it repeats and must not hide it: it comes first
-        label = "" if number else "B again, start perturbed"
+        label = "" if k else "B again, start perturbed"
         series.append(Series(label, step, _positive(run.series[name]), role="muted"))
     named: tuple[tuple[str, str, Role], ...] = (
         ("free", "A and B, free", "first"),
@@ -77,7 +78,7 @@ def separation(run: ForkFolder) -> Plot | None:
         tuple(series),
         y_scale="log",
         verticals=verticals,
-        horizontals=((tolerance, "split"),),
+        horizontals=((tolerance, ""),),
     )
 
 
@@ -89,7 +90,7 @@ def _positive(values: np.ndarray) -> np.ndarray:
 def _fit(run: ForkFolder) -> tuple[np.ndarray, np.ndarray] | None:
     """The fitted growth as a line, drawn on to a predicted split that is near enough."""
     fit = (run.summary.get("growth") or {}).get("B") or {}
-    if fit.get("rate") is None:
+    if fit.get("rate") is None or fit["r_squared"] < FITS:
         return None
     end = float(fit["last"])
     guess = run.summary.get("predicted_split")
@@ -106,19 +107,45 @@ def _separation(run: ForkFolder, plot: Plot, width: float) -> Figure:
     for line in axes.lines:
         if line.get_color() == MUTED and line.get_linestyle() == "-":
             line.set_linewidth(0.7)
+    _name_tolerance(axes, run)
     _ticks(axes, run)
     return figure
 
 
+def _name_tolerance(axes: Axes, run: ForkFolder) -> None:
+    """Writes what the horizontal line is into the widest gap between the dates, whose names stand upright."""
+    low, high = axes.get_xlim()
+    edges = np.sort([low, *run.dates.values(), high])
+    widest = int(np.argmax(np.diff(edges)))
+    tolerance = float(run.summary["tolerance"])
+    label = axes.annotate(
+        f"split: beyond {number(tolerance, 3)} {run.units.length}",
+        (float(edges[widest] + edges[widest + 1]) / 2, tolerance), (0, 3), textcoords="offset points",
+        ha="center", va="bottom", fontsize=8, color=MUTED, zorder=4,
+    )  # fmt: skip
+    label.set_gid(HALO)
+
+
 def _ticks(axes: Axes, run: ForkFolder) -> None:
-    """A tick at the lower edge for each flip that one run made and the other did not."""
+    """A tick below the axis for each flip that one run made and the other did not."""
     step = np.unique(run.flips.get("step", np.zeros(0)))
     if not len(step):
         return
     step = step[thin.points(step.astype(float), np.zeros(len(step)), _TICKS)]
+    low, high = axes.get_xlim()
+    # below the axis, where they hide neither a line nor the name of a date
     axes.vlines(
-        step, 0.0, 0.035, transform=axes.get_xaxis_transform(), color=plots.COLORS["bad"], lw=0.6, alpha=0.8
+        step,
+        -0.045,
+        -0.012,
+        transform=axes.get_xaxis_transform(),
+        color=BAD,
+        lw=0.6,
+        alpha=0.8,
+        clip_on=False,
     )
+    axes.set_xlim(low, high)
+    axes.tick_params(axis="x", pad=14)
 
 
 def cross(run: ForkFolder) -> Plot | None:
@@ -140,7 +167,11 @@ def overridden(run: ForkFolder) -> Plot | None:
     values = run.series.get("overridden", np.zeros(0))
     if not np.any(np.nan_to_num(values)):
         return None
-    series = (Series("overridden", run.series["step"], values, mark="steps", role="second"),)
+    some = np.nan_to_num(values) > 0
+    sparse = np.count_nonzero(some) < 200
+    values = np.where(some, values, np.nan) if sparse else values
+    mark: Literal["points", "steps"] = "points" if sparse else "steps"
+    series = (Series("decisions overridden", run.series["step"], values, mark=mark, role="second"),)
     return Plot(
         "Decisions overridden in the run under A’s decisions", "step", "decisions overridden", series,
         verticals=_dates(run),
@@ -188,7 +219,7 @@ def _dates(run: ForkFolder) -> tuple[tuple[float, str], ...]:
 
 def captions(run: ForkFolder) -> dict[str, str]:
     """What stands below the figures."""
-    ticks = "; a tick at the lower edge for each step at which only one run flips a pair" if len(
+    ticks = "; a tick below the axis for each step at which only one run flips a pair" if len(
         run.flips.get("step", ())
     ) else ""  # fmt: skip
     handed = (

@@ -16,6 +16,8 @@ from mdnum.store import RunFolder
 CODES = frozenset({
     "MUST_HOLD_FORKED", "RUN_FAILED", "AMBIGUOUS_FORK", "HORIZON_SHORT", "GUARD", "NO_REPEATS",
 })  # fmt: skip
+#: r² from which a separation counts as one exponential.
+FITS = 0.8
 
 
 @dataclass(frozen=True)
@@ -112,13 +114,15 @@ def _headline(run: ForkFolder) -> str:
 
 def _evidence(run: ForkFolder) -> Iterator[str]:
     length = run.units.length
-    for reason in run.summary.get("reasons") or ():
-        yield _sentence(typeset(str(reason)))
+    reasons = [str(reason) for reason in run.summary.get("reasons") or ()]
+    told = "; ".join(reasons).replace("; and ", ", and ").replace("the first run's", "A’s")
+    if told:
+        yield _sentence(typeset(told))
     made = run.decision
     if made is not None:
         yield decided(made, length)
     rate = run.summary.get("growth_rate")
-    if rate is not None:
+    if rate is not None and (run.summary.get("r_squared") or 0.0) >= FITS:
         fits = number(run.summary.get("r_squared"), 3)
         yield (
             f"The separation grows by {number(rate, 2)} of itself a step, "
@@ -134,20 +138,24 @@ def decided(made: Mapping[str, Any], length: str) -> str:
     else:
         way = "enters its cutoff" if made["entered"] else "leaves its cutoff"
         what = f"Pair {pair} {way} in run {made['run']} alone at step {count(made['step'])}"
-    margin, bound = abs(made["margin_length"]), made["bound_length"]
-    near = f"{number(margin, 2)} {length} from it"
-    if made["ambiguous"]:
-        rounding = f"within rounding ({number(bound, 2)} {length}): either answer was as good"
-    else:
-        times = number(margin / bound, 2) if bound else "∞"
-        rounding = f"{times} times the bound on rounding, so not ambiguous"
-    text = f"{what}, {near}, {rounding}."
+    text = f"{what}, {number(abs(made['margin_length']), 2)} {length} from it; {_doubt(made)}."
     if made.get("protected") is not None:
         text += (
             f" The step before, the runs were {number(made['separation_before'], 2)} {length} apart: "
             f"the margin is {number(made['protected'], 2)} of that."
         )
     return text
+
+
+def _doubt(made: Mapping[str, Any]) -> str:
+    """In which run rounding alone could have decided otherwise."""
+    names = made.get("ambiguous_in")
+    if names is None:
+        names = [made["run"]] if made["ambiguous"] else []
+    if not names:
+        return "in neither run could rounding alone have decided otherwise"
+    where = "either run" if len(names) > 1 else f"run {names[0]}"
+    return f"in {where} it was ambiguous: rounding alone could have decided otherwise"
 
 
 def _findings(run: ForkFolder) -> Iterator[Finding]:
@@ -164,13 +172,19 @@ def _findings(run: ForkFolder) -> Iterator[Finding]:
             "Use a smaller time step, or look at the decisions before it.",
         )
     made = run.decision
-    if made is not None and made["ambiguous"]:
+    doubtful = [] if made is None else made.get("ambiguous_in") or (["A"] if made["ambiguous"] else [])
+    if made is not None and doubtful:
+        sizes = [
+            f"{number(abs(made['margins'][name]), 2)} of {number(made['bounds'][name], 2)} in {name}"
+            for name in doubtful
+            if name in (made.get("margins") or {})
+        ]
         yield Finding(
             "AMBIGUOUS_FORK",
             "info",
             f"the decision at the fork is ambiguous: pair {made['i']}–{made['j']}",
-            f"Its margin {number(abs(made['margin']), 2)} is within the rounding bound "
-            f"{number(made['bound'], 2)} of the computed quantity.",
+            "Its margin is within the rounding bound of the computed quantity"
+            f"{': ' + listed(sizes) if sizes else ''}.",
         )
     if "fork" in dates and "split" not in dates and not summary.get("failed"):
         guess = summary.get("predicted_split")

@@ -87,13 +87,19 @@ def _key_figures(run: ForkFolder) -> Iterator[tuple[str, str, str]]:
     ):
         at = summary.get(name)
         when = summary.get(f"{name}_time")
-        small = (
-            f"{what}, {number(when, 4)} {time}" if at is not None else f"none in {many(run.steps, 'step')}"
-        )
+        small = f"{what}, {plain(when, 6)} {time}" if at is not None else f"none in {many(run.steps, 'step')}"
         yield name.capitalize(), "–" if at is None else f"step {count(at)}", small
     guess = summary.get("predicted_split")
     rate = number(summary.get("growth_rate_time"), 3)
-    small = f"per {time}; split expected at step {count(guess)}" if guess else f"per {time}, while they part"
+    fits = summary.get("r_squared")
+    poor = fits is not None and fits < findings.FITS
+    small = (
+        f"per {time}, but no single exponential"
+        if poor
+        else f"per {time}; split expected at step {count(guess)}"
+        if guess
+        else f"per {time}, while they part"
+    )
     yield "Growth rate", rate, small
     nats = summary.get("nats")
     # an infinite share has no place in JSON
@@ -118,25 +124,30 @@ def _decision(run: ForkFolder) -> Iterator[tuple[str, str]]:
     )
     yield "Pair", f"{made['i']}–{made['j']} {where}{way}"
     also = made.get("also")
-    when = f"{count(made['step'])}, {number(made['step'] * run.summary['timestep'], 5)} {run.units.time}"
+    when = f"{count(made['step'])}, {plain(made['step'] * run.summary['timestep'], 6)} {run.units.time}"
     yield "Step", when + (f"; {many(also, 'more pair')} at the same step" if also else "")
-    yield (
-        "Distance",
-        f"{number(made.get('distance'), 10)} {length}, cutoff {number(made.get('r_cut'), 10)} {length}",
-    )
-    yield (
-        "Margin",
-        f"{number(made['margin'], 3, signed=True)} in {space}, which is "
-        f"{number(made['margin_length'], 3, signed=True)} {length}",
-    )
-    bound = made["bound"]
-    ratio = f"{number(abs(made['margin']) / bound, 3)} times as much" if bound else "no rounding"
-    word = (
-        "ambiguous: rounding alone could have decided otherwise"
-        if made["ambiguous"]
-        else f"the margin is {ratio}: not ambiguous"
-    )
-    yield "Rounding bound", f"{number(bound, 3)} in {space}; {word}"
+    cutoffs = made["cutoffs"]
+    own = cutoffs["B" if made["run"] == "B" else "A"]
+    yield "Distance", f"{number(made['distance'], 11)} {length}, cutoff {number(own, 11)} {length}"
+    if cutoffs["A"] != cutoffs["B"]:
+        off = number(cutoffs["B"] - cutoffs["A"], 3, signed=True)
+        yield "Cutoff", f"not the same number in both runs: B’s is {off} {length} off A’s"
+    slope = made["margin"] / made["margin_length"] if made["margin_length"] else 1.0
+    for name, margin in (made.get("margins") or {made["run"]: made["margin"]}).items():
+        bound = (made.get("bounds") or {}).get(name, made["bound"])
+        doubtful = abs(margin) <= bound
+        ratio = f"{number(abs(margin) / bound, 3)} times the bound" if bound else "no rounding"
+        word = (
+            "ambiguous: rounding alone could have decided otherwise"
+            if doubtful
+            else f"{ratio}, not ambiguous"
+        )
+        yield (
+            f"Margin in {name}",
+            f"{number(margin, 3, signed=True)} in {space} "
+            f"({number(margin / slope, 3, signed=True)} {length}), "
+            f"rounding bound {number(bound, 3)}: {word}",
+        )
     before = made.get("separation_before")
     if made.get("protected") is not None:
         protects = (
@@ -158,22 +169,27 @@ def _runs(run: ForkFolder) -> Iterator[dict[str, str]]:
     split = run.summary.get("split")
     for name, at in (run.summary.get("splits") or {}).items():
         arithmetic, decisions = _RUNS[name]
-        gained = "" if name == "B" or at is None or split is None else f"{number(at - split, 6, signed=True)}"
         yield {
             "arithmetic": arithmetic,
             "decisions": decisions,
-            "against": "B" if name == "A|B" else "A",
+            "small": "splits from B" if name == "A|B" else "",
             "split": "none" if at is None else count(at),
-            "gained": gained or ("" if name == "B" else "–"),
+            "gained": "" if name == "B" else _later(at, split),
         }
     for at in run.summary.get("repeats") or ():
         yield {
             "arithmetic": "B, start perturbed",
             "decisions": "its own",
-            "against": "A",
+            "small": "",
             "split": count(at),
-            "gained": number(at - split, 6, signed=True) if split is not None else "–",
+            "gained": _later(at, split),
         }
+
+
+def _later(at: int | None, split: int | None) -> str:
+    if at is None or split is None:
+        return "–"
+    return f"+{count(at - split)}" if at > split else count(at - split)
 
 
 def _growth(run: ForkFolder) -> Iterator[tuple[str, str]]:
@@ -184,11 +200,12 @@ def _growth(run: ForkFolder) -> Iterator[tuple[str, str]]:
             yield names.get(str(name), str(name)), "too few rows between rounding and saturation for a fit"
             continue
         rate = fit["rate"]
-        text = (
+        poor = fit["r_squared"] < findings.FITS
+        text = ("No single exponential: " if poor else "") + (
             f"{number(rate, 3)} a step, {number(rate / run.summary['timestep'], 3)} per {run.units.time}, "
             f"fitted to steps {count(fit['first'])} to {count(fit['last'])}, r² {number(fit['r_squared'], 3)}"
         )
-        if rate > 0:
+        if rate > 0 and not poor:
             text += f"; doubles in {number(np.log(2) / rate, 3)} steps"
         yield names.get(str(name), str(name)), text
 
