@@ -312,7 +312,9 @@ class _Rule:
         if self.tol is None:
             return iteration >= self.max_iter
         if isinstance(self.rule, Relative):
-            return residual < (Dyadic.of(float(np.finfo(np.float32).tiny)) if first.zero else self.tol * first)
+            return residual < (
+                Dyadic.of(float(np.finfo(np.float32).tiny)) if first.zero else self.tol * first
+            )
         return residual < self.tol
 
 

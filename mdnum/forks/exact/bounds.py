@@ -285,6 +285,8 @@ def shadow_horizon(simulation: Simulation, steps: int | None = None) -> ShadowHo
 def _shadow(simulation: Simulation, last: int) -> Tape:
     begin = first_state(simulation)
     state = begin.state
-    wide = state._replace(**{name: getattr(state, name).astype(np.float64) for name in ("x", "v", "x_before")})
+    wide = state._replace(
+        **{name: getattr(state, name).astype(np.float64) for name in ("x", "v", "x_before")}
+    )
     start = Start(wide, begin.reference)
     return taped(with_policy(simulation, PrecisionPolicy()), last, start).tape

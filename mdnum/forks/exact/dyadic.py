@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from fractions import Fraction
+from typing import SupportsFloat
 
 
 @dataclass(frozen=True, eq=False)
@@ -15,8 +16,8 @@ class Dyadic:
     exponent: int = 0
 
     @classmethod
-    def of(cls, value: float) -> Dyadic:
-        """A float, exactly.
+    def of(cls, value: SupportsFloat) -> Dyadic:
+        """A float of at most 64 bits, exactly.
 
         Raises:
             ValueError: it is not finite.
@@ -63,9 +64,11 @@ class Dyadic:
         return Fraction(self.mantissa) * Fraction(2) ** self.exponent
 
     def __float__(self) -> float:
-        # 64 bits keep the rounding to 53 right to the last place but for ties
-        cut = max(0, self.mantissa.bit_length() - 64)
-        return math.ldexp(self.mantissa >> cut, self.exponent + cut)
+        size = abs(self.mantissa)
+        cut = max(0, size.bit_length() - 64)
+        # the last of 64 bits says whether anything was cut: the rounding to 53 is then the correct one
+        kept = size >> cut | bool(size & ((1 << cut) - 1))
+        return math.ldexp(-kept if self.negative else kept, self.exponent + cut)
 
 
 ZERO = Dyadic(0)

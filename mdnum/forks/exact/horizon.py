@@ -165,9 +165,7 @@ def compare(name: str, policy: PrecisionPolicy, simulation: Simulation, exact: E
     margin = float("nan")
     if difference is not None:
         place = _reduced(simulation, exact.x[difference.step])
-        dx, dy, dz = HostCell(simulation.cell).displacement(
-            place[[difference.i]], place[[difference.j]]
-        )
+        dx, dy, dz = HostCell(simulation.cell).displacement(place[[difference.i]], place[[difference.j]])
         kind = int(simulation.type_of(np.array([difference.i]), np.array([difference.j]))[0])
         margin = simulation.decider.r_cut[kind] ** 2 - float((dx * dx + dy * dy + dz * dz)[0])
     return PolicyHorizon(

@@ -185,7 +185,7 @@ class ExactProgram:
                 failed = run.step
             bits = max(more, bits + bits // 2)
         raise InputError(
-            f"a pair at step {failed} cannot be told from its cutoff with {bits} bits: it may be exactly there",
+            f"a pair at step {failed} is too close to its cutoff for {bits} bits; it may be exactly there",
             remedy="Change the start by one ulp",
         )
 
@@ -232,9 +232,7 @@ class _Run:
             np.concatenate([np.empty(0, bool)] + [now for _, _, now in self._flips]),
         )
         seconds = time.perf_counter() - begin
-        return Exact(
-            tape, self._margin, self._radius, self._x, self.bits, restarts, self._close, seconds
-        )
+        return Exact(tape, self._margin, self._radius, self._x, self.bits, restarts, self._close, seconds)
 
     def _all(self, progress) -> Bool[np.ndarray, "all_pairs"]:
         from flint import arb, ctx
@@ -311,9 +309,7 @@ class _Run:
 
     def _decide(
         self, x, centers: Float[np.ndarray, "atoms 3"], radius: float, thresholds: list
-    ) -> tuple[
-        Bool[np.ndarray, "all_pairs"], Int[np.ndarray, "all_pairs 3"], Float[np.ndarray, "all_pairs"]
-    ]:
+    ) -> tuple[Bool[np.ndarray, "all_pairs"], Int[np.ndarray, "all_pairs 3"], Float[np.ndarray, "all_pairs"]]:
         """All decisions of a step: by a bound in double precision, or by the balls where that is too coarse.
 
         The image that is nearest in double precision is the exact one, or the pair is further away than

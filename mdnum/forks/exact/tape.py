@@ -39,8 +39,8 @@ class Tape:
     def inside(self, step: int) -> Int[np.ndarray, "pairs"]:
         """Keys of the pairs inside at a step, sorted."""
         members = set(self.first.tolist())
-        upto = int(np.searchsorted(self.step, step, side="right"))
-        for key, entered in zip(self.key[:upto].tolist(), self.entered[:upto].tolist(), strict=True):
+        so_far = self.step <= step
+        for key, entered in zip(self.key[so_far].tolist(), self.entered[so_far].tolist(), strict=True):
             (members.add if entered else members.discard)(key)
         return np.array(sorted(members), np.int64)
 

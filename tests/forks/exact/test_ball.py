@@ -1,0 +1,169 @@
+"""The exact ball against plain rationals, and the horizons of narrow balls."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from ball import oracles
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mdnum.ball import (
+    EventLocated,
+    ExplicitEuler,
+    GlobalSum,
+    Impact,
+    ImplicitMidpoint,
+    Penalty,
+    PerInstance,
+    Projection,
+    SemiImplicitEuler,
+    VelocityVerlet,
+    World,
+    simulate,
+)
+from mdnum.errors import InputError
+from mdnum.forks.exact.ball import ball_history, ball_horizon, certify_ball, in_dtype
+from mdnum.forks.exact.dyadic import Dyadic
+
+SCHEMES = {
+    "explicit-euler": ExplicitEuler,
+    "semi-implicit-euler": SemiImplicitEuler,
+    "velocity-verlet": VelocityVerlet,
+}
+H, G, START = 0.01, 9.81, 0.71
+
+
+def same(history, rows, decided) -> None:
+    np.testing.assert_array_equal(history.contact[:, 0], decided)
+    np.testing.assert_array_equal(history.y[:, 0], [float(y) for y, _ in rows])
+    np.testing.assert_array_equal(history.v[:, 0], [float(v) for _, v in rows])
+
+
+@given(
+    st.floats(-1e6, 1e6).filter(lambda x: x == 0 or abs(x) > 1e-100),
+    st.floats(-1e6, 1e6).filter(lambda x: x == 0 or abs(x) > 1e-100),
+    st.floats(-1e6, 1e6).filter(lambda x: x == 0 or abs(x) > 1e-100),
+)
+def test_exact_numbers(a, b, c):
+    x, y, z = (Dyadic.of(value) for value in (a, b, c))
+    p, q, r = (Fraction(value) for value in (a, b, c))
+    assert (x * y - z + -x).fraction() == p * q - r - p
+    assert (x < y) == (p < q) and (x <= y) == (p <= q) and (x * y < z) == (p * q < r)
+    assert float(x) == a and float(x * y) == pytest.approx(a * b, rel=2.0**-52)
+    assert x.negative == (a < 0) and x.zero == (a == 0)
+
+
+def test_a_number_that_is_none():
+    with pytest.raises(ValueError, match="no number"):
+        Dyadic.of(float("nan"))
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_a_penalty_against_fractions(scheme):
+    k, c, steps = 900.0, 3.0, 60
+    world = World.create(Penalty(k, c), SCHEMES[scheme](H), G)
+    history = ball_history(world, world.start(START), steps)
+    rows, decided = oracles.penalty(scheme, *oracles.rational(START, 0.0, H, G, k, c), steps)
+    same(history, rows, decided)
+    assert 0 < sum(decided) < steps
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_an_impact_against_fractions(scheme):
+    e, rest, steps = 0.8, 0.5, 250
+    world = World.create(Impact(e, rest), SCHEMES[scheme](H), G)
+    history = ball_history(world, world.start(START), steps)
+    rows, decided = oracles.impact(scheme, *oracles.rational(START, 0.0, H, G, e, rest), steps)
+    same(history, rows, decided)
+    assert sum(decided) >= 5
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_a_projection_against_fractions(scheme):
+    alpha, k, e, tol, cap, steps = 0.5, 0.5, 0.8, 1e-4, 100, 120
+    world = World.create(Projection(k, alpha, GlobalSum(tol, cap), e), SCHEMES[scheme](H), G)
+    starts = [0.3, 0.41, 0.52]
+    history = ball_history(world, world.start(starts), steps)
+    rows, decided, counts = oracles.projection(
+        scheme,
+        oracles.rational(*starts),
+        oracles.rational(0.0, 0.0, 0.0),
+        *oracles.rational(H, G, alpha, k, e, tol),
+        cap,
+        steps,
+    )
+    np.testing.assert_array_equal(history.contact, decided)
+    np.testing.assert_array_equal(history.iterations[:, 0], counts)
+    np.testing.assert_array_equal(history.y, [[float(c) for c in y] for y, _ in rows])
+    assert max(counts) > 5
+    # a rule for each ball makes no ball iterate for another
+    alone = World.create(Projection(k, alpha, PerInstance(tol, cap), e), SCHEMES[scheme](H), G)
+    own = ball_history(alone, alone.start(starts), steps)
+    assert np.all(own.iterations[~own.contact] == 0) and np.any(history.iterations[~history.contact] > 0)
+
+
+def test_control_and_hysteresis_as_the_program_has_them():
+    """Short enough for float64 to decide as exact arithmetic does."""
+    control = np.linspace(-3.0, 3.0, 40)
+    world = World.create(Penalty(900.0, 2.0), VelocityVerlet(H), G, control, hysteresis=0.02)
+    start = world.start([0.2, 0.35])
+    history, run = ball_history(world, start, 80), simulate(world, start, 80)
+    np.testing.assert_array_equal(history.contact, run.contact)
+    np.testing.assert_allclose(history.y, run.y, atol=1e-13)
+    assert np.any(history.contact & (history.height > 0))
+
+
+def test_narrow_numbers_leave_and_wide_ones_stay():
+    """The steps at which plain rationals say that 16 bits leave (tests of the ball's record)."""
+    world = World.create(Penalty(512.0), SemiImplicitEuler(2.0**-6), 9.75)
+    history, rows = certify_ball(world, 0.40625, 0.0, 300)
+    found = {row.dtype: row.horizon for row in rows}
+    assert found == {"float64": None, "float32": None, "float16": 170, "bfloat16": 66}
+    row = next(row for row in rows if row.dtype == "float16")
+    assert row.channel == "contact" and row.ball == 0 and abs(row.height) < 0.05
+    assert row.separation[0] == 0 and row.separation[-1] > 0
+    assert history.contact.sum() > 30
+
+
+def test_constants_that_are_rounded_are_part_of_the_difference_unless_they_are_its_own():
+    world = World.create(Penalty(900.1), SemiImplicitEuler(0.01), 9.81)
+    _, (against_wide,) = certify_ball(world, 1.01, 0.0, 40, ("float16",))
+    _, (against_own,) = certify_ball(world, 1.01, 0.0, 40, ("float16",), own=True)
+    assert against_wide.separation[0] > 0 and against_own.separation[0] == 0
+
+
+def test_a_stop_that_differs_is_dated():
+    world = World.create(Projection(0.5, 0.5, GlobalSum(1e-4, 100)), SemiImplicitEuler(0.01))
+    _, rows = certify_ball(world, [1.0, 1.1, 1.3], 0.0, 60, ("float64", "float16"))
+    assert rows[0].horizon is None
+    assert rows[1].channel == "stop" and rows[1].horizon is not None
+    # planted: one iteration more in one step
+    start = world.start([1.0, 1.1, 1.3])
+    history, run = ball_history(world, start, 60), simulate(world, start, 60)
+    counts = run.iterations.copy()
+    counts[50] += 1
+    object.__setattr__(run, "iterations", counts)
+    found = ball_horizon(history, run)
+    assert (found.horizon, found.channel) == (51, "stop")
+
+
+def test_what_is_not_rational_is_refused():
+    located = World.create(Impact(), EventLocated(0.01))
+    with pytest.raises(InputError, match="more than sums and products"):
+        ball_history(located, located.start(1.0), 10)
+    implicit = World.create(Penalty(900.0), ImplicitMidpoint(0.01))
+    with pytest.raises(InputError, match="ImplicitMidpoint"):
+        ball_history(implicit, implicit.start(1.0), 10)
+    smooth = World.create(Penalty(900.0, eps=0.01, smooth=True), SemiImplicitEuler(0.01))
+    with pytest.raises(InputError, match="not smooth"):
+        ball_history(smooth, smooth.start(1.0), 10)
+    world = World.create(Penalty(900.0), SemiImplicitEuler(0.01))
+    with pytest.raises(InputError, match="steps = 0"):
+        ball_history(world, world.start(1.0), 0)
+    history = ball_history(world, world.start(1.0), 10)
+    with pytest.raises(InputError, match="equal size"):
+        ball_horizon(history, simulate(world, world.start(1.0), 11))
+    assert in_dtype(world, "float16").policy.state == "float16"
