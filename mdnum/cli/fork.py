@@ -45,8 +45,10 @@ def fork(
 ) -> int:
     """Follow two runs that differ in one numerical choice, and judge the flip that parted them."""
     overrides = output.parse_overrides(settings)
-    if system is None or vary is None:
+    if vary is None:
         return _choices(system, as_json)
+    if system is None:
+        raise InputError("no system given", remedy="`mdnum systems list` names those that come with mdnum")
     from mdnum.workflow import fork as compare
 
     try:
@@ -76,23 +78,21 @@ def fork(
 
 def _choices(system: str | None, as_json: bool) -> int:
     """What can be varied, for somebody who did not say."""
-    if system is not None and not as_json:
-        typer.echo("Say what to vary: --vary CHOICE. The choices are:\n")
+    if system is not None:
+        raise InputError(
+            "nothing to vary", remedy="Add --vary CHOICE, or --vary all; `mdnum fork` alone lists the choices"
+        )
     from mdnum.forks.choices import BY_NAME
 
     rows = [
-        {"name": name, "about": choice.about, "must_hold": bool(choice.must_hold)}
+        {"name": name, "about": choice.about, "must_hold": choice.must_hold}
         for name, choice in BY_NAME.items()
     ]
     if as_json:
         output.print_json({"choices": rows})
     else:
-        lines = [
-            (row["name"], "a fork is a finding" if row["must_hold"] else "", row["about"]) for row in rows
-        ]
+        lines = [(row["name"], "must hold" if row["must_hold"] else "", row["about"]) for row in rows]
         output.print_table("choices: `mdnum fork SYSTEM --vary CHOICE`", ("choice", "", "about"), lines)
-    if system is not None:
-        raise InputError("nothing to vary", remedy="Add --vary CHOICE, or --vary all")
     return output.EXIT_FINE
 
 

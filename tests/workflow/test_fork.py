@@ -161,7 +161,7 @@ def test_a_run_that_blows_up_on_one_side_is_reported(tmp_path, monkeypatch):
     use(monkeypatch, StandIn(wild))
     result = fork("argon/crystal-108", "stand-in", steps=60, out=tmp_path / "here", report=False, **BARE)
     assert result.summary["status"] == "failed" and list(result.summary["failed"]) == ["B"]
-    assert [finding["code"] for finding in result.summary["findings"]][0] == "RUN_FAILED"
+    assert result.summary["findings"][0]["code"] == "RUN_FAILED"
     assert result.summary["headline"].startswith("Run B ended in a ")
 
 

@@ -1,0 +1,206 @@
+"""`mdnum fork`: what it passes on, prints and exits with."""
+
+from __future__ import annotations
+
+import json
+import types
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import mdnum.workflow
+from mdnum.cli import main
+from mdnum.cli.progress import ProgressBar
+from mdnum.errors import InputError
+from mdnum.forks import choices
+
+SUMMARY: dict[str, Any] = {
+    "world": "fork", "system": "argon/crystal-108", "choice": "precision",
+    "difference": "float32, not float64",
+    "atoms": 108, "steps": 3839, "seed": 1, "seed_time": 0.004, "fork": 625, "fork_time": 2.5, "split": 1806,
+    "split_time": 7.224, "tolerance": 0.0635, "verdict": "cause",
+    "reasons": ["free, the runs split at step 1806", "and it does not grow"],
+    "headline": "The flip at step 625 is the cause.",
+    "decision": {
+        "i": 3, "j": 75, "run": "A", "entered": False, "step": 625, "space": "r2", "margin": -5.3e-7,
+        "bound": 2.1e-14, "ambiguous": False, "margins": {"A": -5.3e-7, "B": 2.4e-7},
+        "bounds": {"A": 2.1e-14, "B": 1.1e-5}, "ambiguous_in": ["B"], "separation_before": 3.33e-7,
+        "protected": 0.5, "also": 2,
+    },
+    "growth_rate": 0.0121, "growth_rate_time": 3.03, "r_squared": 0.673, "predicted_split": None,
+    "splits": {"B": 1806, "B|A": None, "A|B": 2400}, "repeats": [1475], "cross_flips": 16114,
+    "findings": [], "status": "complete",
+}  # fmt: skip
+
+
+@dataclass
+class Recorder:
+    summary: dict[str, Any] = field(default_factory=lambda: dict(SUMMARY))
+    error: BaseException | None = None
+    calls: list[tuple[Any, ...]] = field(default_factory=list)
+
+    def __call__(self, system: Any, vary: str, **options: Any) -> Any:
+        self.calls.append((system, vary, options))
+        if self.error is not None:
+            raise self.error
+        options["progress"](1, 10, {"phase": "run", "separation": 1e-9})
+        return types.SimpleNamespace(folder=options["out"] or Path("runs/x"), summary=self.summary)
+
+
+@pytest.fixture
+def compare(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Recorder:
+    """`mdnum fork` in an empty folder with the comparison replaced by a recorder."""
+    recorder = Recorder()
+    monkeypatch.setattr(mdnum.workflow, "fork", recorder)
+    monkeypatch.chdir(tmp_path)
+    return recorder
+
+
+def call(*arguments: str) -> int:
+    """The exit code of `mdnum ARGUMENTS`."""
+    with pytest.raises(SystemExit) as stopped:
+        main(list(arguments))
+    assert isinstance(stopped.value.code, int)
+    return stopped.value.code
+
+
+def printed(capsys: pytest.CaptureFixture[str]) -> list[str]:
+    """Lines of stdout with single spaces."""
+    return [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
+
+
+def test_fork_passes_on_what_was_asked(compare: Recorder):
+    code = call(
+        "fork", "argon/crystal-108", "--vary", "reduction=exact", "--steps", "20", "--split", "0.1",
+        "--repeats", "4", "--set", "cutoff.kind=switched", "--no-counterfactual", "--back", "-o", "here",
+        "--no-report",
+    )  # fmt: skip
+    assert code == 0
+    ((system, vary, options),) = compare.calls
+    assert (system, vary) == ("argon/crystal-108", "reduction=exact")
+    assert isinstance(options.pop("progress"), ProgressBar)
+    assert options == {
+        "steps": 20, "split": 0.1, "repeats": 4, "counterfactual": False, "back": True, "out": Path("here"),
+        "overrides": {"cutoff.kind": "switched"}, "report": False,
+    }  # fmt: skip
+
+
+def test_the_verdict_comes_first_then_dates_and_decision(compare: Recorder, capsys):
+    assert call("fork", "argon/crystal-108", "--vary", "precision") == 0
+    lines = printed(capsys)
+    assert lines[:3] == [
+        "The flip at step 625 is the cause.", "free, the runs split at step 1806", "and it does not grow",
+    ]  # fmt: skip
+    for line in (
+        "system argon/crystal-108, 108 atoms, 3,839 steps",
+        "differs in float32, not float64",
+        "seed step 1, time 0.004 (first bit differs)",
+        "fork step 625, time 2.5 (first decision differs)",
+        "split step 1,806, time 7.224 (further apart than 0.0635)",
+        "deciding pair 3–75 left in A only, with 2 more at this step",
+        "margin in A -5.3e-07 in r²; rounding bound 2.1e-14: not ambiguous",
+        "margin in B 2.4e-07 in r²; rounding bound 1.1e-05: ambiguous",
+        "apart the step before 3.33e-07; the margin is 0.5 of it",
+        "growth 0.0121 a step, 3.03 a unit of time, r² 0.673",
+        "flips in one run only 16,114",
+        "B its own 1,806", "B A's none", "A B's 2,400", "B, start perturbed its own 1,475",
+    ):  # fmt: skip
+        assert line in lines, line
+    assert lines[-1] == "wrote runs/x"
+
+
+def test_a_horizon_too_short_is_no_failure(compare: Recorder, capsys):
+    compare.summary = SUMMARY | {
+        "split": None, "split_time": None, "predicted_split": 5200, "verdict": "open", "repeats": [],
+        "splits": {"B": None},
+        "findings": [{"code": "HORIZON_SHORT", "severity": "info", "title": "short", "text": "0.02 apart."}],
+    }  # fmt: skip
+    assert call("fork", "argon/crystal-108", "--vary", "precision") == 0
+    lines = printed(capsys)
+    assert "split none in 3,839 steps (further apart than 0.0635)" in lines
+    assert "predicted split about step 5,200" in lines
+    assert "info: short" in lines and "0.02 apart." in lines
+    assert not any(line.startswith("splits from") for line in lines)
+
+
+def test_runs_that_do_not_fork_print_too(compare: Recorder, capsys):
+    nothing = dict.fromkeys(("seed", "fork", "split", "decision", "growth_rate", "predicted_split"))
+    compare.summary = SUMMARY | nothing | {"verdict": "same", "splits": {"B": None}, "repeats": []}
+    assert call("fork", "argon/crystal-108", "--vary", "translate=lattice") == 0
+    assert "seed none in 3,839 steps (first bit differs)" in printed(capsys)
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"findings": [{"code": "MUST_HOLD_FORKED", "severity": "error", "title": "it forked"}]},
+        {"status": "failed"},
+    ],
+)
+def test_a_broken_promise_or_a_failed_run_exits_1(compare: Recorder, changed):
+    compare.summary = SUMMARY | changed
+    assert call("fork", "argon/crystal-108", "--vary", "order@exact") == 1
+
+
+def test_json_is_the_summary_with_its_folder(compare: Recorder, capsys):
+    assert call("fork", "argon/crystal-108", "--vary", "precision", "-o", "here", "--json") == 0
+    assert json.loads(capsys.readouterr().out) == {"folder": "here", **SUMMARY}
+
+
+def test_a_ranking(compare: Recorder, capsys):
+    one = {
+        "choice": "precision",
+        "difference": "float32",
+        "seed": 1,
+        "fork": 303,
+        "split": None,
+        "failed": "",
+    }
+    two = {"choice": "order@exact", "difference": "shuffled", "seed": None, "fork": None, "split": None}
+    compare.summary = {
+        "world": "fork", "headline": "1 of 2 choices fork.", "steps": 1000,
+        "ranking": [one, two | {"must_hold": True}], "not_applicable": [{"choice": "noise", "why": "nve"}],
+        "findings": [], "status": "complete",
+    }  # fmt: skip
+    assert call("fork", "argon/crystal-108", "--vary", "all") == 0
+    lines = printed(capsys)
+    assert "precision 1 303 none float32" in lines
+    assert "order@exact none none none must hold shuffled" in lines
+    assert "noise nve" in lines
+
+
+def test_mistakes_exit_2(compare: Recorder, capsys):
+    compare.error = InputError("no choice 'x'")
+    assert call("fork", "argon/crystal-108", "--vary", "x", "--json") == 2
+    assert json.loads(capsys.readouterr().out)["error"]["message"] == "no choice 'x'"
+    assert call("fork", "argon/crystal-108", "--vary", "x", "--steps", "0") == 2
+    compare.error = KeyboardInterrupt()
+    assert call("fork", "argon/crystal-108", "--vary", "precision") == 130
+
+
+def test_without_a_choice_they_are_listed(compare: Recorder, capsys):
+    assert call("fork") == 0
+    lines = printed(capsys)
+    assert any(line.startswith("precision ") for line in lines)
+    assert any(line.startswith("translate=lattice must hold ") for line in lines)
+    assert call("fork", "--json") == 0
+    document = json.loads(capsys.readouterr().out)
+    assert [one["name"] for one in document["choices"]] == choices.names()
+    assert call("fork", "argon/crystal-108") == 2
+    assert "--vary" in capsys.readouterr().err
+    assert compare.calls == []
+
+
+def test_a_real_comparison(tmp_path: Path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    code = call(
+        "fork", "pair/at-cutoff", "--vary", "start", "--steps", "30", "--no-counterfactual", "--repeats", "0",
+        "-o", "here", "--json",
+    )  # fmt: skip
+    assert code == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document == {"folder": "here", **json.loads(Path("here/summary.json").read_text())}
+    assert call("report", "here") == 0
+    assert "wrote here/report.html" in capsys.readouterr().out
