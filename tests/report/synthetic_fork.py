@@ -1,0 +1,148 @@
+"""Fork folders without a simulation: two exponentials, written as a comparison would be."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mdnum.store import RunFolder
+
+TOML = """name = "argon/synthetic"
+units = "lj"
+
+[dynamics]
+timestep = 0.01
+"""
+RATE, SEED, FORK, SIZE, TOLERANCE = 0.02, 5, 400, 1e-9, 0.1
+STEPS = 1500
+
+
+def make_fork(
+    path: Path,
+    *,
+    summary: dict[str, Any] | None = None,
+    handed: bool = True,
+    forks: bool = True,
+    toml: str = TOML,
+) -> RunFolder:
+    """Writes a folder as `mdnum fork` would: the free runs jump at the fork, those told A's decisions do not.
+
+    Args:
+        summary: entries that replace the honest ones.
+        handed: with a counterfactual.
+        forks: with a fork; else the separation stays small.
+    """
+    step = np.arange(STEPS + 1)
+    quiet = np.where(step < SEED, 0.0, SIZE)
+    free = quiet.copy()
+    if forks:
+        free[FORK:] = np.minimum(SIZE * np.exp(RATE * (step[FORK:] - FORK)), 0.5)
+    nothing = np.full(len(step), np.nan)
+    after = forks & (step >= FORK)
+    folder = RunFolder.create(path, world="fork")
+    folder.write_system(toml)
+    folder.append(
+        "separation",
+        {
+            "step": step, "time": 0.01 * step, "free": free, "handed": quiet if handed else nothing,
+            "back": nothing, "cross": np.where(after, 1 + (step - FORK) // 50, 0),
+            "overridden": np.where(step % 200 == 0, after, False).astype(float) if handed else nothing,
+            "furthest": np.where((step % 200 == 0) & after, 1e-8, 0.0) if handed else nothing,
+            "energy_a": np.full(len(step), -5.0), "energy_b": -5.0 + free,
+            "energy_handed": -5.0 + quiet if handed else nothing, "repeat_1": 1.1 * free,
+            "repeat_2": 0.9 * free,
+        },
+    )  # fmt: skip
+    split = int(np.argmax(free > TOLERANCE)) if forks else None
+    if forks:
+        n = 7_000
+        folder.append(
+            "cross_flips",
+            {
+                "step": np.minimum(FORK + np.arange(n) // 8, STEPS),
+                "i": np.arange(n) % 7, "j": 7 + np.arange(n) % 11,
+                "differs": np.arange(n) % 2 == 0, "run": np.where(np.arange(n) % 3 == 0, "A", "B"),
+                "entered": np.arange(n) % 2 == 1, "margin": np.linspace(-1e-9, 1e-3, n),
+                "bound": np.full(n, 2e-15),
+            },
+        )  # fmt: skip
+        rng = np.random.default_rng(0)
+        place = np.concatenate([[[-0.75, 0, 0], [0.75, 0, 0]], rng.uniform(-1.8, 1.8, (30, 3))])
+        moved = SIZE * rng.standard_normal(place.shape)
+        vectors = {name: place[:, k] for k, name in enumerate("xyz")}
+        vectors |= {f"d{name}": moved[:, k] for k, name in enumerate("xyz")}
+        folder.append("neighborhood", {"atom": 3 + np.arange(len(place)), **vectors})
+    folder.finalize()
+    folder.write_provenance({"command": "mdnum fork argon/synthetic", "fingerprint": "0123456789abcdef"})
+    fit = {
+        "rate": RATE,
+        "r_squared": 0.99,
+        "first": FORK,
+        "last": 1300,
+        "intercept": np.log(SIZE) - RATE * FORK,
+    }
+    folder.write_summary(
+        {
+            "world": "fork", "system": "argon/synthetic", "about": "Nothing but exponentials.",
+            "choice": "reduction=exact", "choice_about": "force sums exact", "must_hold": False,
+            "difference": "force sums exact, not sequential",
+            "changes": {"precision.reduction": ["sequential", "exact"]}, "atoms": 108, "steps": STEPS,
+            "steps_asked": STEPS, "timestep": 0.01, "units": "lj", "r_cut": 1.5, "seed": SEED,
+            "seed_time": 0.01 * SEED, "fork": FORK if forks else None, "fork_time": 4.0 if forks else None,
+            "split": split, "split_time": None if split is None else 0.01 * split, "tolerance": TOLERANCE,
+            "decision": DECISION if forks else None, "verdict": "cause" if forks else "no fork",
+            "reasons": ["free, split at step 1321; under the first run's decisions not", "and so on"],
+            "growth_rate": RATE if forks else None, "growth_rate_time": RATE / 0.01 if forks else None,
+            "r_squared": 0.99 if forks else None, "growth": {"B": fit if forks else dict.fromkeys(fit)},
+            "predicted_split": None, "splits": {"B": split, "B|A": None} if handed else {"B": split},
+            "nats": None, "noise": 12.0, "repeats": [1316, 1326] if forks else [], "repeats_run": 2,
+            "handed_until": STEPS if handed else None, "handed_largest": SIZE,
+            "separation_end": float(free[-1]),
+            "separation_largest": float(free.max()), "overridden": 6, "cross_flips": 7_000 if forks else 0,
+            "cross_flips_kept": 7_000 if forks else 0, "certified_horizon": None, "lyapunov": None,
+            "failed": {},
+            "findings": [], "status": "complete", "seconds": 3.5,
+        }
+        | (summary or {})
+    )  # fmt: skip
+    return folder
+
+
+DECISION: dict[str, Any] = {
+    "channel": "pair", "step": FORK, "run": "B", "i": 3, "j": 4, "entered": True, "space": "r2",
+    "margin": 3e-10, "bound": 2e-15, "ambiguous": False, "margins": {"A": -6e-10, "B": 3e-10},
+    "bounds": {"A": 2e-15, "B": 2e-15}, "ambiguous_in": [], "cutoffs": {"A": 1.5, "B": 1.5},
+    "distance": 1.4999999999, "margin_length": 1e-10, "bound_length": 7e-16, "separation_before": 1e-9,
+    "protected": 0.1, "also": 0,
+}  # fmt: skip
+
+
+def make_screen(path: Path, summary: dict[str, Any] | None = None) -> RunFolder:
+    """Writes the folder of a screening."""
+    folder = RunFolder.create(path, world="fork")
+    folder.write_system(TOML)
+    folder.finalize()
+    folder.write_summary(
+        {
+            "world": "fork", "system": "argon/synthetic", "about": "Nothing.", "choice": "all", "atoms": 108,
+            "steps": 1000, "steps_asked": 1000, "timestep": 0.01, "units": "lj",
+            "ranking": [
+                ranked("precision.state", seed=0, fork=303, split=900), ranked("skin", seed=1),
+                ranked("order@exact", must_hold=True), ranked("ulps=dynamics.temperature:+1", seed=0),
+            ],
+            "not_applicable": [{"choice": "noise", "why": "constant energy has none"}],
+            "findings": [], "status": "complete", "seconds": 60.0,
+        }
+        | (summary or {})
+    )  # fmt: skip
+    return folder
+
+
+def ranked(choice: str, **entries: Any) -> dict[str, Any]:
+    """A line of a ranking; by default of a choice that changes nothing."""
+    return {
+        "choice": choice, "difference": f"{choice} differs", "seed": None, "fork": None, "split": None,
+        "must_hold": False, "held": None, "steps": 1000, "failed": "",
+    } | entries  # fmt: skip
