@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,7 +20,8 @@ from mdnum.rollout.engine import FAILURES, Engine, Start, first_state
 from mdnum.rollout.flips import PairRecorder, decided_pairs
 from mdnum.rollout.frame import Frame
 from mdnum.rollout.tracks import rows_of
-from mdnum.systems.build import Simulation
+from mdnum.systems.build import Simulation, build
+from mdnum.systems.load import System
 
 _NARROW = PrecisionPolicy("float32", "float32", "float32", "float32")
 
@@ -34,8 +36,8 @@ POLICIES: Mapping[str, PrecisionPolicy] = {
     "float64": PrecisionPolicy(),
 }
 
-#: A share of what double precision gains that counts as nothing, and as a little.
-_NOTHING, _LITTLE = 0.05, 0.25
+#: A share of what double precision gains that counts as nothing, and bits of error that do.
+_NOTHING, _NO_BITS = 0.05, 1.0
 #: Separation from the exact run up to which its growth is fitted, as a share of the longest cutoff.
 _SATURATED = 0.04
 
@@ -68,7 +70,10 @@ class PolicyHorizon:
         separation: largest distance of an atom from its exact place at each step, length.
         growth: of that separation.
         failed: how the run ended, where badly.
-        gain: share of what double precision gains over single that this policy gains; NaN where unknown.
+        gain: share of the steps that double precision gains over single which this policy gains; an upper
+            bound where double precision never left; NaN where unknown.
+        closer: bits by which its positions are closer to the exact ones than those of single precision
+            throughout, while both decide exactly; NaN where unknown.
     """
 
     name: str
@@ -80,6 +85,7 @@ class PolicyHorizon:
     growth: Growth
     failed: str
     gain: float = float("nan")
+    closer: float = float("nan")
 
 
 @dataclass(frozen=True)
@@ -93,6 +99,8 @@ class Certificate:
         ranking: policies, longest horizon first.
         same_start: whether all runs begin at single-precision positions and velocities, so that rounding
             the start is no part of the comparison.
+        steps_per_bit: by how many steps one more bit puts a horizon off: ln 2 over the growth rate of the
+            separation from the exact run; NaN where no growth was seen.
         says: what follows, in sentences.
     """
 
@@ -101,7 +109,27 @@ class Certificate:
     exact: Exact
     ranking: tuple[PolicyHorizon, ...]
     same_start: bool
+    steps_per_bit: float
     says: tuple[str, ...]
+
+    def summary(self) -> dict[str, Any]:
+        """Plain numbers and words for a summary file; None stands for what is unknown or never happened."""
+        exact = self.exact
+        return {
+            "steps": self.steps,
+            "bits": exact.bits,
+            "restarts": exact.restarts,
+            "flips": exact.tape.flips,
+            "smallest_margin": float(exact.margin.min()),
+            "smallest_margin_step": int(exact.margin.argmin()),
+            "log2_radius_end": _known(exact.radius[-1]),
+            "bits_per_step": _known(exact.bits_per_step),
+            "ms_per_step": 1000 * exact.seconds / (self.steps + 1),
+            "steps_per_bit": _known(self.steps_per_bit),
+            "same_start": self.same_start,
+            "policies": [_plain(row) for row in self.ranking],
+            "says": list(self.says),
+        }
 
     def of(self, name: str) -> PolicyHorizon:
         """The row of a policy.
@@ -113,6 +141,27 @@ class Certificate:
             if row.name == name:
                 return row
         raise KeyError(name)
+
+
+def _known(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _plain(row: PolicyHorizon) -> dict[str, Any]:
+    found = row.difference
+    return {
+        "name": row.name,
+        **{role: getattr(row.policy, role) for role in ("state", "force", "decision", "accumulate")},
+        "horizon": row.horizon,
+        "pair": None if found is None else [found.i, found.j],
+        "inside_exact": None if found is None else found.inside[0],
+        "margin": _known(row.margin),
+        "gain": _known(row.gain),
+        "closer_bits": _known(row.closer),
+        "growth_rate": _known(row.growth.rate),
+        "separation_end": _known(row.separation[-1]),
+        "failed": row.failed or None,
+    }
 
 
 def taped(simulation: Simulation, steps: int, start: Start | None = None) -> Taped:
@@ -187,7 +236,7 @@ def _reduced(simulation: Simulation, x: Float[np.ndarray, "... 3"]) -> Float[np.
 
 
 def certify(
-    simulation: Simulation,
+    system: Simulation | System | str,
     steps: int | None = None,
     *,
     policies: Mapping[str, PrecisionPolicy] | None = None,
@@ -198,7 +247,7 @@ def certify(
     """The exact history of a system, and the step at which a run under each precision policy leaves it.
 
     Args:
-        simulation: Lennard-Jones, NVE, at most 108 atoms.
+        system: Lennard-Jones, NVE, at most 108 atoms.
         steps: last step; default the system's own.
         policies: to compare, by name; default `POLICIES`.
         same_start: let all runs, and the exact one, begin at the start rounded to 24 bits.
@@ -208,6 +257,7 @@ def certify(
     Raises:
         InputError: the system cannot be certified, or steps below 1.
     """
+    simulation = system if isinstance(system, Simulation) else build(system)
     refused = why_not(simulation)
     if refused is not None:
         raise refused
@@ -227,30 +277,55 @@ def certify(
     rows = _with_gains(rows, last)
     rows.sort(key=lambda row: -(last + 1 if row.horizon is None else row.horizon))
     timestep = float(simulation.system.spec.dynamics.timestep)
-    return Certificate(last, timestep, exact, tuple(rows), same_start, _says(rows, last))
+    per_bit = _steps_per_bit(rows)
+    return Certificate(last, timestep, exact, tuple(rows), same_start, per_bit, _says(rows, last, per_bit))
+
+
+def _steps_per_bit(rows: list[PolicyHorizon]) -> float:
+    """ln 2 over the growth rate of the run whose growth could be followed longest."""
+    known = [row.growth for row in rows if np.isfinite(row.growth.rate) and row.growth.rate > 0]
+    if not known:
+        return float("nan")
+    longest = max(known, key=lambda found: found.last - found.first)
+    return float(np.log(2) / longest.rate)
 
 
 def _with_gains(rows: list[PolicyHorizon], last: int) -> list[PolicyHorizon]:
-    """Gains relative to single and double precision throughout, where both horizons are known."""
+    """What each policy gains over single precision throughout, where that leaves the exact history."""
     by_policy = {row.policy: row for row in rows}
     low, high = by_policy.get(_NARROW), by_policy.get(PrecisionPolicy())
-    if low is None or high is None or low.horizon is None:
+    if low is None or low.horizon is None:
         return rows
-    # a horizon beyond the last step counts as that step: a lower bound on the gain of double precision
-    reach = last if high.horizon is None else high.horizon
-    span = reach - low.horizon
-    if span <= 0:
-        return rows
-    return [
-        replace(row, gain=((last if row.horizon is None else row.horizon) - low.horizon) / span)
-        for row in rows
-    ]
+    # a double precision that never left gains at least the steps up to the last: shares are upper bounds then
+    reach = None if high is None else last if high.horizon is None else high.horizon
+    done = []
+    for row in rows:
+        gain = float("nan")
+        if reach is not None and reach > low.horizon and row.horizon is not None:
+            gain = (row.horizon - low.horizon) / (reach - low.horizon)
+        done.append(replace(row, gain=gain, closer=_closer(low, row)))
+    return done
 
 
-def _says(rows: list[PolicyHorizon], last: int) -> tuple[str, ...]:
+def _closer(base: PolicyHorizon, row: PolicyHorizon) -> float:
+    """By how many bits a run is closer to the exact positions, while both decide as the exact program does.
+
+    The median over the second half of the steps before the first decision at fault: unlike the horizon, it
+    does not hang on which pair happens to come close to its cutoff.
+    """
+    end = min(h for h in (base.horizon, row.horizon) if h is not None)
+    a, b = (one.separation[end // 2 : end] for one in (base, row))
+    if not len(a) or not len(b) or not np.all(b[: len(a)] > 0):
+        return float("nan")
+    return float(np.median(np.log2(a[: len(b)] / b)))
+
+
+def _says(rows: list[PolicyHorizon], last: int, per_bit: float) -> tuple[str, ...]:
     """What the ranking means, plainly; rows in any order."""
-    sentences = []
     base = next((row for row in rows if row.policy == _NARROW), None)
+    wide = next((row for row in rows if row.policy == PrecisionPolicy()), None)
+    at_most = "" if wide is not None and wide.horizon is not None else "at most "
+    sentences = []
     for row in rows:
         kept = (
             f"keeps every decision of the exact history up to step {last}"
@@ -261,14 +336,24 @@ def _says(rows: list[PolicyHorizon], last: int) -> tuple[str, ...]:
         if row.failed:
             sentence += f" (its run ended in a {row.failed})"
         promoted = row.policy not in (_NARROW, PrecisionPolicy())
-        if promoted and base is not None and base.horizon is not None and np.isfinite(row.gain):
-            steps = (last if row.horizon is None else row.horizon) - base.horizon
-            share = f"{steps:+d} steps, {row.gain:.0%} of what double precision throughout gains"
-            if row.gain < _NOTHING:
-                sentence += f": the promotion gains nothing ({share})"
-            elif row.gain < _LITTLE:
-                sentence += f": the promotion gains little ({share})"
-            else:
-                sentence += f": the promotion gains {share}"
+        if promoted and base is not None and base.horizon is not None:
+            sentence += ": " + _gained(row, base.horizon, last, at_most)
         sentences.append(sentence + ".")
+    if np.isfinite(per_bit):
+        sentences.append(f"One more bit in every number is worth about {per_bit:.0f} steps here.")
     return tuple(sentences)
+
+
+def _gained(row: PolicyHorizon, base: int, last: int, at_most: str) -> str:
+    bits = f"its positions are {row.closer:+.1f} bits closer to the exact ones"
+    if row.horizon is None:
+        return f"the promotion gains {last - base} steps or more, and {bits}"
+    share = f"{row.horizon - base:+d} steps"
+    if np.isfinite(row.gain):
+        share += f", {at_most}{row.gain:.0%} of what double precision throughout gains"
+    # a horizon hangs on one pair; what is not closer to the exact run was lucky, not better
+    if row.closer < _NO_BITS:
+        if row.horizon - base <= 0 or row.gain < _NOTHING:
+            return f"the promotion gains nothing ({share}; {bits})"
+        return f"one decision came out right, and that is all the promotion gains ({share}; {bits})"
+    return f"the promotion gains {share}; {bits}"

@@ -66,6 +66,15 @@ class Exact:
     close: int
     seconds: float
 
+    @property
+    def bits_per_step(self) -> float:
+        """Bits by which the largest ball grows in a step, over the second half; NaN for a short run."""
+        rows = np.flatnonzero(np.isfinite(self.radius))
+        if len(rows) < 4:
+            return float("nan")
+        half, end = rows[len(rows) // 2], rows[-1]
+        return float((self.radius[end] - self.radius[half]) / (end - half))
+
 
 def installed() -> bool:
     """Whether the ball arithmetic (python-flint) is there."""
