@@ -41,7 +41,7 @@ def _compose(run: ForkFolder, wide: bool, figure: Figure) -> None:
     for axes, name in zip(panels, "AB", strict=True):
         offset = shift if name == "B" else np.zeros_like(shift)
         cutoff = float(made["cutoffs"][name])
-        _panel(axes, run, flat, inside[name], cutoff, gap(positions, moved, cutoff, name), name)
+        _panel(axes, run, flat, inside[name], cutoff, gap(run, name), name)
         if name == "B" and factor:
             axes.quiver(
                 flat[:, 0], flat[:, 1], factor * offset[:, 0], factor * offset[:, 1], angles="xy",
@@ -123,10 +123,11 @@ def decided_inside(run: ForkFolder) -> dict[str, bool]:
     return {str(made["run"]): bool(made["entered"]), other: not made["entered"]}
 
 
-def gap(positions: np.ndarray, moved: np.ndarray, r_cut: float, name: str) -> float:
-    """How far beyond the cutoff the pair was in a run, length."""
-    ends = positions[:2] + (moved[:2] if name == "B" else 0.0)
-    return float(np.linalg.norm(ends[1] - ends[0])) - r_cut
+def gap(run: ForkFolder, name: str) -> float:
+    """How far beyond the cutoff a run found the pair, length: in its own arithmetic, which decided."""
+    made = run.decision or {}
+    slope = made["margin"] / made["margin_length"] if made["margin_length"] else 1.0
+    return -float(made["margins"][name]) / slope
 
 
 def _round(factor: float) -> str:

@@ -15,8 +15,10 @@ from mdnum.report.svg import BAD, FIRST, HALO, INK, MUTED, SECOND
 
 def ranking(run: ForkFolder, width: float = PAGE_WIDTH) -> Figure:
     """A line per choice: where the first bit, the first decision and the runs part."""
-    height = 0.75 + 0.24 * len(run.ranking)
-    return drawn(partial(_ranking, run), height if width >= PAGE_WIDTH else height / 0.85, width)
+    wide = width >= PAGE_WIDTH
+    # `drawn` lowers a figure on a phone, where names take two lines
+    height = 0.75 + 0.24 * len(run.ranking) if wide else (1.0 + 0.29 * len(run.ranking)) / 0.85
+    return drawn(partial(_ranking, run), height, width)
 
 
 def _ranking(run: ForkFolder, figure: Figure) -> None:

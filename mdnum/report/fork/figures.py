@@ -16,7 +16,7 @@ from mdnum.report.axes import PAGE_WIDTH
 from mdnum.report.fork import atoms, choices
 from mdnum.report.fork.findings import FITS
 from mdnum.report.fork.run import ForkFolder
-from mdnum.report.svg import BAD, HALO, MUTED
+from mdnum.report.svg import BAD, FIRST, HALO, MUTED, SECOND, THIRD
 from mdnum.report.words import many, number, plain
 
 Drawer = Callable[[float], Figure]
@@ -24,6 +24,8 @@ Role = Literal["first", "second", "third", "bad", "muted", "ink"]
 
 #: Flips that are drawn as ticks.
 _TICKS = 1_500
+#: Points of the lines by color: free runs, counterfactuals, repeats.
+_WIDTHS = {FIRST: 2.6, SECOND: 1.2, THIRD: 1.0, MUTED: 0.7}
 #: A fit is drawn on where it predicts a split, for at most so many times the steps that were followed.
 _BEYOND = 2.0
 
@@ -105,8 +107,9 @@ def _separation(run: ForkFolder, plot: Plot, width: float) -> Figure:
     figure.set_figheight(figure.get_figheight() + (1.5 if width >= PAGE_WIDTH else 0.9))
     axes = figure.axes[0]
     for line in axes.lines:
-        if line.get_color() == MUTED and line.get_linestyle() == "-":
-            line.set_linewidth(0.7)
+        if line.get_linestyle() == "-" and line.get_color() in _WIDTHS:
+            # before the fork the lines lie upon one another: the wider one shows at both sides of the others
+            line.set(linewidth=_WIDTHS[str(line.get_color())], alpha=1.0)
     _name_tolerance(axes, run)
     _ticks(axes, run)
     return figure

@@ -189,10 +189,10 @@ def _findings(run: ForkFolder) -> Iterator[Finding]:
     if "fork" in dates and "split" not in dates and not summary.get("failed"):
         guess = summary.get("predicted_split")
         text = (
-            f"After {many(run.steps, 'step')} the runs are {number(summary.get('separation_end'), 2)} "
-            f"{run.units.length} apart, the tolerance is {number(summary.get('tolerance'), 2)}."
+            f"After {many(run.steps, 'step')} the runs are {number(summary.get('separation_end'), 3)} "
+            f"{run.units.length} apart, the tolerance is {number(summary.get('tolerance'), 3)}."
         )
-        more = f"Follow about {count(guess)} steps." if guess else "Follow more steps."
+        more = f"Follow more than {count(guess)} steps." if guess else "Follow more steps."
         yield Finding("HORIZON_SHORT", "info", "the horizon is too short for a split", text, more)
     until = summary.get("handed_until")
     if until is not None and until < run.steps and not summary.get("failed"):
