@@ -106,7 +106,8 @@ def _separation(run: ForkFolder, plot: Plot, width: float) -> Figure:
     figure = plots.draw(plot, width)
     figure.set_figheight(figure.get_figheight() + (1.5 if width >= PAGE_WIDTH else 0.9))
     axes = figure.axes[0]
-    for line in axes.lines:
+    legend = axes.get_legend()
+    for line in (*axes.lines, *(legend.get_lines() if legend is not None else ())):
         if line.get_linestyle() == "-" and line.get_color() in _WIDTHS:
             # before the fork the lines lie upon one another: the wider one shows at both sides of the others
             line.set(linewidth=_WIDTHS[str(line.get_color())], alpha=1.0)
