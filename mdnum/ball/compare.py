@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from mdnum.ball.contacts import Penalty, Projection
+from mdnum.ball.integrators import EventLocated, ImplicitMidpoint
 from mdnum.ball.rollout import BallRun
 from mdnum.errors import InputError
 
@@ -22,7 +24,8 @@ class Difference:
         ball: the first ball whose decision differs there; -1 where the decision is the batch's.
         margins: the deciding margin in the first and in the second run: for a contact minus the height, for
             a stop threshold minus residual at the decision that differed.
-        iterations_differ: number of steps whose iteration counts differ.
+        iterations_differ: number of steps whose iteration counts differ; 0 where the runs count other things
+            (impacts, iterations of one solver or another, nothing).
         contacts_differ: number of contact decisions that differ.
         separation: largest |difference| of heights at each step, m, shape (steps + 1,); empty where states
             were not kept.
@@ -61,6 +64,9 @@ def first_difference(a: BallRun, b: BallRun) -> Difference:
     # a rule per ball and a rule for all have counts of other shapes: compare them per ball
     counts = [_per_ball(run) for run in (a, b)]
     stops = counts[0] != counts[1]
+    if _counted(a) != _counted(b):
+        # impacts are no iterations, and a run without a solver has stopped none: nothing to compare
+        stops = np.zeros_like(stops)
     at = [
         int(steps.argmax()) if (steps := differ.any(axis=1)).any() else a.steps for differ in (contact, stops)
     ]
@@ -77,6 +83,18 @@ def first_difference(a: BallRun, b: BallRun) -> Difference:
     return Difference(
         seed, row + 1, channel, ball, margins, int(stops.any(axis=1).sum()), int(contact.sum()), separation
     )
+
+
+def _counted(run: BallRun) -> str:
+    """What the iteration counts of a run count."""
+    contact, scheme = run.world.contact, run.world.integrator
+    if isinstance(scheme, EventLocated):
+        return "impacts"
+    if isinstance(contact, Projection):
+        return "iterations of a projection"
+    if isinstance(contact, Penalty) and isinstance(scheme, ImplicitMidpoint):
+        return "iterations of Newton's method"
+    return "nothing"
 
 
 def _per_ball(run: BallRun) -> np.ndarray:
