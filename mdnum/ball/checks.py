@@ -13,6 +13,9 @@ from mdnum.ball.stopping import Fixed, Hysteresis
 from mdnum.errors import InputError
 from mdnum.precision.policy import RolePrecision
 
+#: Iterations are counted in 32 bits.
+MOST_ITERATIONS = 2**31 - 1
+
 
 def check(
     contact: Any, integrator: Any, gravity: Any, control: Any, policy: RolePrecision, lift: Any
@@ -34,8 +37,10 @@ def check(
                 "an event-located step needs an impact",
                 remedy="A penalty or a projection has no instant of contact; choose another integrator",
             )
-        if integrator.max_impacts < 1:
-            raise InputError(f"max_impacts = {integrator.max_impacts}; expected at least 1")
+        if not 1 <= integrator.max_impacts <= MOST_ITERATIONS:
+            raise InputError(
+                f"max_impacts = {integrator.max_impacts}; expected a number from 1 to {MOST_ITERATIONS}"
+            )
     if isinstance(contact, Penalty):
         _positive("stiffness k", contact.k)
         _at_least_zero("damping", contact.damping)
@@ -67,8 +72,8 @@ def check_stop(rule: Any, policy: RolePrecision, gain: float) -> None:
     Raises:
         InputError: out of range, or a tolerance that can never be met.
     """
-    if rule.max_iter < 1:
-        raise InputError(f"max_iter = {rule.max_iter}; expected at least 1")
+    if not 1 <= rule.max_iter <= MOST_ITERATIONS:
+        raise InputError(f"max_iter = {rule.max_iter}; expected a number from 1 to {MOST_ITERATIONS}")
     if isinstance(rule, Fixed):
         return
     if isinstance(rule, Hysteresis):

@@ -94,7 +94,9 @@ class Relative(GlobalSum):
     def threshold(self, first, iteration):
         """tol times the first residual; a residual that starts at zero is below any tolerance."""
         scaled = jnp.asarray(self.tol).astype(first.dtype) * first
-        return jnp.where(first == 0, jnp.asarray(np.finfo(np.float32).tiny, first.dtype), scaled)
+        # float32's smallest would be 0 in float16, and no residual is below that
+        least = jnp.finfo(first.dtype).tiny
+        return jnp.where(first == 0, jnp.asarray(least, first.dtype), scaled)
 
 
 class Hysteresis(eqx.Module):

@@ -181,9 +181,15 @@ class ImpactContact(_Contact):
 Contact = Annotated[PenaltyContact | ProjectionContact | ImpactContact, Discriminator("kind")]
 
 
+#: Iterations are counted in 32 bits.
+_MOST = 2**31 - 1
+
+
 class _Tolerance(Table):
     tol: Positive = Field(description="the solver stops when its residual is below (m; relative: a share)")
-    max_iter: int = Field(default=100, ge=1, description="iterations after which the solver gives up")
+    max_iter: int = Field(
+        default=100, ge=1, le=_MOST, description="iterations after which the solver gives up"
+    )
     enter: Positive | None = Field(
         default=None, description="a residual below this starts no solve (m), at least tol; default tol"
     )
@@ -217,7 +223,7 @@ class FixedRule(Table):
     """So many iterations, whatever the residual."""
 
     rule: Literal["fixed"]
-    count: int = Field(ge=1, description="iterations of every solve")
+    count: int = Field(ge=1, le=_MOST, description="iterations of every solve")
 
 
 ToleranceRule = SumRule | PerInstanceRule | MaximumRule | RelativeRule

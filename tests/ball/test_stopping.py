@@ -94,6 +94,13 @@ def test_relative_tolerance_scales():
     assert solve([0.0], ball.Relative(1e-3)).iterations[0] == 0
 
 
+@pytest.mark.parametrize("dtype", ["float16", "bfloat16", "float32"])
+def test_nothing_to_solve_is_below_a_relative_tolerance_in_every_dtype(dtype):
+    run = solve([0.0], ball.Relative(1e-2, 7), policy=RolePrecision(dtype, dtype, dtype, dtype, "float64"))
+    assert run.ended() == {"tolerance": 1}
+    assert run.iterations[0] == 0
+
+
 @pytest.mark.parametrize(("dtype", "accumulate", "iterations"), [
     ("float32", "float32", 1),
     ("bfloat16", "bfloat16", 0),
@@ -148,6 +155,12 @@ def test_the_smallest_usable_tolerance_can_be_met_and_the_next_smaller_one_is_re
             lambda: (ball.Projection(0.5, 0.5, ball.GlobalSum(1e-3, 0)), ball.ExplicitEuler(0.1)),
             "max_iter = 0",
         ),
+        (
+            # 2^32 would be counted as 0
+            lambda: (ball.Projection(0.5, 0.5, ball.GlobalSum(1e-3, 2**32)), ball.ExplicitEuler(0.1)),
+            "max_iter = 4294967296",
+        ),
+        (lambda: (ball.Impact(0.5), ball.EventLocated(0.1, 2**32)), "max_impacts = 4294967296"),
         (
             lambda: (
                 ball.Projection(0.5, 0.5, ball.Hysteresis(ball.GlobalSum(1e-3), 1e-4)),
