@@ -101,6 +101,13 @@ def _start(spec: ball.BallSpec) -> None:
                 'Give a [stop] table with rule = "sum" and tol',
             )
         low = rounded(spec.stop.tol, start.boundary.format)
+        least, most = smallest(start.boundary.format), largest(start.boundary.format)
+        if not least <= low <= most:
+            raise Refusal(
+                "stop.tol",
+                f"stop.tol = {spec.stop.tol:g} is outside of what {start.boundary.format} can hold",
+                f"The smallest usable tolerance is {least:.3g}, the largest {most:.4g}",
+            )
         if low != spec.stop.tol:
             raise Refusal(
                 "stop.tol",
@@ -275,10 +282,13 @@ def _tolerance(spec: ball.BallSpec, stop: ball.ToleranceRule, key: str, value: f
         roles.append("accumulate")
     if stop.rule != "relative":
         roles += ["state", "arithmetic"]
-    for role in roles:
-        name = getattr(spec.precision, role)
-        # a penetration whose share alpha k rounds to nothing no longer shrinks
-        least = smallest(name) / (gain if role == "arithmetic" else 1.0)
+    # a penetration whose share alpha k rounds to nothing no longer shrinks
+    usable = {
+        role: smallest(getattr(spec.precision, role)) / (gain if role == "arithmetic" else 1.0)
+        for role in roles
+    }
+    for role in sorted(roles, key=lambda role: -usable[role]):
+        name, least = getattr(spec.precision, role), usable[role]
         if value > largest(name):
             raise Refusal(
                 key,

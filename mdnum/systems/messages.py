@@ -136,7 +136,7 @@ def _sentence(
         return f"{name} = {_show(seen)}; expected {options}", meaning(f"{last}: {{}}")
     if kind in _BOUNDS:
         limit, word = _BOUNDS[kind]
-        return f"{name} = {_show(seen)}; expected a number {word} {context[limit]:g}", meaning(
+        return f"{name} = {_show(seen)}; expected a number {word} {context[limit]:.15g}", meaning(
             f"{last}: {{}}"
         )
     if kind in ("too_short", "too_long", "missing_positional_only_argument"):

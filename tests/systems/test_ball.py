@@ -248,6 +248,7 @@ def test_a_projection_that_cannot_converge_is_told_its_product(projection: Path)
         ({"stop.tol": "0"}, ["stop.tol = 0", "above 0"]),
         ({"stop.tol": "-1e-6"}, ["above 0"]),
         ({"stop.tol": "inf"}, ["finite"]),
+        ({"stop.max_iter": "4294967296"}, ["at most 2147483647"]),
         ({"stop.max_iter": "0"}, ["stop.max_iter = 0", "at least 1"]),
         ({"stop.max_iter": "2.5"}, ["a whole number"]),
         ({"stop.enter": "1e-7"}, ["stop.enter = 1e-07 is below stop.tol = 1e-06"]),
@@ -302,7 +303,8 @@ def test_a_tolerance_below_what_a_role_can_tell_from_zero(projection: Path, name
 
 def test_a_tolerance_below_the_smallest_float64(projection: Path):
     said = refusal(projection, {"stop.tol": "1e-320"})
-    assert "The smallest usable tolerance is 2.23e-308" in said
+    # of all roles, so that no second message corrects the first: 2.23e-308 / (alpha k)
+    assert "The smallest usable tolerance is 8.9e-308" in said
     assert "smallest usable tolerance is 8.9e-308" in refusal(projection, {"stop.tol": "3e-308"})
 
 
@@ -408,6 +410,12 @@ def test_a_batch_on_the_boundary_needs_a_tolerance_of_its_format():
     name = "ball/batch-on-the-boundary"
     with pytest.raises(InputError, match=r"is no bfloat16.*tol = 0\.00099945068359375"):
         load(name, {"stop.tol": "1e-3"})
+    # the nearest one would be 0 or infinite: no tolerance
+    for beyond in ("1e-50", "1e39"):
+        with pytest.raises(
+            InputError, match=r"smallest usable tolerance is 1\.18e-38, the largest 3\.39e\+38"
+        ):
+            load(name, {"stop.tol": beyond})
     with pytest.raises(InputError, match=r"in 4096 parts gives .* below the smallest float16"):
         load(
             name,
