@@ -34,6 +34,9 @@ SUMMARY: dict[str, Any] = {
     "gradient": [
         {"method": "unrolled", "says": "Of what ran.", "gradient": {"k": 0.0, "y0": 2.5},
          "depends": {"k": False, "y0": True}, "refused": False},
+        {"method": "randomized", "says": "Of an average.", "gradient": {"k": 0.0, "y0": 2.25},
+         "depends": {"k": False, "y0": True}, "refused": False,
+         "details": {"standard_error": {"k": 0.0, "y0": 0.125}}},
         {"method": "implicit", "says": "No fixed point here.", "gradient": {}, "refused": True},
     ],
     "variants": [
@@ -109,6 +112,7 @@ def test_ball_prints_what_a_person_wants_to_know(bounce: Recorder, capsys: pytes
     assert "solver 30 iterations; ended by: 3 tolerance, 1 cap" in lines
     assert "against the closed form height at the end off by 1.25e-05 m" in lines
     assert "unrolled 0 (does not depend) 2.5 Of what ran." in lines
+    assert "randomized 0 (does not depend) 2.25 ± 0.12 Of an average." in lines
     assert "implicit - - No fixed point here." in lines
     assert "float32 0 7 contact, ball 0 1e-17 and -2e-17 0.25 0.25 1.5 3.5" in lines
     assert "same - - none differs - 0 0.5 0 (does not depend) 2.5" in lines

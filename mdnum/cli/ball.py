@@ -135,7 +135,8 @@ def _slope(made: Mapping[str, Any], name: str) -> str | None:
         return None
     if not made.get("depends", {}).get(name, True):
         return "0 (does not depend)"
-    return output.show(made["gradient"][name])
+    error = made.get("details", {}).get("standard_error", {}).get(name)
+    return output.show(made["gradient"][name]) + ("" if error is None else f" ± {error:.2g}")
 
 
 def _slopes(summary: Mapping[str, Any]) -> list[str]:

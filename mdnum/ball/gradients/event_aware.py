@@ -22,6 +22,11 @@ from mdnum.events.saltation import carry, grazing
 
 #: Parameters of how a projection is solved, not of what it stands for.
 _SOLVER = ("k", "alpha", "tol", "enter")
+#: What is said of a spring, sharp or soft.
+_SPRING = (
+    "The derivative of the steps: a spring's force does not jump at a contact, so its time moves no "
+    "tangent (the saltation matrix is 1)."
+)
 #: |n · F-| below this share of |F-| counts as grazing.
 _NARROW = 1e-6
 
@@ -34,7 +39,8 @@ class EventAware:
     arrives later: for an impact reset at the end of the step the derivative by y0 is 0 however small the
     step. Here a tangent is carried along with the rollout and multiplied by the saltation matrix at every
     contact. Where the impact is located inside the step the program's own derivative is already this one.
-    A projection is read as the impact that it stands for.
+    A projection is read as the impact that it stands for. The force of a spring without a damper does not
+    jump, so nothing is added: of a spring this is the unrolled derivative, and says so.
     """
 
     name = "event-aware"
@@ -71,7 +77,9 @@ class EventAware:
             elif name in _SOLVER and isinstance(world.contact, Projection):
                 depends[name], why[name] = False, f"the impact that is solved for does not depend on {name}"
         details = {"events": events, "located": located}
-        return Gradient(self.name, self.says, value, slopes, depends, why, details)
+        spring = isinstance(world.contact, Penalty) and not float(world.contact.damping)
+        says = _SPRING if spring else self.says
+        return Gradient(self.name, says, value, slopes, depends, why, details)
 
 
 def _refuse(grazing: int) -> None:
