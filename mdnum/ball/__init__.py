@@ -15,6 +15,9 @@ _HOMES = {
     "Decisions": "state",
     "Difference": "compare",
     "EventLocated": "integrators",
+    "ExactDamped": "exact_damped",
+    "ExactImpact": "exact",
+    "ExactPenalty": "exact_penalty",
     "ExplicitEuler": "integrators",
     "FinalHeight": "losses",
     "Fixed": "stopping",
@@ -24,9 +27,10 @@ _HOMES = {
     "ImplicitMidpoint": "integrators",
     "Maximum": "stopping",
     "MeanHeight": "losses",
-    "PerInstance": "stopping",
     "Penalty": "contacts",
+    "PerInstance": "stopping",
     "Problem": "problem",
+    "Profile": "adjoint",
     "Projection": "contacts",
     "Reason": "state",
     "Relative": "stopping",
@@ -34,14 +38,22 @@ _HOMES = {
     "SemiImplicitEuler": "integrators",
     "VelocityVerlet": "integrators",
     "World": "world",
+    "fingerprint": "determinism",
     "first_difference": "compare",
     "loss_of": "problem",
+    "profile": "adjoint",
+    "require_deterministic": "determinism",
     "simulate": "rollout",
 }
 
 if TYPE_CHECKING:
+    from mdnum.ball.adjoint import Profile, profile
     from mdnum.ball.compare import Difference, first_difference
     from mdnum.ball.contacts import Impact, Penalty, Projection
+    from mdnum.ball.determinism import fingerprint, require_deterministic
+    from mdnum.ball.exact import ExactImpact
+    from mdnum.ball.exact_damped import ExactDamped
+    from mdnum.ball.exact_penalty import ExactPenalty
     from mdnum.ball.integrators import (
         EventLocated,
         ExplicitEuler,
@@ -62,6 +74,9 @@ __all__ = [
     "Decisions",
     "Difference",
     "EventLocated",
+    "ExactDamped",
+    "ExactImpact",
+    "ExactPenalty",
     "ExplicitEuler",
     "FinalHeight",
     "Fixed",
@@ -74,6 +89,7 @@ __all__ = [
     "Penalty",
     "PerInstance",
     "Problem",
+    "Profile",
     "Projection",
     "Reason",
     "Relative",
@@ -81,8 +97,11 @@ __all__ = [
     "SemiImplicitEuler",
     "VelocityVerlet",
     "World",
+    "fingerprint",
     "first_difference",
     "loss_of",
+    "profile",
+    "require_deterministic",
     "simulate",
 ]
 
