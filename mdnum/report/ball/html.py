@@ -80,6 +80,8 @@ def _key_figures(run: BallFolder) -> Iterator[tuple[str, str, str]]:
     first = summary.get("first_contact")
     when = "none" if first is None or first < 0 else f"first at step {count(first)}"
     entered = summary.get("flips_entered")
+    if entered == 0 and first is not None and first >= 0:
+        when = "in contact at the start"
     yield "Contacts", count(run.series["entered"].sum() if entered is None else entered), when
     total = summary.get("iterations_total")
     if run.located:
