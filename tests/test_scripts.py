@@ -17,6 +17,8 @@ STUDIES = (
     "ball_sensitivity",
     "benchmark",
     "cutoff_sensitivity",
+    "precision_fork",
+    "reduction_order",
     "skin_sensitivity",
     "termination_precision",
     "topology_flip_report",
@@ -188,3 +190,26 @@ def test_a_narrow_sequential_sum_stops_early_and_a_tree_mends_it(tmp_path: Path)
     assert float(narrow[column("change")]) > 1e-3
     assert tree[2:] == wide[2:]
     assert is_png(tmp_path / "p.png")
+
+
+def test_narrow_forces_fork_a_crystal_and_its_own_decisions_save_it(tmp_path: Path) -> None:
+    words = ["--steps", "1300", "--roles", "force", "accumulate", "--repeats", "0", "-o", "f.png"]
+    table = study("precision_fork", *words, cwd=tmp_path)
+    column = ["role", "seed", "fork", "split", "told", "growth", "verdict"].index
+    force, sums = row(table, "force"), row(table, "accumulate")
+    assert force[column("seed")] == sums[column("seed")] == "1"
+    assert 1 < int(force[column("fork")]) < 1300
+    assert force[column("told")] == "-"
+    assert is_png(tmp_path / "f.png")
+
+
+def test_sums_without_an_order_are_told_from_those_with_one(tmp_path: Path) -> None:
+    words = ["--reductions", "sequential", "reversed", "exact", "--steps", "60", "-o", "r.png"]
+    table = study("reduction_order", *words, cwd=tmp_path)
+    column = ["sum", "error", "seed", "fork", "split", "end", "shuffled"].index
+    own, other, exact = (row(table, word) for word in ("sequential", "reversed", "exact"))
+    assert own[column("seed")] == "-" and other[column("seed")] == exact[column("seed")] == "1"
+    assert own[column("shuffled")] == other[column("shuffled")] == "1" and exact[column("shuffled")] == "-"
+    assert float(exact[column("error")]) == 0 < float(own[column("error")]) < 1000
+    assert 0 < float(other[column("end")]) < 1e-10
+    assert is_png(tmp_path / "r.png")

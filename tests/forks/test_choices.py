@@ -121,6 +121,7 @@ def test_what_is_no_choice_is_refused_with_those_there_are(word: str, says: str)
         (CRYSTAL, "builder=host", "already"),
         (CRYSTAL, "start=108:0:1", "no atom 108 among 108"),
         (CRYSTAL, "ulps=cutoff.in_sigma:+1", "there are potential.sigma, potential.epsilon, cutoff.radius"),
+        ("silicon/tersoff-512", "energy-shift", "carries its own cutoff"),
         ("argon/langevin-500", "relabel", "belongs to labels"),
         ("argon/langevin-500", "rotate", "belongs to axes"),
         ("argon/tilted-500", "rotate", "not the same with its axes exchanged"),
@@ -193,6 +194,14 @@ def test_roles_and_sums_are_those_asked_for(crystal: System):
         assert twin.b.system.spec.precision.reduction == ("exact" if word == "exact" else "sequential")
     twin = parse("order@fixed-point").make(crystal)
     assert twin.a.reduction == twin.b.reduction != build(crystal).reduction
+
+
+def test_a_shift_changes_the_energy_and_no_force(crystal: System):
+    twin = parse("energy-shift").make(crystal)
+    a, b = (one.evaluate() for one in (twin.a, twin.b))
+    assert np.array_equal(a.forces, b.forces) and abs(a.energy - b.energy) > 1
+    switched = varied(crystal, {"cutoff.kind": "force-shifted"})
+    assert parse("energy-shift").why_not(switched) == "a force-shifted cutoff changes the force too"
 
 
 def test_lists_are_those_asked_for(crystal: System):
@@ -271,7 +280,18 @@ def test_another_noise_is_another_key_and_the_same_start():
 
 @pytest.mark.parametrize(
     "word",
-    ["translate=lattice", "unwrapped", "order@exact", "order@fixed-point", "relabel@exact", "skin@exact"],
+    [
+        "translate=lattice",
+        "unwrapped",
+        "energy-shift",
+        "order@exact",
+        "order@fixed-point",
+        "relabel@exact",
+        "skin@exact",
+        # a list and a program for every step
+        pytest.param("rebuild=every:1@exact", marks=pytest.mark.slow),
+        pytest.param("builder@exact", marks=pytest.mark.slow),
+    ],
 )
 def test_what_must_hold_holds_to_the_last_bit(crystal: System, word: str):
     row = screened(word, crystal, 200)

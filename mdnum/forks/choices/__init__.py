@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from mdnum.forks.choices.arithmetic import Precision, Summation
 from mdnum.forks.choices.base import Choice
+from mdnum.forks.choices.energy import EnergyShift
 from mdnum.forks.choices.frames import Images, Relabel, Rotate, Translate
 from mdnum.forks.choices.inputs import Noise, StartUlp, Ulps
 from mdnum.forks.choices.lists import Builder, Order, Rebuild, Skin
@@ -14,6 +15,7 @@ __all__ = [
     "BY_NAME",
     "Builder",
     "Choice",
+    "EnergyShift",
     "Images",
     "Noise",
     "Order",

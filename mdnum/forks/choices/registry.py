@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from mdnum.errors import InputError
 from mdnum.forks.choices.arithmetic import ROLES, Precision, Summation
 from mdnum.forks.choices.base import ORDERLESS, Choice, real, whole
+from mdnum.forks.choices.energy import EnergyShift
 from mdnum.forks.choices.frames import Images, Relabel, Rotate, Translate
 from mdnum.forks.choices.inputs import Noise, StartUlp, Ulps
 from mdnum.forks.choices.lists import Builder, Order, Rebuild, Skin
@@ -28,6 +29,7 @@ _SHIPPED: tuple[Choice, ...] = (
     Translate(),
     Images(),
     Images(1),
+    EnergyShift(),
     *(Order(both=word) for word in ORDERLESS),
     *(one(both="exact") for one in (Builder, Skin, Rebuild, Relabel, Rotate)),
     *(
