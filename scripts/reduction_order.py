@@ -10,14 +10,15 @@ each atom shuffled. The table says:
     fork     first step with another decision
     split    first step with an atom further apart than the tolerance
     end      separation from the system's own run at the last step
-    shuffled first step with another bit when neighbors are shuffled, - where all bits hold
+    shuffled first of 100 steps with another bit when neighbors are shuffled, - where all bits hold
 
 The crystal of argon/crystal-108 is melted by drawing its velocities at a temperature of 6: in the cold
 crystal a difference in the last bit stays one.
 
 How to read it. A smaller error is not a later fork: any difference is enough, and it grows at the
-system's own rate. Only sums without an order (no step under "shuffled") give the same run whatever
-the neighbor list does; they buy determinism, not accuracy of the trajectory.
+system's own rate. Sums with no step under "shuffled" gave the same run whatever the neighbor list did:
+exact and fixed-point ones by design, sorted ones unless two terms are of one size, compensated ones as
+long as their error rounds away. They buy determinism, not accuracy of the trajectory.
 """
 
 from __future__ import annotations
