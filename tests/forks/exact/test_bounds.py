@@ -174,3 +174,19 @@ def test_what_gives_no_bound_is_refused():
     unsafe = replace(simulation, rule=replace(simulation.rule, every=5))
     with pytest.raises(InputError, match="may leave pairs out"):
         certified_horizon(unsafe, 10)
+
+
+def test_a_state_wider_than_the_decision_is_off_by_its_narrowing():
+    """Far from the origin nearly all of the error is in the cast of the positions."""
+    cell = Cell.create(np.zeros((3, 3)), False)
+    decider = PairDecider((2.3,), "r2 <", "float32", (3.0, 3.0, 3.0))
+    rng = np.random.default_rng(5)
+    start = 3000 + rng.random((200, 3))
+    direction = rng.standard_normal((200, 3))
+    end = start + 2.3 * direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    d = HostCell(cell, "float32").displacement(start, end)
+    margin = decider.thresholds[0].value - decider.host_quantity(*d).astype(np.float64)
+    exact = [float(exact_margin(decider, cell, a, b)[0]) for a, b in zip(start, end, strict=True)]
+    error = np.abs(margin - exact).max()
+    assert margin_bounds(decider, "float32")[0] < error
+    assert error <= margin_bounds(decider, "float64", np.full(3, 3004.0))[0] < 30 * error

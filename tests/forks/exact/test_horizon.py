@@ -106,14 +106,14 @@ def test_steps_and_systems_that_cannot_be_certified():
 @pytest.mark.slow
 def test_the_horizon_grows_with_the_bits_of_the_start():
     """Steps per bit are ln 2 over the growth rate, measured on the same runs (slope within 30 %)."""
-    bits = np.array([20, 26, 32, 38, 44, 50])
+    bits = np.array([20, 26, 32, 38])
     horizons, rates = [], []
     for seed in (3, 4, 5):
         simulation = liquid(seed)
-        exact = ExactProgram(simulation).run(1300)
+        exact = ExactProgram(simulation).run(1150)
         row = []
         for b in bits:
-            run = taped(simulation, 1300, rounded_start(simulation, WIDE, int(b)))
+            run = taped(simulation, 1150, rounded_start(simulation, WIDE, int(b)))
             found = compare(str(b), WIDE, simulation, exact, run)
             assert found.horizon is not None
             row.append(found.horizon)
@@ -127,11 +127,11 @@ def test_the_horizon_grows_with_the_bits_of_the_start():
 @pytest.mark.slow
 def test_two_precisions_prove_the_same_long_history():
     simulation = liquid()
-    exact = ExactProgram(simulation).run(2000)
-    assert first_difference(exact.tape, ExactProgram(simulation).run(2000, bits=1200).tape) is None
+    exact = ExactProgram(simulation).run(1200)
+    assert first_difference(exact.tape, ExactProgram(simulation).run(1200, bits=900).tape) is None
     narrow, wide = (
-        compare("", policy, simulation, exact, taped(with_policy(simulation, policy), 2000))
+        compare("", policy, simulation, exact, taped(with_policy(simulation, policy), 1200))
         for policy in (POLICIES["float32"], WIDE)
     )
     assert narrow.horizon is not None and wide.horizon is not None
-    assert wide.horizon > 4 * narrow.horizon
+    assert wide.horizon > 3 * narrow.horizon

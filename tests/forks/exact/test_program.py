@@ -252,3 +252,17 @@ def test_bits_follow_the_growth_of_the_balls():
     run.all(None, 0)
     rate = (run._radius[100] - run._radius[25]) / 75
     assert run.bits_needed() == pytest.approx(1.1 * rate * 100 + 120, abs=1.5)
+
+
+def test_only_the_first_step_that_differs_is_reported():
+    tape = Tape(
+        20, 50, np.array([9]), np.array([10, 10, 30]), np.array([45, 47, 3]), np.array([True, True, True])
+    )
+    bare = replace(tape, step=tape.step[:0], key=tape.key[:0], entered=tape.entered[:0])
+    found = first_difference(bare, tape)
+    assert found is not None
+    assert (found.step, found.i, found.j, found.also, found.inside) == (10, 2, 5, 1, (False, True))
+    # a tape that ended before is not different
+    assert first_difference(replace(bare, steps=9), tape) is None
+    with pytest.raises(ValueError, match="20 and 21 atoms"):
+        first_difference(tape, replace(tape, atoms=21))
