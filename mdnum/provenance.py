@@ -50,6 +50,10 @@ class _System(Protocol):
     def path(self) -> Path | None: ...
 
 
+#: Of a system file: words, what is hashed by itself, and what is asked about the run.
+_NOT_THE_PROGRAM = {"name", "about", "structure", "gradient", "variants"}
+
+
 def collect(system: _System) -> dict[str, Any]:
     """Everything outside the system file that a run depends on, and hashes of what is inside.
 
@@ -144,20 +148,26 @@ def cpu(cpuinfo: Path = Path("/proc/cpuinfo")) -> dict[str, Any]:
 
 
 def hashes(system: _System) -> dict[str, str | None]:
-    """SHA-256 of the system file as written and of the structure as it was read.
+    """SHA-256 of the system file as written, of the program it means, and of the structure as it was read.
 
-    The structure is hashed as numbers (species, masses, positions, velocities, cell, periodicity), so
-    that a file in another format with the same atoms has the same hash.
+    The program is every number and choice but the structure, defaults and overrides included: change one and
+    its hash changes; another name does not change it. The structure is hashed as numbers (species, masses,
+    positions, velocities, cell, periodicity), so that a file in another format with the same atoms has the
+    same hash.
 
     Returns:
-        file (None for a system that did not come from a file) and structure (None without atoms).
+        file (None for a system that did not come from a file), program, and structure (None without atoms).
     """
     file = None
     if system.path is not None and Path(system.path).is_file():
         file = hashlib.sha256(Path(system.path).read_bytes()).hexdigest()
+    program = None
+    if system.spec is not None:
+        spec = system.spec.model_dump(mode="json", exclude=_NOT_THE_PROGRAM)
+        program = hashlib.sha256(json.dumps(spec, sort_keys=True).encode()).hexdigest()
     atoms = getattr(system, "atoms", None)
     if atoms is None:
-        return {"file": file, "structure": None}
+        return {"file": file, "program": program, "structure": None}
     digest = hashlib.sha256()
     for name, array in (
         ("numbers", atoms.get_atomic_numbers()),
@@ -169,7 +179,7 @@ def hashes(system: _System) -> dict[str, str | None]:
     ):
         digest.update(f"{name} {array.dtype.str} {array.shape}".encode())
         digest.update(array.tobytes())
-    return {"file": file, "structure": digest.hexdigest()}
+    return {"file": file, "program": program, "structure": digest.hexdigest()}
 
 
 def commit(package: Path) -> str | None:

@@ -62,6 +62,21 @@ def test_structure_hash_sees_a_last_bit_and_not_a_file_format(tmp_path: Path):
     assert after["structure"] != before["structure"]
 
 
+@pytest.mark.parametrize("name", ["ball/drop", "argon/crystal-108"])
+def test_program_hash_changes_with_every_knob_and_with_no_word(name: str):
+    knobs = {
+        "ball/drop": {"contact.k": "10000.000000000002", "integrator.timestep": "0.002",
+                      "flight.gravity": "9.8", "integrator.kind": "velocity-verlet",
+                      "precision.reduction": "exact"},
+        "argon/crystal-108": {"dynamics.timestep": "0.001", "cutoff.kind": "switched",
+                              "neighbors.skin": "0.1"},
+    }[name]  # fmt: skip
+    before = provenance.hashes(systems.load(name))["program"]
+    assert before == provenance.hashes(systems.load(name, {"about": "other words"}))["program"]
+    seen = {provenance.hashes(systems.load(name, {key: value}))["program"] for key, value in knobs.items()}
+    assert len(seen | {before}) == len(knobs) + 1
+
+
 def test_file_hash_is_that_of_its_bytes(tmp_path: Path):
     path = tmp_path / "a.toml"
     path.write_text("abc")
