@@ -8,7 +8,7 @@ from typing import Any
 
 import typer
 
-from mdnum.cli import output
+from mdnum.cli import fork_questions, output
 from mdnum.cli.progress import ProgressBar
 from mdnum.errors import InputError
 
@@ -19,6 +19,9 @@ _RUNS = {"B": ("B", "its own"), "B|A": ("B", "A's"), "A|B": ("A", "B's")}
 def fork(
     system: str | None = typer.Argument(
         None, metavar="SYSTEM", help="A name from `mdnum systems list`, or the path of a TOML file."
+    ),
+    other: Path | None = typer.Argument(
+        None, metavar="[RUN]", help="With a run folder as SYSTEM: the run folder to compare it with."
     ),
     vary: str | None = typer.Option(
         None,
@@ -37,6 +40,18 @@ def fork(
         False, "--no-counterfactual", help="Do not run B under A's decisions: dates, but no cause."
     ),
     back: bool = typer.Option(False, "--back", help="Run A under B's decisions too."),
+    along: str | None = typer.Option(
+        None, metavar="KEY=LOW:HIGH", help="Where the history of decisions changes along a number."
+    ),
+    certify: bool = typer.Option(
+        False, "--certify", help="When runs leave the history in exact arithmetic, by precision."
+    ),
+    forecast: float | None = typer.Option(
+        None, metavar="LENGTH", help="Which decisions a displacement of the start would flip first."
+    ),
+    benign: bool = typer.Option(
+        False, "--benign", help="With --vary: whether anything that would be measured differs."
+    ),
     out: Path | None = typer.Option(
         None, "-o", "--out", metavar="DIR", help="The fork folder; runs/fork-NAME-N by default."
     ),
@@ -45,6 +60,31 @@ def fork(
 ) -> int:
     """Follow two runs that differ in one numerical choice, and judge the flip that parted them."""
     overrides = output.parse_overrides(settings)
+    asked = {
+        "RUN": other is not None,
+        "--along": along is not None,
+        "--certify": certify,
+        "--forecast": forecast is not None,
+        "--vary": vary is not None,
+    }
+    if sum(asked.values()) > 1:
+        given = " and ".join(name for name, is_asked in asked.items() if is_asked)
+        raise InputError(f"{given} are different questions", remedy="Ask one at a time")
+    if benign and vary is None:
+        raise InputError("--benign needs a choice", remedy="Add --vary CHOICE")
+    if any(asked.values()) and system is None:
+        raise InputError("no system given", remedy="`mdnum systems list` names those that come with mdnum")
+    if system is not None:
+        if other is not None:
+            return fork_questions.folders(Path(system), other, as_json=as_json)
+        if along is not None:
+            return fork_questions.along(system, along, steps, overrides, as_json=as_json)
+        if certify:
+            return fork_questions.certify(system, steps, overrides, as_json=as_json)
+        if forecast is not None:
+            return fork_questions.foretell(system, forecast, steps, overrides, as_json=as_json)
+        if benign and vary is not None:
+            return fork_questions.consistent(system, vary, steps, overrides, as_json=as_json)
     if vary is None:
         return _choices(system, as_json)
     if system is None:

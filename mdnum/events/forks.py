@@ -24,6 +24,8 @@ _FIT_ROWS = 16
 _PATIENCE = 1.2
 #: A counterfactual that grows and would split within so many times the free run's steps is late, not saved.
 _SAVED = 5.0
+#: A delay of less than one power of e is no delay: the separation was never as much as e times smaller.
+_NATS = 1.0
 #: Of a fit that counts as growth.
 _FITS = 0.5
 
@@ -105,7 +107,7 @@ class Verdict:
     Attributes:
         word: "same" (no bit differs), "no fork" (no decision differs), "open" (no split within the horizon),
             "cause" (without the flips no split), "hurried" (without them later, beyond chance), "bystander"
-            (without them just as early, or no later than chance).
+            (without them as early, no later than by chance, or by less than one power of e).
         free: split of the free run, step.
         handed: split of the run under the other's decisions, step; None where there is none.
         noise: by how many steps two splits differ by chance: twice the standard deviation of a difference.
@@ -178,7 +180,9 @@ def judge(
             nats = rate.rate * (late - dates.split) if np.isfinite(rate.rate) else None
             more = f"it grows and is expected to split about step {late:.0f}: later, but not saved"
             return Verdict("hurried", dates.split, None, noise, nats, (text, more))
-        return Verdict("cause", dates.split, None, noise, float("inf"), (text, "and it does not grow"))
+        return Verdict(
+            "cause", dates.split, None, noise, float("inf"), (text, "and it is not on its way there")
+        )
     gained = other - dates.split
     nats = rate.rate * gained if np.isfinite(rate.rate) else None
     text = (
@@ -188,8 +192,11 @@ def judge(
     scatter = (
         f"repeats that differ by an ulp scatter by {noise:.0f} steps" if chance else "no repeats were run"
     )
-    word: Word = "hurried" if gained > max(noise, 0.0) and chance else "bystander"
-    return Verdict(word, dates.split, other, noise, nats, (text, scatter))
+    later = bool(chance) and gained > noise and (nats is None or nats >= _NATS)
+    worth = f"the flips were worth {nats:.2g} powers of e of separation" if nats is not None else ""
+    word: Word = "hurried" if later else "bystander"
+    reasons = tuple(part for part in (text, scatter, worth) if part)
+    return Verdict(word, dates.split, other, noise, nats, reasons)
 
 
 def _expected(separation: Float[np.ndarray, "steps"], tolerance: float, seen: int) -> float | None:

@@ -24,6 +24,8 @@ SPLIT = 0.04
 _BEYOND = 2.0
 #: A counterfactual ends when a decision it is told is so many tolerances from its cutoff.
 _GUARD = 3.0
+#: Repeats are perturbed by so many tolerances at most.
+_LARGEST_NUDGE = 1e-3
 #: Cross-run flips that are kept; the counts cover all of them.
 FLIPS_KEPT = 100_000
 
@@ -139,7 +141,9 @@ def fork(
     start_b = twin.start_b or first_state(b)
     starts = []
     if counterfactual and repeats:
-        starts = nudged(b, start_b, seed_size(twin), repeats, seed)
+        # a choice that changes everything at once (another noise) still leaves room to grow
+        size = min(seed_size(twin), _LARGEST_NUDGE * tolerance)
+        starts = nudged(b, start_b, size, repeats, seed)
     gathered: list[Stretch] = []
     flips: list[CrossFlip] = []
     total = 0
