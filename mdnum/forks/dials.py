@@ -98,12 +98,11 @@ def _fixed(simulation: Simulation) -> dict[str, Dial]:
     ]
     if isinstance(integrator, Langevin):
         k_B = simulation.units.k_B
-        dials += [
-            _plain("dynamics.temperature", float(integrator.kT) / k_B, _integrator("kT", k_B)),
-            _plain(
-                "dynamics.friction", float(integrator.friction) * factor, _integrator("friction", factor, 1)
-            ),
-        ]
+        friction = float(integrator.friction) * factor
+        dials.append(_plain("dynamics.friction", friction, _integrator("friction", factor, inverse=True)))
+        # velocities that are drawn are drawn at the temperature: then it is more than one number
+        if simulation.system.velocities is not None:
+            dials.append(_plain("dynamics.temperature", float(integrator.kT) / k_B, _integrator("kT", k_B)))
     if simulation.pairwise:
         dials += _constants(simulation) + _radii(simulation)
     return {one.key: one for one in dials}
@@ -118,7 +117,7 @@ def _number(value: float) -> Float[Array, ""]:
     return jnp.asarray(np.float64(value))
 
 
-def _integrator(name: str, factor: float, inverse: int = 0) -> Turn:
+def _integrator(name: str, factor: float, *, inverse: bool = False) -> Turn:
     def turn(simulation: Simulation, value: float) -> Simulation:
         inner = value / factor if inverse else value * factor
         changed = eqx.tree_at(lambda part: getattr(part, name), simulation.integrator, _number(inner))

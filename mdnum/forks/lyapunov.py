@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mdnum.errors import InputError
+from mdnum.events.forks import Growth
 from mdnum.forks.tangent import tangents
 from mdnum.systems.build import Simulation
 
@@ -56,6 +57,13 @@ class Lyapunov:
     def error_time(self) -> float:
         """Its standard error."""
         return self.error / self.timestep
+
+    def ratio(self, seen: Growth) -> float:
+        """Growth rate of two runs over the exponent; NaN where they were not seen to grow.
+
+        Near 1 the runs parted as the motion parts them. Well above it, their flips did it.
+        """
+        return seen.rate / self.rate if self.chaotic else float("nan")
 
     def steps_to(self, start: float, end: float) -> float | None:
         """The step at which a displacement of the start has grown from one size to another.

@@ -86,15 +86,15 @@ def test_the_last_step_alone_makes_no_jump_and_an_earlier_one_does(crossings):
 
 @pytest.mark.parametrize(
     ("key", "at", "width"),
-    [("sigma", 1.0, 1e-3), ("velocity.scale", 1.0, 1e-2), ("position.17.y", None, 1e-2)],
+    [("sigma", 1.0, 1e-3), ("position.17.y", None, 1e-2)],
 )
 def test_brute_force_over_all_floats_finds_the_same(key, at, width):
-    system, steps = solid(), 40
+    system, steps = solid(), 30
     at = dial(build(system), key).value if at is None else at
     coarse = boundaries(system, key, at, at + width, steps, cells=8, most=1, confirm=False)
     (one,) = coarse.boundaries
     ulp = np.spacing(one.below.at)
-    window = one.below.at + ulp * np.arange(-20, 22)
+    window = one.below.at + ulp * np.arange(-12, 14)
     truth = brute(system, key, steps, window)
     assert truth
     every = boundaries(system, key, window[0], window[-1], steps, cells=len(window), confirm=False)
@@ -107,11 +107,11 @@ def test_brute_force_over_all_floats_finds_the_same(key, at, width):
 
 
 def test_both_sides_differ_in_a_fresh_process():
-    system, steps = solid(), 60
-    found = boundaries(system, "epsilon", 1.0, 1.01, steps, cells=4, most=2)
+    system, steps = solid(), 30
+    found = boundaries(system, "velocity.scale", 1.0, 1.01, steps, cells=4, most=2)
     assert found.boundaries
     values = [side.at for b in found.boundaries for side in (b.below, b.above)]
-    elsewhere = digests_elsewhere(system, "epsilon", steps, values)
+    elsewhere = digests_elsewhere(system, "velocity.scale", steps, values)
     for k, boundary in enumerate(found.boundaries):
         below, above = elsewhere[2 * k : 2 * k + 2]
         assert below != above and np.nextafter(values[2 * k], 2.0) == values[2 * k + 1]

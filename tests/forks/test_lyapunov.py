@@ -11,7 +11,7 @@ from ase.build import bulk
 from small_systems import LENNARD_JONES, make
 
 from mdnum.errors import InputError
-from mdnum.events.forks import growth
+from mdnum.events.forks import Growth, growth
 from mdnum.forks.lyapunov import lyapunov
 from mdnum.rollout.lockstep import lockstep
 from mdnum.systems.build import build
@@ -47,6 +47,7 @@ def test_the_exponent_is_the_rate_at_which_two_runs_part():
     seen = growth(apart, 0.088)
     assert seen.r_squared > 0.98
     assert found.rate == pytest.approx(seen.rate, rel=0.2)
+    assert found.ratio(seen) == pytest.approx(1, rel=0.25)
     assert found.rate_time == pytest.approx(found.rate / 0.004)
     # beyond the run at the rate
     far = found.steps_to(1e-30, 1.0)
@@ -75,6 +76,7 @@ def test_a_tangent_does_not_overflow():
 def test_a_cold_crystal_is_not_chaotic():
     found = lyapunov(build("argon/crystal-108", {"cutoff.radius": 1.35}), 2000)
     assert not found.chaotic and abs(found.rate) < 3e-4
+    assert np.isnan(found.ratio(Growth(0.1, 1.0, 0, 100)))
     assert found.steps_to(1e-16, 1.0) is None
 
 
