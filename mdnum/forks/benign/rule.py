@@ -36,7 +36,7 @@ class Space:
     """The principal components of an ensemble.
 
     Attributes:
-        mean, spread: of each feature over the ensemble.
+        mean, spread: of each feature over the ensemble; infinite spread leaves a feature out.
         axes: components as rows, in standardized features.
         sigma: standard deviation of the ensemble along each component.
     """
@@ -51,7 +51,8 @@ class Space:
         """The components that explain an ensemble's variance, at most ten and a third of its runs, at
         least two."""
         mean, spread = features.mean(axis=0), features.std(axis=0, ddof=1)
-        spread = np.maximum(spread, _ROUNDING * np.maximum(np.abs(mean), 1e-300))
+        # nothing can be said of a feature that is constant, such as a distance that no pair has
+        spread = np.where(spread > _ROUNDING * np.abs(mean), spread, np.inf)
         z = (features - mean) / spread
         _, size, axes = np.linalg.svd(z, full_matrices=False)
         explained = np.cumsum(size**2) / np.sum(size**2)

@@ -20,6 +20,8 @@ from mdnum.systems.build import Simulation
 
 #: Features that are named, at most.
 _NAMED = 5
+#: A feature is named where it matters so much, relative to the one that matters most.
+_TELLING = 0.02
 #: Noise of B's runs; no seed of a calibration's.
 _SEED = 1_000_003
 
@@ -167,13 +169,12 @@ def _failing(calibration: Calibration, rows: np.ndarray, scores: np.ndarray) -> 
     space, limit = calibration.window.space, calibration.window.limit
     z = np.median(space.standardized(rows), axis=0)
     middle = np.median(scores, axis=0)
-    weight = np.where(np.abs(middle) > limit, np.sign(middle) / space.sigma, 0.0)
+    weight = np.where(np.abs(middle) > limit, middle / space.sigma, 0.0)
     share = (weight @ space.axes) * z
     names = calibration.ruler.names
-    chosen = [k for k in np.argsort(-share) if share[k] > 0 and abs(z[k]) > limit]
-    if not chosen:
-        # beyond the limit only together, as a sum of energies that must stay constant can be
-        chosen = [k for k in np.argsort(-share) if share[k] > 0]
+    telling = [k for k in np.argsort(-share) if share[k] > _TELLING * share.max()]
+    # none is where they are beyond the limit only together, as a sum of energies that is kept can be
+    chosen = [k for k in telling if abs(z[k]) > limit] or telling
     return {names[k]: float(z[k]) for k in chosen[:_NAMED]}
 
 

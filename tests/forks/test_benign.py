@@ -1,0 +1,307 @@
+"""Benign or not: a changed model is seen and named, another rounding is not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from fractions import Fraction
+from math import comb
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+
+from mdnum.errors import InputError
+from mdnum.forks import Twin
+from mdnum.forks.benign import Calibration, benign, calibrate
+from mdnum.forks.benign import rule as rules
+from mdnum.forks.benign.calibration import Planted, Window, choose
+from mdnum.forks.benign.ensemble import Member, ensemble, noise_size, starts
+from mdnum.forks.benign.features import Ruler, hats, measure, pair_distances
+from mdnum.forks.benign.planted import planted, shorter
+from mdnum.rollout.engine import first_state
+from mdnum.systems.build import Simulation, build
+
+HOT = """
+about = "A small hot Lennard-Jones fluid, melting."
+units = "lj"
+[structure]
+builder = "fcc"
+symbol = "Ar"
+lattice_constant = 1.6796
+repeat = [3, 3, 3]
+[potential]
+kind = "lennard-jones"
+sigma = 1.0
+epsilon = 1.0
+[cutoff]
+kind = "shifted"
+radius = 2.2
+[neighbors]
+skin = 0.3
+[dynamics]
+kind = "nve"
+timestep = 0.004
+temperature = 1.44
+steps = 1000
+"""
+
+
+@pytest.fixture(scope="module")
+def hot(tmp_path_factory) -> Simulation:
+    path = tmp_path_factory.mktemp("hot") / "hot.toml"
+    path.write_text(HOT)
+    return build(str(path))
+
+
+@pytest.fixture(scope="module")
+def calibrated(hot) -> Calibration:
+    # jax-md's lists mix dtypes, and their search compiles for seconds: see the slow test
+    changes = [change for change in planted(hot) if change.simulation.builder == "host"]
+    # as the tests themselves, or their programs would be compiled twice
+    with jax.numpy_dtype_promotion("strict"):
+        return calibrate(hot, members=30, held_out=15, tries=1, steps=400, changes=changes)
+
+
+def slower(a: Simulation, factor: float) -> Simulation:
+    timestep = a.integrator.timestep * factor
+    return replace(a, integrator=eqx.tree_at(lambda one: one.timestep, a.integrator, timestep))
+
+
+def binomial_tail(count: int, of: int, rate: Fraction) -> Fraction:
+    """Chance of so many or more."""
+    return sum(
+        (comb(of, k) * rate**k * (1 - rate) ** (of - k) for k in range(count, of + 1)), start=Fraction(0)
+    )
+
+
+def test_a_calibrated_window_tells_models_from_rounding(calibrated):
+    table = {one.change: one for one in calibrated.window.table}
+    assert set(table) == {
+        "time step + 2.5 %",
+        "cutoff - 4 %",
+        "forces in float32",
+        "pairs in another order",
+    }
+    assert calibrated.window.step == 400
+    for name in ("time step + 2.5 %", "cutoff - 4 %"):
+        assert table[name].must_fail and min(table[name].scores) > 5
+    for name in ("forces in float32", "pairs in another order"):
+        assert not table[name].must_fail and max(table[name].scores) < 2
+    # the limit is a quantile: more false positives than these would be a rare accident
+    assert binomial_tail(calibrated.alone + 1, 15, Fraction(1, 10)) > Fraction(1, 1000)
+    assert calibrated.triples == 5 and calibrated.held_out == 15
+    assert binomial_tail(calibrated.false_positives, 5, Fraction(4, 100)) > Fraction(1, 1000)
+    low, high = calibrated.rate_bounds
+    assert low <= calibrated.rate <= high and low <= rules.ACCEPTED
+
+
+def test_single_precision_is_benign(hot, calibrated):
+    b = replace(hot, policy=replace(hot.policy, force="float32"))
+    found = benign(Twin(hot, b, "forces in float32"), calibration=calibrated)
+    assert found.passed and not found.failing
+    assert found.scores.shape == (3, found.components) and 2 <= found.components <= 10
+    assert "forces in float32" in found.says and "nothing you would measure does" in found.says
+
+
+def test_an_energy_that_is_not_shifted_is_named_and_nothing_else(hot, calibrated):
+    # the same forces, so the same trajectory
+    found = benign(Twin(hot, hot.with_cutoff("hard"), "cutoff not shifted"), calibration=calibrated)
+    assert not found.passed
+    assert list(found.failing) == ["potential energy"] and found.failing["potential energy"] < -100
+    assert "given away by potential energy (-" in found.says
+
+
+def test_another_well_is_seen_in_many_features(hot, calibrated):
+    potential = eqx.tree_at(lambda one: one.epsilon, hot.potential, hot.potential.epsilon * 1.01)
+    b = replace(hot, model=eqx.tree_at(lambda one: one.potential, hot.model, potential))
+    found = benign(Twin(hot, b, "epsilon + 1 %"), calibration=calibrated)
+    assert not found.passed and "Not benign" in found.says
+    assert all(name in found.says for name in found.failing)
+    assert 2 <= len(found.failing) <= 5
+    assert all(abs(z) > found.limit for z in found.failing.values())
+
+
+def test_a_run_that_blows_up_is_not_benign(hot, calibrated):
+    found = benign(Twin(hot, slower(hot, 30), "a wild time step"), calibration=calibrated)
+    assert not found.passed and "3 of 3 runs of B blew up" in found.says
+    assert np.isnan(found.scores).all()
+
+
+def test_what_cannot_be_judged_is_refused(hot, calibrated):
+    with pytest.raises(InputError, match="108 and 864 atoms"):
+        benign(Twin(hot, build("argon/liquid-864"), "another system"))
+    with pytest.raises(InputError, match="members = 5 are too few"):
+        benign(Twin(hot, hot, "nothing"), members=5)
+    with pytest.raises(InputError, match="steps = 0"):
+        calibrate(hot, steps=0)
+    with pytest.raises(InputError, match="tries = 0"):
+        calibrate(hot, tries=0)
+    with pytest.raises(InputError, match="no planted change must fail"):
+        calibrate(hot, steps=100, changes=[change for change in planted(hot) if not change.must_fail])
+    noisy = build("argon/langevin-500")
+    other = eqx.tree_at(lambda one: one.key, noisy.integrator, jax.random.key(99))
+    with pytest.raises(InputError, match="different noise"):
+        benign(Twin(noisy, replace(noisy, integrator=other), "noise"))
+    moved = replace(hot, positions=hot.positions + 0.01)
+    with pytest.raises(InputError, match="the calibration is of"):
+        benign(Twin(moved, moved, "nothing"), calibration=calibrated)
+
+
+def window(step: int, seen: float, rounding: float) -> Window:
+    space = rules.Space.of(np.random.default_rng(0).standard_normal((30, 4)))
+    table = (
+        Planted("time step + 2.5 %", True, int(seen > 1), 1, (seen,)),
+        Planted("forces in float32", False, 2 * int(rounding > 1), 2, (rounding, rounding)),
+    )
+    return Window(step, space, 2.0, table)
+
+
+def test_the_latest_clear_window_is_chosen():
+    early, good, late = window(100, 500.0, 7.0), window(300, 50.0, 0.5), window(500, 4.0, 0.5)
+    faint, blind = window(600, 1.5, 0.5), window(1000, 0.7, 0.5)
+    assert choose([early, good, late, faint, blind], "it") is late
+    assert choose([early, faint, blind], "it") is faint
+    with pytest.raises(InputError, match="cannot be told from rounding after 100, 1000 steps"):
+        choose([early, blind], "it")
+
+
+def test_members_differ_by_ten_ulps_of_single_precision_and_share_one_program(hot):
+    from mdnum.rollout.epoch import run_epoch
+
+    begin = starts(hot, 4, 0)
+    x = np.asarray(first_state(hot).state.x)
+    ulp = float(np.spacing(np.float32(x.max())))
+    for one in begin:
+        moved = np.sqrt(((np.asarray(one.state.x) - x) ** 2).sum(axis=0))
+        assert np.sqrt((moved**2).mean()) > 10 * ulp
+        assert moved.max() == pytest.approx(noise_size(hot), rel=1e-6)
+    ruler = Ruler.of(hot, begin[0])
+    ensemble(hot, begin[:1], [150, 170], ruler)
+    before = run_epoch._cache_size()  # type: ignore[attr-defined]
+    rows = ensemble(hot, begin, [150, 170], ruler)
+    assert run_epoch._cache_size() == before  # type: ignore[attr-defined]
+    # stopping on the way changes nothing
+    straight = ensemble(hot, begin, [170], ruler)
+    assert np.array_equal(rows[1], straight[0])
+
+
+def test_features_are_those_of_the_last_step(hot):
+    ruler = Ruler.of(hot, first_state(hot))
+    segment = Member(hot, first_state(hot)).to(130)
+    assert segment is not None and segment.last == 130
+    found = dict(zip(ruler.names, measure(hot, segment, ruler), strict=True))
+    x = np.asarray(segment.state.x_before).T
+    # every pair by itself, in every image
+    matrix = np.asarray(hot.cell.matrix)
+    box = matrix.diagonal()
+    d = x[:, None] - x[None]
+    d -= box * np.round(d / box)
+    r = np.sqrt((d**2).sum(-1))
+    i, j = np.triu_indices(len(x), 1)
+    inside = r[i, j] < 2.2
+    one = r[i, j][inside]
+    shift = 4 * (2.2**-12 - 2.2**-6)
+    assert found["potential energy"] == pytest.approx((4 * (one**-12 - one**-6) - shift).sum(), rel=1e-10)
+    pull = 4 * (12 * one**-12 - 6 * one**-6)
+    volume = np.prod(box)
+    pressure = (2 * found["kinetic energy"] + pull.sum()) / (3 * volume)
+    assert found["pressure"] == pytest.approx(pressure, rel=1e-10)
+    force = np.zeros_like(x)
+    np.add.at(force, i[inside], (pull / one**2)[:, None] * d[i, j][inside])
+    np.add.at(force, j[inside], -(pull / one**2)[:, None] * d[i, j][inside])
+    square = (force**2).sum(1)
+    assert found["root mean square force"] == pytest.approx(np.sqrt(square.mean()), rel=1e-10)
+    reach = float(ruler.nodes[-1])
+    mine = np.sort(pair_distances(hot, x, reach))
+    assert mine == pytest.approx(np.sort(r[i, j][r[i, j] < reach]), rel=1e-12)
+
+
+def test_hats_count_every_pair_once_and_do_not_jump():
+    nodes = np.linspace(1.0, 2.0, 6)
+    r = np.array([0.5, 1.0, 1.05, 1.3, 1.6])
+    expected = np.array([max(0.0, 1 - abs(max(q, 1.0) - n) / 0.2) for n in nodes[:-1] for q in r])
+    assert hats(r, nodes) == pytest.approx(expected.reshape(5, -1).sum(1))
+    assert hats(r, nodes).sum() == pytest.approx(5)
+    # a pair that leaves goes to zero before it is gone
+    assert hats(np.array([2.0 - 1e-9]), nodes).sum() == pytest.approx(0, abs=1e-7)
+    assert hats(np.array([2.5]), nodes).sum() == 0
+
+
+def test_components_are_those_of_the_correlation_matrix():
+    rng = np.random.default_rng(1)
+    rows = rng.standard_normal((60, 3)) @ rng.standard_normal((3, 12)) + 0.1 * rng.standard_normal((60, 12))
+    space = rules.Space.of(rows)
+    sizes = np.sort(np.linalg.eigvalsh(np.corrcoef(rows.T)))[::-1]
+    assert space.sigma**2 == pytest.approx(sizes[: len(space.sigma)], rel=1e-8)
+    # eight explain 99.9 % of the variance
+    explained = np.cumsum(sizes) / sizes.sum()
+    assert len(space.sigma) == 8 and explained[6] < 0.999 <= explained[7]
+    assert space.scores(rows).std(axis=0, ddof=1) == pytest.approx(np.ones(8))
+    assert space.second(rows) == pytest.approx(np.sort(np.abs(space.scores(rows)))[:, -2])
+
+
+def test_a_feature_without_spread_says_nothing():
+    rows = np.random.default_rng(2).standard_normal((30, 5))
+    # a distance that no pair has, and one whose scatter is rounding
+    rows[:, 3] = 0.0
+    rows[:, 4] = 5.0 + 1e-15 * rows[:, 0]
+    space, without = rules.Space.of(rows), rules.Space.of(rows[:, :3])
+    moved = np.array([[0.5, -1.0, 2.0, 1e-3, 5.001]])
+    assert space.second(moved) == pytest.approx(without.second(moved[:, :3]), rel=1e-10)
+    assert space.second(np.array([[50.0, 0.0, 0.0, 0.0, 5.0]])) > 10
+
+
+def test_the_rule_fails_its_own_ensemble_as_rarely_as_it_says():
+    rng = np.random.default_rng(3)
+    failures = tries = 0
+    for _ in range(40):
+        # wide tails: a limit of two would fail far more often
+        rows = rng.standard_t(4, (60 + 30, 15))
+        space, limit = rules.Space.of(rows[:60]), rules.limit_of(rows[:60])
+        assert limit >= rules.LIMIT
+        medians = rules.triples(space.second(rows[60:]))
+        failures += int((medians > limit).sum())
+        tries += len(medians)
+    assert tries == 400
+    assert rules.bounds(failures, tries)[0] <= rules.ACCEPTED
+
+
+def test_the_interval_of_a_rate_is_exact():
+    for count, of in ((0, 10), (3, 30), (30, 30), (7, 9)):
+        low, high = rules.bounds(count, of)
+        if count:
+            assert float(binomial_tail(count, of, Fraction(low))) == pytest.approx(0.025, rel=1e-6)
+        else:
+            assert low == 0
+        if count < of:
+            assert float(1 - binomial_tail(count + 1, of, Fraction(high))) == pytest.approx(0.025, rel=1e-6)
+        else:
+            assert high == 1
+    p = Fraction(1, 10)
+    assert rules.two_of_three(0.1) == pytest.approx(float(binomial_tail(2, 3, p)))
+
+
+def test_planted_changes_change_what_they_say(hot):
+    changes = {change.name: change.simulation for change in planted(hot)}
+    assert float(changes["time step + 2.5 %"].integrator.timestep) == pytest.approx(0.0041)
+    cut = changes["cutoff - 4 %"]
+    assert cut.r_cut == pytest.approx(2.112) and float(cut.model.r_cut[0]) == cut.decider.r_cut[0]
+    assert changes["forces in float32"].policy.force == "float32"
+    assert changes["lists by jax-md"].builder == "jax-md"
+    assert shorter(hot, 1.0).r_cut == hot.r_cut
+    # a potential that carries its own cutoff keeps it
+    metal = build("silicon/stillinger-weber-512")
+    assert [c.must_fail for c in planted(metal)] == [True, False, False]
+
+
+@pytest.mark.slow
+@pytest.mark.jax_md
+def test_false_positives_and_power_over_many_tries(hot):
+    found = calibrate(hot, members=100, held_out=300, tries=10)
+    assert found.triples == 100
+    assert rules.bounds(found.false_positives, 100)[0] <= rules.ACCEPTED
+    assert rules.bounds(found.alone, 300)[0] <= rules.ALONE
+    assert 250 <= found.window.step <= 650
+    for one in found.window.table:
+        assert one.failures == one.tries if one.must_fail else one.failures <= 2
