@@ -16,10 +16,11 @@ import numpy as np
 
 from mdnum.errors import InputError
 from mdnum.forks.confirm import digests_elsewhere
-from mdnum.forks.dials import Dial, checked, dial
-from mdnum.forks.histories import History, Look, Loss, history, look, margin, squared_displacement
-from mdnum.precision.ulp import neighbor, ordinal
-from mdnum.systems.build import Simulation, build
+from mdnum.forks.dials import checked, dial
+from mdnum.forks.histories import Loss, margin, squared_displacement
+from mdnum.forks.line import Line
+from mdnum.precision.ulp import ordinal
+from mdnum.systems.build import build
 from mdnum.systems.load import System, load
 
 
@@ -203,7 +204,7 @@ def boundaries(
     checked(one, low, high)
     for end in (low, high):
         one.turn(simulation, end)
-    line = _Line(simulation, one, last, loss)
+    line = Line(simulation, one, last, loss)
     places = _grid(low, high, cells)
     pending: list[tuple[int, int, int]] = []
     for k, place in enumerate(places):
@@ -227,7 +228,7 @@ def boundaries(
     return _mapped(line, bounds)
 
 
-def _tell(progress, found: int, most: int, line: _Line, phase: str) -> None:
+def _tell(progress, found: int, most: int, line: Line, phase: str) -> None:
     if progress is not None:
         progress(found, most, {"phase": phase, "runs": len(line.known)})
 
@@ -240,47 +241,7 @@ def _grid(low: float, high: float, cells: int) -> list[int]:
     return sorted({int(place) for place in ordinal(np.linspace(low, high, cells + 1))})
 
 
-@dataclass(frozen=True)
-class _Point:
-    digest: str
-    loss: float
-    energy: float
-
-
-class _Line:
-    """Runs of one system along one number, addressed by the ordinal of a float."""
-
-    def __init__(self, simulation: Simulation, one: Dial, steps: int, loss: Loss):
-        self.simulation, self.dial, self.steps, self.loss = simulation, one, steps, loss
-        self.known: dict[int, _Point] = {}
-
-    def value(self, place: int) -> float:
-        """The float of an ordinal."""
-        return float(neighbor(0.0, place))
-
-    def at(self, place: int) -> Simulation:
-        """The simulation at a float."""
-        return self.dial.turn(self.simulation, self.value(place))
-
-    def run(self, place: int) -> History:
-        """The run at a float; what it decided is remembered."""
-        simulation = self.at(place)
-        made = history(simulation, self.steps)
-        self.known[place] = _Point(made.digest, float(self.loss(simulation, made.x, made.v)), made.energy)
-        return made
-
-    def digest(self, place: int) -> str:
-        """What the run at a float decided."""
-        if place not in self.known:
-            self.run(place)
-        return self.known[place].digest
-
-    def look(self, place: int, step: int) -> Look:
-        """One step of the run at a float."""
-        return look(self.at(place), self.steps, step)
-
-
-def _bisect(line: _Line, a: int, b: int, pending: list[tuple[int, int, int]]) -> tuple[int, int]:
+def _bisect(line: Line, a: int, b: int, pending: list[tuple[int, int, int]]) -> tuple[int, int]:
     """Adjacent ordinals between two whose histories differ; the halves not followed go to `pending`."""
     while b - a > 1:
         middle = (a + b) // 2
@@ -294,7 +255,7 @@ def _bisect(line: _Line, a: int, b: int, pending: list[tuple[int, int, int]]) ->
     return a, b
 
 
-def _annotated(line: _Line, pair: tuple[int, int], elsewhere: list[str] | None) -> Boundary:
+def _annotated(line: Line, pair: tuple[int, int], elsewhere: list[str] | None) -> Boundary:
     """What differs between two adjacent floats."""
     runs = [line.run(place) for place in pair]
     step = runs[0].first_difference(runs[1])
@@ -334,7 +295,7 @@ def _annotated(line: _Line, pair: tuple[int, int], elsewhere: list[str] | None) 
     return Boundary(below, above, step, i, j, bound, len(pairs) - 1, apart, confirmed)
 
 
-def _mapped(line: _Line, found: list[Boundary]) -> BoundaryMap:
+def _mapped(line: Line, found: list[Boundary]) -> BoundaryMap:
     """Everything that was run, put in order."""
     places = sorted(line.known)
     values = [line.value(place) for place in places]
