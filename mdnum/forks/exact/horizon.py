@@ -38,6 +38,8 @@ POLICIES: Mapping[str, PrecisionPolicy] = {
 
 #: A share of what double precision gains that counts as nothing, and bits of error that do.
 _NOTHING, _NO_BITS = 0.05, 1.0
+#: Quality of a fit from which on a growth counts as exponential.
+_EXPONENTIAL = 0.95
 #: Separation from the exact run up to which its growth is fitted, as a share of the longest cutoff.
 _SATURATED = 0.04
 
@@ -283,7 +285,8 @@ def certify(
 
 def _steps_per_bit(rows: list[PolicyHorizon]) -> float:
     """ln 2 over the growth rate of the run whose growth could be followed longest."""
-    known = [row.growth for row in rows if np.isfinite(row.growth.rate) and row.growth.rate > 0]
+    # separations that grow by a power of time, as those of a lone pair, are no exponentials
+    known = [row.growth for row in rows if row.growth.rate > 0 and row.growth.r_squared > _EXPONENTIAL]
     if not known:
         return float("nan")
     longest = max(known, key=lambda found: found.last - found.first)
