@@ -11,7 +11,7 @@ from jaxtyping import Float, UInt64
 
 from mdnum.md.cell import HostCell
 from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, unwrapped
-from mdnum.rollout.flips import _fingerprint_of_bits, decided_pairs
+from mdnum.rollout.flips import fingerprint_of_bits, decided_pairs
 from mdnum.systems.build import Simulation
 
 Loss = Callable[[Simulation, Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"]], float]
@@ -53,7 +53,7 @@ def marks_of(segment: Segment) -> UInt64[np.ndarray, "rows"]:
     """The marks of the steps of a segment."""
     table = segment.table
     rows = segment.rows_of("bits")
-    return np.array([_fingerprint_of_bits(bits, table.index, table.order)[1] for bits in rows], np.uint64)
+    return np.array([fingerprint_of_bits(bits, table.index, table.order)[1] for bits in rows], np.uint64)
 
 
 def history(simulation: Simulation, steps: int, start: Start | None = None) -> History:

@@ -24,7 +24,7 @@ def _mixed(key):
 
 
 @numba.njit(cache=True, nogil=True)
-def _fingerprint_of_bits(bits, index, order):
+def fingerprint_of_bits(bits, index, order):
     """Number and mixed sum of the keys of all pairs inside; the same for every list that decides alike."""
     count, total = 0, np.uint64(0)
     atoms = order.shape[0]
@@ -210,10 +210,10 @@ class PairRecorder:
             return None
         if self._held_segment is not None:
             table, bits = self._held_segment
-            old = _fingerprint_of_bits(bits, table.index, table.order)
+            old = fingerprint_of_bits(bits, table.index, table.order)
         else:
             old = _fingerprint_of_keys(self._held_keys)
-        if old == _fingerprint_of_bits(before, segment.table.index, segment.table.order):
+        if old == fingerprint_of_bits(before, segment.table.index, segment.table.order):
             return None
         held = self.held()
         assert held is not None
