@@ -11,7 +11,7 @@ from jaxtyping import Float, UInt64
 
 from mdnum.md.cell import HostCell
 from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, unwrapped
-from mdnum.rollout.flips import fingerprint_of_bits, decided_pairs
+from mdnum.rollout.flips import decided_pairs, fingerprint_of_bits
 from mdnum.systems.build import Simulation
 
 Loss = Callable[[Simulation, Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"]], float]

@@ -95,7 +95,7 @@ def test_bounds_hold_the_error_of_the_height_that_was_compared():
 
 
 def test_contact_history_against_exact_rationals():
-    """The same program in exact arithmetic: the events of float64 and float32 hold, those of 16 bits do not."""
+    """The same program in exact arithmetic: the events of 64 and 32 bits hold, those of 16 bits do not."""
     steps = 300
     h, g, k = 2.0**-6, 9.75, 512.0
     start = 0.40625
