@@ -21,6 +21,9 @@ from mdnum.ball.stopping import PerInstance
 from mdnum.ball.world import World
 from mdnum.errors import InputError
 
+# step sizes down to a ten-thousandth
+pytestmark = pytest.mark.slow
+
 # three impacts each by the time 2, none of them near it
 STARTS = np.linspace(0.9, 1.1, 32)
 TIME = 2.0

@@ -22,6 +22,9 @@ from mdnum.forks.benign.planted import planted, shorter
 from mdnum.rollout.engine import first_state
 from mdnum.systems.build import Simulation, build
 
+# ensembles
+pytestmark = pytest.mark.slow
+
 HOT = """
 about = "A small hot Lennard-Jones fluid, melting."
 units = "lj"

@@ -14,6 +14,9 @@ from mdnum.forks.dials import dial, names
 from mdnum.rollout.engine import Engine
 from mdnum.systems.build import build
 
+# processes of their own, and hundreds of runs
+pytestmark = pytest.mark.slow
+
 APART, RADIUS, SPEED = 3.0, 2.5, 1.25
 
 

@@ -30,6 +30,9 @@ from mdnum.rollout.engine import first_state
 from mdnum.systems.build import build
 from mdnum.systems.load import System, load
 
+# a program is compiled for almost every choice
+pytestmark = pytest.mark.slow
+
 CRYSTAL = "argon/crystal-108"
 
 

@@ -16,6 +16,9 @@ from mdnum.forks.lyapunov import lyapunov
 from mdnum.rollout.lockstep import lockstep
 from mdnum.systems.build import build
 
+# long tangent runs
+pytestmark = pytest.mark.slow
+
 
 def liquid():
     """A hot dense fluid of 108 atoms."""

@@ -22,6 +22,9 @@ from mdnum.rollout.engine import Engine
 from mdnum.systems.build import build
 from mdnum.systems.load import System, load
 
+# processes of their own
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def crystal() -> System:

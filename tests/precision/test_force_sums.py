@@ -18,6 +18,9 @@ from mdnum.precision.running import Tap, running_sum_table
 from mdnum.systems import load
 from mdnum.systems.build import build
 
+# a force is compiled for every reduction
+pytestmark = pytest.mark.slow
+
 #: All of them in float32; each compiles the force anew, so a few in float64.
 NAMES = {"float32": tuple(BY_NAME), "float64": ("sequential", "pairwise", "blocked", "kahan", "exact")}
 SAME_IN_EVERY_ORDER = ("sorted", "exact", "fixed-point")

@@ -19,6 +19,9 @@ from mdnum.ball.problem import Problem
 from mdnum.ball.world import World
 from mdnum.errors import InputError, NumericalError
 
+# the whole demonstration is run
+pytestmark = pytest.mark.slow
+
 G, H, E = 9.81, 0.01, 0.8
 
 

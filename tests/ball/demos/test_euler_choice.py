@@ -6,6 +6,9 @@ import pytest
 
 from mdnum.ball import demos
 
+# the whole demonstration is run
+pytestmark = pytest.mark.slow
+
 G, STEPS, H = 9.81, 200, 0.01
 
 

@@ -13,6 +13,9 @@ from mdnum.ball.demos.fork import STEPS, adjacent
 from mdnum.ball.integrators import SemiImplicitEuler
 from mdnum.ball.world import World
 
+# the whole demonstration is run
+pytestmark = pytest.mark.slow
+
 G, H, E = 9.81, 0.01, 0.8
 
 

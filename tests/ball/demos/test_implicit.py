@@ -8,6 +8,9 @@ import pytest
 from mdnum.ball.demos import Demo, run
 from mdnum.ball.gradients.cost import accuracy
 
+# the whole demonstration is run
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def demo() -> Demo:

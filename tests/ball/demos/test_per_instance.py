@@ -8,6 +8,9 @@ import pytest
 from mdnum.ball.demos import Demo, run
 from mdnum.ball.demos.per_instance import BATCH, STRANGER, TOL
 
+# the whole demonstration is run
+pytestmark = pytest.mark.slow
+
 MEASURES = {"global sum": sum, "maximum": max}
 
 

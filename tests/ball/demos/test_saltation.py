@@ -8,6 +8,9 @@ import pytest
 
 from mdnum.ball import demos
 
+# the whole demonstration is run
+pytestmark = pytest.mark.slow
+
 G, E, TIME = 9.81, 0.8, 2.0
 
 

@@ -7,6 +7,9 @@ import pytest
 
 from mdnum.ball import demos
 
+# the whole demonstration is run
+pytestmark = pytest.mark.slow
+
 G, K, H, STEPS = 9.81, 3000.0, 0.01, 200
 STARTS = np.linspace(0.9, 1.1, 1001)
 

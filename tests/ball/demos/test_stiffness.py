@@ -7,6 +7,9 @@ import pytest
 
 from mdnum.ball import demos
 
+# the whole demonstration is run
+pytestmark = pytest.mark.slow
+
 G, H = 9.81, 0.01
 
 

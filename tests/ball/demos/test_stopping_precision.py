@@ -13,6 +13,9 @@ from mdnum.ball.demos.stopping_precision import boundary_batch, policies, proble
 from mdnum.errors import InputError
 from mdnum.precision.reductions import Exact
 
+# the whole demonstration is run
+pytestmark = pytest.mark.slow
+
 KINDS = {"bfloat16": ml_dtypes.bfloat16, "float16": np.float16}
 
 

@@ -16,6 +16,9 @@ from mdnum.forks.exact.tape import first_difference
 from mdnum.precision import PrecisionPolicy
 from mdnum.systems.build import Simulation, build
 
+# exact runs
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("flint", reason="exact runs need python-flint")
 
 WIDE = PrecisionPolicy()
