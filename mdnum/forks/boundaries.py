@@ -144,7 +144,8 @@ class BoundaryMap:
     def words(self) -> str:
         """The map in one sentence, with what it cannot know."""
         text = (
-            f"{len(self.boundaries)} boundaries and {self.histories} histories of {self.steps} steps between "
+            f"{_many(len(self.boundaries), 'boundary', 'boundaries')} and "
+            f"{_many(self.histories, 'history', 'histories')} of {self.steps} steps between "
             f"{self.key} = {self.low!r} and {self.high!r}"
         )
         if self.unresolved:
@@ -152,6 +153,10 @@ class BoundaryMap:
         if self.complete:
             return text + "; every float was run"
         return text + f"; pairs of boundaries closer than {self.resolution:.2g} may be missed"
+
+
+def _many(count: int, one: str, more: str) -> str:
+    return f"{count} {one if count == 1 else more}"
 
 
 def boundaries(

@@ -1,0 +1,69 @@
+"""The other questions of `mdnum fork`, from the command line to the answer."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from mdnum.cli import main
+from mdnum.cli.fork_questions import interval
+from mdnum.errors import InputError
+from mdnum.rollout.run import run
+
+
+def call(*arguments: str) -> int:
+    with pytest.raises(SystemExit) as stopped:
+        main(list(arguments))
+    assert isinstance(stopped.value.code, int)
+    return stopped.value.code
+
+
+def test_an_interval_is_a_key_and_two_numbers():
+    assert interval("potential.sigma=3.40:3.41") == ("potential.sigma", 3.40, 3.41)
+    assert interval(" r_cut = 1e0 : 2.5") == ("r_cut", 1.0, 2.5)
+    for text in ("sigma", "sigma=3", "sigma=a:b", "=1:2", "sigma=1:2:3"):
+        with pytest.raises(InputError, match="KEY=LOW:HIGH"):
+            interval(text)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("argon/crystal-108", "--certify", "--forecast", "1e-6"), "different questions"),
+        (("argon/crystal-108", "--vary", "skin", "--along", "sigma=1:2"), "different questions"),
+        (("argon/crystal-108", "--benign"), "--benign needs a choice"),
+        (("--certify",), "no system given"),
+        (("argon/crystal-108", "--forecast", "-1"), "expected a length above 0"),
+        (("argon/crystal-108", "--along", "sigma"), "KEY=LOW:HIGH"),
+        (("silicon/tersoff-512", "--certify", "--steps", "2"), "Lennard-Jones"),
+    ],
+)
+def test_what_cannot_be_asked_is_refused_in_one_line(arguments, message, capsys):
+    assert call("fork", *arguments) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+
+
+def test_a_forecast_names_the_flip_that_comes(capsys):
+    assert call("fork", "argon/crystal-108", "--forecast", "1e-6", "--steps", "60", "--json") == 0
+    answer = json.loads(capsys.readouterr().out)
+    first = answer["first"][0]
+    # the fork of two runs that far apart is at step 5, by this pair
+    assert (first["step"], first["i"], first["j"]) == (5, 28, 64)
+    assert call("fork", "argon/crystal-108", "--forecast", "1e-6", "--steps", "60") == 0
+    assert "28–64 at step 5" in capsys.readouterr().out
+
+
+def test_two_folders(tmp_path: Path, capsys):
+    run("argon/crystal-108", out=tmp_path / "a", steps=40)
+    run("argon/crystal-108", out=tmp_path / "b", steps=40, overrides={"precision.force": "float32"})
+    assert call("fork", str(tmp_path / "a"), str(tmp_path / "b"), "--json") == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["steps"] == 40 and answer["seed"] == 0
+    assert ["precision.force", "float64", "float32"] in answer["differences"]
+    assert call("fork", str(tmp_path / "a"), str(tmp_path / "b")) == 0
+    assert "precision.force" in capsys.readouterr().out
+    assert call("fork", str(tmp_path / "a"), str(tmp_path / "nowhere")) == 2
+    assert "no such folder" in capsys.readouterr().err
