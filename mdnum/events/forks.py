@@ -160,8 +160,10 @@ def judge(
     if handed is None:
         text = f"split at step {dates.split}; without a counterfactual nothing is said about the cause"
         return Verdict("open", dates.split, None, 0.0, None, (text,))
+    # repeats may all be earlier than the pair, when they are perturbed by more: their own scatter counts
+    sample = chance if len(chance) > 1 else [dates.split, *chance]
     # both dates scatter, the free one and the handed one
-    noise = 2.0 * float(np.sqrt(2) * np.std([dates.split, *chance], ddof=1)) if chance else 0.0
+    noise = 2.0 * float(np.sqrt(2) * np.std(sample, ddof=1)) if chance else 0.0
     other = split_of(handed, tolerance)
     seen = int(np.flatnonzero(np.isfinite(handed))[-1]) if np.isfinite(handed).any() else 0
     if other is None:
