@@ -33,7 +33,8 @@ def study(name: str, *words: str, cwd: Path, code: int = 0) -> str:
     done = subprocess.run(
         [sys.executable, str(SCRIPTS / f"{name}.py"), *words],
         cwd=cwd,
-        env={**os.environ, "MPLBACKEND": "Agg"},
+        # a worker of the tests has a terminal 80 columns wide; a table in a file has not
+        env={name: value for name, value in os.environ.items() if name != "COLUMNS"} | {"MPLBACKEND": "Agg"},
         capture_output=True,
         text=True,
         timeout=600,
