@@ -301,10 +301,10 @@ def test_planted_changes_change_what_they_say(hot):
 @pytest.mark.slow
 @pytest.mark.jax_md
 def test_false_positives_and_power_over_many_tries(hot):
-    found = calibrate(hot, members=100, held_out=300, tries=10)
-    assert found.triples == 100
-    assert rules.bounds(found.false_positives, 100)[0] <= rules.ACCEPTED
-    assert rules.bounds(found.alone, 300)[0] <= rules.ALONE
+    found = calibrate(hot, members=60, held_out=120, tries=4)
+    assert found.triples == 40
+    assert rules.bounds(found.false_positives, 40)[0] <= rules.ACCEPTED
+    assert rules.bounds(found.alone, 120)[0] <= rules.ALONE
     assert 250 <= found.window.step <= 650
     for one in found.window.table:
         assert one.failures == one.tries if one.must_fail else one.failures <= 2
