@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from mdnum.cli import output
 from mdnum.cli.progress import ProgressBar
@@ -240,14 +239,3 @@ def folders(a: Path, b: Path, *, as_json: bool) -> int:
 
 def _step(step: int | None, steps: int) -> str:
     return f"none in {steps:,}" if step is None else f"{step:,}"
-
-
-def minimal(made: Any, *, tests: int) -> dict[str, Any]:
-    """The fewest decisions that had to be taken back, as a document."""
-    from mdnum.forks.minimal import minimal_cause
-
-    with ProgressBar() as progress:
-        found = minimal_cause(
-            made, tests=tests, progress=lambda at, last: progress(at, last, {"phase": "run"})
-        )
-    return output.plain(found)

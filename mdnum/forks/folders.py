@@ -115,7 +115,7 @@ def compare_folders(a: RunFolder | str | Path, b: RunFolder | str | Path) -> Fol
 def twin(a: str | Path, b: str | Path) -> Twin:
     """The runs of two folders, to be followed again.
 
-    A replay has the bits of the stored run where versions and processor are the same; `replays` says so.
+    A replay has the bits of the stored run where versions and processor are the same.
     """
     found = compare_folders(a, b)
     words = "; ".join(f"{key}: {one} and {other}" for key, one, other in found.differences[:3])
