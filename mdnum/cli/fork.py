@@ -11,6 +11,7 @@ from mdnum.cli.fork_print import print_fork
 from mdnum.cli.progress import ProgressBar
 from mdnum.errors import InputError
 
+
 def fork(
     system: str | None = typer.Argument(
         None, metavar="SYSTEM", help="A name from `mdnum systems list`, or the path of a TOML file."
