@@ -14,16 +14,9 @@ def report(
     as_json: bool = output.JSON_OPTION,
 ) -> int:
     """Write the report of a run folder again."""
-    from mdnum.store import RunFolder
+    from mdnum.report import write
 
-    run = RunFolder.open(folder)
-    if run.world == "ball":
-        from mdnum.report.ball.html import write_report
-    elif run.world == "fork":
-        from mdnum.report.fork.html import write_report
-    else:
-        from mdnum.report.html import write_report
-    written = write_report(run)
+    written = write(folder)
     if as_json:
         output.print_json({"folder": folder, "report": written})
     else:

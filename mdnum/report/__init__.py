@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
+import importlib
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mdnum.store import RunFolder
 
 __all__ = ["judge", "write"]
+
+# which module judges a folder (`record`) and which writes its page (`write_report`); fork folders that answer
+# another question than where two runs part go by that question
+_MODULES = {
+    "md": ("mdnum.report.findings", "mdnum.report.html"),
+    "ball": ("mdnum.report.ball.findings", "mdnum.report.ball.html"),
+    "fork": ("mdnum.report.fork.findings", "mdnum.report.fork.html"),
+    "along": ("mdnum.report.fork.map", "mdnum.report.fork.map"),
+    "processes": ("mdnum.report.fork.processes", "mdnum.report.fork.processes"),
+}
 
 
 def write(folder: RunFolder | str | Path) -> Path:
@@ -20,15 +31,7 @@ def write(folder: RunFolder | str | Path) -> Path:
     Raises:
         FolderError: no run in the folder, or it cannot be written.
     """
-    world = _world(folder)
-    if world == "ball":
-        from mdnum.report.ball.html import write_report
-    elif world == "fork":
-        from mdnum.report.fork.html import write_report
-    else:
-        from mdnum.report.html import write_report
-
-    return write_report(folder)
+    return _modules(folder)[1].write_report(folder)
 
 
 def judge(folder: RunFolder | str | Path) -> None:
@@ -37,20 +40,17 @@ def judge(folder: RunFolder | str | Path) -> None:
     Raises:
         FolderError: no run in the folder, or it cannot be written.
     """
-    world = _world(folder)
-    if world == "ball":
-        from mdnum.report.ball.findings import record
-    elif world == "fork":
-        from mdnum.report.fork.findings import record
-    else:
-        from mdnum.report.findings import record
-
-    record(folder)
+    _modules(folder)[0].record(folder)
 
 
-def _world(folder: RunFolder | str | Path) -> str:
-    """ "ball", "fork" or "md"; folders from before there were two worlds do not say."""
+def _modules(folder: RunFolder | str | Path) -> tuple[Any, Any]:
+    """What judges a folder, and what writes its page."""
     from mdnum.store import RunFolder
 
     folder = folder if isinstance(folder, RunFolder) else RunFolder.open(folder)
-    return str(folder.summary.get("world") or "md")
+    summary = folder.summary
+    # a folder from before there were two worlds does not say; one that was killed has its tables alone
+    kinds = (summary.get("question"), summary.get("world"), folder.world)
+    kind = next(kind for kind in kinds if kind in _MODULES)
+    judges, writes = (importlib.import_module(name) for name in _MODULES[kind])
+    return judges, writes

@@ -41,7 +41,7 @@ class RunFolder:
 
     Attributes:
         path: the folder.
-        world: "md", "ball" or "fork": which tables it has.
+        world: which tables it has, a key of `TABLES`.
     """
 
     def __init__(self, path: Path, world: str = "md"):
@@ -63,7 +63,7 @@ class RunFolder:
         Args:
             path: made if missing, parents included.
             overwrite: remove the run that is there. Files that are not a run's are left alone.
-            world: "md", "ball" or "fork".
+            world: a key of `TABLES`.
 
         Raises:
             FolderError: the folder holds a run or other files, is a file, or cannot be written.
@@ -109,8 +109,8 @@ class RunFolder:
             raise FolderError("no such folder", remedy="Give the folder of a run", where=str(path))
         if not any((folder.path / name).exists() for name in (*_FILES, "parts")):
             raise FolderError("holds no run", remedy="Give the folder of a run", where=str(path))
-        for world in ("ball", "fork"):
-            if any((folder.path / f"{name}.parquet").exists() for name in TABLES[world]):
+        for world, tables in TABLES.items():
+            if any((folder.path / f"{name}.parquet").exists() for name in tables):
                 folder.world = world
         return folder
 

@@ -67,15 +67,50 @@ COLUMNS: Mapping[str, Mapping[str, pa.DataType]] = MappingProxyType(
         "neighborhood": _columns(
             atom=_SHORT, x=_FLOAT, y=_FLOAT, z=_FLOAT, dx=_FLOAT, dy=_FLOAT, dz=_FLOAT,
         ),
+        "boundaries": _columns(
+            below=_FLOAT, above=_FLOAT, step=_INT, i=_SHORT, j=_SHORT, inside=_BOOL, also=_INT,
+            margin_below=_FLOAT, margin_above=_FLOAT, bound=_FLOAT, loss_below=_FLOAT, loss_above=_FLOAT,
+            jump=_FLOAT, energy_below=_FLOAT, energy_above=_FLOAT, apart=_FLOAT, confirmed=_TEXT,
+        ),
+        "intervals": _columns(
+            low=_FLOAT, high=_FLOAT, history=_INT, digest=_TEXT, loss_low=_FLOAT, loss_high=_FLOAT,
+            runs=_INT, gap=_FLOAT,
+        ),
+        "points": _columns(at=_FLOAT, history=_INT, loss=_FLOAT, energy=_FLOAT),
+        "variants": _columns(
+            variant=_TEXT, program=_TEXT, flags=_TEXT, reduction=_TEXT, cluster=_INT, seed=_INT, steps=_INT,
+            separation=_FLOAT, seconds=_FLOAT, hash=_TEXT, failed=_TEXT,
+        ),
+        "variant_separations": _columns(variant=_TEXT, step=_INT, separation=_FLOAT),
+        "policies": _columns(
+            policy=_TEXT, state=_TEXT, force=_TEXT, decision=_TEXT, accumulate=_TEXT, horizon=_INT, i=_SHORT,
+            j=_SHORT, margin=_FLOAT, gain=_FLOAT, closer_bits=_FLOAT, growth_rate=_FLOAT, failed=_TEXT,
+        ),
+        "policy_separations": _columns(policy=_TEXT, step=_INT, separation=_FLOAT),
+        "ambiguous": _columns(
+            step=_INT, i=_SHORT, j=_SHORT, inside=_BOOL, margin=_FLOAT, bound=_FLOAT, exact=_FLOAT,
+            wrong=_BOOL,
+        ),
+        "reach": _columns(
+            step=_INT, positive=_FLOAT, negative=_FLOAT, i=_SHORT, j=_SHORT, furthest=_FLOAT,
+        ),
+        "foretold": _columns(
+            asked=_TEXT, step=_INT, i=_SHORT, j=_SHORT, amplitude=_FLOAT, margin=_FLOAT, ulps=_FLOAT,
+        ),
     }
 )  # fmt: skip
 
-#: The tables that the folder of a run has, whether they hold a row or not, by the world that was run.
+#: The tables that a folder has, whether they hold a row or not, by the world that was run; fork folders that
+#: answer another question than where two runs part go by that question.
 TABLES: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         "md": ("series", "flips", "epochs"),
         "ball": ("steps", "contacts", "solver", "heights", "separations"),
         "fork": ("separation", "cross_flips", "neighborhood"),
+        "along": ("boundaries", "intervals", "points"),
+        "processes": ("variants", "variant_separations"),
+        "certify": ("policies", "ambiguous", "policy_separations"),
+        "forecast": ("foretold", "reach"),
     }
 )
 
