@@ -23,6 +23,8 @@ _HOMES = {
     "build": "mdnum.systems:build",
     "diagnose": "mdnum.doctor:diagnose",
     "fork": "mdnum.workflow:fork",
+    "fork_map": "mdnum.workflow:fork_map",
+    "fork_processes": "mdnum.workflow:fork_processes",
     "load": "mdnum.systems:load",
     "run": "mdnum.workflow:run",
     "systems": "mdnum.systems",
@@ -41,6 +43,8 @@ if TYPE_CHECKING:
     from mdnum.systems import load as load
     from mdnum.workflow import bounce as bounce
     from mdnum.workflow import fork as fork
+    from mdnum.workflow import fork_map as fork_map
+    from mdnum.workflow import fork_processes as fork_processes
     from mdnum.workflow import run as run
 
 __all__ = [
@@ -55,6 +59,8 @@ __all__ = [
     "build",
     "diagnose",
     "fork",
+    "fork_map",
+    "fork_processes",
     "load",
     "run",
     "systems",

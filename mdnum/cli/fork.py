@@ -6,7 +6,7 @@ from pathlib import Path
 
 import typer
 
-from mdnum.cli import fork_questions, output
+from mdnum.cli import fork_map, fork_processes, fork_questions, output
 from mdnum.cli.fork_print import print_fork
 from mdnum.cli.progress import ProgressBar
 from mdnum.errors import InputError
@@ -39,6 +39,12 @@ def fork(
     along: str | None = typer.Option(
         None, metavar="KEY=LOW:HIGH", help="Where the history of decisions changes along a number."
     ),
+    most: int | None = typer.Option(
+        None, min=1, metavar="N", help="With --along: stop after so many boundaries; 24 by default."
+    ),
+    processes: bool = typer.Option(
+        False, "--processes", help="Which programs agree: jit, eager, vmap, grad, flags of XLA."
+    ),
     certify: bool = typer.Option(
         False, "--certify", help="When runs leave the history in exact arithmetic, by precision."
     ),
@@ -59,6 +65,7 @@ def fork(
     asked = {
         "RUN": other is not None,
         "--along": along is not None,
+        "--processes": processes,
         "--certify": certify,
         "--forecast": forecast is not None,
         "--vary": vary is not None,
@@ -68,13 +75,21 @@ def fork(
         raise InputError(f"{given} are different questions", remedy="Ask one at a time")
     if benign and vary is None:
         raise InputError("--benign needs a choice", remedy="Add --vary CHOICE")
+    if most is not None and along is None:
+        raise InputError("--most needs a number to go along", remedy="Add --along KEY=LOW:HIGH")
     if any(asked.values()) and system is None:
         raise InputError("no system given", remedy="`mdnum systems list` names those that come with mdnum")
     if system is not None:
         if other is not None:
             return fork_questions.folders(Path(system), other, as_json=as_json)
         if along is not None:
-            return fork_questions.along(system, along, steps, overrides, as_json=as_json)
+            return fork_map.along(
+                system, along, steps, most, overrides, out=out, report=not no_report, as_json=as_json
+            )
+        if processes:
+            return fork_processes.processes(
+                system, steps, overrides, out=out, report=not no_report, as_json=as_json
+            )
         if certify:
             return fork_questions.certify(system, steps, overrides, as_json=as_json)
         if forecast is not None:

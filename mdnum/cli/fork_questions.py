@@ -1,98 +1,13 @@
-"""The other questions of `mdnum fork`: along a number, in exact arithmetic, ahead of time, of two folders."""
+"""The other questions of `mdnum fork`: in exact arithmetic, ahead of time, of an ensemble, of two folders."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from pathlib import Path
 
 from mdnum.cli import output
 from mdnum.cli.progress import ProgressBar
 from mdnum.errors import InputError
-
-_INTERVAL = re.compile(r"^\s*([^=\s]+)\s*=\s*([^:\s]+)\s*:\s*([^:\s]+)\s*$")
-
-
-def interval(text: str) -> tuple[str, float, float]:
-    """The words of `--along KEY=LOW:HIGH`.
-
-    Raises:
-        InputError: not of that form.
-    """
-    found = _INTERVAL.match(text)
-    try:
-        if found is None:
-            raise ValueError
-        return found[1], float(found[2]), float(found[3])
-    except ValueError:
-        raise InputError(
-            f"--along {text!r} is not of the form KEY=LOW:HIGH",
-            remedy="Write for example --along potential.sigma=3.40:3.41",
-        ) from None
-
-
-def along(system: str, text: str, steps: int | None, overrides: Mapping[str, str], *, as_json: bool) -> int:
-    """Where the history of a system's decisions changes along a number, to adjacent floats."""
-    key, low, high = interval(text)
-    from mdnum.forks.boundaries import boundaries
-
-    with ProgressBar() as progress:
-        found = boundaries(system, key, low, high, steps, overrides=overrides, progress=progress)
-    rows = [
-        {
-            "below": edge.below.at,
-            "above": edge.above.at,
-            "step": edge.step,
-            "i": edge.i,
-            "j": edge.j,
-            "margin_below": edge.below.margin,
-            "margin_above": edge.above.margin,
-            "bound": edge.bound,
-            "loss_below": edge.below.loss,
-            "loss_above": edge.above.loss,
-            "jump": edge.jump,
-            "apart": edge.apart,
-            "confirmed": edge.confirmed,
-        }
-        for edge in found.boundaries
-    ]
-    if as_json:
-        output.print_json(
-            {
-                "question": "along",
-                "key": key,
-                "low": low,
-                "high": high,
-                "steps": found.steps,
-                "says": found.words,
-                "histories": found.histories,
-                "complete": found.complete,
-                "resolution": found.resolution,
-                "evaluations": found.evaluations,
-                "unresolved": found.unresolved,
-                "boundaries": rows,
-                "intervals": found.intervals,
-            }
-        )
-        return output.EXIT_FINE
-    out = output.console()
-    out.print(found.words, style="bold", markup=False)
-    table = [
-        (
-            repr(row["below"]),
-            repr(row["above"]),
-            row["step"],
-            f"{row['i']}–{row['j']}",
-            f"{row['margin_below']:.2e} / {row['margin_above']:.2e}",
-            f"{row['jump']:.3e}",
-            row["confirmed"],
-        )
-        for row in rows
-    ]
-    output.print_table(
-        "", ("below", "above", "step", "pair", "margins", "jump of the loss", "confirmed"), table
-    )
-    return output.EXIT_FINE
 
 
 def certify(system: str, steps: int | None, overrides: Mapping[str, str], *, as_json: bool) -> int:

@@ -6,7 +6,7 @@ import dataclasses
 import json
 import math
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -177,3 +177,28 @@ def exit_code(findings: Iterable[Any], *, ok: bool = True) -> int:
     """1 when a finding asks for attention or the check failed, else 0; information is no finding."""
     matters = any(field(finding, "severity") in ("warning", "error") for finding in findings)
     return EXIT_FINDINGS if matters or not ok else EXIT_FINE
+
+
+def answer(
+    folder: Path,
+    summary: Mapping[str, Any],
+    print_rows: Callable[[Mapping[str, Any]], None],
+    *,
+    as_json: bool,
+) -> int:
+    """What a folder says, as JSON or for people; returns the exit code.
+
+    Args:
+        print_rows: prints what stands between the headline and the findings.
+    """
+    findings = summary.get("findings", ())
+    if as_json:
+        print_json({"folder": folder, **summary})
+        return exit_code(findings, ok=summary.get("status") == "complete")
+    out = console()
+    out.print(summary.get("headline", ""), style="bold", markup=False)
+    print_rows(summary)
+    print_findings(findings)
+    report = folder / "report.html"
+    out.print(f"wrote {report if report.exists() else folder}", markup=False)
+    return exit_code(findings, ok=summary.get("status") == "complete")

@@ -23,6 +23,8 @@ _WORDS = {
 class ProgressBar:
     """Called by a rollout as progress(step, steps, info); shows steps/s, flips, rebuilds and ETA.
 
+    What counts something else than steps says so: info["unit"] names it.
+
     The bar is started by a timer rather than by a call, because the first thing a run does is compile,
     for seconds, without calling.
 
@@ -94,7 +96,7 @@ class ProgressBar:
             return
         step, steps, info = self._last
         phase = str(info.get("phase", "run"))
-        counting = phase == "run" and steps > 0
+        counting = steps > 0 and (phase == "run" or "unit" in info)
         self._bar.update(
             self._task,
             description=_WORDS.get(phase, phase),
@@ -106,7 +108,7 @@ class ProgressBar:
 
 def describe(step: int, steps: int, info: dict[str, Any]) -> str:
     """The numbers beside the bar, in one line."""
-    parts = [f"{step:,} of {steps:,} steps"]
+    parts = [f"{step:,} of {steps:,} {info.get('unit', 'steps')}"]
     rate = info.get("steps_per_second")
     if rate:
         parts.append(f"{rate:,.0f} steps/s")

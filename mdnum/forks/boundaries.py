@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -22,6 +22,11 @@ from mdnum.forks.line import Line
 from mdnum.precision.ulp import ordinal
 from mdnum.systems.build import build
 from mdnum.systems.load import System, load
+
+Progress = Callable[[int, int, dict[str, Any]], None]
+
+#: Boundaries that are searched for, unless more are asked for: as many as a figure can name.
+MOST = 24
 
 
 @dataclass(frozen=True)
@@ -114,12 +119,14 @@ class BoundaryMap:
         low, high: the interval that was searched.
         intervals: with one history each, in order.
         boundaries: between them, in order.
-        unresolved: stretches whose ends have different histories but were not searched to the last bit.
+        unresolved: stretches whose ends have different histories but were not searched to the last bit, and
+            adjacent floats where a run fails on one side before any pair is decided otherwise.
         complete: whether every float of the interval was run, so that nothing can hide.
         resolution: the longest stretch between two runs of one history; a pair of boundaries within it that
             cancel each other may be missed.
         evaluations: runs made to find them.
-        at, loss: of every run made, in order.
+        at, loss, energy: of every run made, in order; at its last step.
+        failed: runs among them that ended in a blow-up or a runaway.
     """
 
     key: str
@@ -134,6 +141,8 @@ class BoundaryMap:
     evaluations: int
     at: np.ndarray
     loss: np.ndarray
+    energy: np.ndarray
+    failed: int
 
     @property
     def histories(self) -> int:
@@ -149,7 +158,8 @@ class BoundaryMap:
             f"{self.key} = {self.low!r} and {self.high!r}"
         )
         if self.unresolved:
-            text += f"; {len(self.unresolved)} more stretches hold boundaries that were not searched for"
+            more = _many(len(self.unresolved), "more stretch holds", "more stretches hold")
+            text += f"; {more} boundaries that were not searched for"
         if self.complete:
             return text + "; every float was run"
         return text + f"; pairs of boundaries closer than {self.resolution:.2g} may be missed"
@@ -168,10 +178,10 @@ def boundaries(
     *,
     overrides: Mapping[str, Any] | None = None,
     cells: int = 64,
-    most: int = 64,
+    most: int = MOST,
     loss: Loss = squared_displacement,
     confirm: bool = True,
-    progress: Callable[[int, int, dict[str, Any]], None] | None = None,
+    progress: Progress | None = None,
 ) -> BoundaryMap:
     """Changes of history along a number, as far as a grid can tell, each to adjacent floats.
 
@@ -190,7 +200,7 @@ def boundaries(
         most: stop after this many boundaries; what is left is told as unresolved.
         loss: of the final state, called with the simulation, unwrapped positions and velocities.
         confirm: whether to run both sides of every boundary in a fresh process.
-        progress: called with boundaries found, `most`, and figures.
+        progress: called with what is done of what there is to do, and figures: the phase, what is counted.
 
     Raises:
         InputError: no such number, an empty interval, or values that make no sense.
@@ -213,29 +223,47 @@ def boundaries(
     places = _grid(low, high, cells)
     pending: list[tuple[int, int, int]] = []
     for k, place in enumerate(places):
+        _tell(progress, k, len(places), "running a grid", "runs")
         line.digest(place)
-        _tell(progress, 0, most, line, f"grid {k + 1}/{len(places)}")
     for a, b in pairwise(places):
         if line.digest(a) != line.digest(b):
             heapq.heappush(pending, (a - b, a, b))
     found: list[tuple[int, int]] = []
     while pending and len(found) < most:
+        _tell(progress, len(found), min(most, len(found) + len(pending)), "bisecting", "boundaries")
         _, a, b = heapq.heappop(pending)
         found.append(_bisect(line, a, b, pending))
-        _tell(progress, len(found), most, line, "bisection")
     found.sort()
-    sides = [float(line.value(place)) for pair in found for place in pair]
-    elsewhere = digests_elsewhere(system, one.key, last, sides) if confirm and sides else None
-    bounds = [
-        _annotated(line, pair, None if elsewhere is None else elsewhere[2 * k : 2 * k + 2])
-        for k, pair in enumerate(found)
+    annotated = []
+    for k, pair in enumerate(found):
+        _tell(progress, k, len(found), "looking at both sides", "boundaries")
+        annotated.append(_annotated(line, pair))
+    bounds = [boundary for boundary in annotated if boundary is not None]
+    return _mapped(line, _confirmed(system, line, bounds, progress) if confirm and bounds else bounds)
+
+
+def _confirmed(
+    system: System, line: Line, found: list[Boundary], progress: Progress | None
+) -> list[Boundary]:
+    """The same boundaries, compared with what a fresh process finds on either side."""
+    sides = [side for boundary in found for side in (boundary.below, boundary.above)]
+    digests = digests_elsewhere(
+        system,
+        line.dial.key,
+        line.steps,
+        [side.at for side in sides],
+        lambda done: _tell(progress, done, len(sides), "confirming in a fresh process", "runs"),
+    )
+    same = [side.digest == digest for side, digest in zip(sides, digests, strict=True)]
+    return [
+        replace(boundary, confirmed=below and above)
+        for boundary, below, above in zip(found, same[::2], same[1::2], strict=True)
     ]
-    return _mapped(line, bounds)
 
 
-def _tell(progress, found: int, most: int, line: Line, phase: str) -> None:
+def _tell(progress: Progress | None, done: int, total: int, phase: str, unit: str) -> None:
     if progress is not None:
-        progress(found, most, {"phase": phase, "runs": len(line.known)})
+        progress(done, total, {"phase": phase, "unit": unit})
 
 
 def _grid(low: float, high: float, cells: int) -> list[int]:
@@ -260,16 +288,13 @@ def _bisect(line: Line, a: int, b: int, pending: list[tuple[int, int, int]]) -> 
     return a, b
 
 
-def _annotated(line: Line, pair: tuple[int, int], elsewhere: list[str] | None) -> Boundary:
-    """What differs between two adjacent floats."""
+def _annotated(line: Line, pair: tuple[int, int]) -> Boundary | None:
+    """What differs between two adjacent floats; None where it is a run that fails, not a decision."""
     runs = [line.run(place) for place in pair]
     step = runs[0].first_difference(runs[1])
     assert step is not None  # their digests differ
     if any(len(run.marks) <= step for run in runs):
-        raise InputError(
-            f"a run fails at step {step} where {line.dial.key} = {line.value(pair[1])!r}",
-            remedy="Search an interval of values that can be run, or fewer steps",
-        )
+        return None
     looks = [line.look(place, step) for place in pair]
     simulations = [line.at(place) for place in pair]
     atoms = line.simulation.atoms
@@ -294,10 +319,9 @@ def _annotated(line: Line, pair: tuple[int, int], elsewhere: list[str] | None) -
     ]
     kind = int(line.simulation.type_of(np.array([i]), np.array([j]))[0])
     apart = float(np.sqrt(np.max(np.sum((runs[1].x - runs[0].x) ** 2, axis=1))))
-    confirmed = None if elsewhere is None else elsewhere == [side.digest for side in sides]
     below, above = sides
     bound = simulations[0].decider.bounds[kind]
-    return Boundary(below, above, step, i, j, bound, len(pairs) - 1, apart, confirmed)
+    return Boundary(below, above, step, i, j, bound, len(pairs) - 1, apart, None)
 
 
 def _mapped(line: Line, found: list[Boundary]) -> BoundaryMap:
@@ -324,7 +348,8 @@ def _mapped(line: Line, found: list[Boundary]) -> BoundaryMap:
                 gap,
             )
         )
-    unresolved = tuple((values[k - 1], values[k]) for k in edges if places[k] - places[k - 1] > 1)
+    known = {boundary.below.at for boundary in found}
+    unresolved = tuple((values[k - 1], values[k]) for k in edges if values[k - 1] not in known)
     return BoundaryMap(
         line.dial.key,
         line.steps,
@@ -338,4 +363,6 @@ def _mapped(line: Line, found: list[Boundary]) -> BoundaryMap:
         len(line.known),
         np.array(values),
         np.array([point.loss for point in points]),
+        np.array([point.energy for point in points]),
+        sum(bool(point.failed) for point in points),
     )

@@ -23,6 +23,7 @@ from mdnum.md.integrators import Langevin
 from mdnum.md.pairforce import Forces, PairForce
 from mdnum.md.verlet import check_radius
 from mdnum.systems.build import Simulation
+from mdnum.systems.messages import nearest
 
 Turn = Callable[[Simulation, float], Simulation]
 _SHORT = {
@@ -32,6 +33,7 @@ _SHORT = {
     "radius": "cutoff.radius",
     "r_cut": "cutoff.radius",
     "onset": "cutoff.onset",
+    "dt": "dynamics.timestep",
 }
 
 
@@ -65,23 +67,46 @@ def dial(simulation: Simulation, key: str) -> Dial:
     Args:
         simulation: the system as objects.
         key: "dynamics.timestep", "potential.sigma" ("potential.pairs.Ni-P.sigma" for one pair of species),
-            "cutoff.radius", "cutoff.onset", "position.17.x", "velocity.17.x", "velocity.scale"; of Langevin
-            dynamics also "dynamics.temperature" and "dynamics.friction". The last word alone will do where it
-            is no question.
+            "cutoff.radius", "cutoff.onset", "neighbors.skin", "position.17.x", "velocity.17.x",
+            "velocity.scale"; of Langevin dynamics also "dynamics.temperature" and "dynamics.friction". The
+            last word alone will do where only one number ends so.
 
     Raises:
-        InputError: no such number; the known ones are listed.
+        InputError: no such number, or several; the known ones are listed.
     """
     dials = _fixed(simulation)
     word = _SHORT.get(key, key)
-    for name in (word, f"potential.{word}"):
-        if name in dials:
-            return dials[name]
+    found = [word] if word in dials else [name for name in dials if name.endswith(f".{word}")]
+    if len(found) == 1:
+        return dials[found[0]]
+    if found:
+        raise InputError(f"{key!r} could be any of {', '.join(found)}", remedy="Write one of them in full")
     started = _start(simulation, key)
     if started is not None:
         return started
-    known = ", ".join([*dials, "position.ATOM.x", "velocity.ATOM.x"])
-    raise InputError(f"{key!r} is no number that can be turned", remedy=f"Use one of: {known}")
+    known = [*dials, "position.ATOM.x", "velocity.ATOM.x"]
+    ends = {name.rpartition(".")[2]: name for name in dials}
+    meant = nearest(key, [*known, *ends])
+    hint = "" if meant is None else f"Did you mean {ends.get(meant, meant)}? "
+    raise InputError(
+        f"{key!r} is no number that can be turned", remedy=f"{hint}Use one of: {', '.join(known)}"
+    )
+
+
+def unit(simulation: Simulation, key: str) -> str:
+    """The unit of a number in the user's words; empty for a pure number and where it is not known."""
+    units, last = simulation.units, key.rpartition(".")[2]
+    if key.startswith("velocity.") and last != "scale":
+        return f"{units.length}/{units.time}"
+    if key.startswith(("position.", "cutoff.")) or last in ("sigma", "skin"):
+        return units.length
+    named = {
+        "timestep": units.time,
+        "friction": f"1/{units.time}",
+        "temperature": units.temperature,
+        "epsilon": units.energy,
+    }
+    return named.get(last, "")
 
 
 def names(simulation: Simulation) -> tuple[str, ...]:
@@ -95,6 +120,7 @@ def _fixed(simulation: Simulation) -> dict[str, Dial]:
     dials = [
         _plain("dynamics.timestep", float(integrator.timestep) / factor, _integrator("timestep", factor)),
         _plain("velocity.scale", 1.0, _scaled),
+        _plain("neighbors.skin", simulation.rule.skin, _skin),
     ]
     if isinstance(integrator, Langevin):
         k_B = simulation.units.k_B
@@ -124,6 +150,12 @@ def _integrator(name: str, factor: float, *, inverse: bool = False) -> Turn:
         return replace(simulation, integrator=changed)
 
     return turn
+
+
+def _skin(simulation: Simulation, value: float) -> Simulation:
+    """Another skin: another list, hence another order of the same sums from the first rebuild on."""
+    check_radius(simulation.cell, simulation.r_cut, value)
+    return replace(simulation, rule=replace(simulation.rule, skin=value))
 
 
 def _scaled(simulation: Simulation, value: float) -> Simulation:
@@ -168,6 +200,8 @@ def _radii(simulation: Simulation) -> list[Dial]:
 
 
 def _onset(simulation: Simulation, value: float) -> Simulation:
+    if value >= simulation.r_cut:
+        raise InputError(f"an onset of {value!r} is not below the cutoff radius {simulation.r_cut!r}")
     leaf = jnp.full_like(simulation.model.r_onset, np.float64(value))
     return replace(simulation, model=eqx.tree_at(lambda m: m.r_onset, simulation.model, leaf))
 
@@ -176,6 +210,9 @@ def _radius(simulation: Simulation, value: float) -> Simulation:
     """Another cutoff radius; the onset of switching stays where it is."""
     check_radius(simulation.cell, value, simulation.rule.skin)
     model = simulation.model
+    if simulation.cutoff.switches and value <= float(np.max(model.r_onset)):
+        onset = float(np.max(model.r_onset))
+        raise InputError(f"a cutoff radius of {value!r} is not above its onset, {onset!r}")
     leaf = jnp.full_like(model.r_cut, np.float64(value))
     model = eqx.tree_at(lambda m: m.r_cut, model, leaf)
     if not simulation.cutoff.switches:
@@ -233,9 +270,7 @@ class _GivenForce(PairForce):
     values: Float[Array, "types"] = eqx.field(kw_only=True)
 
     def _told(self) -> PairForce:
-        decider = _GivenDecider(
-            self.decider.r_cut, self.decider.compare, self.decider.dtype, self.decider.extent
-        )
+        decider = _GivenDecider(self.decider.r_cut, self.decider.compare, self.decider.dtype)
         object.__setattr__(decider, "given", self.values)
         return PairForce(self.model, self.cell, self.zero, decider, self.policy, self.reduction)
 

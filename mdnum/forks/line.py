@@ -12,11 +12,12 @@ from mdnum.systems.build import Simulation
 
 @dataclass(frozen=True)
 class Point:
-    """What is remembered of a run: its decisions' digest, and loss and energy at its last step."""
+    """What is remembered of a run: a digest of its decisions, loss and energy at its last step, a failure."""
 
     digest: str
     loss: float
     energy: float
+    failed: str
 
 
 class Line:
@@ -38,7 +39,8 @@ class Line:
         """The run at a float; what it decided is remembered."""
         simulation = self.at(place)
         made = history(simulation, self.steps)
-        self.known[place] = Point(made.digest, float(self.loss(simulation, made.x, made.v)), made.energy)
+        loss = float(self.loss(simulation, made.x, made.v))
+        self.known[place] = Point(made.digest, loss, made.energy, made.failed)
         return made
 
     def digest(self, place: int) -> str:

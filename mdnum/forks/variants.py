@@ -17,24 +17,19 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from threading import Lock
 
 import numpy as np
 from jaxtyping import Float
 
 from mdnum.errors import InputError, MdnumError
-from mdnum.forks.choices.base import is_pairwise, varied
+from mdnum.forks.choices.base import is_pairwise
+from mdnum.forks.programs import Program
 from mdnum.md.cell import Cell, displacement
-from mdnum.systems.load import System, load
+from mdnum.systems.load import System
 
-Program = Literal["scan", "rollout", "vmap", "grad", "eager"]
-
-#: Steps of the eager program: operation by operation, a step takes a hundred times as long.
-_EAGER_STEPS = 12
-#: Copies in a batch.
-_BATCH = 4
 _PROCESSES = 2
 _TIMEOUT = 600
 _NO_FMA = ("--xla_cpu_max_isa=AVX",)
@@ -87,6 +82,7 @@ class Ran:
         separation: largest distance from the reference's atoms at the last common step, length.
         seconds: of its process.
         failed: the last line that a failed process said.
+        separations: as `separation`, at steps 1, 2, ... as far as both ran.
     """
 
     variant: Variant
@@ -96,6 +92,7 @@ class Ran:
     separation: float
     seconds: float
     failed: str = ""
+    separations: Float[np.ndarray, "steps"] = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True)
@@ -103,12 +100,14 @@ class Variants:
     """Variants of one system, by what they compute.
 
     Attributes:
-        rows: one a variant, the reference first.
-        steps: that every program but the eager one ran.
+        rows: one a variant, in the order asked for.
+        reference: name of the one that the others are compared with: the first that ran.
+        steps: that it ran.
         causes: what tells the clusters apart, sentence by sentence.
     """
 
     rows: tuple[Ran, ...]
+    reference: str
     steps: int
     causes: tuple[str, ...]
 
@@ -133,12 +132,13 @@ def variants(
     Args:
         system: as loaded; pair potentials only.
         steps: of each program; the eager one takes a dozen.
-        which: the first one is what the others are compared with.
+        which: the first one that runs is what the others are compared with; one that fails or takes too long
+            says so in its row.
         progress: called with how many have ended, how many there are, and the name of the last.
 
     Raises:
         InputError: a many-body potential, no steps, or no variant.
-        MdnumError: the reference did not run.
+        MdnumError: none of them ran.
     """
     if not is_pairwise(system):
         raise InputError("variants of a many-body potential are not there", where=system.name)
@@ -148,24 +148,32 @@ def variants(
         folder = Path(scratch)
         # a system changed in memory is on no disk; what is written loads bit for bit
         system.write(folder / "system")
-        done = 0
+        done, count = 0, Lock()
 
         def ran(k: int) -> tuple[Ran, Float[np.ndarray, "steps 3 atoms"] | None]:
             nonlocal done
             got = _process(which[k], folder, k, steps)
-            done += 1
-            if progress is not None:
-                progress(done, len(which), which[k].name)
+            with count:
+                done += 1
+                if progress is not None:
+                    progress(done, len(which), which[k].name)
             return got
 
-        with ThreadPoolExecutor(_PROCESSES) as pool:
+        pool = ThreadPoolExecutor(_PROCESSES)
+        try:
             found = list(pool.map(ran, range(len(which))))
-    reference, x = found[0]
-    if x is None:
-        raise MdnumError(f"the variant {reference.variant.name!r} did not run: {reference.failed}")
+        finally:
+            # after a control-C no further process is started
+            pool.shutdown(cancel_futures=True)
+    first = next((k for k, (_, x) in enumerate(found) if x is not None), None)
+    if first is None:
+        row = found[0][0]
+        raise MdnumError(f"no variant ran; {row.variant.name!r} said: {row.failed}")
+    reference, x = found[first]
+    assert x is not None
     cell = Cell.create(np.asarray(system.atoms.cell), system.atoms.pbc)
-    rows = _clustered([_dated(row, other, reference, x, cell) for row, other in found])
-    return Variants(tuple(rows), len(reference.hashes), tuple(_causes(rows)))
+    rows = _clustered([_dated(row, other, reference, x, cell) for row, other in found], reference)
+    return Variants(tuple(rows), reference.variant.name, len(reference.hashes), tuple(_causes(rows)))
 
 
 def _process(variant: Variant, folder: Path, k: int, steps: int) -> tuple[Ran, np.ndarray | None]:
@@ -180,21 +188,33 @@ def _process(variant: Variant, folder: Path, k: int, steps: int) -> tuple[Ran, n
     # a program cached by another variant must not answer for this one; these flags are a CPU's
     told = {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "JAX_ENABLE_COMPILATION_CACHE": "false"}
     begin = time.perf_counter()
-    done = subprocess.run(
-        [sys.executable, "-c", "from mdnum.forks.variants import child; child()", json.dumps(task)],
-        env={**os.environ, **told},
-        stderr=subprocess.PIPE,
-        stdin=subprocess.DEVNULL,
-        text=True,
-        timeout=_TIMEOUT,
-    )
+    command = [sys.executable, "-m", "mdnum.forks.programs", json.dumps(task)]
+    words = ""
+    try:
+        # nothing that a child says may reach the output of the parent
+        done = subprocess.run(
+            command,
+            env={**os.environ, **told},
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            errors="replace",
+            timeout=_TIMEOUT,
+        )
+    except subprocess.TimeoutExpired:
+        words = f"took longer than {_TIMEOUT} s"
+    else:
+        if done.returncode:
+            said = [line for line in done.stderr.splitlines() if line.strip()]
+            words = said[-1].strip() if said else f"ended with exit code {done.returncode}"
     seconds = time.perf_counter() - begin
-    if done.returncode:
-        said = [line for line in done.stderr.splitlines() if line.strip()]
-        words = said[-1].strip() if said else f"exit code {done.returncode}"
+    if words:
         return Ran(variant, (), -1, None, float("nan"), seconds, words), None
     x = np.load(task["out"])
     hashes = tuple(hashlib.sha256(np.ascontiguousarray(row).tobytes()).hexdigest() for row in x)
+    if not hashes:
+        return Ran(variant, (), -1, None, float("nan"), seconds, "the skin was used up at once"), None
     return Ran(variant, hashes, -1, None, 0.0, seconds), x
 
 
@@ -204,8 +224,11 @@ def _dated(row: Ran, x: np.ndarray | None, reference: Ran, x_reference: np.ndarr
     common = min(len(row.hashes), len(reference.hashes))
     pairs = zip(row.hashes[:common], reference.hashes[:common], strict=True)
     seed = next((step for step, (one, other) in enumerate(pairs, 1) if one != other), None)
-    dx, dy, dz = displacement(cell, x_reference[common - 1].T, x[common - 1].T)
-    return replace(row, seed=seed, separation=float(np.sqrt((dx * dx + dy * dy + dz * dz).max())))
+    separations = np.zeros(common)
+    for step in range(common):
+        dx, dy, dz = displacement(cell, x_reference[step].T, x[step].T)
+        separations[step] = np.sqrt((dx * dx + dy * dy + dz * dz).max())
+    return replace(row, seed=seed, separation=float(separations[-1]), separations=separations)
 
 
 def _agree(one: Ran, other: Ran) -> bool:
@@ -213,11 +236,13 @@ def _agree(one: Ran, other: Ran) -> bool:
     return common > 0 and one.hashes[:common] == other.hashes[:common]
 
 
-def _clustered(rows: list[Ran]) -> list[Ran]:
-    # the longest of each cluster stands for it, so that a short run joins whom it agrees with
+def _clustered(rows: list[Ran], reference: Ran | None = None) -> list[Ran]:
+    # the longest of each cluster stands for it, so that a short run joins whom it agrees with; the reference
+    # comes first, so that its cluster is number 0
     heads: list[Ran] = []
     numbers: dict[str, int] = {}
-    for row in sorted(rows, key=lambda row: -len(row.hashes)):
+    name = None if reference is None else reference.variant.name
+    for row in sorted(rows, key=lambda row: (row.variant.name != name, -len(row.hashes))):
         if row.failed:
             continue
         at = next((k for k, head in enumerate(heads) if _agree(row, head)), len(heads))
@@ -230,7 +255,7 @@ def _clustered(rows: list[Ran]) -> list[Ran]:
 def _causes(rows: Sequence[Ran]) -> list[str]:
     """What the pattern of agreement says; nothing is said of variants that were not run."""
     by_name = {row.variant.name: row for row in rows if not row.failed}
-    reference = rows[0]
+    reference = next(iter(by_name.values()))
     told = []
 
     def same(one: str, other: str) -> bool | None:
@@ -282,89 +307,3 @@ def _causes(rows: Sequence[Ran]) -> list[str]:
     if same("reversed", "scan") is False:
         told.append(f"Order: sums in reverse leave the reference at step {by_name['reversed'].seed}.")
     return told
-
-
-# --- the process of one variant -----------------------------------------------------------------------------
-
-
-def child() -> None:
-    """Run one variant, told by the last argument, and write its positions; called by `variants` alone."""
-    task: dict[str, Any] = json.loads(sys.argv[-1])
-    system = load(task["system"], world="md")
-    if task["reduction"]:
-        system = varied(system, {"precision.reduction": task["reduction"]})
-    np.save(task["out"], positions_of(system, task["steps"], task["program"]))
-
-
-def positions_of(system: System, steps: int, program: Program) -> Float[np.ndarray, "steps 3 atoms"]:
-    """Wrapped positions at steps 1, 2, ... in the user's order, as one program computes them in this process.
-
-    Ends before an atom has moved by half the skin of the one list.
-    """
-    from mdnum.rollout.engine import Engine, first_state
-    from mdnum.systems.build import build
-
-    simulation = build(system)
-    room = float(np.min(simulation.cell.widths)) / 2 - simulation.r_cut
-    skin = min(2 * simulation.rule.skin, room)
-    simulation = replace(simulation, rule=replace(simulation.rule, skin=skin, check=True))
-    home = first_state(simulation).reference
-    if program == "rollout":
-        parts = []
-        for segment in Engine(simulation, steps).segments():
-            parts += [segment.unsorted("x", row).T for row in range(segment.rows)]
-        x = np.array(parts[1:])
-    else:
-        x = _stepped(simulation, steps, program)
-    moved = [np.max(sum(c * c for c in displacement(simulation.cell, home, row.T))) for row in x]
-    used = np.flatnonzero(np.sqrt(moved) > skin / 2)
-    return x[: used[0]] if len(used) else x
-
-
-def _stepped(simulation: Any, steps: int, program: Program) -> np.ndarray:
-    import jax
-    import jax.numpy as jnp
-    from jax import lax
-
-    from mdnum.md.stepper import MdState, PairDynamics
-    from mdnum.rollout.engine import first_state
-
-    start = first_state(simulation)
-    table = simulation.verlet_list().build(start.reference, simulation.cell)
-    dynamics = PairDynamics(
-        simulation.force,
-        simulation.integrator,
-        jnp.asarray(simulation.masses[table.order]),
-        simulation.tables(table),
-    )
-    state = MdState(jnp.zeros((), jnp.int64), start.state.x[:, table.order], start.state.v[:, table.order])
-    leaves, structure = jax.tree.flatten(dynamics)
-
-    # the dynamics comes in as an argument: its fence is a number that the compiler must not know
-    def trajectory(leaves, x, v, count):
-        dynamics = jax.tree.unflatten(structure, leaves)
-
-        def body(state, _):
-            state = dynamics.step(state, dynamics.decide(state))
-            return state, state.x
-
-        return lax.scan(body, MdState(state.step, x, v), None, length=count)[1]
-
-    def loss(x, v, leaves):
-        path = trajectory(leaves, x, v, steps)
-        return jnp.mean(jnp.square(path[-1])), path
-
-    if program == "eager":
-        with jax.disable_jit():
-            x = trajectory(leaves, state.x, state.v, min(steps, _EAGER_STEPS))
-    elif program == "vmap":
-        copies = (jnp.stack([q] * _BATCH) for q in (state.x, state.v))
-        batched = jax.jit(jax.vmap(lambda leaves, x, v: trajectory(leaves, x, v, steps), (None, 0, 0)))
-        x = batched(leaves, *copies)[0]
-    elif program == "grad":
-        (_, x), _ = jax.jit(jax.value_and_grad(loss, has_aux=True))(state.x, state.v, leaves)
-    else:
-        x = jax.jit(trajectory, static_argnums=3)(leaves, state.x, state.v, steps)
-    ours = np.empty(x.shape, np.asarray(x).dtype)
-    ours[:, :, table.order] = np.asarray(x)
-    return ours

@@ -4,6 +4,18 @@ from __future__ import annotations
 
 from mdnum.workflow.ball import BallResult, bounce
 from mdnum.workflow.fork import ForkResult, fork
+from mdnum.workflow.fork_map import MapResult, fork_map
+from mdnum.workflow.fork_processes import ProcessesResult, fork_processes
 from mdnum.workflow.md import run
 
-__all__ = ["BallResult", "ForkResult", "bounce", "fork", "run"]
+__all__ = [
+    "BallResult",
+    "ForkResult",
+    "MapResult",
+    "ProcessesResult",
+    "bounce",
+    "fork",
+    "fork_map",
+    "fork_processes",
+    "run",
+]

@@ -130,7 +130,7 @@ def test_the_radius_is_turned_without_compiling_and_agrees_with_the_program_prop
     one = dial(simulation, "radius")
     assert one.compiles
     for value in (2.27, 2.29):
-        assert digests(meeting(), "radius", 12, [value]) == [_digest(one.turn(simulation, value), 12)]
+        assert list(digests(meeting(), "radius", 12, [value])) == [_digest(one.turn(simulation, value), 12)]
     assert all(boundary.confirmed for boundary in found.boundaries)
 
 

@@ -8,16 +8,8 @@ import numpy as np
 import pytest
 
 from mdnum.errors import InputError, MdnumError
-from mdnum.forks.variants import (
-    REFERENCE,
-    VARIANTS,
-    Ran,
-    Variant,
-    _causes,
-    _clustered,
-    positions_of,
-    variants,
-)
+from mdnum.forks.programs import positions_of
+from mdnum.forks.variants import REFERENCE, VARIANTS, Ran, Variant, _causes, _clustered, variants
 from mdnum.rollout.engine import Engine
 from mdnum.systems.build import build
 from mdnum.systems.load import System, load
@@ -129,5 +121,5 @@ def test_what_cannot_be_run_is_refused(crystal: System):
         variants(crystal, 0)
     with pytest.raises(InputError, match="at least one step and one variant"):
         variants(crystal, 10, [])
-    with pytest.raises(MdnumError, match="'bogus' did not run"):
+    with pytest.raises(MdnumError, match="no variant ran; 'bogus' said"):
         variants(crystal, 2, [Variant("bogus", flags=("--xla_no_such_flag=1",))])

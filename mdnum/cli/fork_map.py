@@ -1,0 +1,93 @@
+"""`mdnum fork SYSTEM --along KEY=LOW:HIGH`: where the history of decisions changes along a number."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from mdnum.cli import output
+from mdnum.cli.progress import ProgressBar
+from mdnum.errors import InputError
+
+_INTERVAL = re.compile(r"^\s*([^=\s]+)\s*=\s*([^:\s]+)\s*:\s*([^:\s]+)\s*$")
+
+
+def interval(text: str) -> tuple[str, float, float]:
+    """The words of `--along KEY=LOW:HIGH`.
+
+    Raises:
+        InputError: not of that form.
+    """
+    found = _INTERVAL.match(text)
+    try:
+        if found is None:
+            raise ValueError
+        return found[1], float(found[2]), float(found[3])
+    except ValueError:
+        raise InputError(
+            f"--along {text!r} is not of the form KEY=LOW:HIGH",
+            remedy="Write for example --along potential.sigma=3.40:3.41",
+        ) from None
+
+
+def along(
+    system: str,
+    text: str,
+    steps: int | None,
+    most: int | None,
+    overrides: Mapping[str, str],
+    *,
+    out: Path | None,
+    report: bool,
+    as_json: bool,
+) -> int:
+    """Write and print the map of a system along a number."""
+    key, low, high = interval(text)
+    from mdnum.workflow import fork_map
+
+    with ProgressBar() as progress:
+        result = fork_map(
+            system,
+            key,
+            low,
+            high,
+            steps=steps,
+            most=most,
+            out=out,
+            overrides=overrides,
+            report=report,
+            progress=progress,
+        )
+    return output.answer(result.folder, result.summary, _print, as_json=as_json)
+
+
+def _print(summary: Mapping[str, Any]) -> None:
+    unit = f" ({summary['loss_unit']})" if summary["loss_unit"] else ""
+    table = [
+        (
+            f"{row['below']!r}\n{row['above']!r}",
+            f"{row['step']:,}",
+            f"{row['i']}–{row['j']}",
+            f"{row['margin_below']:+.2e}\n{row['margin_above']:+.2e}",
+            f"{row['jump']:+.3e}",
+            f"{row['apart']:.2e}",
+            row["confirmed"],
+        )
+        for row in summary["boundaries"]
+    ]
+    if table:
+        columns = ("below, above", "step", "pair", "margins", f"jump of the loss{unit}", "apart", "confirmed")
+        output.print_table("", columns, table)
+    counts = [
+        ("histories", f"{summary['histories']:,}"),
+        ("runs", f"{summary['evaluations']:,} of {summary['steps']:,} steps"),
+        ("not searched", f"{len(summary['unresolved']):,}"),
+        ("may be missed", f"pairs of boundaries closer than {summary['resolution']:.2g}"),
+    ]
+    if not summary["unresolved"]:
+        del counts[2]
+    if summary["complete"]:
+        counts[-1] = ("may be missed", "nothing: every float was run")
+    output.print_table("", ("", ""), counts)

@@ -1,0 +1,114 @@
+"""What the questions about forks share: a system, a folder of its own kind, and its page."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mdnum.errors import InputError
+from mdnum.store import RunFolder
+from mdnum.store.naming import default_folder
+
+if TYPE_CHECKING:
+    from mdnum.systems.load import System
+
+Progress = Callable[[int, int, dict[str, Any]], None]
+
+#: Steps of a question that makes hundreds of runs, or follows them by hand, unless more are asked for.
+FEW_STEPS = 500
+
+
+def loaded(system: System | str | Path, overrides: Mapping[str, Any] | None) -> System:
+    """The system of molecular dynamics that is meant.
+
+    Raises:
+        InputError: there is none, it is a ball, or it is loaded already and there are overrides.
+    """
+    from mdnum.systems import BallSystem, System, load
+
+    if isinstance(system, BallSystem):
+        raise InputError("this system is a ball", where=system.name, remedy="Use mdnum.bounce")
+    if not isinstance(system, System):
+        return load(system, overrides, world="md")
+    if overrides:
+        raise InputError(
+            "overrides change a system while it is loaded",
+            remedy="Load it with the overrides, or give its name",
+            where=system.name,
+        )
+    return system
+
+
+def steps_of(system: System, steps: int | None) -> int:
+    """The last step: the one asked for, else the system's own, but no more than a few hundred."""
+    last = min(FEW_STEPS, system.spec.dynamics.steps) if steps is None else steps
+    if last < 1:
+        raise InputError(f"steps = {last}; expected at least 1")
+    return last
+
+
+def opened(system: System, question: str, out: str | Path | None) -> RunFolder:
+    """An empty fork folder that is to answer a question, with the system and its provenance.
+
+    Args:
+        question: a key of `store.TABLES`.
+    """
+    from mdnum.provenance import collect
+
+    path = default_folder(f"fork-{system.name}") if out is None else out
+    folder = RunFolder.create(path, world=question)
+    try:
+        system.write(folder.path)
+        folder.write_provenance(collect(system))
+    except BaseException:
+        folder.close()
+        raise
+    return folder
+
+
+def basics(system: System, question: str, steps: int) -> dict[str, Any]:
+    """The entries of summary.json that all questions have."""
+    return {
+        "world": "fork",
+        "question": question,
+        "system": system.name,
+        "about": system.spec.about,
+        "atoms": len(system.atoms),
+        "steps": steps,
+        "timestep": float(system.spec.dynamics.timestep),
+        "units": system.units.name,
+        "findings": [],
+        "status": "complete",
+    }
+
+
+def finish(folder: RunFolder, report: bool, progress: Progress | None) -> dict[str, Any]:
+    """Headline, findings and, where it is wanted, the page; the summary with them."""
+    from mdnum import report as pages
+
+    if progress is not None:
+        progress(0, 0, {"phase": "report" if report else "check"})
+    if report:
+        pages.write(folder)
+    else:
+        pages.judge(folder)
+    return folder.summary
+
+
+class Log:
+    """Passes progress on, and writes a line of log.txt at each new phase and now and then."""
+
+    def __init__(self, folder: RunFolder, progress: Progress | None):
+        self._folder, self._progress = folder, progress
+        self._last = ("", -1.0)
+
+    def __call__(self, step: int, steps: int, info: dict[str, Any]) -> None:
+        """As a rollout calls it."""
+        phase, share = str(info.get("phase", "run")), 10 * step // steps if steps else 0
+        if (phase, share) != self._last:
+            unit = info.get("unit", "steps")
+            self._folder.log(f"{phase}: {step:,} of {steps:,} {unit}" if steps else phase)
+            self._last = (phase, share)
+        if self._progress is not None:
+            self._progress(step, steps, info)
