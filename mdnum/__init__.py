@@ -23,6 +23,8 @@ _HOMES = {
     "build": "mdnum.systems:build",
     "diagnose": "mdnum.doctor:diagnose",
     "fork": "mdnum.workflow:fork",
+    "fork_certify": "mdnum.workflow:fork_certify",
+    "fork_forecast": "mdnum.workflow:fork_forecast",
     "fork_map": "mdnum.workflow:fork_map",
     "fork_processes": "mdnum.workflow:fork_processes",
     "load": "mdnum.systems:load",
@@ -43,6 +45,8 @@ if TYPE_CHECKING:
     from mdnum.systems import load as load
     from mdnum.workflow import bounce as bounce
     from mdnum.workflow import fork as fork
+    from mdnum.workflow import fork_certify as fork_certify
+    from mdnum.workflow import fork_forecast as fork_forecast
     from mdnum.workflow import fork_map as fork_map
     from mdnum.workflow import fork_processes as fork_processes
     from mdnum.workflow import run as run
@@ -59,6 +63,8 @@ __all__ = [
     "build",
     "diagnose",
     "fork",
+    "fork_certify",
+    "fork_forecast",
     "fork_map",
     "fork_processes",
     "load",

@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from mdnum.cli import main
-from mdnum.cli.fork_questions import interval
+from mdnum.cli.fork_map import interval
 from mdnum.errors import InputError
 from mdnum.rollout.run import run
+from mdnum.store import RunFolder
 
 
 def call(*arguments: str) -> int:
@@ -37,23 +39,40 @@ def test_an_interval_is_a_key_and_two_numbers():
         (("--certify",), "no system given"),
         (("argon/crystal-108", "--forecast", "-1"), "expected a length above 0"),
         (("argon/crystal-108", "--along", "sigma"), "KEY=LOW:HIGH"),
+        (("argon/crystal-108", "--along", "sigma=2:1"), "nothing between 2.0 and 1.0"),
+        (("argon/crystal-108", "--along", "sgima=1:2"), "Did you mean potential.sigma?"),
+        (("argon/crystal-108", "--along", "timestep=-1:1"), "expected a value above 0"),
+        (("argon/crystal-108", "--along", "r_cut=1.5:9"), "exceeds half the smallest perpendicular"),
+        (("binary/kob-andersen-1000", "--along", "epsilon=1:2"), "could be any of"),
+        (("argon/crystal-108", "--most", "3"), "--most needs a number"),
+        (("argon/crystal-108", "--processes", "--certify"), "different questions"),
+        (("silicon/tersoff-512", "--processes"), "many-body"),
         (("silicon/tersoff-512", "--certify", "--steps", "2"), "Lennard-Jones"),
     ],
 )
-def test_what_cannot_be_asked_is_refused_in_one_line(arguments, message, capsys):
+def test_what_cannot_be_asked_is_refused_in_one_line(arguments, message, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     assert call("fork", *arguments) == 2
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1
+    # and leaves no folder behind
+    assert not list(tmp_path.iterdir())
 
 
-def test_a_forecast_names_the_flip_that_comes(capsys):
-    assert call("fork", "argon/crystal-108", "--forecast", "1e-6", "--steps", "60", "--json") == 0
+def test_a_forecast_names_the_flip_that_comes(tmp_path: Path, capsys):
+    arguments = ("fork", "argon/crystal-108", "--forecast", "1e-6", "--steps", "60")
+    assert call(*arguments, "--json", "-o", str(tmp_path / "a")) == 0
     answer = json.loads(capsys.readouterr().out)
     first = answer["first"][0]
     # the fork of two runs that far apart is at step 5, by this pair
     assert (first["step"], first["i"], first["j"]) == (5, 28, 64)
-    assert call("fork", "argon/crystal-108", "--forecast", "1e-6", "--steps", "60") == 0
+    assert call(*arguments, "--no-report", "-o", str(tmp_path / "b")) == 0
     assert "28–64 at step 5" in capsys.readouterr().out
+    assert (tmp_path / "a/report.html").exists() and not (tmp_path / "b/report.html").exists()
+    reach = RunFolder.open(tmp_path / "a").read("reach")
+    # the first step at which the nearest decision is nearer than the displacement is the step foretold
+    assert int(np.flatnonzero(reach["positive"] <= 1e-6)[0]) == 5
+    assert (reach["i"][5], reach["j"][5]) == (28, 64)
 
 
 def test_two_folders(tmp_path: Path, capsys):

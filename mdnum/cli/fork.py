@@ -6,7 +6,7 @@ from pathlib import Path
 
 import typer
 
-from mdnum.cli import fork_map, fork_processes, fork_questions, output
+from mdnum.cli import fork_ahead, fork_map, fork_processes, fork_questions, output
 from mdnum.cli.fork_print import print_fork
 from mdnum.cli.progress import ProgressBar
 from mdnum.errors import InputError
@@ -91,9 +91,13 @@ def fork(
                 system, steps, overrides, out=out, report=not no_report, as_json=as_json
             )
         if certify:
-            return fork_questions.certify(system, steps, overrides, as_json=as_json)
+            return fork_ahead.certify(
+                system, steps, overrides, out=out, report=not no_report, as_json=as_json
+            )
         if forecast is not None:
-            return fork_questions.foretell(system, forecast, steps, overrides, as_json=as_json)
+            return fork_ahead.foretell(
+                system, forecast, steps, overrides, out=out, report=not no_report, as_json=as_json
+            )
         if benign and vary is not None:
             return fork_questions.consistent(system, vary, steps, overrides, as_json=as_json)
     if vary is None:

@@ -1,4 +1,4 @@
-"""The other questions of `mdnum fork`: in exact arithmetic, ahead of time, of an ensemble, of two folders."""
+"""The questions of `mdnum fork` that leave no folder: of an ensemble, and of two finished runs."""
 
 from __future__ import annotations
 
@@ -7,95 +7,6 @@ from pathlib import Path
 
 from mdnum.cli import output
 from mdnum.cli.progress import ProgressBar
-from mdnum.errors import InputError
-
-
-def certify(system: str, steps: int | None, overrides: Mapping[str, str], *, as_json: bool) -> int:
-    """When runs under each precision policy leave the history in exact arithmetic."""
-    from mdnum.forks.exact import certify as certified
-    from mdnum.systems import build
-
-    with ProgressBar() as progress:
-        found = certified(
-            build(system, overrides), steps, progress=lambda at, last: progress(at, last, {"phase": "run"})
-        )
-    rows = [
-        {
-            "policy": row.name,
-            "horizon": row.horizon,
-            "margin": row.margin,
-            "growth_rate": row.growth.rate,
-            "failed": row.failed,
-            "gain": row.gain,
-        }
-        for row in found.ranking
-    ]
-    if as_json:
-        output.print_json({"question": "certify", "steps": found.steps, "says": found.says, "ranking": rows})
-        return output.EXIT_FINE
-    out = output.console()
-    for sentence in found.says:
-        out.print(sentence, style="bold", markup=False)
-    table = [
-        (
-            row["policy"],
-            f"beyond step {found.steps:,}" if row["horizon"] is None else f"step {row['horizon']:,}",
-            row["growth_rate"],
-            row["failed"],
-        )
-        for row in rows
-    ]
-    output.print_table("", ("precision", "leaves the exact history", "growth a step", ""), table)
-    return output.EXIT_FINE
-
-
-def foretell(
-    system: str, size: float, steps: int | None, overrides: Mapping[str, str], *, as_json: bool
-) -> int:
-    """Which decisions a perturbation of the start would flip first, from one tangent run."""
-    if not 0 < size < float("inf"):
-        raise InputError(f"--forecast {size:g}; expected a length above 0")
-    from mdnum.forks.forecast import forecast
-    from mdnum.systems import build
-
-    found = forecast(build(system, overrides), steps)
-    first, nearest = found.first(size), found.nearest()
-    until = found.linear_until(size)
-    if as_json:
-        output.print_json(
-            {
-                "question": "forecast",
-                "steps": found.steps,
-                "size": size,
-                "first": first,
-                "nearest": nearest,
-                "linear_until": until,
-            }
-        )
-        return output.EXIT_FINE
-    out = output.console()
-    if first:
-        flip = first[0]
-        which = f"pair {flip.i}–{flip.j} at step {flip.step:,}"
-        head = f"A random displacement of {size:g} is expected to flip {which} first."
-    else:
-        head = f"A random displacement of {size:g} is expected to flip nothing in {found.steps:,} steps."
-    out.print(head, style="bold", markup=False)
-    out.print(f"  small enough for a forecast up to step {until:,}", markup=False)
-    for title, flips in (("flips first", first), ("nearest to flipping", nearest)):
-        table = [
-            (
-                flip.step,
-                f"{flip.i}–{flip.j}",
-                f"{flip.amplitude:.3e}",
-                f"{flip.ulps:.3g}",
-                f"{flip.margin:.3e}",
-            )
-            for flip in flips
-        ]
-        if table:
-            output.print_table(title, ("step", "pair", "displacement", "ulps of the start", "margin"), table)
-    return output.EXIT_FINE
 
 
 def consistent(

@@ -253,6 +253,8 @@ def _confirmed(
         line.steps,
         [side.at for side in sides],
         lambda done: _tell(progress, done, len(sides), "confirming in a fresh process", "runs"),
+        # each side is another compiled program then, and compiling is what takes the time
+        processes=2 if line.dial.compiles else 1,
     )
     same = [side.digest == digest for side, digest in zip(sides, digests, strict=True)]
     return [

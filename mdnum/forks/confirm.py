@@ -7,7 +7,11 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
+from threading import Lock
+from typing import Any
 
 from mdnum.errors import MdnumError
 from mdnum.forks.dials import dial
@@ -22,6 +26,8 @@ def digests_elsewhere(
     steps: int,
     values: Sequence[float],
     progress: Callable[[int], None] | None = None,
+    *,
+    processes: int = 1,
 ) -> list[str]:
     """Digests of the histories at some values of a number, from a fresh process.
 
@@ -30,27 +36,50 @@ def digests_elsewhere(
 
     Args:
         progress: called with how many are known, at the start and after each.
+        processes: that share the values; worth it where each value is another compiled program.
 
     Raises:
-        MdnumError: the process failed.
+        MdnumError: a process failed.
     """
-    tell = progress if progress is not None else (lambda done: None)
-    with tempfile.TemporaryDirectory() as folder, open(Path(folder) / "errors", "w+") as errors:
+    done, lock = 0, Lock()
+
+    def tell(more: int) -> None:
+        nonlocal done
+        with lock:
+            done += more
+            if progress is not None:
+                progress(done)
+
+    tell(0)
+    with tempfile.TemporaryDirectory() as folder:
         path = system.write(Path(folder) / "system")
-        asked = {"path": str(path), "key": key, "steps": steps, "values": [value.hex() for value in values]}
-        command = [sys.executable, "-m", "mdnum.forks.confirm"]
-        found: list[str] = []
-        tell(0)
+        asked = {"path": str(path), "key": key, "steps": steps}
+        size = -(-len(values) // processes)
+        parts = [values[first : first + size] for first in range(0, len(values), size)]
+        with ThreadPoolExecutor(max(1, len(parts))) as pool:
+            found = list(pool.map(lambda part: _answered(asked, part, lambda: tell(1)), parts))
+    return [digest for part in found for digest in part]
+
+
+def _answered(asked: dict[str, Any], values: Sequence[float], tell: Callable[[], None]) -> list[str]:
+    """What one process says."""
+    question = json.dumps({**asked, "values": [value.hex() for value in values]})
+    command = [sys.executable, "-m", "mdnum.forks.confirm"]
+    found: list[str] = []
+    # what it says on stderr may be long, and nobody reads a pipe meanwhile
+    with tempfile.TemporaryFile("w+") as errors:
         with subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, text=True
         ) as process:
             assert process.stdin is not None and process.stdout is not None
             try:
-                process.stdin.write(json.dumps(asked))
-                process.stdin.close()
+                # one that died before it read has said why
+                with suppress(BrokenPipeError):
+                    process.stdin.write(question)
+                    process.stdin.close()
                 for line in process.stdout:
                     found.append(line.strip())
-                    tell(len(found))
+                    tell()
             except BaseException:
                 process.kill()
                 raise

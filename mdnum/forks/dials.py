@@ -8,8 +8,9 @@ threshold, and what is found there is confirmed in the program proper.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -222,9 +223,12 @@ def _radius(simulation: Simulation, value: float) -> Simulation:
 
 
 def _given_radius(simulation: Simulation, value: float) -> Simulation:
-    turned = _radius(simulation, value)
-    parts = {name: getattr(turned, name) for name in turned.__dataclass_fields__}
-    return _GivenSimulation(**parts, compiled=simulation.decider)
+    return _GivenSimulation(**_parts(_radius(simulation, value)), compiled=simulation.decider)
+
+
+def _parts(one: Any) -> dict[str, Any]:
+    """The fields of a dataclass, for another of the same fields and more."""
+    return {field.name: getattr(one, field.name) for field in fields(one)}
 
 
 def _start(simulation: Simulation, key: str) -> Dial | None:
@@ -284,8 +288,9 @@ class _GivenForce(PairForce):
         *,
         decisions: bool,
         given: UInt8[Array, "words atoms"] | None = None,
+        where: UInt8[Array, "words atoms"] | None = None,
     ) -> Forces:
-        return self._told()(positions, tables, decisions=decisions, given=given)
+        return self._told()(positions, tables, decisions=decisions, given=given, where=where)
 
 
 @dataclass(frozen=True)
@@ -305,9 +310,7 @@ class _GivenSimulation(Simulation):
         cell: Cell = self.cell
         plain = PairForce.create(self.model, cell, self.compiled, policy, self.reduction)
         values = jnp.asarray(np.asarray([t.value for t in self.decider.thresholds], policy.dtype("decision")))
-        return _GivenForce(
-            plain.model, plain.cell, plain.zero, plain.decider, policy, self.reduction, values=values
-        )
+        return _GivenForce(**_parts(plain), values=values)
 
 
 def checked(one: Dial, low: float, high: float) -> None:

@@ -16,9 +16,12 @@ __all__ = ["judge", "write"]
 _MODULES = {
     "md": ("mdnum.report.findings", "mdnum.report.html"),
     "ball": ("mdnum.report.ball.findings", "mdnum.report.ball.html"),
+    "ball-fork": ("mdnum.report.fork.ball", "mdnum.report.fork.ball"),
     "fork": ("mdnum.report.fork.findings", "mdnum.report.fork.html"),
     "along": ("mdnum.report.fork.map", "mdnum.report.fork.map"),
     "processes": ("mdnum.report.fork.processes", "mdnum.report.fork.processes"),
+    "certify": ("mdnum.report.fork.certify", "mdnum.report.fork.certify"),
+    "forecast": ("mdnum.report.fork.forecast", "mdnum.report.fork.forecast"),
 }
 
 

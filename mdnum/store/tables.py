@@ -88,8 +88,8 @@ COLUMNS: Mapping[str, Mapping[str, pa.DataType]] = MappingProxyType(
         ),
         "policy_separations": _columns(policy=_TEXT, step=_INT, separation=_FLOAT),
         "ambiguous": _columns(
-            step=_INT, i=_SHORT, j=_SHORT, inside=_BOOL, margin=_FLOAT, bound=_FLOAT, exact=_FLOAT,
-            wrong=_BOOL,
+            policy=_TEXT, step=_INT, i=_SHORT, j=_SHORT, inside=_BOOL, margin=_FLOAT, bound=_FLOAT,
+            exact=_FLOAT, wrong=_BOOL,
         ),
         "reach": _columns(
             step=_INT, positive=_FLOAT, negative=_FLOAT, i=_SHORT, j=_SHORT, furthest=_FLOAT,

@@ -4,17 +4,23 @@ from __future__ import annotations
 
 from mdnum.workflow.ball import BallResult, bounce
 from mdnum.workflow.fork import ForkResult, fork
+from mdnum.workflow.fork_certify import CertifyResult, fork_certify
+from mdnum.workflow.fork_forecast import ForecastResult, fork_forecast
 from mdnum.workflow.fork_map import MapResult, fork_map
 from mdnum.workflow.fork_processes import ProcessesResult, fork_processes
 from mdnum.workflow.md import run
 
 __all__ = [
     "BallResult",
+    "CertifyResult",
+    "ForecastResult",
     "ForkResult",
     "MapResult",
     "ProcessesResult",
     "bounce",
     "fork",
+    "fork_certify",
+    "fork_forecast",
     "fork_map",
     "fork_processes",
     "run",

@@ -86,6 +86,8 @@ def fork_map(
     simulation = build(system)
     one = dial(simulation, key)
     checked(one, low, high)
+    for end in (low, high):
+        one.turn(simulation, end)
     folder = opened(system, "along", out)
     try:
         found = boundaries(

@@ -22,6 +22,9 @@ from mdnum.store import TABLES, RunFolder
 from mdnum.store.atomic import write_text
 from mdnum.units import Units
 
+#: Title of a figure, what draws it at a width in inches, and what it cannot show.
+Drawn = tuple[str, Callable[[float], Figure], list[str]]
+
 _ORDER = ("error", "warning", "info")
 
 
@@ -89,13 +92,13 @@ def write_page(
     run: Question,
     judged: Verdict,
     template: str,
-    drawn: Mapping[str, tuple[str, Callable[[float], Figure], list[str]]],
+    drawn: Mapping[str, Drawn],
     **content: Any,
 ) -> Path:
     """Writes report.html and figures/*.svg, and puts headline and findings into summary.json.
 
     Args:
-        drawn: title, what draws it at a width, and notes, by the name of a figure.
+        drawn: figures by name.
     """
     judged.store(folder, run.summary)
     pictures = {
@@ -117,7 +120,7 @@ def write_page(
     return path
 
 
-def declared(plot: Plot) -> tuple[str, Callable[[float], Figure], list[str]]:
+def declared(plot: Plot) -> Drawn:
     """A plot as `write_page` wants it."""
     return plot.title, partial(plots.draw, plot), plots.notes(plot)
 

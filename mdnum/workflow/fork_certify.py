@@ -1,0 +1,150 @@
+"""`mdnum fork SYSTEM --certify` as a function: real runs against exact arithmetic, into a folder."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mdnum.errors import InputError
+from mdnum.store import RunFolder
+from mdnum.workflow.fork_question import Log, Progress, basics, finish, loaded, opened
+
+if TYPE_CHECKING:
+    from mdnum.forks.exact import Certificate, CertifiedHorizon
+    from mdnum.precision import PrecisionPolicy
+    from mdnum.systems.build import Simulation
+    from mdnum.systems.load import System
+
+_EXACT = {"phase": "in exact arithmetic", "unit": "steps"}
+
+
+@dataclass(frozen=True)
+class CertifyResult:
+    """A finished ranking of precision policies.
+
+    Attributes:
+        folder: the fork folder.
+        certificate: the exact history, and when each policy leaves it.
+        ambiguous: decisions of each policy's run that are within their rounding bound, by its name.
+        summary: what summary.json says, findings included.
+    """
+
+    folder: Path
+    certificate: Certificate
+    ambiguous: Mapping[str, CertifiedHorizon]
+    summary: dict[str, Any]
+
+
+def fork_certify(
+    system: System | str | Path,
+    *,
+    steps: int | None = None,
+    policies: Mapping[str, PrecisionPolicy] | None = None,
+    out: str | Path | None = None,
+    overrides: Mapping[str, Any] | None = None,
+    report: bool = True,
+    progress: Progress | None = None,
+) -> CertifyResult:
+    """When runs under each precision policy leave the history in exact arithmetic.
+
+    Args:
+        system: a loaded system, a shipped name or the path of a system file: Lennard-Jones, NVE, at most 108
+            atoms.
+        steps: last step; default the system's own.
+        policies: to rank, by name; default `forks.exact.POLICIES`.
+        out: the new fork folder; default runs/fork-<name>-<n>.
+        overrides: dotted keys to values.
+        report: write report.html.
+        progress: called now and then with step, steps and a dictionary of figures.
+
+    Raises:
+        InputError: the system cannot be certified.
+        FolderError: the folder cannot be used.
+    """
+    from mdnum.forks.exact import certify, why_not
+    from mdnum.systems import build
+
+    began = time.perf_counter()
+    system = loaded(system, overrides)
+    simulation = build(system)
+    refused = why_not(simulation)
+    if refused is not None:
+        raise refused
+    last = system.spec.dynamics.steps if steps is None else steps
+    if last < 1:
+        raise InputError(f"steps = {last}; expected at least 1")
+    folder = opened(system, "certify", out)
+    try:
+        note = Log(folder, progress)
+        found = certify(
+            simulation,
+            last,
+            progress=lambda at, end: note(at, end, {"phase": "in exact arithmetic"} | _STEPS),
+        )
+        ambiguous = _ambiguous(simulation, found, note)
+        _write(folder, found, ambiguous)
+        for sentence in found.says:
+            folder.log(sentence)
+        folder.finalize()
+        summary = {
+            **basics(system, "certify", last),
+            **found.summary(),
+            "ambiguous": {
+                name: {"total": one.total, "horizon": one.horizon, "wrong": one.wrong}
+                for name, one in ambiguous.items()
+            },
+            "seconds": time.perf_counter() - began,
+        }
+        folder.write_summary(summary)
+    except BaseException:
+        folder.close()
+        raise
+    return CertifyResult(folder.path, found, ambiguous, finish(folder, report, progress))
+
+
+def _ambiguous(simulation: Simulation, found: Certificate, note: Log) -> dict[str, CertifiedHorizon]:
+    """Every policy's decisions against their rounding bounds, and the ambiguous ones in exact arithmetic."""
+    from mdnum.forks.exact import certified_horizon, with_policy
+
+    done = {}
+    for k, row in enumerate(found.ranking):
+        note(k, len(found.ranking), {"phase": "bounding decisions", "unit": "policies"})
+        done[row.name] = certified_horizon(with_policy(simulation, row.policy), found.steps)
+    return done
+
+
+def _write(folder: RunFolder, found: Certificate, ambiguous: Mapping[str, CertifiedHorizon]) -> None:
+    """Puts policies, ambiguous decisions and separations into the folder's tables."""
+    rows = found.summary()["policies"]
+    plain = [
+        {
+            "policy": row["name"],
+            **{role: row[role] for role in ("state", "force", "decision", "accumulate")},
+            "horizon": -1 if row["horizon"] is None else row["horizon"],
+            "i": -1 if row["pair"] is None else row["pair"][0],
+            "j": -1 if row["pair"] is None else row["pair"][1],
+            **{
+                name: np.nan if row[name] is None else row[name]
+                for name in ("margin", "gain", "closer_bits", "growth_rate")
+            },
+            "failed": row["failed"] or "",
+        }
+        for row in rows
+    ]
+    folder.append("policies", {name: np.array([row[name] for row in plain]) for name in plain[0]})
+    for row in found.ranking:
+        count = len(row.separation)
+        folder.append(
+            "policy_separations",
+            {"policy": np.full(count, row.name), "step": np.arange(count), "separation": row.separation},
+        )
+    names = ("step", "i", "j", "inside", "margin", "bound", "exact", "wrong")
+    for policy, one in ambiguous.items():
+        if one.decisions:
+            columns = {name: np.array([getattr(each, name) for each in one.decisions]) for name in names}
+            folder.append("ambiguous", {"policy": np.full(len(one.decisions), policy), **columns})
