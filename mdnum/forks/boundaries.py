@@ -186,7 +186,8 @@ def boundaries(
     """Changes of history along a number, as far as a grid can tell, each to adjacent floats.
 
     The interval is run on a grid. A cell whose ends differ is bisected until its ends are adjacent floats; a
-    half that differs too is searched as well, widest first. All runs are by the program that a user runs
+    half that differs too is searched as well, from the lowest float on: what is left, when there are as many as
+    asked for, lies above all that were found. All runs are by the program that a user runs
     (for the cutoff radius: by its twin that is given the radius), and both sides of every boundary are run
     again by a fresh process.
 
@@ -221,17 +222,17 @@ def boundaries(
         one.turn(simulation, end)
     line = Line(simulation, one, last, loss)
     places = _grid(low, high, cells)
-    pending: list[tuple[int, int, int]] = []
+    pending: list[tuple[int, int]] = []
     for k, place in enumerate(places):
         _tell(progress, k, len(places), "running a grid", "runs")
         line.digest(place)
     for a, b in pairwise(places):
         if line.digest(a) != line.digest(b):
-            heapq.heappush(pending, (a - b, a, b))
+            heapq.heappush(pending, (a, b))
     found: list[tuple[int, int]] = []
     while pending and len(found) < most:
         _tell(progress, len(found), min(most, len(found) + len(pending)), "bisecting", "boundaries")
-        _, a, b = heapq.heappop(pending)
+        a, b = heapq.heappop(pending)
         found.append(_bisect(line, a, b, pending))
     found.sort()
     annotated = []
@@ -276,7 +277,7 @@ def _grid(low: float, high: float, cells: int) -> list[int]:
     return sorted({int(place) for place in ordinal(np.linspace(low, high, cells + 1))})
 
 
-def _bisect(line: Line, a: int, b: int, pending: list[tuple[int, int, int]]) -> tuple[int, int]:
+def _bisect(line: Line, a: int, b: int, pending: list[tuple[int, int]]) -> tuple[int, int]:
     """Adjacent ordinals between two whose histories differ; the halves not followed go to `pending`."""
     while b - a > 1:
         middle = (a + b) // 2
@@ -285,7 +286,7 @@ def _bisect(line: Line, a: int, b: int, pending: list[tuple[int, int, int]]) -> 
             a = middle
             continue
         if here != line.digest(b):
-            heapq.heappush(pending, (middle - b, middle, b))
+            heapq.heappush(pending, (middle, b))
         b = middle
     return a, b
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ import mdnum
 from mdnum import report
 from mdnum.cli import main
 from mdnum.errors import FolderError, InputError
+from mdnum.forks.boundaries import MOST
 from mdnum.report.fork import map as page
 from mdnum.report.fork.question import load
 from mdnum.rollout.engine import Engine
@@ -24,7 +26,7 @@ from mdnum.systems import build
 APART, RADIUS, SPEED, STEPS = 3.0, 2.5, 1.25, 9
 
 
-def meeting(timestep: float = 0.05):
+def meeting(timestep: float = 0.07):
     """Two free atoms that fly towards each other and feel nothing before they are inside."""
     atoms = Atoms("Ar2", positions=[[0, 0, 0], [APART, 0, 0]], masses=[1.0, 1.0])
     atoms.set_velocities([[0, 0, 0], [-SPEED, 0, 0]])
@@ -35,14 +37,15 @@ def meeting(timestep: float = 0.05):
 @pytest.fixture(scope="module")
 def mapped(tmp_path_factory):
     out = tmp_path_factory.mktemp("maps") / "meeting"
-    return mdnum.fork_map(meeting(), "timestep", 0.04, 0.105, cells=32, confirm=False, out=out)
+    return mdnum.fork_map(meeting(), "timestep", 0.06, 0.105, cells=6, confirm=False, out=out)
 
 
 def displacement(timestep: float) -> float:
     """Mean squared displacement at the last step, by a run of the system that has this time step."""
     simulation = build(meeting(timestep))
-    (segment,) = Engine(simulation, STEPS).segments()
-    return float(np.mean(np.sum((segment.unsorted("x", STEPS) - simulation.positions) ** 2, axis=1)))
+    *_, segment = Engine(simulation, STEPS).segments()
+    x = segment.unsorted("x", segment.rows - 1)
+    return float(np.mean(np.sum((x - simulation.positions) ** 2, axis=1)))
 
 
 def test_the_folder_holds_the_piecewise_map(mapped):
@@ -50,18 +53,18 @@ def test_the_folder_holds_the_piecewise_map(mapped):
     assert folder.world == "along" and folder.summary == mapped.summary
     summary = mapped.summary
     assert (summary["world"], summary["question"], summary["key"]) == ("fork", "along", "dynamics.timestep")
-    assert (summary["low"], summary["high"], summary["value"]) == (0.04, 0.105, 0.05)
+    assert (summary["low"], summary["high"], summary["value"]) == (0.06, 0.105, 0.07)
     edges, pieces, points = (folder.read(name) for name in ("boundaries", "intervals", "points"))
     # inside from the first step k on with APART - SPEED k dt < RADIUS
-    closed = [(APART - RADIUS) / SPEED / k for k in range(STEPS, 3, -1)]
+    closed = [(APART - RADIUS) / SPEED / k for k in (6, 5, 4)]
     np.testing.assert_allclose(edges["above"], closed, rtol=1e-14)
     assert edges["above"].tolist() == np.nextafter(edges["below"], 1.0).tolist()
-    assert edges["step"].tolist() == [9, 8, 7, 6, 5, 4] and set(edges["confirmed"]) == {"not asked"}
+    assert edges["step"].tolist() == [6, 5, 4] and set(edges["confirmed"]) == {"not asked"}
     # intervals and boundaries alternate, and between them cover what was asked for
-    assert pieces["low"].tolist() == [0.04, *edges["above"]]
+    assert pieces["low"].tolist() == [0.06, *edges["above"]]
     assert pieces["high"].tolist() == [*edges["below"], 0.105]
-    assert pieces["history"].tolist() == list(range(7))
-    for k in (0, 3):
+    assert pieces["history"].tolist() == list(range(4))
+    for k in (0, 2):
         for side in ("below", "above"):
             assert edges[f"loss_{side}"][k] == displacement(float(edges[side][k]))
     np.testing.assert_array_equal(edges["jump"], edges["loss_above"] - edges["loss_below"])
@@ -77,13 +80,13 @@ def test_the_page_says_what_the_folder_holds(mapped):
     tags = Tags()
     tags.feed(text)
     assert tags.open == [] and tags.sources == []
-    assert sorted(path.stem for path in (mapped.folder / "figures").iterdir()) == ["jumps", "map"]
+    assert sorted(path.stem for path in (mapped.folder / "figures").iterdir()) == ["detail", "jumps", "map"]
     words = re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", text))
     for edge in mapped.summary["boundaries"]:
         assert f"{edge['below']!r} {edge['above']!r} {edge['step']} 0–1 inside above" in words
         # in the figure, beside its line
         assert f"0–1, step {edge['step']}" in words
-    assert "change at 6 places between dynamics.timestep = 0.04 and 0.105" in words
+    assert "change at 3 places between dynamics.timestep = 0.06 and 0.105" in words
     (mapped.folder / "report.html").unlink()
     report.write(mapped.folder)
     assert (mapped.folder / "report.html").read_text(encoding="utf-8") == text
@@ -102,16 +105,16 @@ def judged(mapped, tmp_path, **changes):
 def test_what_a_person_must_know_is_a_finding(mapped, tmp_path):
     assert [one.code for one in judged(mapped, tmp_path / "a").findings] == ["NOT_CONFIRMED"]
     edges = [{**edge, "confirmed": "yes"} for edge in mapped.summary["boundaries"]]
-    sure = {"confirm": True, "confirmed": 6, "boundaries": edges}
+    sure = {"confirm": True, "confirmed": 3, "boundaries": edges}
     verdict = judged(mapped, tmp_path / "b", **sure)
     assert verdict.findings == () and verdict.tone == "info"
     assert any("a fresh process finds the same" in sentence for sentence in verdict.evidence)
     moved = [{**edges[0], "confirmed": "no"}, *edges[1:]]
-    verdict = judged(mapped, tmp_path / "c", confirm=True, confirmed=5, boundaries=moved)
+    verdict = judged(mapped, tmp_path / "c", confirm=True, confirmed=2, boundaries=moved)
     (finding,) = verdict.findings
     assert (finding.code, verdict.tone) == ("NOT_REPRODUCED", "warning")
     assert repr(edges[0]["above"]) in finding.text and "1 boundary" in finding.title
-    verdict = judged(mapped, tmp_path / "d", **sure, unresolved=[[0.05, 0.06]], failed_runs=3)
+    verdict = judged(mapped, tmp_path / "d", **sure, unresolved=[[0.08, 0.09]], failed_runs=3)
     assert [one.code for one in verdict.findings] == ["RUNS_FAILED", "MORE_BOUNDARIES"]
     quiet = judged(
         mapped, tmp_path / "e", boundaries=[], confirm=True, confirmed=0, jump_largest=None,
@@ -120,29 +123,38 @@ def test_what_a_person_must_know_is_a_finding(mapped, tmp_path):
     assert quiet.tone == "good" and quiet.headline.startswith("One history")
 
 
-def test_from_the_command_line(tmp_path, monkeypatch, capsys):
+def test_from_the_command_line(mapped, tmp_path, monkeypatch, capsys):
     path = meeting().write(tmp_path / "system")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("mdnum.forks.boundaries.digests_elsewhere", lambda *_, **__: ["another"] * 4)
-    arguments = ["fork", str(path), "--along", "timestep=0.04:0.105", "--most", "2", "--no-report"]
+    first, *others = mapped.map.boundaries
+    edges = (replace(first, confirmed=False), *(replace(one, confirmed=True) for one in others))
+    asked = []
+
+    def search(system, key, low, high, steps, **options):
+        asked.append((key, low, high, steps, options["most"], options["confirm"]))
+        options["progress"](1, 7, {"phase": "running a grid", "unit": "runs"})
+        return replace(mapped.map, boundaries=edges, unresolved=((0.08, 0.09),))
+
+    monkeypatch.setattr("mdnum.forks.boundaries.boundaries", search)
+    arguments = ["fork", str(path), "--along", "timestep=0.06:0.105", "--no-report"]
     with pytest.raises(SystemExit) as stopped:
-        main([*arguments, "--json", "-o", "here"])
+        main([*arguments, "--most", "3", "--json", "-o", "here"])
     answer = json.loads(capsys.readouterr().out)
-    # a boundary that a fresh process does not find is a finding
-    assert stopped.value.code == 1 and answer["folder"] == "here" and len(answer["unresolved"]) == 4
+    # the default number of steps, and a boundary that a fresh process does not find is a finding
+    assert asked == [("dynamics.timestep", 0.06, 0.105, STEPS, 3, True)] and stopped.value.code == 1
     assert [one["code"] for one in answer["findings"]] == ["NOT_REPRODUCED", "MORE_BOUNDARIES"]
+    assert answer["folder"] == "here" and answer["boundaries"][0]["confirmed"] == "no"
+    assert "running a grid: 1 of 7 runs" in (tmp_path / "here/log.txt").read_text()
     assert not (tmp_path / "here/report.html").exists()
     with pytest.raises(SystemExit):
         main(["report", "here"])
     assert (tmp_path / "here/report.html").exists()
     capsys.readouterr()
-    monkeypatch.setattr("mdnum.cli.output._PIPE_WIDTH", 120)
     with pytest.raises(SystemExit):
         main(arguments)
     said = capsys.readouterr().out
-    for edge in answer["boundaries"]:
-        assert repr(edge["below"]) in said and repr(edge["above"]) in said
-    assert "wrote runs/fork-" in said
+    assert all(repr(side.at) in said for edge in edges for side in (edge.below, edge.above))
+    assert "wrote runs/fork-" in said and asked[1][4] == MOST
 
 
 def test_what_cannot_be_is_refused_before_there_is_a_folder(tmp_path):

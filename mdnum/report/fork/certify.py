@@ -53,7 +53,7 @@ def write_report(folder: RunFolder | str | Path) -> Path:
             "a kink; before it only rounding grows.",
         },
         figures=list(_key_figures(run)),
-        rows=[_row(run, row) for row in run.summary["policies"]],
+        ranked=[_row(run, row) for row in run.summary["policies"]],
         what=list(_what(run)),
     )
 

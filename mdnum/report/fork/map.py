@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mdnum.report.fork.findings import Verdict
-from mdnum.report.fork.map_figures import captions, detail, jumps, parameter_map, with_unit
+from mdnum.report.fork.map_figures import captions, detail, jumps, numbered, parameter_map, with_unit
 from mdnum.report.fork.question import Question, declared, load, size_of, took, verdict, write_page
 from mdnum.report.verdict import Finding
-from mdnum.report.words import count, many, number
+from mdnum.report.words import count, listed, many, number
 from mdnum.store import RunFolder
 
 
@@ -35,7 +35,9 @@ def write_report(folder: RunFolder | str | Path) -> Path:
         {name: declared(plot) for name, plot in plots.items() if plot is not None},
         captions=captions(run),
         figures=list(_key_figures(run)),
-        boundaries=[_boundary(run, edge) for edge in run.summary["boundaries"]],
+        boundaries=[_boundary(edge) for edge in run.summary["boundaries"]],
+        bounds=_bounds(run.summary["boundaries"]),
+        numbered=numbered(run),
         intervals=[_interval(one) for one in run.summary["intervals"]],
         unresolved=[f"{low!r} to {high!r}" for low, high in run.summary["unresolved"]],
         what=list(_what(run)),
@@ -68,6 +70,9 @@ def _headline(run: Question) -> str:
             return f"No decision was found to change {where}, and yet the runs at its ends fail differently."
         return f"One history: no decision of {many(run.steps, 'step')} changes {where}."
     places = many(len(edges), "place")
+    if summary["unresolved"]:
+        places += f" and more {where}, as far as they were searched for"
+        return f"The decisions of {many(run.steps, 'step')} change at {places}."
     return f"The decisions of {many(run.steps, 'step')} change at {places} {where}."
 
 
@@ -82,9 +87,10 @@ def _evidence(run: Question) -> Iterator[str]:
         )
         total = sum(edge["jump"] for edge in edges)
         ends = summary["intervals"][-1]["loss_high"] - summary["intervals"][0]["loss_low"]
+        known = "the jumps that were found" if summary["unresolved"] else "the jumps"
         yield (
             f"From end to end the {summary['loss']} changes by {number(ends, 3, signed=True)}; "
-            f"the jumps add up to {number(total, 3, signed=True)} of it. "
+            f"{known} add up to {number(total, 3, signed=True)}. "
             "A derivative of the program knows nothing of them."
         )
         if summary["confirm"] and summary["confirmed"] == len(edges):
@@ -128,8 +134,8 @@ def _findings(run: Question) -> Iterator[Finding]:
             "MORE_BOUNDARIES",
             "info",
             f"{many(len(left), 'more stretch', 'more stretches')} with a change of history",
-            f"The search stopped after {many(len(edges), 'boundary', 'boundaries')}; the ends of these "
-            "stretches were decided differently.",
+            f"The search stopped after {many(len(edges), 'boundary', 'boundaries')}, at {left[0][0]!r}. "
+            "The ends of these stretches were decided differently.",
             "Allow more with --most, or search a narrower interval or fewer steps.",
         )
     if summary["failed_runs"]:
@@ -166,23 +172,27 @@ def _key_figures(run: Question) -> Iterator[tuple[str, str, str]]:
     yield "Runs", count(summary["evaluations"]), f"{number(summary.get('seconds'), 2)} s in all"
 
 
-def _boundary(run: Question, edge: Mapping[str, Any]) -> dict[str, Any]:
+def _boundary(edge: Mapping[str, Any]) -> dict[str, Any]:
     """A boundary as text."""
-    bound = edge["bound"]
     return {
         "below": repr(edge["below"]),
         "above": repr(edge["above"]),
         "step": count(edge["step"]),
         "pair": f"{edge['i']}–{edge['j']}",
-        "way": "inside above" if edge["inside"] else "inside below",
-        "also": f"and {many(edge['also'], 'more pair')}" if edge["also"] else "",
+        "way": "in above" if edge["inside"] else "in below",
+        "also": f"+ {count(edge['also'])}" if edge["also"] else "",
         "margin_below": number(edge["margin_below"], 2, signed=True),
         "margin_above": number(edge["margin_above"], 2, signed=True),
-        "bound": number(bound, 2),
         "jump": number(edge["jump"], 3, signed=True),
         "apart": number(edge["apart"], 2),
         "confirmed": edge["confirmed"],
     }
+
+
+def _bounds(edges: Sequence[Mapping[str, Any]]) -> str:
+    """The rounding bounds of the margins, in words; they differ from one kind of pair to another only."""
+    known = sorted({number(edge["bound"], 2) for edge in edges})
+    return f"{'s' if len(known) > 1 else ''} {listed(known)}" if known else ""
 
 
 def _interval(one: Mapping[str, Any]) -> dict[str, str]:

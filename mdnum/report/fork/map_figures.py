@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 
 from mdnum.ball.demos.base import Plot, Series
@@ -11,6 +13,10 @@ from mdnum.report.fork.question import Question
 _VISIBLE = 0.05
 #: Degree of the trend that is taken off.
 _TREND = 3
+#: Share of the interval that a label with pair and step takes.
+_ROOM = 0.03
+
+Role = Literal["first", "bad", "muted"]
 
 
 def parameter_map(run: Question) -> Plot | None:
@@ -65,11 +71,17 @@ def _plot(
     for column, source in zip(jump, (at, values), strict=True):
         column[0], column[1] = source[places - 1], source[places + 1]
     series = [Series("one history", at, values, mark="line+points")]
-    if len(breaks):
-        series.append(Series("jump", jump[0].T.ravel(), jump[1].T.ravel(), role="bad"))
-    edges = [
-        (edge["above"], f"{edge['i']}–{edge['j']}, step {edge['step']:,}") for edge in summary["boundaries"]
-    ]
+    # a stretch whose ends differ and that was not searched holds jumps, and nobody knows where
+    searched = np.isin(at[places - 1], [edge["below"] for edge in summary["boundaries"]])
+    named: tuple[tuple[np.ndarray, str, Role, bool], ...] = (
+        (~searched, "not searched", "muted", True),
+        (searched, "jump", "bad", False),
+    )
+    for which, label, role, dashed in named:
+        if which.any():
+            x, y = (column[:, which].T.ravel() for column in jump)
+            series.append(Series(label, x, y, role=role, dashed=dashed))
+    edges = list(zip((edge["above"] for edge in summary["boundaries"]), labels(run), strict=True))
     own = summary.get("value")
     if own is not None and summary["low"] < own < summary["high"]:
         edges.append((own, "the system’s own"))
@@ -81,6 +93,21 @@ def _plot(
         tuple(series),
         verticals=tuple(edges),
     )
+
+
+def labels(run: Question) -> list[str]:
+    """What stands beside the boundaries: pair and step, or their numbers where that would be too much."""
+    edges = run.summary["boundaries"]
+    if not numbered(run):
+        return [f"{edge['i']}–{edge['j']}, step {edge['step']:,}" for edge in edges]
+    return [f"{place}" for place in range(1, len(edges) + 1)]
+
+
+def numbered(run: Question) -> bool:
+    """Whether the boundaries are so close to one another that a figure can only number them."""
+    summary = run.summary
+    at = [edge["above"] for edge in summary["boundaries"]]
+    return len(at) > 1 and bool(np.diff(at).min() < _ROOM * (summary["high"] - summary["low"]))
 
 
 def jumps(run: Question) -> Plot | None:
@@ -110,10 +137,14 @@ def with_unit(text: str, unit: str) -> str:
 
 
 def captions(run: Question) -> dict[str, str]:
+    which = (
+        "the boundary of this number in the table"
+        if numbered(run)
+        else "this pair is the first to be decided otherwise, at this step"
+    )
     return {
         "map": "A line for each stretch with one history of decisions; dots are runs, which crowd where a "
-        "boundary was closed in. Dashed: between two adjacent floats this pair is the first to be decided "
-        "otherwise, at this step.",
+        f"boundary was closed in. Upright: between two adjacent floats, {which}.",
         "detail": "The same runs, with a cubic in the number taken off: what is left are the jumps.",
         "jumps": "Sizes, whatever their sign. A flip at the last steps has had no time to move anything.",
     }

@@ -49,7 +49,7 @@ def write_report(folder: RunFolder | str | Path) -> Path:
             "all programs of a cluster: they have the same bits at every step that they ran."
         },
         figures=list(_key_figures(run)),
-        rows=[_row(run, row) for row in _ordered(run)],
+        programs=[_row(run, row) for row in _ordered(run)],
         what=list(_what(run)),
     )
 
