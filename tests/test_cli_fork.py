@@ -31,6 +31,34 @@ SUMMARY: dict[str, Any] = {
     },
     "growth_rate": 0.0121, "growth_rate_time": 3.03, "r_squared": 0.673, "predicted_split": None,
     "splits": {"B": 1806, "B|A": None, "A|B": 2400}, "repeats": [1475], "cross_flips": 16114,
+    "table": [
+        {"arithmetic": x, "decisions": y, "from": z, "same": x == y == z, "split": split, "until": 3839}
+        for x, y, z, split in (
+            ("A", "A", "A", None), ("B", "B", "A", 1806), ("B", "A", "A", None), ("A", "B", "A", 1790),
+            ("A", "A", "B", 1806), ("B", "B", "B", None), ("B", "A", "B", 1811), ("A", "B", "B", 2400),
+        )
+    ],
+    "shares": [
+        {"what": "decisions", "reference": "A", "steps": 2033, "at_least": True, "nats": 24.6},
+        {"what": "decisions", "reference": "B", "steps": 594, "at_least": False, "nats": 7.19},
+        {"what": "arithmetic", "reference": "A", "steps": -16, "at_least": False, "nats": None},
+    ],
+    "certified_horizon": {"A": 3839, "B": -1}, "ambiguous": {"A": 0, "B": 431},
+    "ambiguous_steps": {"A": 0, "B": 390}, "lists_complete": {"A": True, "B": False},
+    "protected_until": 302, "shadow": "A", "shadow_horizon": 624,
+    "lyapunov": {
+        "rate": 0.0119, "error": 0.0004, "rate_time": 2.98, "steps": 2000, "ratio": 1.02, "ulp": 8.9e-16,
+        "ulp_split": 2700,
+    },
+    "lyapunov_reason": None,
+    "minimal": {
+        "pairs": [{"i": 3, "j": 75, "differs": [[625, 640], [700, None]]}], "proven": True,
+        "fork_alone": True, "candidates": 4000, "tests": 1, "horizon": 2258, "reason": "it alone does it",
+    },
+    "pinned": {
+        "pin": "fork", "pairs": [[3, 75]], "first": 625, "last": 639, "split": None, "free": 1806,
+        "until": 3839, "largest": 2.3e-6, "reason": None,
+    },
     "findings": [], "status": "complete",
 }  # fmt: skip
 
@@ -74,15 +102,16 @@ def printed(capsys: pytest.CaptureFixture[str]) -> list[str]:
 def test_fork_passes_on_what_was_asked(compare: Recorder):
     code = call(
         "fork", "argon/crystal-108", "--vary", "reduction=exact", "--steps", "20", "--split", "0.1",
-        "--repeats", "4", "--set", "cutoff.kind=switched", "--no-counterfactual", "--back", "-o", "here",
-        "--no-report",
+        "--repeats", "4", "--set", "cutoff.kind=switched", "--no-counterfactual", "--no-back",
+        "--no-lyapunov", "--minimal", "--pin", "3-75:600..700", "-o", "here", "--no-report",
     )  # fmt: skip
     assert code == 0
     ((system, vary, options),) = compare.calls
     assert (system, vary) == ("argon/crystal-108", "reduction=exact")
     assert isinstance(options.pop("progress"), ProgressBar)
     assert options == {
-        "steps": 20, "split": 0.1, "repeats": 4, "counterfactual": False, "back": True, "out": Path("here"),
+        "steps": 20, "split": 0.1, "repeats": 4, "counterfactual": False, "back": False, "lyapunov": False,
+        "minimal": True, "pin": "3-75:600..700", "out": Path("here"),
         "overrides": {"cutoff.kind": "switched"}, "report": False,
     }  # fmt: skip
 
@@ -105,7 +134,21 @@ def test_the_verdict_comes_first_then_dates_and_decision(compare: Recorder, caps
         "apart the step before 3.33e-07; the margin is 0.5 of it",
         "growth 0.0121 a step, 3.03 a unit of time, r² 0.673",
         "flips in one run only 16,114",
-        "B its own 1,806", "B A's none", "A B's 2,400", "B, start perturbed its own 1,475",
+        "A its own is A 1,806", "B its own 1,806 is B", "B A's > 3,839 1,811", "A B's 1,790 2,400",
+        "B, start perturbed its own 1,475",
+        "decisions > 2,033 steps, > 24.6 nats 594 steps, 7.19 nats", "arithmetic -16 steps",
+        "certified in A up to step 3,839: no decision is ambiguous",
+        "certified in B not even at the start; 431 ambiguous decisions at 390 steps after it; "
+        "of listed pairs only, a rule of rebuilds that is not safe may miss some",
+        "protected up to step 302: every pair is further from its cutoff than twice the separation",
+        "shadow horizon step 624: B decides as the wider program, A, up to there",
+        "Lyapunov exponent 0.0119 ± 0.0004 a step, 2.98 a unit of time, from 2,000 steps of A; "
+        "the runs part 1.02 times as fast",
+        "an ulp of the start (8.9e-16) splits them about step 2,700",
+        "taken back 3–75 as A decided it at steps 625 to 639: no split by step 3,839, 2.3e-06 apart at most "
+        "(free: 1,806)",
+        "minimal cause: it alone does it (1 run, 4,000 candidates)",
+        "3–75 steps 625 to 639, and 1 time more",
     ):  # fmt: skip
         assert line in lines, line
     assert lines[-1] == "wrote runs/x"
@@ -114,7 +157,9 @@ def test_the_verdict_comes_first_then_dates_and_decision(compare: Recorder, caps
 def test_a_horizon_too_short_is_no_failure(compare: Recorder, capsys):
     compare.summary = SUMMARY | {
         "split": None, "split_time": None, "predicted_split": 5200, "verdict": "open", "repeats": [],
-        "splits": {"B": None},
+        "splits": {"B": None}, "table": SUMMARY["table"][:2], "shares": [],
+        "lyapunov": None, "lyapunov_reason": "a many-body potential",
+        "minimal": {"pairs": None, "tests": 0, "reason": "the runs did not split"},
         "findings": [{"code": "HORIZON_SHORT", "severity": "info", "title": "short", "text": "0.02 apart."}],
     }  # fmt: skip
     assert call("fork", "argon/crystal-108", "--vary", "precision") == 0
@@ -122,7 +167,9 @@ def test_a_horizon_too_short_is_no_failure(compare: Recorder, capsys):
     assert "split none in 3,839 steps (further apart than 0.0635)" in lines
     assert "predicted split about step 5,200" in lines
     assert "info: short" in lines and "0.02 apart." in lines
-    assert not any(line.startswith("splits from") for line in lines)
+    assert not any(line.startswith(("splits,", "without the difference")) for line in lines)
+    assert "Lyapunov exponent none: a many-body potential" in lines
+    assert "minimal cause: none; the runs did not split" in lines
 
 
 def test_runs_that_do_not_fork_print_too(compare: Recorder, capsys):
@@ -176,6 +223,8 @@ def test_mistakes_exit_2(compare: Recorder, capsys):
     assert call("fork", "argon/crystal-108", "--vary", "x", "--json") == 2
     assert json.loads(capsys.readouterr().out)["error"]["message"] == "no choice 'x'"
     assert call("fork", "argon/crystal-108", "--vary", "x", "--steps", "0") == 2
+    assert call("fork", "argon/crystal-108", "--minimal", "--along", "cutoff.radius=1.4:1.5") == 2
+    assert "--minimal needs a choice" in capsys.readouterr().err
     compare.error = KeyboardInterrupt()
     assert call("fork", "argon/crystal-108", "--vary", "precision") == 130
 

@@ -35,7 +35,22 @@ def fork(
     no_counterfactual: bool = typer.Option(
         False, "--no-counterfactual", help="Do not run B under A's decisions: dates, but no cause."
     ),
-    back: bool = typer.Option(False, "--back", help="Run A under B's decisions too."),
+    no_back: bool = typer.Option(
+        False, "--no-back", help="Do not run A under B's decisions: half of the table of two by two."
+    ),
+    no_lyapunov: bool = typer.Option(
+        False, "--no-lyapunov", help="Do not carry a tangent along A for its Lyapunov exponent."
+    ),
+    minimal: bool = typer.Option(
+        False,
+        "--minimal",
+        help="With --vary: the fewest decisions whose taking back keeps the runs together.",
+    ),
+    pin: str | None = typer.Option(
+        None,
+        metavar="DECISION",
+        help="With --vary: run B once more, told what A decided: fork, a pair 3-75, or 3-75:600..700.",
+    ),
     along: str | None = typer.Option(
         None, metavar="KEY=LOW:HIGH", help="Where the history of decisions changes along a number."
     ),
@@ -73,8 +88,9 @@ def fork(
     if sum(asked.values()) > 1:
         given = " and ".join(name for name, is_asked in asked.items() if is_asked)
         raise InputError(f"{given} are different questions", remedy="Ask one at a time")
-    if benign and vary is None:
-        raise InputError("--benign needs a choice", remedy="Add --vary CHOICE")
+    for name, is_asked in (("--benign", benign), ("--minimal", minimal), ("--pin", pin is not None)):
+        if is_asked and vary is None:
+            raise InputError(f"{name} needs a choice", remedy="Add --vary CHOICE")
     if most is not None and along is None:
         raise InputError("--most needs a number to go along", remedy="Add --along KEY=LOW:HIGH")
     if any(asked.values()) and system is None:
@@ -115,7 +131,10 @@ def fork(
                 split=split,
                 repeats=repeats,
                 counterfactual=not no_counterfactual,
-                back=back,
+                back=not no_back,
+                lyapunov=not no_lyapunov,
+                minimal=minimal,
+                pin=pin,
                 out=out,
                 overrides=overrides,
                 report=not no_report,

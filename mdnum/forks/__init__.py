@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from mdnum.forks.pair import Decision, Fork, fork
+from mdnum.forks.take_back import Pinned, pinned
 from mdnum.forks.twin import Twin
 
-__all__ = ["Decision", "Fork", "Twin", "fork"]
+__all__ = ["Decision", "Fork", "Pinned", "Twin", "fork", "pinned"]

@@ -14,10 +14,9 @@ import numpy as np
 
 from mdnum.errors import InputError
 from mdnum.forks.pair import Fork
+from mdnum.forks.take_back import check_pins, decided
 from mdnum.md.cell import HostCell
-from mdnum.rollout.engine import Engine
-from mdnum.rollout.flips import PairRecorder, decided_pairs
-from mdnum.rollout.pins import Pin, Pins
+from mdnum.rollout.engine import Engine, Segment
 
 #: "Together" means up to so many times the step of the split.
 _BEYOND = 1.25
@@ -59,19 +58,17 @@ def minimal_cause(
         progress: called with the tests made and allowed.
 
     Raises:
-        InputError: the runs did not split, or are seen in other labels or axes.
+        InputError: the runs did not split, are seen in other labels or axes, or have many-body potentials.
 
     Error: 1-minimal only: no single pair can be left out, but another, smaller set may exist.
     """
-    twin = found.twin
     if found.dates.fork is None or found.dates.split is None or found.decision is None:
         raise InputError("the runs did not split", remedy="Run longer, or with a smaller split tolerance")
-    if twin.frame is not None and not twin.frame.is_same:
-        raise InputError("the runs have other labels or axes", remedy="Choose a variation without")
+    check_pins(found)
     horizon = int(_BEYOND * found.dates.split) + 1
     keys = _candidates(found)
     search = _Search(found, keys, horizon, tests, progress)
-    first = found.decision.i * twin.a.atoms + found.decision.j
+    first = found.decision.i * found.twin.a.atoms + found.decision.j
     alone = search.holds([first])
     if alone:
         return search.answer([first], True, "the decision at the fork alone does it")
@@ -116,7 +113,9 @@ class _Search:
         self._known: dict[frozenset[int], bool] = {}
         self._cell = HostCell(found.twin.a.cell)
         self._every = max(1, horizon // _SAMPLES)
-        self._follow_a(set(keys))
+        self._positions: dict[int, np.ndarray] = {}
+        twin = found.twin
+        self._told = decided(twin.a, keys, horizon, twin.start_a, self._keep)
 
     @property
     def spent(self) -> bool:
@@ -135,35 +134,11 @@ class _Search:
             pairs, proven and pairs is not None, alone, self.candidates, self.made, self.horizon, reason
         )
 
-    def _follow_a(self, keys: set[int]) -> None:
-        """A's decisions of the candidates, and its positions now and then."""
-        a = self.found.twin.a
-        recorder = PairRecorder(a)
-        changes: dict[int, list[int]] = {key: [] for key in keys}
-        self._first: set[int] | None = None
-        self._positions: dict[int, np.ndarray] = {}
-        for segment in Engine(a, self.horizon, start=self.found.twin.start_a).segments():
-            if self._first is None:
-                self._first = set(decided_pairs(a, segment, 0).tolist())
-            ledger = recorder.flips(segment)
-            named = ledger.subject[:, 0] * a.atoms + ledger.subject[:, 1]
-            for step, key in zip(ledger.step.tolist(), named.tolist(), strict=True):
-                if key in changes:
-                    changes[key].append(step)
-            for row in range(segment.rows):
-                if (segment.first + row) % self._every == 0:
-                    self._positions[segment.first + row] = segment.unsorted("x", row).astype(np.float64)
-        self._changes = changes
-
-    def _pins(self, keys: Sequence[int]) -> Pins:
-        atoms = self.found.twin.a.atoms
-        assert self._first is not None
-        return Pins(
-            [
-                Pin(*divmod(key, atoms), 0, self.horizon, tuple(self._changes[key]), key in self._first)
-                for key in keys
-            ]
-        )
+    def _keep(self, segment: Segment) -> None:
+        """A's positions now and then."""
+        for row in range(segment.rows):
+            if (segment.first + row) % self._every == 0:
+                self._positions[segment.first + row] = segment.unsorted("x", row).astype(np.float64)
 
     def holds(self, keys: Sequence[int]) -> bool:
         """Whether B stays with A when these pairs are pinned; False once no more runs are allowed."""
@@ -180,7 +155,8 @@ class _Search:
     def _stays(self, keys: Sequence[int]) -> bool:
         twin, tolerance = self.found.twin, self.found.tolerance
         reached = -1
-        for segment in Engine(twin.b, self.horizon, start=twin.start_b, pins=self._pins(keys)).segments():
+        pins = self._told.pins(keys, 0, self.horizon)
+        for segment in Engine(twin.b, self.horizon, start=twin.start_b, pins=pins).segments():
             for row in range(segment.rows):
                 step = segment.first + row
                 if step in self._positions:

@@ -12,9 +12,11 @@ from jaxtyping import Shaped
 
 from mdnum.errors import InputError
 from mdnum.events.forks import Dates, Growth, Verdict, growth, judge, split_of
+from mdnum.events.shares import Cell, Share, shares, table
 from mdnum.forks.twin import Twin
 from mdnum.md.cell import HostCell
 from mdnum.rollout.engine import Start, first_state
+from mdnum.rollout.flips import Ambiguous
 from mdnum.rollout.lockstep import CrossFlip, Stretch, lockstep
 from mdnum.systems.build import Simulation
 
@@ -68,12 +70,17 @@ class Fork:
         tolerance: of the split, length.
         dates: seed, fork and split.
         decision: at the fork; None without one.
-        series: arrays by step: "step"; separations "B", "B|A", "A|B", "B 1", ... (length); "cross", pairs
-            that differ; "overridden" and "furthest" of B|A; energies "energy A", "energy B", "energy B|A".
+        series: arrays by step: "step"; separations from A "B", "B|A", "A|B from A", "B 1", ..., from B "A|B"
+            and "B|A from B" (length); "cross", pairs that differ; "overridden" and "furthest" of B|A;
+            energies "energy A", "energy B", "energy B|A"; "nearest A", "nearest B", the distance of the pair
+            next to its cutoff from it (length); "ambiguous A", "ambiguous B", ambiguous decisions.
         flips: cross-run flips, the first `FLIPS_KEPT`.
         flips_total: of all.
+        doubts: ambiguous decisions of A and of B, the first `FLIPS_KEPT` of each.
         growth: of the separations "B" and "B|A".
         splits: first step beyond the tolerance by separation; None where there is none.
+        table: splits of either arithmetic under either decisions.
+        shares: what the decisions and what the arithmetic contributed to the split.
         verdict: on the flips.
         failed: runs that ended in "blow-up" or "runaway".
     """
@@ -87,8 +94,11 @@ class Fork:
     series: dict[str, Shaped[np.ndarray, "steps"]]
     flips: tuple[CrossFlip, ...]
     flips_total: int
+    doubts: dict[str, Ambiguous]
     growth: dict[str, Growth]
     splits: dict[str, int | None]
+    table: tuple[Cell, ...]
+    shares: tuple[Share, ...]
     verdict: Verdict
     failed: dict[str, str]
 
@@ -105,7 +115,7 @@ def fork(
     *,
     split: float | None = None,
     counterfactual: bool = True,
-    back: bool = False,
+    back: bool = True,
     repeats: int = 2,
     seed: int = 0,
     progress: Callable[[int, int, dict[str, Any]], None] | None = None,
@@ -117,7 +127,8 @@ def fork(
         steps: last step; default the system's own. Followed to twice the split at most.
         split: separation that counts as split, length; default 0.04 of the longest cutoff.
         counterfactual: whether to run B under A's decisions.
-        back: whether to run A under B's decisions too, for the full table of two by two.
+        back: whether to run A under B's decisions too, for the full table of two by two; it costs as much
+            as the run of B under A's.
         repeats: runs of B whose start is perturbed as much as the choice perturbs A, to tell a delay from
             chance.
         seed: of the perturbations.
@@ -146,6 +157,7 @@ def fork(
         starts = nudged(b, start_b, size, repeats, seed)
     gathered: list[Stretch] = []
     flips: list[CrossFlip] = []
+    doubts = {name: Ambiguous.joined([]) for name in ("A", "B")}
     total = 0
     end = None
     for stretch in lockstep(
@@ -160,9 +172,12 @@ def fork(
         repeats=starts,
         guard=_GUARD * tolerance,
     ):
-        gathered.append(replace(stretch, flips=()))
+        gathered.append(replace(stretch, flips=(), doubts={}))
         total += len(stretch.flips)
         flips += stretch.flips[: max(0, FLIPS_KEPT - len(flips))]
+        for name, more in stretch.doubts.items():
+            room = max(0, FLIPS_KEPT - len(doubts[name].step))
+            doubts[name] = Ambiguous.joined([doubts[name], more.where(slice(room))])
         reached = stretch.first + stretch.rows - 1
         apart = split_of(stretch.separation["B"], tolerance)
         if end is None and apart is not None:
@@ -172,7 +187,7 @@ def fork(
             progress(min(reached, last), min(last, end or last), shown)
         if end is not None and reached >= end:
             break
-    return _judged(twin, last, tolerance, gathered, tuple(flips), total)
+    return _judged(twin, last, tolerance, gathered, tuple(flips), total, doubts)
 
 
 def seed_size(twin: Twin, steps: int = 100) -> float:
@@ -219,6 +234,7 @@ def _judged(
     gathered: list[Stretch],
     flips: tuple[CrossFlip, ...],
     total: int,
+    doubts: dict[str, Ambiguous],
 ) -> Fork:
     series = _series(gathered)
     bits = np.concatenate([stretch.bits for stretch in gathered])
@@ -231,6 +247,7 @@ def _judged(
     rates = {name: growth(series[name], tolerance) for name in ("B", "B|A") if name in series}
     chance = [split for name, split in splits.items() if name.startswith("B ") and split is not None]
     verdict = judge(dates, free, handed, tolerance, chance)
+    cells = table(series, tolerance)
     return Fork(
         twin,
         len(free) - 1,
@@ -241,8 +258,11 @@ def _judged(
         series,
         flips,
         total,
+        doubts,
         rates,
         splits,
+        cells,
+        shares(cells, rates["B"].rate),
         verdict,
         failed,
     )
@@ -258,6 +278,9 @@ def _series(gathered: list[Stretch]) -> dict[str, np.ndarray]:
     if "B|A" in gathered[0].overridden:
         series["overridden"] = np.concatenate([s.overridden["B|A"] for s in gathered])
         series["furthest"] = np.concatenate([s.furthest["B|A"] for s in gathered])
+    for name in ("A", "B"):
+        series[f"nearest {name}"] = np.concatenate([s.nearest[name] for s in gathered])
+        series[f"ambiguous {name}"] = np.concatenate([s.ambiguous[name] for s in gathered])
     return series
 
 

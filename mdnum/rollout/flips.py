@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numba
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -84,6 +86,34 @@ def _at(values: np.ndarray, row: np.ndarray, place: np.ndarray) -> np.ndarray:
     return out.T
 
 
+class Ambiguous(NamedTuple):
+    """Pair decisions that another legitimate rounding could have made otherwise, a row each.
+
+    Attributes:
+        step: of the decision.
+        i, j: the pair, i < j.
+        margin, bound: of the decision, and on the rounding error of its quantity; |margin| <= bound.
+    """
+
+    step: Int[np.ndarray, "rows"]
+    i: Int[np.ndarray, "rows"]
+    j: Int[np.ndarray, "rows"]
+    margin: Float[np.ndarray, "rows"]
+    bound: Float[np.ndarray, "rows"]
+
+    def where(self, chosen) -> Ambiguous:
+        """Some of the rows: a mask, a slice or indices."""
+        return Ambiguous(*(column[chosen] for column in self))
+
+    @classmethod
+    def joined(cls, parts: list[Ambiguous]) -> Ambiguous:
+        """The rows of several, one after the other."""
+        whole, real = np.zeros(0, np.int64), np.zeros(0)
+        parts = [cls(whole, whole, whole, real, real), *parts]
+        step, i, j, margin, bound = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+        return cls(step, i, j, margin, bound)
+
+
 class PairRecorder:
     """Writes the `pair` channel of a simulation.
 
@@ -125,17 +155,30 @@ class PairRecorder:
 
     def ambiguous(self, segment: Segment) -> Int[np.ndarray, "rows"]:
         """Pairs whose decision another legitimate rounding could have changed, at every step of a segment."""
-        counts = np.zeros(segment.rows, np.int64)
-        bounds = self._bounds
+        return np.bincount(self.doubtful(segment).step - segment.first, minlength=segment.rows)
+
+    def doubtful(self, segment: Segment) -> Ambiguous:
+        """The pairs that `ambiguous` counts, in the order of their steps."""
+        parts: list[Ambiguous] = []
+        bounds, table = self._bounds, segment.table
         # almost always no pair comes that close; where one does, the host looks again
-        for row in np.flatnonzero(segment.rows_of("nearest") <= bounds.max()):
-            table, x = segment.table, segment.rows_of("x")[row]
+        close = np.flatnonzero(segment.rows_of("nearest") <= bounds.max())
+        if len(close):
             slot, first = np.nonzero(table.index < self.simulation.atoms)
             second = table.index[slot, first]
             i, j = table.order[first], table.order[second]
+            once = i < j
+            first, second, i, j = first[once], second[once], i[once], j[once]
+        for row in close:
+            x = segment.rows_of("x")[row]
             kind, margin = self._margins(x[:, first].T, x[:, second].T, i, j)
-            counts[row] = int(np.sum((np.abs(margin) <= bounds[kind]) & (i < j)))
-        return counts
+            at = np.flatnonzero(np.abs(margin) <= bounds[kind])
+            at = at[sort_rows(np.zeros(len(at), np.int64), np.stack([i[at], j[at]], axis=1))]
+            step = np.full(len(at), segment.first + row, np.int64)
+            parts.append(
+                Ambiguous(step, i[at].astype(np.int64), j[at].astype(np.int64), margin[at], bounds[kind[at]])
+            )
+        return Ambiguous.joined(parts)
 
     def _margins(self, start, end, i, j):
         """Pair types and margins of pairs at given positions, with the bits of the program's decision."""

@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 
 from mdnum.md.cell import HostCell
 from mdnum.rollout.engine import Segment, Start
+from mdnum.rollout.flips import Ambiguous
 from mdnum.rollout.frame import Frame
 from mdnum.rollout.handed import Handed, Overridden
 from mdnum.rollout.tracks import Flip, Rows, Track, joined
@@ -51,13 +52,17 @@ class Stretch:
     Attributes:
         first: step of the first row.
         separation: largest distance between an atom of A and the same atom of another run, length, by the
-            name ("B", "B|A", "B 1", ...), and of "A|B" from B; shape (rows,), NaN where a run has ended.
+            name ("B", "B|A", "B 1", ...), of "A|B" from B, and the other way around, "A|B from A" and
+            "B|A from B"; shape (rows,), NaN where a run has ended.
         bits: whether any bit of the state of A and B differs, shape (rows,).
         energy: total energy by run, shape (rows,).
         cross: pairs that A and B decide differently, shape (rows,).
         flips: cross-run flips of these steps, in order.
         overridden: by counterfactual: decisions it would have made otherwise, shape (rows,).
         furthest: by counterfactual: distance of the furthest of them from its cutoff, length, shape (rows,).
+        nearest: of A and B, how far the pair next to its cutoff is from it at least, length, shape (rows,).
+        ambiguous: of A and B, how many decisions rounding could have changed, shape (rows,).
+        doubts: which ones they are.
         failed: by run, "blow-up" or "runaway" where it ended that way.
     """
 
@@ -69,6 +74,9 @@ class Stretch:
     flips: tuple[CrossFlip, ...]
     overridden: dict[str, Float[np.ndarray, "rows"]]
     furthest: dict[str, Float[np.ndarray, "rows"]]
+    nearest: dict[str, Float[np.ndarray, "rows"]]
+    ambiguous: dict[str, Float[np.ndarray, "rows"]]
+    doubts: dict[str, Ambiguous]
     failed: dict[str, str]
 
     @property
@@ -112,7 +120,7 @@ def lockstep(
     leader = Track(a, last, start_a, listener=forward)
     follower = Track(b, last, start_b, frame, listener=backward)
     others = {f"B {k + 1}": Track(b, last, start, frame, flips=False) for k, start in enumerate(repeats)}
-    cell_a, cell_b = HostCell(a.cell), HostCell(b.cell)
+    cell_a = HostCell(a.cell)
     differing: set[int] | None = None
     while leader.segment() is not None:
         end = leader.ready
@@ -125,28 +133,37 @@ def lockstep(
             differing = set(np.setxor1d(leader.first_pairs, follower.first_pairs).tolist())
             opening = [_opening(key, a.atoms) for key in sorted(differing)]
         cross, flips = _cross(differing, rows_a, flips_a, flips_b, a.atoms)
-        separation = {"B": _apart(cell_a, rows_a, rows_b)}
+        separation = {"B": apart(cell_a, rows_a, rows_b)}
         energy = {"A": rows_a.energy, "B": _energy(rows_a, rows_b)}
         failed = {"A": leader.failed, "B": follower.failed}
         overridden: dict[str, np.ndarray] = {}
         furthest: dict[str, np.ndarray] = {}
+        own: dict[str, Rows | None] = {}
         for name, told in (("B|A", forward), ("A|B", backward)):
             if told is None:
                 continue
             rows, note = told.until(end)
-            if name == "B|A":
-                separation[name] = _apart(cell_a, rows_a, rows)
-            else:
-                # in B's labels and axes: distances do not mind, a row of B's that ended has nothing to give
-                own_b = None if rows_b is None else _in_frame(rows_b, frame.inverse)
-                part = _apart(cell_b, own_b, rows) if own_b is not None else np.zeros(0)
-                separation[name] = _padded(part, rows_a)
+            own[name] = rows
             energy[name] = _energy(rows_a, rows)
             overridden[name], furthest[name] = (_padded(x, rows_a) for x in (note.count, note.furthest))
             failed[name] = told.failed
+        # in the labels and axes of the run whose decisions it acts on; distances do not mind
+        if forward is not None:
+            rows = own["B|A"]
+            separation["B|A"] = apart(cell_a, rows_a, rows)
+            separation["B|A from B"] = _padded(apart(cell_a, rows_b, rows), rows_a)
+        if backward is not None:
+            rows = None if own["A|B"] is None else _in_frame(own["A|B"], frame)
+            separation["A|B"] = _padded(apart(cell_a, rows_b, rows), rows_a)
+            separation["A|B from A"] = apart(cell_a, rows_a, rows)
+        nearest = {"A": _nearest(a, rows_a, rows_a), "B": _nearest(b, rows_b, rows_a)}
+        doubts = {"A": leader.doubts(end), "B": follower.doubts(end)}
+        ambiguous = {
+            name: np.where(np.isnan(nearest[name]), np.nan, _per_row(doubts[name], rows_a)) for name in doubts
+        }
         for name, track in others.items():
             rows, _ = track.until(end)
-            separation[name] = _apart(cell_a, rows_a, rows)
+            separation[name] = apart(cell_a, rows_a, rows)
         yield Stretch(
             rows_a.first,
             separation,
@@ -156,6 +173,9 @@ def lockstep(
             tuple(opening + flips),
             overridden,
             furthest,
+            nearest,
+            ambiguous,
+            doubts,
             failed,
         )
         if follower.failed or leader.failed:
@@ -257,10 +277,10 @@ def _cross(
     return counts, out
 
 
-def _apart(cell: HostCell, a: Rows, b: Rows | None) -> Float[np.ndarray, "rows"]:
+def apart(cell: HostCell, a: Rows | None, b: Rows | None) -> Float[np.ndarray, "rows"]:
     """Largest distance between the same atoms of two runs at each step; NaN where the second has ended."""
-    out = np.full(len(a), np.nan)
-    if b is None:
+    out = np.full(0 if a is None else len(a), np.nan)
+    if a is None or b is None:
         return out
     count = min(len(a), len(b))
     shape = (count * a.x.shape[2], 3)
@@ -283,6 +303,25 @@ def _bits_differ(a: Rows, b: Rows | None) -> np.ndarray:
 
 def _energy(a: Rows, other: Rows | None) -> Float[np.ndarray, "rows"]:
     return np.full(len(a), np.nan) if other is None else _padded(other.energy, a)
+
+
+def _per_row(doubts: Ambiguous, rows: Rows) -> Int[np.ndarray, "rows"]:
+    return np.bincount(doubts.step - rows.first, minlength=len(rows))
+
+
+def _nearest(run: Simulation, rows: Rows | None, clock: Rows) -> Float[np.ndarray, "rows"]:
+    """The smallest |margin| of each step as a length: at least so far is every pair from its cutoff."""
+    if rows is None or rows.nearest is None:
+        return np.full(len(clock), np.nan)
+    margin = rows.nearest
+    if run.decider.space == "r2":
+        # |r - R| = |r² - R²| / (r + R); from outside, and for the longest cutoff, it is the smallest
+        longest = max(run.decider.r_cut)
+        with np.errstate(invalid="ignore"):
+            length = margin / (np.sqrt(longest**2 + margin) + longest)
+        # a step without a pair has nothing near
+        margin = np.where(np.isinf(margin), np.inf, length)
+    return _padded(margin, clock)
 
 
 def _padded(values: np.ndarray, rows: Rows) -> np.ndarray:

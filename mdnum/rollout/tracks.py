@@ -10,8 +10,9 @@ from jaxtyping import Bool, Float, Int
 
 from mdnum.events import Ledger
 from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, first_state
-from mdnum.rollout.flips import PairRecorder, decided_pairs
+from mdnum.rollout.flips import Ambiguous, PairRecorder, decided_pairs
 from mdnum.rollout.frame import Frame
+from mdnum.rollout.pins import Pins
 from mdnum.systems.build import Simulation
 
 
@@ -24,6 +25,8 @@ class Rows:
         x, v: wrapped positions and full-step velocities, shape (rows, 3, atoms), float64.
         energy: total energy, shape (rows,).
         failed: "blow-up", "runaway", or "" .
+        nearest: smallest |margin| of any listed pair, in the quantity's space, shape (rows,); None for a run
+            whose decisions are not its own.
     """
 
     first: int
@@ -31,15 +34,17 @@ class Rows:
     v: Float[np.ndarray, "rows 3 atoms"]
     energy: Float[np.ndarray, "rows"]
     failed: str = ""
+    nearest: Float[np.ndarray, "rows"] | None = None
 
     def __len__(self) -> int:
         return len(self.x)
 
     def cut(self, count: int) -> tuple[Rows, Rows]:
         """The first rows, and the rest."""
+        near, rest = (None, None) if self.nearest is None else np.split(self.nearest, [count])
         return (
-            Rows(self.first, self.x[:count], self.v[:count], self.energy[:count], ""),
-            Rows(self.first + count, self.x[count:], self.v[count:], self.energy[count:], self.failed),
+            Rows(self.first, self.x[:count], self.v[:count], self.energy[:count], "", near),
+            Rows(self.first + count, self.x[count:], self.v[count:], self.energy[count:], self.failed, rest),
         )
 
 
@@ -47,12 +52,14 @@ def joined(parts: list[Rows]) -> Rows:
     """Consecutive rows as one."""
     if len(parts) == 1:
         return parts[0]
+    nearest = [part.nearest for part in parts if part.nearest is not None]
     return Rows(
         parts[0].first,
         np.concatenate([part.x for part in parts]),
         np.concatenate([part.v for part in parts]),
         np.concatenate([part.energy for part in parts]),
         parts[-1].failed,
+        np.concatenate(nearest) if len(nearest) == len(parts) else None,
     )
 
 
@@ -77,6 +84,7 @@ class Track:
         frame: how its atoms and axes are those of the first run.
         flips: whether to read its flips.
         listener: called with each segment as it is read, while its decisions are still on the device.
+        pins: decisions that it is told.
     """
 
     def __init__(
@@ -88,16 +96,18 @@ class Track:
         *,
         flips: bool = True,
         listener: Callable[[Segment], None] | None = None,
+        pins: Pins | None = None,
     ):
         self.simulation = simulation
         self.frame = frame or Frame.same(simulation.atoms)
         self.start = start or first_state(simulation)
-        self._engine = Engine(simulation, last, start=self.start)
+        self._engine = Engine(simulation, last, start=self.start, pins=pins)
         self._segments = self._engine.segments()
         self._recorder = PairRecorder(simulation) if flips else None
         self._listener = listener
         self._ahead: list[Rows] = []
         self._flips: list[Ledger] = []
+        self._doubts: list[Ambiguous] = []
         self.first_pairs: Int[np.ndarray, "pairs"] | None = None
         self.failed = ""
 
@@ -112,6 +122,7 @@ class Track:
             if self.first_pairs is None:
                 self.first_pairs = self.frame.keys(decided_pairs(self.simulation, segment, 0))
             self._flips.append(self._recorder.flips(segment))
+            self._doubts.append(self._recorder.doubtful(segment))
         failed = segment.closes if segment.closes in FAILURES else ""
         self.failed = failed or ""
         self._ahead.append(rows_of(segment, self.frame, self.failed))
@@ -143,6 +154,14 @@ class Track:
                 kept.append(_part(ledger, ~chosen))
         self._flips = kept
         return (joined(taken) if taken else None), flips
+
+    def doubts(self, last: int) -> Ambiguous:
+        """The ambiguous decisions up to a step that were not yet asked for, in the first run's labels."""
+        every = Ambiguous.joined(self._doubts)
+        taken = every.where(every.step <= last)
+        self._doubts = [every.where(every.step > last)]
+        i, j = np.divmod(self.frame.keys_of(taken.i, taken.j), self.simulation.atoms)
+        return taken._replace(i=i, j=j)
 
     def _plain(self, ledger: Ledger, chosen: Bool[np.ndarray, "flips"]) -> list[Flip]:
         keys = self.frame.keys_of(ledger.subject[chosen, 0], ledger.subject[chosen, 1])
@@ -176,4 +195,5 @@ def rows_of(segment: Segment, frame: Frame, failed: str) -> Rows:
     place = np.argsort(segment.table.order)
     x, v = (segment.rows_of(name).astype(np.float64)[:, :, place] for name in ("x", "v"))
     energy = segment.rows_of("potential") + segment.rows_of("kinetic")
-    return Rows(segment.first, frame.positions(x), frame.vectors(v), energy, failed)
+    nearest = segment.rows_of("nearest").astype(np.float64)
+    return Rows(segment.first, frame.positions(x), frame.vectors(v), energy, failed, nearest)

@@ -64,6 +64,7 @@ COLUMNS: Mapping[str, Mapping[str, pa.DataType]] = MappingProxyType(
             step=_INT, i=_SHORT, j=_SHORT, differs=_BOOL, run=_TEXT, entered=_BOOL, margin=_FLOAT,
             bound=_FLOAT,
         ),
+        "ambiguous_pairs": _columns(run=_TEXT, step=_INT, i=_SHORT, j=_SHORT, margin=_FLOAT, bound=_FLOAT),
         "neighborhood": _columns(
             atom=_SHORT, x=_FLOAT, y=_FLOAT, z=_FLOAT, dx=_FLOAT, dy=_FLOAT, dz=_FLOAT,
         ),
@@ -106,7 +107,7 @@ TABLES: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         "md": ("series", "flips", "epochs"),
         "ball": ("steps", "contacts", "solver", "heights", "separations"),
-        "fork": ("separation", "cross_flips", "neighborhood"),
+        "fork": ("separation", "cross_flips", "ambiguous_pairs", "neighborhood"),
         "along": ("boundaries", "intervals", "points"),
         "processes": ("variants", "variant_separations"),
         "certify": ("policies", "ambiguous", "policy_separations"),

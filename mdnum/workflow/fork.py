@@ -38,6 +38,15 @@ class ForkResult:
     summary: dict[str, Any]
 
 
+@dataclass(frozen=True)
+class Asked:
+    """What is to be found out beside dates and verdict."""
+
+    lyapunov: bool
+    minimal: bool
+    pin: str | None
+
+
 def fork(
     system: System | str | Path,
     vary: str,
@@ -46,7 +55,10 @@ def fork(
     split: float | None = None,
     repeats: int = 2,
     counterfactual: bool = True,
-    back: bool = False,
+    back: bool = True,
+    lyapunov: bool = True,
+    minimal: bool = False,
+    pin: str | None = None,
     out: str | Path | None = None,
     overrides: Mapping[str, Any] | None = None,
     report: bool = True,
@@ -61,7 +73,12 @@ def fork(
         split: separation that counts as split, length; default 0.04 of the longest cutoff.
         repeats: further runs with perturbed starts, to tell a delay from chance.
         counterfactual: whether to run B's arithmetic under A's decisions, which the verdict rests on.
-        back: whether to run A's arithmetic under B's decisions too.
+        back: whether to run A's arithmetic under B's decisions too, for the table of two by two.
+        lyapunov: whether to carry a tangent along A, for the largest Lyapunov exponent.
+        minimal: whether to look for the fewest decisions whose taking back keeps the runs together; it takes
+            up to 80 runs.
+        pin: a decision to take back in one more run of B: "fork", a pair "3-75", or a pair over a window
+            "3-75:600..700".
         out: the new fork folder; default runs/fork-<name>-<n>.
         overrides: dotted keys to values, such as {"cutoff.kind": "switched"}.
         report: write report.html.
@@ -73,7 +90,15 @@ def fork(
     """
     system = _loaded(system, overrides)
     _check(steps, split, repeats)
+    if pin is not None:
+        from mdnum.forks.take_back import parse_pin
+
+        parse_pin(pin, len(system.atoms))
     if vary == ALL:
+        if minimal or pin is not None:
+            raise InputError(
+                "decisions are taken back in one comparison, not in all", remedy="Give one choice to vary"
+            )
         from mdnum.workflow.fork_screen import screen
 
         return screen(system, steps, out=out, report=report, progress=progress)
@@ -84,13 +109,14 @@ def fork(
         "counterfactual": counterfactual,
         "back": back,
     }
-    return _one(system, vary, options, out, report, progress)
+    return _one(system, vary, options, Asked(lyapunov, minimal, pin), out, report, progress)
 
 
 def _one(
     system: System,
     vary: str,
     options: dict[str, Any],
+    asked: Asked,
     out: str | Path | None,
     report: bool,
     progress: Progress | None,
@@ -98,7 +124,7 @@ def _one(
     from mdnum.forks import fork as follow
     from mdnum.forks.choices import parse
     from mdnum.forks.neighborhood import neighborhood
-    from mdnum.workflow import fork_record
+    from mdnum.workflow import fork_answers, fork_record
 
     choice = parse(vary)
     began = time.perf_counter()
@@ -109,10 +135,20 @@ def _one(
         made = follow(twin, progress=_logged(folder, progress), **options)
         say(progress, made.steps, "the atoms at the fork")
         around = neighborhood(made)
-        fork_record.write(folder, made, around)
+        answers: dict[str, Any] = {"lyapunov": None, "lyapunov_reason": "not asked for", "minimal": None}
+        taken = None
+        if asked.lyapunov:
+            say(progress, made.steps, "the Lyapunov exponent")
+            answers |= fork_answers.exponent(made)
+        if asked.minimal:
+            answers["minimal"] = fork_answers.minimal(made, progress)
+        if asked.pin is not None:
+            say(progress, made.steps, "a decision taken back")
+            answers["pinned"], taken = fork_answers.take_back(made, asked.pin)
+        fork_record.write(folder, made, around, taken)
         folder.finalize()
         seconds = time.perf_counter() - began
-        folder.write_summary(fork_record.summarize(made, around, vary, choice, seconds))
+        folder.write_summary(fork_record.summarize(made, around, vary, choice, seconds) | answers)
     except BaseException:
         folder.close()
         raise

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
 from mdnum.events.forks import Growth
+from mdnum.events.shares import Cell
+from mdnum.forks.certified import certified
 from mdnum.forks.neighborhood import Neighborhood
 from mdnum.forks.pair import FLIPS_KEPT, Fork
+from mdnum.forks.take_back import Pinned
 from mdnum.store import RunFolder
 from mdnum.systems.build import Simulation
 
@@ -17,24 +21,32 @@ from mdnum.systems.build import Simulation
 _SERIES = {
     "free": "B", "handed": "B|A", "back": "A|B", "cross": "cross", "overridden": "overridden",
     "furthest": "furthest", "energy_a": "energy A", "energy_b": "energy B", "energy_handed": "energy B|A",
+    "handed_from_b": "B|A from B", "back_from_a": "A|B from A", "nearest_a": "nearest A",
+    "nearest_b": "nearest B", "ambiguous_a": "ambiguous A", "ambiguous_b": "ambiguous B",
 }  # fmt: skip
 #: r² of a fit that counts as growth.
 _FITS = 0.5
 
 
-def write(folder: RunFolder, fork: Fork, around: Neighborhood | None) -> None:
-    """Puts the series, the cross-run flips and the atoms at the fork into a folder's tables."""
+def write(folder: RunFolder, fork: Fork, around: Neighborhood | None, pinned: Pinned | None = None) -> None:
+    """Puts series, cross-run flips, ambiguous decisions and the atoms at the fork into a folder's tables."""
     series = fork.series
     rows = len(series["step"])
     columns = {name: series.get(key, np.full(rows, np.nan)) for name, key in _SERIES.items()}
     columns |= {"step": series["step"], "time": series["step"] * timestep(fork.twin.a)}
     columns |= {f"repeat_{name[2:]}": series[name] for name in series if name.startswith("B ")}
+    if pinned is not None:
+        columns["pinned"] = pinned.separation
     folder.append("separation", columns)
     if fork.flips:
         names = ("step", "i", "j", "differs", "run", "entered", "margin", "bound")
         folder.append(
             "cross_flips", {name: np.array([getattr(flip, name) for flip in fork.flips]) for name in names}
         )
+    for name, doubts in fork.doubts.items():
+        if len(doubts.step):
+            run = np.full(len(doubts.step), name)
+            folder.append("ambiguous_pairs", {"run": run, **doubts._asdict()})
     if around is not None:
         vectors = {name: around.positions[:, k] for k, name in enumerate("xyz")}
         vectors |= {f"d{name}": around.moved[:, k] for k, name in enumerate("xyz")}
@@ -88,8 +100,9 @@ def summarize(
         "overridden": _total(fork, "overridden"),
         "cross_flips": fork.flips_total,
         "cross_flips_kept": min(fork.flips_total, FLIPS_KEPT),
-        "certified_horizon": None,
-        "lyapunov": None,
+        "table": [_cell(cell) for cell in fork.table],
+        "shares": [asdict(share) for share in fork.shares],
+        **_certified(fork),
         "failed": dict(fork.failed),
         "findings": [],
         "status": "failed" if fork.failed else "complete",
@@ -167,6 +180,34 @@ def _decision(fork: Fork, around: Neighborhood | None) -> dict[str, Any] | None:
         "separation_before": made.separation,
         "protected": abs(length) / made.separation if made.separation > 0 else None,
         "also": made.also,
+    }
+
+
+def _cell(cell: Cell) -> dict[str, Any]:
+    """A run of the table of two by two: whose arithmetic and decisions, and when it splits from which run."""
+    return {
+        "arithmetic": cell.arithmetic,
+        "decisions": cell.decisions,
+        "from": cell.reference,
+        "same": cell.same,
+        "split": cell.split,
+        "until": cell.until,
+    }
+
+
+def _certified(fork: Fork) -> dict[str, Any]:
+    """How far the decisions of either run are certain, by themselves and against the other's."""
+    found = certified(fork)
+    runs = found.horizon.items()
+    return {
+        "certified_horizon": {name: one.step for name, one in runs},
+        "ambiguous": {name: one.decisions for name, one in runs},
+        "ambiguous_steps": {name: one.steps for name, one in runs},
+        "ambiguous_kept": {name: len(fork.doubts[name].step) for name in found.horizon},
+        "lists_complete": {name: one.complete for name, one in runs},
+        "protected_until": found.protected,
+        "shadow": found.shadow,
+        "shadow_horizon": found.shadow_step,
     }
 
 

@@ -17,6 +17,34 @@ timestep = 0.01
 """
 RATE, SEED, FORK, SIZE, TOLERANCE = 0.02, 5, 400, 1e-9, 0.1
 STEPS = 1500
+#: From here on the nearest pair is closer to its cutoff than the runs can have moved it.
+NEAR = 390
+SHARES = [
+    {"what": "decisions", "reference": "A", "steps": 179, "at_least": True, "nats": 3.58},
+    {"what": "arithmetic", "reference": "B", "steps": -1, "at_least": False, "nats": -0.02},
+]
+LYAPUNOV = {
+    "rate": 0.019, "error": 0.0004, "rate_time": 1.9, "error_time": 0.04, "steps": 750, "chaotic": True,
+    "ratio": 1.05, "ulp": 8.9e-16, "ulp_split": 1702,
+}  # fmt: skip
+MINIMAL = {
+    "pairs": [
+        {"i": 3, "j": 4, "differs": [[400, 407], [420, 421], [430, 460], [500, None]]},
+        {"i": 3, "j": 9, "differs": [[410, None]]},
+    ],
+    "proven": True, "fork_alone": False, "candidates": 77, "tests": 23, "horizon": 1652,
+    "reason": "2 pairs are enough, and none of them can be left out",
+}  # fmt: skip
+
+
+def two_by_two(split: int | None) -> list[dict[str, Any]]:
+    """The table of a run under either decisions; A under B's was not run."""
+    rows = (("A", "A", "A", None), ("B", "B", "A", split), ("B", "A", "A", None), ("A", "A", "B", split),
+            ("B", "B", "B", None), ("B", "A", "B", split and split - 1))  # fmt: skip
+    return [
+        {"arithmetic": x, "decisions": y, "from": z, "same": x == y == z, "split": at, "until": STEPS}
+        for x, y, z, at in rows
+    ]
 
 
 def make_fork(
@@ -51,7 +79,11 @@ def make_fork(
             "overridden": np.where(step % 200 == 0, after, False).astype(float) if handed else nothing,
             "furthest": np.where((step % 200 == 0) & after, 1e-8, 0.0) if handed else nothing,
             "energy_a": np.full(len(step), -5.0), "energy_b": -5.0 + free,
-            "energy_handed": -5.0 + quiet if handed else nothing, "repeat_1": 1.1 * free,
+            "energy_handed": -5.0 + quiet if handed else nothing,
+            "handed_from_b": free if handed else nothing, "back_from_a": nothing,
+            "nearest_a": np.where(step < NEAR, 1e-6, 1e-9), "nearest_b": np.full(len(step), 1e-6),
+            "ambiguous_a": np.zeros(len(step)), "ambiguous_b": np.where(step > 70, 2.0, 0.0),
+            "repeat_1": 1.1 * free,
             "repeat_2": 0.9 * free,
         },
     )  # fmt: skip
@@ -101,8 +133,13 @@ def make_fork(
             "handed_until": STEPS if handed else None, "handed_largest": SIZE,
             "separation_end": float(free[-1]),
             "separation_largest": float(free.max()), "overridden": 6, "cross_flips": 7_000 if forks else 0,
-            "cross_flips_kept": 7_000 if forks else 0, "certified_horizon": None, "lyapunov": None,
-            "failed": {},
+            "cross_flips_kept": 7_000 if forks else 0,
+            "table": two_by_two(split) if handed else [], "shares": SHARES if split and handed else [],
+            "certified_horizon": {"A": STEPS, "B": 70}, "ambiguous": {"A": 0, "B": 2 * (STEPS - 70)},
+            "ambiguous_steps": {"A": 0, "B": STEPS - 70}, "ambiguous_kept": {"A": 0, "B": 2 * (STEPS - 70)},
+            "lists_complete": {"A": True, "B": True}, "protected_until": NEAR - 1 if forks else STEPS,
+            "shadow": "A", "shadow_horizon": FORK - 1 if forks else STEPS, "lyapunov": LYAPUNOV,
+            "lyapunov_reason": None, "minimal": MINIMAL if forks else None, "failed": {},
             "findings": [], "status": "complete", "seconds": 3.5,
         }
         | (summary or {})

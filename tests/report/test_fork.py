@@ -8,7 +8,18 @@ import subprocess
 
 import numpy as np
 import pytest
-from report.synthetic_fork import DECISION, FORK, RATE, SIZE, STEPS, TOLERANCE, make_fork, make_screen, ranked
+from report.synthetic_fork import (
+    DECISION,
+    FORK,
+    NEAR,
+    RATE,
+    SIZE,
+    STEPS,
+    TOLERANCE,
+    make_fork,
+    make_screen,
+    ranked,
+)
 from report.test_browser import BROWSER
 from report.test_html import Tags
 
@@ -44,7 +55,7 @@ def test_one_whole_file_that_loads_nothing(page, folder):
     used = set(re.findall(r'href="#([^"]+)"', page)) | set(re.findall(r"url\(#([^)]+)\)", page))
     assert used and used <= set(tags.ids)
     names = sorted(path.stem for path in (folder.path / "figures").iterdir())
-    assert names == ["atoms", "cross", "energy", "furthest", "overridden", "separation"]
+    assert names == ["atoms", "cross", "energy", "furthest", "overridden", "protection", "separation"]
     assert tags.seen.count("svg") == 2 * len(names)
     assert len(page) < 2_000_000
 
@@ -61,6 +72,15 @@ def test_the_page_states_what_the_folder_holds(page, folder):
         "precision.reduction", "sequential in A, exact in B", "0123456789abcdef",
         "The first 5,000 of 7,000 flips", "all of them are in cross_flips.parquet",
         "2 repeats; two splits differ by 12.0 steps by chance", "doubles in 34.7 steps",
+        f"arithmetic decisions splits from A splits from B A its own is A {split:,} B its own {split:,} is B",
+        f"B A’s not by 1,500 {split - 1:,}", "B, start perturbed its own 1,316",
+        "decisions &gt; 179 steps, &gt; 3.58 nats –", "arithmetic – −1 steps, −0.0200 nats",
+        "up to step 1,500: no decision is ambiguous",
+        "up to step 70; after it 2,860 ambiguous decisions at 1,430 steps", "up to step 389; then a pair",
+        "step 399: up to there B decides as A", "0.0190 ± 0.0004 a step, 1.90 per τ",
+        "the runs part 1.05 times as fast", "8.9 × 10⁻¹⁶ σ reaches the split tolerance about step 1,702",
+        "2 pairs are enough, and none of them can be left out. 23 runs of B told, 77 pairs that differ",
+        "3–4 400 to 406, 420, 430 to 459, and 1 time more", "3–9 from 410 on",
         f"split {split:,}", "fork 400", "seed 5", "split: beyond 0.100 σ", "A and B under A’s decisions",
     ):  # fmt: skip
         assert words in text, words
@@ -79,6 +99,43 @@ def test_the_figure_shows_both_separations_and_the_dates(folder):
     assert np.diff(np.log(fit.y)).sum() / (fit.x[-1] - fit.x[0]) == pytest.approx(RATE)
     assert fit.y[0] == pytest.approx(SIZE)
     assert "B and A under B’s decisions" not in by_label
+
+
+def test_a_point_below_the_line_is_where_protection_ends(folder):
+    plot = figures.protection(load(folder))
+    near, moved = plot.series
+    below = near.y < np.nan_to_num(moved.y)
+    assert below.argmax() == NEAR and moved.y[FORK - 1] == 2 * SIZE
+    assert plot.verticals[0] == (NEAR - 1.0, "protected") and plot.y_scale == "log"
+
+
+def test_without_an_exponent_or_a_minimal_cause_the_page_says_why(tmp_path):
+    entries = {
+        "lyapunov": None, "lyapunov_reason": "a many-body potential",
+        "minimal": {"pairs": None, "tests": 0, "reason": "the runs did not split"},
+    }  # fmt: skip
+    page = report.write(make_fork(tmp_path / "run", summary=entries)).read_text(encoding="utf-8")
+    assert "none: a many-body potential" in page and "<p>The runs did not split.</p>" in page
+
+
+def test_a_decision_that_was_taken_back_is_told(tmp_path):
+    made = {
+        "pin": "fork", "pairs": [[3, 4]], "first": FORK, "last": FORK + 6, "split": None, "free": 1321,
+        "until": STEPS, "largest": 2e-9, "reason": None,
+    }  # fmt: skip
+
+    def told(name, **entries):
+        page = report.write(make_fork(tmp_path / name, summary={"pinned": made | entries}))
+        return re.sub(r"\s+", " ", page.read_text(encoding="utf-8"))
+
+    assert (
+        "<p>Told what A decided about 3–4 at steps 400 to 406 and nothing else, B does not split from A by "
+        "step 1,500: they are 2.0 × 10⁻⁹ σ apart at most; without, at 1,321.</p>"
+    ) in told("held").replace("\N{NO-BREAK SPACE}", " ")
+    assert "at step 400 and nothing else, B splits from A at step 1,333" in told("one", last=400, split=1333)
+    assert "No decision could be taken back: the runs do not fork." in told(
+        "none", pairs=None, reason="the runs do not fork"
+    )
 
 
 def test_a_poor_fit_is_not_drawn_and_a_predicted_split_is(tmp_path):
@@ -164,7 +221,8 @@ def test_bare_folders_have_pages(tmp_path):
     assert "both runs decided alike at every step" in text and "none was run: nothing is said" in text
     assert "The decision at the fork" not in text
     names = sorted(path.stem for path in (bare.path / "figures").iterdir())
-    assert names == ["energy", "separation"]
+    assert names == ["energy", "protection", "separation"]
+    assert "Whose decisions, whose arithmetic" not in text and "Minimal cause" not in text
     same = make_fork(tmp_path / "same", summary={"about": "<script>alert(1)</script>", "choice": "<b>x"})
     text = report.write(same).read_text(encoding="utf-8")
     assert "<script>alert" not in text and "<b>x" not in text

@@ -100,6 +100,29 @@ def test_cross_flips_are_the_differences_of_the_pair_sets():
     assert step == last + 1
 
 
+def test_every_run_is_compared_with_the_one_that_its_name_says():
+    a = build("argon/crystal-108")
+    b = shifted(a, 1e-4)
+    last = 120
+    free = {"A": alone(a, last)[0], "B": alone(b, last)[0]}
+    mixed = {}
+    for name, own, leader in (("B|A", b, a), ("A|B", a, b)):
+        told = Handed(own, leader)
+        rows = [told.follow(segment)[0].x for segment in Engine(leader, last).segments()]
+        mixed[name] = np.concatenate(rows).transpose(0, 2, 1)
+    stretches = list(lockstep(a, b, last, back=True))
+    for name, one, other in (
+        ("B", free["B"], free["A"]), ("B|A", mixed["B|A"], free["A"]), ("A|B", mixed["A|B"], free["B"]),
+        ("A|B from A", mixed["A|B"], free["A"]), ("B|A from B", mixed["B|A"], free["B"]),
+    ):  # fmt: skip
+        d = one - other
+        box = np.diag(np.asarray(a.cell.matrix))
+        d -= box * np.round(d / box)
+        got = np.concatenate([stretch.separation[name] for stretch in stretches])
+        np.testing.assert_allclose(got, np.linalg.norm(d, axis=2).max(axis=1), rtol=1e-12)
+    assert stretches[0].separation["A|B from A"][0] == 0, "the same start"
+
+
 def test_the_flips_of_a_cold_crystal_cause_what_they_are_blamed_for():
     a = build("argon/crystal-108")
     b = shifted(a, 1e-6)

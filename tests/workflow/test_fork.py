@@ -47,7 +47,9 @@ def use(monkeypatch, choice):
 def compared(tmp_path_factory) -> ForkResult:
     """float32 against float64 on the crystal, up to a little after the fork."""
     out = tmp_path_factory.mktemp("forks") / "crystal"
-    return mdnum.fork("argon/crystal-108", "precision", steps=STEPS, out=out, repeats=1, back=True)
+    return mdnum.fork(
+        "argon/crystal-108", "precision", steps=STEPS, out=out, repeats=1, minimal=True, pin="fork"
+    )
 
 
 def test_the_summary_says_what_was_followed(compared):
@@ -63,6 +65,22 @@ def test_the_summary_says_what_was_followed(compared):
     assert summary["changes"]["precision.force"] == ["float64", "float32"]
     assert summary["cross_flips"] == made.flips_total > 0
     assert set(summary["splits"]) == {"B", "B|A", "A|B"} and summary["repeats_run"] == 1
+    assert [(cell["arithmetic"], cell["decisions"], cell["from"]) for cell in summary["table"]] == [
+        ("A", "A", "A"), ("B", "B", "A"), ("B", "A", "A"), ("A", "B", "A"),
+        ("A", "A", "B"), ("B", "B", "B"), ("B", "A", "B"), ("A", "B", "B"),
+    ]  # fmt: skip
+    assert summary["shares"] == [] and summary["minimal"]["reason"] == "the runs did not split"
+    # float32 decides: its own rounding is what makes it fork, and A is its shadow
+    assert summary["certified_horizon"]["A"] == STEPS and summary["ambiguous"]["A"] == 0
+    assert summary["certified_horizon"]["B"] < made.dates.fork and summary["ambiguous"]["B"] > 0
+    assert summary["protected_until"] < made.dates.fork
+    assert (summary["shadow"], summary["shadow_horizon"]) == ("A", made.dates.fork - 1)
+    assert summary["pinned"]["pairs"] == [[made.decision.i, made.decision.j]]
+    assert summary["pinned"]["first"] == made.dates.fork and summary["pinned"]["split"] is None
+    exponent = summary["lyapunov"]
+    assert exponent["steps"] == STEPS // 2 and exponent["rate_time"] == pytest.approx(
+        exponent["rate"] / 0.004
+    )
     assert "HORIZON_SHORT" in [finding["code"] for finding in summary["findings"]]
     assert summary["headline"].startswith(f"The runs fork at step {made.dates.fork}")
     assert json.loads((compared.folder / "summary.json").read_text()) == summary
@@ -77,6 +95,13 @@ def test_the_tables_hold_the_series(compared):
     for column, name in (("free", "B"), ("handed", "B|A"), ("back", "A|B"), ("repeat_1", "B 1"),
                          ("energy_b", "energy B"), ("overridden", "overridden")):  # fmt: skip
         np.testing.assert_array_equal(table[column], series[name])
+    for column, name in (("back_from_a", "A|B from A"), ("nearest_a", "nearest A"),
+                         ("ambiguous_b", "ambiguous B")):  # fmt: skip
+        np.testing.assert_array_equal(table[column], series[name])
+    doubts = folder.read("ambiguous_pairs")
+    assert set(doubts["run"]) == {"B"} and len(doubts["step"]) == compared.summary["ambiguous"]["B"]
+    assert (np.abs(doubts["margin"]) <= doubts["bound"]).all()
+    np.testing.assert_array_equal(np.bincount(doubts["step"], minlength=STEPS + 1), table["ambiguous_b"])
     flips = folder.read("cross_flips")
     assert len(flips["step"]) == compared.fork.flips_total
     assert flips["step"][0] == compared.summary["fork"]
@@ -139,6 +164,7 @@ def test_a_choice_that_changes_nothing_is_said_to(tmp_path):
     assert result.summary["verdict"] == "same" and result.summary["must_hold"]
     assert result.summary["headline"] == "The same trajectory: no bit differs in 40 steps."
     assert result.summary["findings"] == [] and result.summary["decision"] is None
+    assert result.summary["lyapunov"] is None and result.summary["lyapunov_reason"].startswith("no bit")
     assert RunFolder.open(result.folder).rows("neighborhood") == 0
     assert not (result.folder / "report.html").exists()
 
@@ -197,13 +223,15 @@ def test_screening_ranks_what_was_screened(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("system", "vary", "options", "words"),
     [
-        ("ball/drop", "precision", {}, "this system is a ball"),
+        ("ball/drop", "skin", {}, "no choice 'skin' of a ball"),
         ("argon/crystal-108", "precison", {}, "no choice 'precison'"),
         ("argon/crystal-108", "noise", {}, "noise"),
         ("argon/crystal-108", "precision", {"steps": 0}, "steps = 0"),
         ("argon/crystal-108", "precision", {"split": -1.0}, "split = -1"),
         ("argon/crystal-108", "precision", {"repeats": -1}, "repeats = -1"),
         ("argon/crystal-108", "precision", {"overrides": {"cutoff.knd": 1}}, "knd"),
+        ("argon/crystal-108", "precision", {"pin": "3-108"}, "no pair 3-108"),
+        ("argon/crystal-108", "all", {"minimal": True}, "in one comparison"),
     ],
 )
 def test_what_is_refused_leaves_no_folder(tmp_path, system, vary, options, words):

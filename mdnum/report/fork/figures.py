@@ -24,8 +24,8 @@ Role = Literal["first", "second", "third", "bad", "muted", "ink"]
 
 #: Flips that are drawn as ticks.
 _TICKS = 1_500
-#: Points of the lines by color: free runs, counterfactuals, repeats.
-_WIDTHS = {FIRST: 2.6, SECOND: 1.2, THIRD: 1.0, MUTED: 0.7}
+#: Points of the lines by color: free runs, counterfactuals, a decision taken back, repeats.
+_WIDTHS = {FIRST: 2.6, SECOND: 1.2, THIRD: 1.0, BAD: 1.0, MUTED: 0.7}
 #: A fit is drawn on where it predicts a split, for at most so many times the steps that were followed.
 _BEYOND = 2.0
 
@@ -41,7 +41,8 @@ def figures(run: ForkFolder) -> Iterator[tuple[str, str, Drawer, list[str]]]:
         yield "separation", plot.title, partial(_separation, run, plot), []
     if len(run.around.get("atom", ())) > 1:
         yield "atoms", "The atoms around the deciding pair at the fork", partial(atoms.draw, run), []
-    for name, plot in (("cross", cross(run)), ("overridden", overridden(run)), ("furthest", furthest(run)),
+    for name, plot in (("protection", protection(run)), ("cross", cross(run)),
+                       ("overridden", overridden(run)), ("furthest", furthest(run)),
                        ("energy", energy(run))):  # fmt: skip
         if plot is not None:
             yield name, plot.title, partial(plots.draw, plot), plots.notes(plot)
@@ -61,6 +62,7 @@ def separation(run: ForkFolder) -> Plot | None:
         ("free", "A and B, free", "first"),
         ("handed", "A and B under A’s decisions", "second"),
         ("back", "B and A under B’s decisions", "third"),
+        ("pinned", "A and B, decision taken back", "bad"),
     )
     for name, label, role in named:
         if run.has(name):
@@ -152,6 +154,27 @@ def _ticks(axes: Axes, run: ForkFolder) -> None:
     axes.tick_params(axis="x", pad=14)
 
 
+def protection(run: ForkFolder) -> Plot | None:
+    """How far the nearest pair is from its cutoff at each step, and how far the runs can have moved it."""
+    if not run.has("nearest_a") or not np.any(run.series["free"] > 0):
+        return None
+    step = run.series["step"]
+    moved = 2.0 * run.series["free"]
+    series = (
+        Series("nearest pair of A to its cutoff", step, _positive(run.series["nearest_a"]), mark="points",
+               role="muted"),
+        Series("twice the separation of A and B", step, _positive(moved), role="first"),
+    )  # fmt: skip
+    verticals = _dates(run)
+    until = run.summary.get("protected_until")
+    if until is not None and 0 <= until < run.steps:
+        verticals = ((float(until), "protected"), *verticals)
+    return Plot(
+        "Nearest decision and separation", "step", f"length ({run.units.length})", series, y_scale="log",
+        verticals=verticals,
+    )  # fmt: skip
+
+
 def cross(run: ForkFolder) -> Plot | None:
     """How many pairs the two runs decide differently."""
     values = run.series.get("cross", np.zeros(0))
@@ -239,6 +262,8 @@ def captions(run: ForkFolder) -> dict[str, str]:
         "atoms": "Seen with the deciding pair in the plane"
         f"{also}; the circle is the cutoff around its first atom. Paler atoms are further "
         "behind or in front. Arrows: where B’s atoms are off A’s, magnified.",
+        "protection": "Two atoms may each be off by the separation. A point below the line is a decision "
+        "that the difference of the runs can have changed.",
         "cross": "From the fork on; a pair counts as long as the two runs disagree about it.",
         "overridden": "Decisions that the run under A’s decisions would have made otherwise, by step.",
         "furthest": "An overridden decision far from its threshold is no longer one that rounding "

@@ -117,7 +117,7 @@ def _evidence(run: ForkFolder) -> Iterator[str]:
     reasons = [str(reason) for reason in run.summary.get("reasons") or ()]
     told = "; ".join(reasons).replace("; and ", ", and ").replace("the first run's", "A’s")
     if told:
-        yield _sentence(typeset(told))
+        yield sentence(typeset(told))
     made = run.decision
     if made is not None:
         yield decided(made, length)
@@ -229,7 +229,8 @@ def _broken(one: Mapping[str, Any], remedy: str) -> Finding:
     )
 
 
-def _sentence(text: str) -> str:
+def sentence(text: str) -> str:
+    """With a capital and a full stop."""
     text = text[:1].upper() + text[1:]
     return text if text.endswith((".", "!", "?")) else text + "."
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from mdnum.report import page
 from mdnum.report.browse import Browse, Column, plain_rows
-from mdnum.report.fork import figures, findings
+from mdnum.report.fork import figures, findings, sections
 from mdnum.report.fork.run import ROWS_LOADED, ForkFolder, load
 from mdnum.report.words import count, many, number, plain
 from mdnum.store import RunFolder
@@ -64,9 +64,13 @@ def render(
         summary=run.summary,
         figures=list(_ranked_figures(run) if run.screened else _key_figures(run)),
         what=list(_what(run)),
-        decision=list(_decision(run)),
-        runs=list(_runs(run)),
-        growth=list(_growth(run)),
+        decision=list(sections.decision(run)),
+        runs=list(sections.runs(run)),
+        shares=sections.shares(run),
+        certain=list(sections.certain(run)),
+        pinned=sections.pinned(run),
+        minimal=sections.minimal(run),
+        growth=list(sections.growth(run)),
         changes=_changes(run.summary.get("changes") or {}),
         ranking=list(_ranking(run)),
         flips=flips,
@@ -106,108 +110,6 @@ def _key_figures(run: ForkFolder) -> Iterator[tuple[str, str, str]]:
     worth = "∞" if nats is None and run.word == "cause" else number(nats, 3)
     yield "The flips were worth", worth, "nats: growth rate × steps gained" if worth != "–" else "not known"
     yield "Cross-run flips", count(summary.get("cross_flips")), "of pairs in one run only"
-
-
-def _decision(run: ForkFolder) -> Iterator[tuple[str, str]]:
-    """(what, words) of the decision at the fork."""
-    made, length = run.decision, run.units.length
-    if made is None:
-        return
-    space = {"r2": "r²", "r": "r"}.get(str(made.get("space")), "")
-    where = "differs from the start on" if made["run"] == "start" else f"flips in run {made['run']} alone"
-    way = (
-        ""
-        if made["run"] == "start"
-        else ", entering its cutoff"
-        if made["entered"]
-        else ", leaving its cutoff"
-    )
-    yield "Pair", f"{made['i']}–{made['j']} {where}{way}"
-    also = made.get("also")
-    when = f"{count(made['step'])}, {plain(made['step'] * run.summary['timestep'], 6)} {run.units.time}"
-    yield "Step", when + (f"; {many(also, 'more pair')} at the same step" if also else "")
-    cutoffs = made["cutoffs"]
-    own = cutoffs["B" if made["run"] == "B" else "A"]
-    yield "Distance", f"{number(made['distance'], 11)} {length}, cutoff {number(own, 11)} {length}"
-    if cutoffs["A"] != cutoffs["B"]:
-        off = number(cutoffs["B"] - cutoffs["A"], 3, signed=True)
-        yield "Cutoff", f"not the same number in both runs: B’s is {off} {length} off A’s"
-    slope = made["margin"] / made["margin_length"] if made["margin_length"] else 1.0
-    for name, margin in (made.get("margins") or {made["run"]: made["margin"]}).items():
-        bound = (made.get("bounds") or {}).get(name, made["bound"])
-        doubtful = abs(margin) <= bound
-        ratio = f"{number(abs(margin) / bound, 3)} times the bound" if bound else "no rounding"
-        word = (
-            "ambiguous: rounding alone could have decided otherwise"
-            if doubtful
-            else f"{ratio}, not ambiguous"
-        )
-        yield (
-            f"Margin in {name}",
-            f"{number(margin, 3, signed=True)} in {space} "
-            f"({number(margin / slope, 3, signed=True)} {length}), "
-            f"rounding bound {number(bound, 3)}: {word}",
-        )
-    before = made.get("separation_before")
-    if made.get("protected") is not None:
-        protects = (
-            "the margin no longer protected it" if made["protected"] < 2 else "the margin still protected it"
-        )
-        yield (
-            "Separation the step before",
-            f"{number(before, 3)} {length}; the margin is {number(made['protected'], 3)} of it: {protects}",
-        )
-    else:
-        yield "Separation the step before", "none: the same bits up to there"
-
-
-_RUNS = {"B": ("B", "its own"), "B|A": ("B", "A’s"), "A|B": ("A", "B’s")}
-
-
-def _runs(run: ForkFolder) -> Iterator[dict[str, str]]:
-    """A row per run that is compared: whose arithmetic, whose decisions, when it splits from which run."""
-    split = run.summary.get("split")
-    for name, at in (run.summary.get("splits") or {}).items():
-        arithmetic, decisions = _RUNS[name]
-        yield {
-            "arithmetic": arithmetic,
-            "decisions": decisions,
-            "small": "splits from B" if name == "A|B" else "",
-            "split": "none" if at is None else count(at),
-            "gained": "" if name == "B" else _later(at, split),
-        }
-    for at in run.summary.get("repeats") or ():
-        yield {
-            "arithmetic": "B, start perturbed",
-            "decisions": "its own",
-            "small": "",
-            "split": count(at),
-            "gained": _later(at, split),
-        }
-
-
-def _later(at: int | None, split: int | None) -> str:
-    if at is None or split is None:
-        return "–"
-    return f"+{count(at - split)}" if at > split else count(at - split)
-
-
-def _growth(run: ForkFolder) -> Iterator[tuple[str, str]]:
-    """(which, words) of the fits."""
-    names = {"B": "A and B, free", "B|A": "Under A’s decisions"}
-    for name, fit in (run.summary.get("growth") or {}).items():
-        if fit.get("rate") is None:
-            yield names.get(str(name), str(name)), "too few rows between rounding and saturation for a fit"
-            continue
-        rate = fit["rate"]
-        poor = fit["r_squared"] < findings.FITS
-        text = ("No single exponential: " if poor else "") + (
-            f"{number(rate, 3)} a step, {number(rate / run.summary['timestep'], 3)} per {run.units.time}, "
-            f"fitted to steps {count(fit['first'])} to {count(fit['last'])}, r² {number(fit['r_squared'], 3)}"
-        )
-        if rate > 0 and not poor:
-            text += f"; doubles in {number(np.log(2) / rate, 3)} steps"
-        yield names.get(str(name), str(name)), text
 
 
 def _changes(changes: Mapping[str, Any]) -> list[tuple[str, str]]:
