@@ -42,12 +42,14 @@ METAL = Units(
     "metal", "Å", "eV", "amu", "ps", "K", "GPa", _PICOSECOND, _GPA_PER_EV_PER_A3, _BOLTZMANN_EV_PER_K
 )
 LJ = Units("lj", "σ", "ε", "m", "τ", "ε/k", "ε/σ³", 1.0, 1.0, 1.0)
+# energies are per mass; a ball has no temperature
+BALL = Units("ball", "m", "m²/s²", "", "s", "", "", 1.0, 1.0, 1.0)
 
-_ALL = {units.name: units for units in (METAL, LJ)}
+_ALL = {units.name: units for units in (METAL, LJ, BALL)}
 
 
 def get(name: str) -> Units:
-    """The unit system called name ("metal" or "lj").
+    """The unit system called name ("metal", "lj" or "ball").
 
     Raises:
         InputError: no such unit system.
@@ -57,5 +59,5 @@ def get(name: str) -> Units:
     except KeyError:
         raise InputError(
             f"unknown units {name!r}; known are {', '.join(_ALL)}",
-            remedy="metal means Å, eV, amu and ps; lj means reduced units",
+            remedy="metal means Å, eV, amu and ps; lj means reduced units; ball means m and s",
         ) from None

@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from mdnum.ball import limits
 from mdnum.ball.contacts import Impact, Penalty, Projection
 from mdnum.ball.integrators import EventLocated
-from mdnum.ball.stopping import Fixed, Hysteresis
+from mdnum.ball.stopping import Fixed, GlobalSum, Hysteresis, Relative
 from mdnum.errors import InputError
 from mdnum.precision.policy import RolePrecision
 
@@ -86,42 +87,16 @@ def check_stop(rule: Any, policy: RolePrecision, gain: float) -> None:
         return
     tol = float(rule.tol)
     _positive("tolerance tol", tol)
-    smallest = smallest_tolerance(policy, gain)
+    kind = "relative" if isinstance(rule, Relative) else "sum" if isinstance(rule, GlobalSum) else "term"
+    role, smallest = limits.strictest(limits.smallest_tolerance(policy, gain, kind))
     if tol < smallest:
         raise InputError(
-            f"tol = {tol:g} cannot be met in {policy.arithmetic} arithmetic with {policy.decision} decisions",
+            f"tol = {tol:g} cannot be met with {role} in {getattr(policy, role)}",
             remedy=f"The smallest usable tolerance is {smallest:.3g}",
         )
-    limit = float(_info(policy.dtype("decision")).max)
+    limit = limits.largest(policy.decision)
     if tol > limit:
         raise InputError(f"tol = {tol:g} is beyond the largest {policy.decision}, {limit:g}")
-
-
-def smallest_tolerance(policy: RolePrecision, gain: float) -> float:
-    """The smallest tolerance that a projection can meet in the dtypes of a policy, m.
-
-    A penetration so small that gain times it rounds to zero no longer shrinks, and a tolerance that is no
-    number of the dtype of decisions is another tolerance.
-
-    Source: measured. XLA on a CPU flushes subnormal results to zero; in float16 it computes in float32, so
-    the subnormals of float16 are there.
-    """
-    smallest = 0.0
-    for role in ("state", "arithmetic", "decision"):
-        info = _info(policy.dtype(role))
-        if policy.dtype(role) == np.float16:
-            # of m grains the iteration takes gain * m, which rounds to none up to one half
-            stuck = (math.floor(0.5 / gain) + 1) * float(info.smallest_subnormal)
-        else:
-            stuck = float(info.smallest_normal) / min(gain, 1.0)
-        smallest = max(smallest, stuck)
-    return smallest
-
-
-def _info(dtype: np.dtype) -> Any:
-    import ml_dtypes
-
-    return ml_dtypes.finfo(dtype)
 
 
 def _finite(name: str, value: Any) -> None:

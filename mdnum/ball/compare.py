@@ -64,7 +64,7 @@ def first_difference(a: BallRun, b: BallRun) -> Difference:
     # a rule per ball and a rule for all have counts of other shapes: compare them per ball
     counts = [_per_ball(run) for run in (a, b)]
     stops = counts[0] != counts[1]
-    if _counted(a) != _counted(b):
+    if not counts_alike(a, b):
         # impacts are no iterations, and a run without a solver has stopped none: nothing to compare
         stops = np.zeros_like(stops)
     at = [
@@ -83,6 +83,11 @@ def first_difference(a: BallRun, b: BallRun) -> Difference:
     return Difference(
         seed, row + 1, channel, ball, margins, int(stops.any(axis=1).sum()), int(contact.sum()), separation
     )
+
+
+def counts_alike(a: BallRun, b: BallRun) -> bool:
+    """Whether the iteration counts of two runs count the same, so that they can be compared."""
+    return _counted(a) == _counted(b)
 
 
 def _counted(run: BallRun) -> str:

@@ -192,7 +192,7 @@ class ImplicitMidpoint(eqx.Module):
         )
         contact = judge(middle(found)[0])
         # the same iterations under the decision that was reached: what a step told its decisions does too
-        count = solve.iterations if push.told is None else push.told
+        count = solve.iterations
 
         def body(carry):
             a, n = carry

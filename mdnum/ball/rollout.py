@@ -13,12 +13,12 @@ import numpy as np
 from jax import lax
 from jaxtyping import Bool, Float, Int
 
+from mdnum.ball.bounds import height_bound
 from mdnum.ball.contacts import Penalty
 from mdnum.ball.state import BallState, Decisions, Reason
 from mdnum.ball.world import World
 from mdnum.errors import InputError
 from mdnum.events import Ledger, changes_in_time
-from mdnum.precision.bounds import gamma
 
 #: Balls times steps that leave the device at once.
 _CHUNK = 2**21
@@ -246,11 +246,7 @@ def _flips(
     first = row == 0
     y_old = np.where(first, y[ball], rows["y"][row - 1, ball]).astype(np.float64)
     v_old = np.where(first, v[ball], rows["v"][row - 1, ball]).astype(np.float64)
-    h = float(world.integrator.h)
-    free = abs(float(world.gravity))
-    # four roundings on the way from the state before to the height that is compared, none cancelling more
-    # than the sum of its parts
-    bound = gamma(4, world.policy.dtype("arithmetic")) * (np.abs(y_old) + h * np.abs(v_old) + h * h * free)
+    bound = height_bound(world, y_old, v_old)
     entered = now == 1
     y_new, v_new = rows["y"][row, ball], rows["v"][row, ball]
     jump = energy(world, y_new, v_new) - energy(world, y_old, v_old)

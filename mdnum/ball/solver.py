@@ -35,7 +35,7 @@ def iterate(
         terms: of the residual, one per ball.
         policy: dtypes of sums and decisions.
         zero: runtime zero for fenced sums.
-        told: iterations to make instead of the rule's own.
+        told: iterations to make instead of the rule's own; a negative number leaves it to the rule.
         history: whether to keep the residual of every decision.
 
     Returns:
@@ -47,7 +47,8 @@ def iterate(
         return lax.stop_gradient(rule.measure(terms(x), accumulate, decision, zero))
 
     def goes_on(stopped, iterations):
-        return ~stopped & (iterations < rule.max_iter) if told is None else iterations < told
+        own = ~stopped & (iterations < rule.max_iter)
+        return own if told is None else jnp.where(told < 0, own, iterations < told)
 
     def note(kept, iterations, residual):
         if not history:
@@ -56,6 +57,9 @@ def iterate(
         return kept.at[jnp.max(iterations)].set(jnp.max(residual))
 
     residual = measure(start)
+    if told is not None:
+        # one rule for the batch may be told a count for each ball
+        residual = jnp.broadcast_to(residual, jnp.broadcast_shapes(residual.shape, told.shape))
     iterations = jnp.zeros(residual.shape, jnp.int32)
     threshold = rule.threshold(residual, iterations)
     kept = jnp.full(rule.max_iter + 1 if history else 0, jnp.nan, decision)

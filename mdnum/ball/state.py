@@ -27,15 +27,17 @@ class BallState(NamedTuple):
 
 
 class Decisions(NamedTuple):
-    """Everything that a step decides.
+    """Everything that a step decides; or what a step is told to act on, in part or in whole.
 
     Attributes:
-        contact: whether each ball is in contact, shape (balls,).
+        contact: whether each ball is in contact, shape (balls,). A step may be told integers instead: 0 or 1,
+            and a negative number where it is to decide by itself.
         iterations: how often the step's solver went on, shape () where one rule stops it for all balls,
-            (balls,) where each ball has its own; impacts located in the step for an event-located one.
+            (balls,) where each ball has its own; impacts located in the step for an event-located one. Told,
+            a negative number leaves it to the step.
     """
 
-    contact: Bool[Array, "balls"]
+    contact: Bool[Array, "balls"] | Int[Array, "balls"]
     iterations: Int[Array, "..."]
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import equinox as eqx
@@ -194,7 +194,7 @@ class World(eqx.Module):
 
         Args:
             state: at this step.
-            told: decisions to act on instead of its own.
+            told: decisions to act on instead of its own, or instead of some of them (see `Decisions`).
             history: whether a solver keeps the residual of every decision.
 
         Returns:
@@ -207,9 +207,7 @@ class World(eqx.Module):
                 v=state.v.astype(arithmetic),
                 carried=state.a.astype(arithmetic),
                 free=self._free(state.step, state.y.shape),
-                judge=(lambda height: self.touches(height, state.touching))
-                if told is None
-                else lambda _: told.contact,
+                judge=self._judge(state, told),
                 told=None if told is None else told.iterations,
                 integrator=self.integrator,
                 policy=self.policy,
@@ -221,6 +219,14 @@ class World(eqx.Module):
         y, v = self._store(moved.y, step, 0), self._store(moved.v, step, 1)
         record = jax.tree.map(jax.lax.stop_gradient, moved.record)._replace(left=moved.record.left)
         return BallState(step, y, v, moved.a, moved.record.contact), record
+
+    def _judge(self, state: BallState, told: Decisions | None) -> Callable[[Balls], Bool[Array, "balls"]]:
+        if told is None:
+            return lambda height: self.touches(height, state.touching)
+        contact = told.contact
+        if contact.dtype == bool:
+            return lambda _: contact
+        return lambda height: jnp.where(contact < 0, self.touches(height, state.touching), contact > 0)
 
     def _free(self, step: Int[Array, ""], shape: tuple[int, ...]) -> Balls:
         free = -self.gravity

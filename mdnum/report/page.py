@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -67,6 +67,29 @@ def picture(folder: Path, name: str, title: str, draw: Callable[[float], Figure]
         f'<div class="wide">{svg.inline(page, title)}</div>'
         f'<div class="narrow">{svg.inline(phone, title)}</div>'
     )
+
+
+def publish(
+    folder: Path,
+    drawn: Iterable[tuple[str, str, Callable[[float], Figure], list[str]]],
+    render: Callable[[dict[str, Markup], dict[str, list[str]]], str],
+) -> Path:
+    """Draws the figures of a page into figures/, and writes report.html.
+
+    Args:
+        folder: the page's own.
+        drawn: name, title, what draws it at a width in inches, and what it cannot show, of every figure.
+        render: the page's text, from the markup and the notes of the figures by name.
+
+    Returns:
+        the path of report.html.
+    """
+    pictures, notes = {}, {}
+    for name, title, draw, said in drawn:
+        pictures[name], notes[name] = picture(folder, name, title, draw), said
+    path = folder / "report.html"
+    write_text(path, render(pictures, notes))
+    return path
 
 
 def in_words(table: Mapping[str, Any], units: Mapping[str, str] | None = None) -> str:

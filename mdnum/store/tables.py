@@ -65,6 +65,7 @@ COLUMNS: Mapping[str, Mapping[str, pa.DataType]] = MappingProxyType(
             bound=_FLOAT,
         ),
         "ambiguous_pairs": _columns(run=_TEXT, step=_INT, i=_SHORT, j=_SHORT, margin=_FLOAT, bound=_FLOAT),
+        "around": _columns(step=_INT, run=_TEXT, ball=_SHORT, y=_FLOAT, v=_FLOAT, contact=_BOOL),
         "neighborhood": _columns(
             atom=_SHORT, x=_FLOAT, y=_FLOAT, z=_FLOAT, dx=_FLOAT, dy=_FLOAT, dz=_FLOAT,
         ),
@@ -107,6 +108,8 @@ TABLES: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         "md": ("series", "flips", "epochs"),
         "ball": ("steps", "contacts", "solver", "heights", "separations"),
+        # before "fork", as which a finished one is opened: they have their tables in common
+        "ball-fork": ("separation", "cross_flips", "around"),
         "fork": ("separation", "cross_flips", "ambiguous_pairs", "neighborhood"),
         "along": ("boundaries", "intervals", "points"),
         "processes": ("variants", "variant_separations"),

@@ -286,6 +286,19 @@ class Gradient(Table):
     )
 
 
+class Fork(Table):
+    """What `mdnum fork` does with this system where the command line does not say."""
+
+    vary: str | None = Field(
+        default=None, description='the choice to vary, such as "precision" or "contact=earlier"'
+    )
+    steps: int | None = Field(default=None, ge=1, description="steps of a run; default integrator.steps")
+    split: Positive | None = Field(
+        default=None,
+        description="separation of heights that counts as split (m); default 1 % of the highest start",
+    )
+
+
 def _flatten(table: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
     for key, value in table.items():
         here = f"{path}.{key}" if path else str(key)
@@ -321,6 +334,7 @@ class BallSpec(Table):
     precision: BallPrecision = Field(default_factory=lambda: BallPrecision())
     loss: Loss = Field(default_factory=lambda: Loss())
     gradient: Gradient = Field(default_factory=lambda: Gradient())
+    fork: Fork | None = Field(default=None, description="a question about this system; not about its runs")
     variants: Variants = Field(
         default_factory=dict,
         description='the same system with some keys changed, such as "precision.state" = "float32"',

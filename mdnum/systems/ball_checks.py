@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mdnum.ball.limits import largest, rounded, smallest, smallest_tolerance, spacing
 from mdnum.systems import ball
-from mdnum.systems.formats import largest, rounded, smallest, spacing
 from mdnum.systems.toml import Key
 
 #: Parameters that a gradient can be asked for, by contact.
@@ -276,18 +276,10 @@ def _tolerance(spec: ball.BallSpec, stop: ball.ToleranceRule, key: str, value: f
     """Refuse a tolerance that no residual but 0 would be below, or that is no number of a role's format."""
     gain = 1.0
     if isinstance(spec.contact, ball.ProjectionContact):
-        gain = min(1.0, spec.contact.alpha * spec.contact.k)
-    roles = ["decision"]
-    if stop.rule == "sum":
-        roles.append("accumulate")
-    if stop.rule != "relative":
-        roles += ["state", "arithmetic"]
-    # a penetration whose share alpha k rounds to nothing no longer shrinks
-    usable = {
-        role: smallest(getattr(spec.precision, role)) / (gain if role == "arithmetic" else 1.0)
-        for role in roles
-    }
-    for role in sorted(roles, key=lambda role: -usable[role]):
+        gain = spec.contact.alpha * spec.contact.k
+    kind = stop.rule if stop.rule in ("sum", "relative") else "term"
+    usable = smallest_tolerance(spec.precision, gain, kind)
+    for role in sorted(usable, key=lambda role: -usable[role]):
         name, least = getattr(spec.precision, role), usable[role]
         if value > largest(name):
             raise Refusal(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from mdnum.errors import InputError
 from mdnum.store.atomic import disk_errors
 from mdnum.systems import ball_checks, messages, overrides, toml
-from mdnum.systems.ball import BallSpec
+from mdnum.systems.ball import BallSpec, ValuesControl
 from mdnum.systems.find import SYSTEM_FILE
 from mdnum.systems.grammar import Grammar
 
@@ -95,10 +95,28 @@ class BallSystem:
         if name in {variant.name for variant in self.variants}:
             raise InputError(f"there is a variant {name!r} already", remedy="Give it once")
         given = {".".join(key): value for key, value in overrides.read(changes).items()}
-        variant = _variant(name, given, self.spec, f"--against {name}")
+        variant = vary(name, given, self.spec, f"--against {name}")
         tables = {**self.spec.variants, name: given}
         spec = self.spec.model_copy(update={"variants": tables})
         return BallSystem(self.name, spec, self.path, (*self.variants, variant))
+
+    def for_steps(self, steps: int) -> BallSystem:
+        """This system with another number of steps; a control given by values is cut, or keeps its last.
+
+        Args:
+            steps: of a run, at least 1.
+        """
+        update: dict[str, Any] = {
+            "integrator": self.spec.integrator.model_copy(update={"steps": steps}),
+        }
+        control = self.spec.flight.control
+        if isinstance(control, ValuesControl):
+            values = control.values[:steps]
+            values += values[-1:] * (steps - len(values))
+            update["flight"] = self.spec.flight.model_copy(
+                update={"control": control.model_copy(update={"values": values})}
+            )
+        return replace(self, spec=self.spec.model_copy(update=update))
 
     def to_toml(self, *, beside: bool = True) -> str:
         """The system file with every default written out; a ball has no other files to be beside."""
@@ -135,7 +153,7 @@ def make(source: Source, data: dict[str, Any]) -> BallSystem:
     except ball_checks.Refusal as refusal:
         raise _located(refusal, source) from None
     variants = tuple(
-        _variant(
+        vary(
             name, changes, spec, messages.place(("variants", name), source.text, source.where, source.values)
         )
         for name, changes in spec.variants.items()
@@ -181,7 +199,7 @@ def _located(refusal: ball_checks.Refusal, source: Source) -> InputError:
     return InputError(refusal.message, remedy=refusal.remedy, where=where)
 
 
-def _variant(name: str, changes: Mapping[str, Any], base: BallSpec, where: str) -> Variant:
+def vary(name: str, changes: Mapping[str, Any], base: BallSpec, where: str) -> Variant:
     """The system with keys changed, checked.
 
     Args:
@@ -189,6 +207,9 @@ def _variant(name: str, changes: Mapping[str, Any], base: BallSpec, where: str) 
         changes: dotted keys to values.
         base: what is changed.
         where: what to blame.
+
+    Raises:
+        InputError: it cannot be run.
     """
     if not changes:
         raise InputError(f"variant {name!r} changes nothing", where=where, remedy="Name a key, or remove it")

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mdnum.ball import contacts, integrators, stopping
+from mdnum.ball import contacts, integrators, limits, stopping
 from mdnum.ball.losses import FinalHeight, Loss, MeanHeight, ResidualPenetration
 from mdnum.ball.problem import Problem
 from mdnum.ball.world import World
 from mdnum.errors import InputError
 from mdnum.precision import neighbor, reductions
 from mdnum.precision.policy import RolePrecision
-from mdnum.systems import ball, ball_checks, formats
+from mdnum.systems import ball, ball_checks
 from mdnum.systems.ball_system import BallSystem
 from mdnum.systems.load import load
 
@@ -135,7 +135,7 @@ def start(spec: ball.BallSpec) -> tuple[Float[np.ndarray, "balls"], Float[np.nda
         return _on_the_boundary(spec, given.boundary), np.zeros(count)
     height = np.asarray(given.height, np.float64)
     if given.spread_ulps:
-        dtype = formats.DTYPES[spec.precision.state]
+        dtype = limits.DTYPES[spec.precision.state]
         height = np.array([float(neighbor(height, n * given.spread_ulps, dtype)) for n in range(count)])
     elif given.spread:
         height = np.linspace(float(height) - given.spread, float(height) + given.spread, count)
@@ -151,7 +151,7 @@ def _on_the_boundary(spec: ball.BallSpec, boundary: ball.Boundary) -> Float[np.n
     """
     assert spec.stop is not None and not isinstance(spec.stop, ball.FixedRule)
     tol = spec.stop.tol
-    below = float(np.nextafter(np.asarray(tol, formats.DTYPES[boundary.format]), 0))
+    below = float(np.nextafter(np.asarray(tol, limits.DTYPES[boundary.format]), 0))
     share = (tol - below) / boundary.terms
     return -np.array([below, *[share] * boundary.terms])
 

@@ -33,6 +33,19 @@ def names(world: Literal["md", "ball"] | None = None) -> list[str]:
     return sorted(path.relative_to(root).with_suffix("").as_posix() for path in found)
 
 
+def world_of(name: str | Path) -> str:
+    """ "md" or "ball", read from a system's file without checking it; "md" where that is no TOML.
+
+    Raises:
+        InputError: nothing of that name.
+    """
+    try:
+        return str(_world(find(name)[1]))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError):
+        # whoever loads it says where the mistake is
+        return "md"
+
+
 def _world(path: Path) -> str:
     return tomllib.loads(path.read_text(encoding="utf-8")).get("world", "md")
 

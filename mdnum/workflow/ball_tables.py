@@ -7,12 +7,12 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from mdnum.ball.bounds import residual_bound
 from mdnum.ball.compare import Difference
 from mdnum.ball.contacts import Penalty, Projection
 from mdnum.ball.rollout import BallRun
 from mdnum.ball.state import Reason
 from mdnum.ball.stopping import Fixed
-from mdnum.precision.bounds import gamma
 from mdnum.store import RunFolder
 from mdnum.systems.build_ball import BallVariant
 
@@ -189,9 +189,7 @@ def ambiguous_stops(run: BallRun) -> np.ndarray:
     rule = rule_of(run)
     if rule is None or isinstance(rule, Fixed):
         return np.zeros(run.steps, np.int64)
-    # all terms of a residual have one sign: |computed - exact| is at most gamma times the sum
-    terms = 1 if run.iterations.ndim == 2 else max(run.balls - 1, 1)
-    share = gamma(terms, run.world.policy.dtype("accumulate"))
+    share = residual_bound(run.world, 1.0, 1 if run.iterations.ndim == 2 else run.balls)
     busy = solved(run)
     residual = run.residual.astype(np.float64)
     near = np.zeros(busy.shape, bool)

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mdnum.workflow.fork import ForkResult, Progress, judge, new_folder, say
 
 if TYPE_CHECKING:
-    from mdnum.forks.choices import Screened
+    from mdnum.forks.ranking import Screened
+    from mdnum.store import RunFolder
     from mdnum.systems.load import System
 
 
@@ -37,15 +39,11 @@ def screen(
     began = time.perf_counter()
     folder = new_folder(system, out)
     try:
-
-        def note(done: int, count: int, name: str) -> None:
-            folder.log(f"{done:4d} of {count}  {name}")
-            if progress is not None:
-                progress(done, count, {"phase": f"{name} ({done + 1} of {count})"})
-
-        rows = screen_choices(system, steps, progress=note)
+        rows = screen_choices(system, steps, progress=noted(folder, progress))
         folder.finalize()
-        folder.write_summary(_summarize(system, steps, rows, time.perf_counter() - began))
+        folder.write_summary(
+            _basics(system, steps) | {**ranked(rows), "seconds": time.perf_counter() - began}
+        )
     except BaseException:
         folder.close()
         raise
@@ -54,8 +52,19 @@ def screen(
     return ForkResult(folder.path, None, folder.summary)
 
 
-def _summarize(system: System, steps: int | None, rows: list[Screened], seconds: float) -> dict[str, Any]:
-    asked = system.spec.dynamics.steps if steps is None else steps
+def noted(folder: RunFolder, progress: Progress | None) -> Callable[[int, int, str], None]:
+    """What a screening calls before each choice: a line in the log, and the choice as the phase."""
+
+    def note(done: int, count: int, name: str) -> None:
+        folder.log(f"{done:4d} of {count}  {name}")
+        if progress is not None:
+            progress(done, count, {"phase": f"{name} ({done + 1} of {count})"})
+
+    return note
+
+
+def ranked(rows: list[Screened]) -> dict[str, Any]:
+    """The ranking, and the choices that do not apply, as summary.json has them."""
     ranking = [
         {
             "choice": row.choice,
@@ -71,6 +80,12 @@ def _summarize(system: System, steps: int | None, rows: list[Screened], seconds:
         for row in rows
         if row.why_not is None
     ]
+    left = [{"choice": row.choice, "why": row.why_not} for row in rows if row.why_not is not None]
+    return {"ranking": ranking, "not_applicable": left}
+
+
+def _basics(system: System, steps: int | None) -> dict[str, Any]:
+    asked = system.spec.dynamics.steps if steps is None else steps
     return {
         "world": "fork",
         "system": system.name,
@@ -81,11 +96,6 @@ def _summarize(system: System, steps: int | None, rows: list[Screened], seconds:
         "steps_asked": asked,
         "timestep": float(system.spec.dynamics.timestep),
         "units": system.units.name,
-        "ranking": ranking,
-        "not_applicable": [
-            {"choice": row.choice, "why": row.why_not} for row in rows if row.why_not is not None
-        ],
         "findings": [],
         "status": "complete",
-        "seconds": seconds,
     }

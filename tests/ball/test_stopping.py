@@ -11,7 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mdnum import ball
-from mdnum.ball.checks import smallest_tolerance
 from mdnum.errors import InputError
 from mdnum.precision.policy import RolePrecision
 from mdnum.precision.reductions import Sequential
@@ -125,17 +124,6 @@ def test_a_projection_that_cannot_converge_is_refused():
         solve([0.1], ball.GlobalSum(1e-3), k=4.0)
     # it overshoots, and then there is no penetration left
     assert solve([0.1], ball.GlobalSum(1e-3), k=3.9).iterations[0] == 1
-
-
-@pytest.mark.parametrize("dtype", ["float16", "bfloat16", "float32"])
-def test_the_smallest_usable_tolerance_can_be_met_and_the_next_smaller_one_is_refused(dtype):
-    policy = RolePrecision(dtype, dtype, dtype, dtype, "float64")
-    smallest = smallest_tolerance(policy, 0.25)
-    depth = {"float16": 1e-4, "bfloat16": 1e-36, "float32": 1e-36}[dtype]
-    run = solve([depth], ball.PerInstance(smallest, 2000), policy=policy)
-    assert run.ended() == {"tolerance": 1}
-    with pytest.raises(InputError, match="smallest usable tolerance"):
-        solve([depth], ball.PerInstance(0.6 * smallest, 2000), policy=policy)
 
 
 @pytest.mark.parametrize(

@@ -65,10 +65,9 @@ class Impact(eqx.Module):
             still = jnp.zeros(y.shape, bool)
 
             def ahead(y, v, left, count, still):
-                if told is not None:
-                    return (count < told) & ~still
                 below = jnp.where(count == 0, touching, lowest(y, v, a, left, rounding) < 0)
-                return below & ~still & (count < scheme.max_impacts)
+                own = below & ~still & (count < scheme.max_impacts)
+                return own if told is None else jnp.where(told < 0, own, (count < told) & ~still)
 
             def body(carry):
                 y, v, left, count, still, hits = carry

@@ -3,48 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 from mdnum.errors import InputError
 from mdnum.forks.choices.base import Choice
 from mdnum.forks.choices.registry import BY_NAME
 from mdnum.forks.pair import fork
+from mdnum.forks.ranking import Screened, followed, not_run, rank
 from mdnum.systems.load import System
-
-
-@dataclass(frozen=True)
-class Screened:
-    """What one choice did within the horizon.
-
-    Attributes:
-        choice: its name.
-        difference: what differed, in words; why it does not apply where it does not.
-        seed, fork, split: dates, steps; None where they did not come.
-        must_hold: whether it cannot change a bit by design.
-        why_not: why it was not run; None where it was.
-        steps: last step that was compared; 0 where it was not run.
-        failed: "blow-up" or "runaway" by run, where one ended that way.
-    """
-
-    choice: str
-    difference: str
-    seed: int | None
-    fork: int | None
-    split: int | None
-    must_hold: bool
-    why_not: str | None = None
-    steps: int = 0
-    failed: str = ""
-
-    @property
-    def held(self) -> bool | None:
-        """Whether no bit differed within the horizon; None where it was not run."""
-        return None if self.why_not is not None else self.seed is None
-
-    @property
-    def finding(self) -> bool:
-        """Whether what must hold did not."""
-        return self.must_hold and self.held is False
 
 
 def screen(
@@ -72,31 +37,13 @@ def screen(
         if progress is not None:
             progress(done, len(asked), choice.name)
         rows.append(_screened(choice, system, steps))
-    return sorted(rows, key=_rank)
+    return sorted(rows, key=rank)
 
 
 def _screened(choice: Choice, system: System, steps: int | None) -> Screened:
     reason = choice.why_not(system)
     if reason is not None:
-        return Screened(choice.name, reason, None, None, None, choice.must_hold, reason)
+        return not_run(choice.name, choice.must_hold, reason)
     twin = choice.make(system)
     found = fork(twin, steps, counterfactual=False, repeats=0)
-    dates = found.dates
-    failed = ", ".join(f"{word} of {name}" for name, word in found.failed.items())
-    return Screened(
-        choice.name,
-        twin.difference,
-        dates.seed,
-        dates.fork,
-        dates.split,
-        choice.must_hold,
-        None,
-        found.steps,
-        failed,
-    )
-
-
-def _rank(row: Screened) -> tuple[bool, float, float, float]:
-    late = float("inf")
-    fork, seed, split = (late if date is None else date for date in (row.fork, row.seed, row.split))
-    return row.why_not is not None, fork, seed, split
+    return followed(choice.name, choice.must_hold, twin.difference, found.dates, found.steps, found.failed)

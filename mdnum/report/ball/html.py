@@ -16,7 +16,6 @@ from mdnum.report.browse import Browse, Column, plain_rows
 from mdnum.report.verdict import Verdict
 from mdnum.report.words import count, many, number, plain
 from mdnum.store import RunFolder
-from mdnum.store.atomic import write_text
 
 #: Rows of a table that the page carries.
 TABLE_ROWS = 5_000
@@ -36,12 +35,11 @@ def write_report(folder: RunFolder | str | Path) -> Path:
     run = load(folder)
     verdict = findings.judge(run)
     verdict.store(folder, run.summary)
-    pictures, notes = {}, {}
-    for name, title, draw, said in figures.figures(run):
-        pictures[name], notes[name] = page.picture(folder.path, name, title, draw), said
-    path = folder.path / "report.html"
-    write_text(path, render(run, verdict, pictures, notes))
-    return path
+    return page.publish(
+        folder.path,
+        figures.figures(run),
+        lambda pictures, notes: render(run, verdict, pictures, notes),
+    )
 
 
 def render(

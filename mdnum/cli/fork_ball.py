@@ -1,0 +1,200 @@
+"""`mdnum fork` of a ball: the same question, the same answers, and which of the options a ball has."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from mdnum.cli import output
+from mdnum.cli.progress import ProgressBar
+from mdnum.errors import InputError
+
+#: What a ball offers in place of an option of molecular dynamics.
+_INSTEAD = {
+    "--along": "where a ball's decisions change along a number is found by mdnum.ball.boundaries, in Python",
+    "--most": "it belongs to --along",
+    "--processes": "whether a ball's bits depend on the program around it is shown by "
+    "`mdnum ball --demo determinism`",
+    "--forecast": "how far each contact is from another step is the margin that `mdnum ball` records",
+    "--benign": "a ball has no ensemble to be consistent with; --vary says how far the heights part",
+    "--minimal": "a ball's decisions are taken back one at a time: --vary contact=STEP:BALL",
+    "--pin": "a ball's decisions are taken back one at a time: --vary contact=STEP:BALL",
+    "--no-back": "a ball is run under either run's decisions always; --no-counterfactual leaves both out",
+    "--no-lyapunov": "a ball has no tangent run to leave out",
+}
+
+
+def is_ball(system: str) -> bool:
+    """Whether a system's file is a ball's."""
+    from mdnum.systems.find import world_of
+
+    return world_of(system) == "ball"
+
+
+def fork(
+    system: str,
+    vary: str | None,
+    *,
+    foreign: Mapping[str, bool],
+    certify: bool,
+    steps: int | None,
+    split: float | None,
+    repeats: int,
+    counterfactual: bool,
+    out: Path | None,
+    overrides: Mapping[str, str],
+    report: bool,
+    as_json: bool,
+) -> int:
+    """Answer for a ball.
+
+    Args:
+        foreign: options of molecular dynamics, and whether they were given.
+        certify: ask when runs leave the exact history instead.
+    """
+    for option, given in foreign.items():
+        if given:
+            raise InputError(
+                f"{option} is a question for molecular dynamics, and {system} is a ball",
+                remedy=_INSTEAD.get(option, "Leave it out"),
+            )
+    if certify:
+        return _certify(system, steps, overrides, as_json=as_json)
+    from mdnum.workflow import fork as compare
+
+    try:
+        with ProgressBar() as progress:
+            result = compare(
+                system,
+                vary,
+                steps=steps,
+                split=split,
+                repeats=repeats,
+                counterfactual=counterfactual,
+                out=out,
+                overrides=overrides,
+                report=report,
+                progress=progress,
+            )
+    except KeyboardInterrupt:
+        raise output.Stopped("stopped") from None
+    return output.answer(result.folder, result.summary, print_rows, as_json=as_json)
+
+
+def print_rows(summary: Mapping[str, Any]) -> None:
+    """Dates, the decision at the fork and splits by run; or a ranking of choices."""
+    from mdnum.cli.fork_print import _print_ranking as print_ranking
+    from mdnum.cli.fork_print import _print_two_by_two as print_two_by_two
+
+    if "ranking" in summary:
+        print_ranking(summary)
+        return
+    out = output.console()
+    for reason in summary.get("reasons") or ():
+        out.print(f"  {reason}", markup=False)
+    balls = summary["balls"]
+    rows = [
+        (
+            "system",
+            f"{summary['system']}, {balls:,} ball{'' if balls == 1 else 's'}, {summary['steps']:,} steps",
+        ),
+        ("differs in", summary["difference"]),
+    ]
+    for name, what in (
+        ("seed", "first bit differs"),
+        ("fork", "first decision differs"),
+        ("split", f"heights further apart than {summary['tolerance']:.3g} m"),
+    ):
+        rows.append((name, _date(summary, name, what)))
+    rows += list(_decision(summary.get("decision")))
+    if summary.get("growth_rate") is not None:
+        fits = f"r² {summary['r_squared']:.3f}" if summary.get("r_squared") is not None else ""
+        rows.append(("growth", f"{summary['growth_rate']:.3g} a step, {fits}"))
+    if summary.get("predicted_split") is not None:
+        rows.append(("predicted split", f"about step {summary['predicted_split']:,}"))
+    stops = summary["cross_stops"]
+    also = f", {stops:,} of solvers" if stops else ""
+    rows.append(("decisions that differ", f"{summary['cross_contacts']:,} of contacts{also}"))
+    output.print_table("", ("", ""), rows)
+    print_two_by_two(summary)
+
+
+def _date(summary: Mapping[str, Any], name: str, what: str) -> str:
+    step = summary.get(name)
+    if step is None:
+        return f"none in {summary['steps']:,} steps ({what})"
+    return f"step {step:,}, {summary[f'{name}_time']:.6g} s ({what})"
+
+
+def _decision(made: Mapping[str, Any] | None) -> Iterator[tuple[str, str]]:
+    if made is None:
+        return
+    whose = "all balls" if made["ball"] is None else f"ball {made['ball']}"
+    also = f", with {made['also']:,} more at this step" if made.get("also") else ""
+    yield "decision", f"{decided(made)}, {whose}{also}"
+    for name, margin in made["margins"].items():
+        bound = made["bounds"][name]
+        if margin is None:
+            yield f"margin in {name}", "no decision at that iteration"
+            continue
+        word = "ambiguous" if name in made["ambiguous_in"] else "not ambiguous"
+        yield f"margin in {name}", f"{margin:.3g} in {made['space']}; rounding bound {bound:.3g}: {word}"
+    if made.get("protected") is not None:
+        yield (
+            "apart the step before",
+            f"{made['separation_before']:.3g} m; the margin is {made['protected']:.3g} of it",
+        )
+
+
+def decided(made: Mapping[str, Any]) -> str:
+    """What each run decided, in words."""
+    a, b = (made["decided"][name] for name in "AB")
+    if made["channel"] == "contact":
+        return f"contact in {'A' if a else 'B'} only"
+    return f"{a} iterations in A, {b} in B"
+
+
+def _certify(system: str, steps: int | None, overrides: Mapping[str, str], *, as_json: bool) -> int:
+    """When runs in each precision leave the history in exact arithmetic."""
+    from mdnum.forks.bounce.certify import certify
+    from mdnum.systems import load
+
+    with ProgressBar() as progress:
+        found = certify(load(system, overrides, world="ball"), steps, progress=progress)
+    rows = [
+        {
+            "policy": row.name,
+            "horizon": row.horizon,
+            "channel": row.channel,
+            "ball": row.ball,
+            "height": row.height,
+            "separation_end": row.separation_end,
+            "why_not": row.why_not,
+        }
+        for row in found.ranking
+    ]
+    if as_json:
+        document = {"question": "certify", "steps": found.steps, "says": found.says, "ranking": rows}
+        output.print_json(document)
+        return output.EXIT_FINE
+    out = output.console()
+    for sentence in found.says:
+        out.print(sentence, style="bold", markup=False)
+    table = [
+        (
+            row["policy"],
+            "" if row["why_not"] else _horizon(row, found.steps),
+            row["separation_end"],
+            row["why_not"] or "",
+        )
+        for row in rows
+    ]
+    output.print_table("", ("precision", "leaves the exact history", "apart at the end, m", ""), table)
+    return output.EXIT_FINE
+
+
+def _horizon(row: Mapping[str, Any], steps: int) -> str:
+    if row["horizon"] is None:
+        return f"beyond step {steps:,}"
+    return f"step {row['horizon']:,}, {row['channel']} of ball {row['ball']}"

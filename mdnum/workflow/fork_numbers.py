@@ -1,0 +1,120 @@
+"""What the summary of any comparison says, whatever was run: dates, growth, the table of two by two."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from mdnum.events.forks import Dates, Growth, Verdict
+from mdnum.events.shares import Cell, Share
+
+#: r² of a fit that counts as growth.
+FITS = 0.5
+
+
+def dates(found: Dates, timestep: float) -> dict[str, Any]:
+    """Seed, fork and split with their times; None where they did not come."""
+    when = {name: getattr(found, name) for name in ("seed", "fork", "split")}
+    return {**when, **{f"{name}_time": None if at is None else at * timestep for name, at in when.items()}}
+
+
+def verdict(found: Verdict) -> dict[str, Any]:
+    """The verdict in plain values."""
+    return {"verdict": found.word, "reasons": list(found.reasons), "nats": found.nats, "noise": found.noise}
+
+
+def rate(fit: Growth, timestep: float) -> dict[str, Any]:
+    """Growth of the free runs, per step and per unit of time."""
+    return {
+        "growth_rate": plain(fit.rate),
+        "growth_rate_time": plain(fit.rate / timestep),
+        "r_squared": plain(fit.r_squared),
+    }
+
+
+def fitted(fit: Growth, separation: Float[np.ndarray, "rows"]) -> dict[str, Any]:
+    """The fit as a line: separation = exp(intercept + rate * step) between first and last."""
+    if not np.isfinite(fit.rate):
+        return {"rate": None, "r_squared": None, "first": None, "last": None, "intercept": None}
+    step = np.arange(fit.first, fit.last + 1)
+    values = separation[fit.first : fit.last + 1]
+    usable = np.isfinite(values) & (values > 0)
+    intercept = float(np.mean(np.log(values[usable]) - fit.rate * step[usable]))
+    return {
+        "rate": fit.rate,
+        "r_squared": fit.r_squared,
+        "first": fit.first,
+        "last": fit.last,
+        "intercept": intercept,
+    }
+
+
+def predicted(
+    found: Dates, fit: Growth, free: Float[np.ndarray, "rows"], tolerance: float, steps: int
+) -> int | None:
+    """The step at which runs that have not split are expected to; None where nothing grows plainly.
+
+    Args:
+        found: their dates.
+        fit: of their separation.
+        free: the separation by step.
+        tolerance: of the split.
+        steps: that were followed.
+    """
+    seen = free[np.isfinite(free)]
+    # a line through noise predicts nothing
+    if found.split is not None or not len(seen) or not fit.r_squared > FITS:
+        return None
+    more = fit.steps_to(float(seen[-1]), tolerance)
+    return None if more is None else round(steps + more)
+
+
+def cell(found: Cell) -> dict[str, Any]:
+    """A run of the table of two by two: whose arithmetic and decisions, and when it splits from which run."""
+    return {
+        "arithmetic": found.arithmetic,
+        "decisions": found.decisions,
+        "from": found.reference,
+        "same": found.same,
+        "split": found.split,
+        "until": found.until,
+    }
+
+
+def share(found: Share) -> dict[str, Any]:
+    """What one difference is worth, in plain values."""
+    return {
+        "what": found.what,
+        "reference": found.reference,
+        "steps": found.steps,
+        "at_least": found.at_least,
+        "nats": None if found.nats is None else plain(found.nats),
+    }
+
+
+def until(series: Mapping[str, np.ndarray], name: str) -> int | None:
+    """The last step of a counterfactual; None where there is none."""
+    if name not in series:
+        return None
+    seen = np.flatnonzero(np.isfinite(series[name]))
+    return int(series["step"][seen[-1]]) if len(seen) else None
+
+
+def largest(series: Mapping[str, np.ndarray], name: str) -> float | None:
+    """The largest value of a series; None where there is none."""
+    values = series.get(name)
+    return plain(float(np.nanmax(values))) if values is not None and np.isfinite(values).any() else None
+
+
+def total(series: Mapping[str, np.ndarray], name: str) -> int | None:
+    """The sum of a series; None where there is none."""
+    values = series.get(name)
+    return int(np.nansum(values)) if values is not None else None
+
+
+def plain(value: float) -> float | None:
+    """A number as JSON has it; None where it is not finite."""
+    return float(value) if np.isfinite(value) else None
