@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import DTypeLike
 
 from mdnum.errors import InputError
+from mdnum.precision.bounds import Reach
 
 
 class Cell(eqx.Module):
@@ -79,6 +80,27 @@ class Cell(eqx.Module):
         """Volume of the three lattice vectors, length cubed; NaN where one is missing (ASE's convention)."""
         volume = float(abs(np.linalg.det(np.asarray(self.matrix))))
         return volume if volume > 0 else float("nan")
+
+    def reach(self, positions: Float[np.ndarray, "atoms 3"]) -> Reach:
+        """What displacements between wrapped positions are made of, for bounds on their rounding.
+
+        Along periodic axes that is a matter of the box. Along free ones atoms are given room to move apart
+        by as much again as they are apart here.
+
+        Args:
+            positions: where the atoms start, length.
+        """
+        flags = np.array(self.pbc)
+        matrix = np.asarray(self.matrix, np.float64)
+        lattice = matrix[flags]
+        box = np.abs(lattice).sum(axis=0)
+        if not len(positions) or flags.all():
+            return Reach.of(lattice, box)
+        # the axes that a free direction has a share in
+        free = (complete(matrix, flags)[~flags] != 0).any(axis=0)
+        wrapped, _ = wrap_positions(self, positions)
+        room = np.abs(wrapped).max(axis=0) + np.ptp(wrapped, axis=0) + 1.0
+        return Reach.of(lattice, np.where(free, box + room, box))
 
     def astype(self, dtype) -> Cell:
         """The cell with jax leaves of the given dtype."""

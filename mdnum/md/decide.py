@@ -20,13 +20,18 @@ from mdnum.events import Threshold
 from mdnum.md.cell import Cell
 from mdnum.md.potentials import of_type
 from mdnum.md.verlet import SLOTS
-from mdnum.precision import distance_bound, squared_distance_bound
+from mdnum.precision import Reach, distance_bound, squared_distance_bound
 from mdnum.precision.exact import squared_norm
 
 # slots that the loops over a list take at a time: half a byte of decisions. Measured in float64 on one core,
 # ms a force: 1.4 for N = 4,000 and 59 for 108,000; with 8 at a time 2.2 and 78 (the compiler then gives up
 # vectorizing the sums), with 1 at a time 1.6 and 66.
 GROUP = SLOTS // 2
+
+# how far beyond its cutoff the bound of a pair holds
+_BEYOND = 1.001
+
+_NO_REACH = Reach()
 
 CONVENTIONS = ("r2 <", "r2 <=", "r <", "r <=")
 
@@ -39,13 +44,15 @@ class PairDecider:
         r_cut: cutoff of each pair type, length.
         compare: quantity and comparison, one of "r2 <", "r2 <=", "r <", "r <=".
         dtype: the dtype in which the quantity is computed and compared.
-        extent: largest coordinate difference per axis, length; sets the rounding bound.
+        reach: what a displacement is made of; sets the rounding bound.
+        state: dtype of the positions; where it is the wider one, their rounding is part of the bound.
     """
 
     r_cut: tuple[float, ...]
     compare: str = "r2 <"
     dtype: str = "float64"
-    extent: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    reach: Reach = _NO_REACH
+    state: str = "float64"
 
     def __post_init__(self):
         if self.compare not in CONVENTIONS:
@@ -57,7 +64,7 @@ class PairDecider:
     @property
     def bare(self) -> PairDecider:
         """Without what only bounds need: a box of another size is then the same compiled program."""
-        return replace(self, extent=(0.0, 0.0, 0.0))
+        return replace(self, reach=_NO_REACH, state="float64")
 
     @property
     def space(self) -> str:
@@ -73,10 +80,25 @@ class PairDecider:
         return tuple(Threshold(float(value), comparison, self.space) for value in values)
 
     @property
+    def exact_thresholds(self) -> tuple[float, ...]:
+        """What every dtype is an approximation of: the thresholds of double precision."""
+        return tuple(threshold.value for threshold in replace(self, dtype="float64").thresholds)
+
+    @property
     def bounds(self) -> tuple[float, ...]:
-        """Rounding bound of the quantity near each threshold (error analysis: precision.bounds)."""
+        """Bound on |computed margin - exact margin| given the state, by pair type, in the quantity's space.
+
+        The exact margin is that of the state's positions in the system's own box and against its own
+        threshold, both doubles: narrowing any of them is rounding like any other (error analysis:
+        precision.bounds). Evaluated a thousandth beyond r_cut, it holds for every pair up to there; a pair
+        that is further away has a margin beyond any rounding.
+        """
         bound = squared_distance_bound if self.space == "r2" else distance_bound
-        return tuple(float(bound(r, self.extent, np.dtype(self.dtype))) for r in self.r_cut)
+        dtype, state = np.dtype(self.dtype), np.dtype(self.state)
+        return tuple(
+            float(bound(_BEYOND * r, self.reach, dtype, state)) + abs(held.value - exact)
+            for r, held, exact in zip(self.r_cut, self.thresholds, self.exact_thresholds, strict=True)
+        )
 
     def values(self) -> jax.Array:
         """Threshold values as an array of the decision's dtype, shape (types,)."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import jax
 
-from mdnum.precision.bounds import distance_bound, gamma, squared_distance_bound
+from mdnum.precision.bounds import Reach, distance_bound, gamma, squared_distance_bound
 from mdnum.precision.policy import PrecisionPolicy, RolePrecision
 from mdnum.precision.ulp import neighbor, ordinal, ulp_distance, unit_roundoff
 
@@ -13,6 +13,7 @@ jax.config.update("jax_enable_x64", True)
 
 __all__ = [
     "PrecisionPolicy",
+    "Reach",
     "RolePrecision",
     "distance_bound",
     "gamma",

@@ -1,11 +1,22 @@
-"""How far a computed distance can be from the exact distance of the positions it was computed from."""
+"""How far a computed distance can be from the exact distance of the positions it was computed from.
+
+A displacement is x_j - x_i, less a lattice vector or none along each periodic axis, with a rounding after
+every subtraction; squares are added in a row. What each rounding can lose goes by the size of the result
+that is rounded: `Reach` says how large those can be in a box, whatever the positions.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
+from jaxtyping import Float
 from numpy.typing import DTypeLike
 
 from mdnum.precision.ulp import unit_roundoff
+
+#: Covers the terms of second order, u times as small: u is at most 2^-24 where distances are compared.
+_SECOND_ORDER = 1.001
 
 
 def gamma(n: int, dtype: DTypeLike = np.float64) -> float:
@@ -14,36 +25,100 @@ def gamma(n: int, dtype: DTypeLike = np.float64) -> float:
     return nu / (1.0 - nu)
 
 
-def squared_distance_bound(r, extent, dtype: DTypeLike = np.float64):
-    """Bound on |computed r² - exact r²| for positions that are exact as given.
+Vector = tuple[float, float, float]
 
-    The computation is d = (x_j - x_i) - n*L for each axis, then dx² + dy² + dz² with a rounding after
-    every operation. Each component d carries an absolute error of at most u*|x_j - x_i| (its first
-    subtraction, at most u*extent), one more per lattice vector subtracted (each intermediate is below
-    2*extent), and the squares and sums add gamma_3*r². Standard forward analysis, first order terms kept
-    and the second order ones covered by gamma instead of u.
+
+@dataclass(frozen=True)
+class Reach:
+    """What a displacement between any two positions in a box is made of, as far as its rounding goes.
+
+    Attributes:
+        lattice: vectors of the periodic axes in the order in which they are taken off, length.
+        coordinate: largest |coordinate| of a position, per axis, length.
+    """
+
+    lattice: tuple[Vector, ...] = ()
+    coordinate: Vector = (0.0, 0.0, 0.0)
+
+    @classmethod
+    def of(cls, lattice: Float[np.ndarray, "vectors 3"], coordinate: Float[np.ndarray, "3"]) -> Reach:
+        """The reach of a box, from arrays."""
+        return cls(tuple(_three(row) for row in lattice), _three(coordinate))
+
+    def rounded(self) -> tuple[Float[np.ndarray, "3"], int]:
+        """Sizes of the results that are rounded, added up, beyond that of the displacement; and how many.
+
+        A component is d + n_1 a_1 + n_2 a_2 + n_3 a_3 after the first subtraction, with each n in {-1, 0, 1},
+        and loses one term with each that follows. What is left is d, which is one part of all of them.
+        """
+        sizes, most = np.zeros(3), 1
+        for axis in range(3):
+            # taking off a zero rounds nothing
+            parts = [abs(vector[axis]) for vector in self.lattice if vector[axis] != 0]
+            sizes[axis] = sum(sum(parts[k:]) for k in range(len(parts)))
+            most = max(most, 1 + len(parts))
+        return sizes, most
+
+    def narrowed(self, dtype: DTypeLike) -> Float[np.ndarray, "3"]:
+        """By how much lattice vectors in dtype are off those of the system, per axis, added up, length."""
+        lattice = np.array(self.lattice, np.float64).reshape(-1, 3)
+        return np.abs(lattice.astype(dtype).astype(np.float64) - lattice).sum(axis=0)
+
+
+def _three(values) -> Vector:
+    x, y, z = (float(value) for value in values)
+    return x, y, z
+
+
+def displacement_bound(r, reach: Reach, dtype: DTypeLike = np.float64, state: DTypeLike = np.float64):
+    """Bound on the length of the error of a computed displacement.
+
+    Half an ulp, at most u times its size, for each result that is rounded. Where the state has more digits
+    than dtype both positions are rounded first, and where a double has, the box is: the exact displacement
+    is that of the positions of the state in the box of the system file. The image that is nearest in dtype
+    is taken to be the nearest one: r_cut is below half the width of the box by more than rounding.
 
     Args:
-        r: distance(s) at which the bound is wanted, length.
-        extent: largest absolute coordinate difference before the minimum image, per axis, length, shape (3,).
-        dtype: the dtype of the arithmetic; positions are taken as already rounded to it.
+        r: length(s) of the displacement.
+        reach: of the box.
+        dtype: of the arithmetic.
+        state: of the positions.
+
+    Returns:
+        The bound, length, of the shape of r.
+    """
+    u = unit_roundoff(dtype)
+    sizes, roundings = reach.rounded()
+    if unit_roundoff(state) < u:
+        sizes = sizes + 2 * np.array(reach.coordinate)
+    error = u * sizes + reach.narrowed(dtype)
+    return _SECOND_ORDER * (float(np.linalg.norm(error)) + u * roundings * np.asarray(r, np.float64))
+
+
+def squared_distance_bound(r, reach: Reach, dtype: DTypeLike = np.float64, state: DTypeLike = np.float64):
+    """Bound on |computed r² - exact r²|: the displacement's error, and gamma_3 for squares and sums.
+
+    Args: as `displacement_bound`.
 
     Returns:
         The bound, length squared, of the shape of r.
     """
     r = np.asarray(r, np.float64)
-    # up to three lattice vectors are subtracted in a triclinic box: 1 + 3*2 roundings of size u*extent
-    component = gamma(7, dtype) * float(np.linalg.norm(np.asarray(extent, np.float64)))
-    return 2.0 * r * component + component**2 + gamma(3, dtype) * (r + component) ** 2
+    error = displacement_bound(r, reach, dtype, state)
+    return 2.0 * r * error + error**2 + gamma(3, dtype) * (r + error) ** 2
 
 
-def distance_bound(r, extent, dtype: DTypeLike = np.float64):
+def distance_bound(r, reach: Reach, dtype: DTypeLike = np.float64, state: DTypeLike = np.float64):
     """Bound on |computed r - exact r|, r = sqrt(r²) with a correctly rounded square root.
 
-    Args, error analysis: as `squared_distance_bound`; sqrt halves the relative error and adds one rounding.
+    A length is off by no more than its vector; the square root halves the relative error of r² and adds one
+    rounding.
+
+    Args: as `displacement_bound`.
+
+    Returns:
+        The bound, length, of the shape of r.
     """
     r = np.asarray(r, np.float64)
-    return (
-        squared_distance_bound(r, extent, dtype) / np.maximum(r, np.finfo(np.float64).tiny)
-        + unit_roundoff(dtype) * r
-    )
+    error = displacement_bound(r, reach, dtype, state)
+    return error + (gamma(3, dtype) / 2 + _SECOND_ORDER * unit_roundoff(dtype)) * (r + error)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mdnum.events import Ledger
+from mdnum.md.cell import Cell
 from mdnum.precision import distance_bound
 from mdnum.rollout.engine import Segment
 from mdnum.rollout.flips import decided_pairs, true_pairs
@@ -177,14 +178,15 @@ def rebuild_ledger(folder: RunFolder) -> Ledger:
         where a blind rule rebuilt early), length. A rebuild does nothing to the energy: its jump is zero.
 
     Error:
-        the bound is that of a displacement between two wrapped positions in float64.
+        the bound is that of a displacement between two wrapped positions, in the dtype of the state.
     """
     rows = folder.read("epochs")
     chosen = np.isin(rows["reason"].astype(str), ("displacement", "interval"))
     margin = -rows["margin"][chosen]
     moved = rows["displacement"][chosen]
-    # a coordinate may have been wrapped in between: the difference is then as large as the box
-    box = np.abs(np.asarray(load(folder.path).atoms.cell)).sum(axis=0)
+    system = load(folder.path, world="md")
+    reach = Cell.create(np.asarray(system.atoms.cell), system.atoms.pbc).reach(system.atoms.positions)
+    dtype = np.dtype(system.spec.precision.state)
     count = int(chosen.sum())
     return Ledger(
         "rebuild",
@@ -192,6 +194,6 @@ def rebuild_ledger(folder: RunFolder) -> Ledger:
         rows["epoch"][chosen][:, None],
         np.ones(count, bool),
         margin,
-        np.asarray(distance_bound(moved, box + np.max(moved, initial=0.0)), np.float64),
+        np.asarray(distance_bound(moved, reach, dtype, dtype), np.float64),
         np.zeros(count),
     )

@@ -134,6 +134,11 @@ class Simulation:
         smoothness = self.model.smoothness
         return np.array([smoothness.energy_jump]), np.array([smoothness.force_jump])
 
+    @property
+    def lists(self) -> tuple[Any, ...]:
+        """What decides which lists a run has and in which order they are: equal here, equal lists."""
+        return self.rule, self.builder
+
     def verlet_list(self, skin: float | None = None) -> VerletList:
         """A new Verlet list for this system, with another skin where one is given."""
         rule = self.rule if skin is None else replace(self.rule, skin=skin)
@@ -143,7 +148,7 @@ class Simulation:
     def _guard(self) -> float:
         """Room for rounding of the displacements that are compared with the skin, length."""
         coarsest = max(unit_roundoff(self.policy.dtype(role)) for role in ("state", "decision"))
-        return 16 * coarsest * float(np.linalg.norm(self.decider.extent))
+        return 16 * coarsest * float(np.linalg.norm(self.decider.reach.coordinate))
 
     def tables(self, table: PairTable) -> Tables:
         """A pair table on the device, with pair types."""
@@ -164,7 +169,7 @@ class Simulation:
     def with_cell(self, cell: Cell) -> Simulation:
         """The same system in another box."""
         check_radius(cell, self.r_cut, 0.0)
-        return replace(self, cell=cell, decider=replace(self.decider, extent=_extent(cell, self.positions)))
+        return replace(self, cell=cell, decider=replace(self.decider, reach=cell.reach(self.positions)))
 
     def evaluate(
         self,
@@ -191,15 +196,6 @@ class Simulation:
         i, j = i[order], j[order]
         dx, dy, dz = displacement(self.cell, wrapped[i], wrapped[j])
         return i, j, np.sqrt(dx * dx + dy * dy + dz * dz)
-
-
-def _extent(cell: Cell, positions) -> tuple[float, float, float]:
-    """Largest coordinate difference per axis between wrapped positions."""
-    matrix = np.asarray(cell.matrix)
-    span = np.ptp(positions, axis=0) if len(positions) else np.zeros(3)
-    box = np.abs(matrix).sum(axis=0)
-    periodic = np.array([any(cell.pbc[k] and matrix[k, c] != 0 for k in range(3)) for c in range(3)])
-    return tuple(float(e) for e in np.where(periodic, box, 2 * span + 1.0))  # type: ignore[return-value]
 
 
 def _per_type(table: Float[np.ndarray, "species species"]) -> Float[np.ndarray, "types"]:
@@ -267,11 +263,11 @@ def build(system: System | str, overrides: Mapping[str, Any] | None = None) -> S
     cell = Cell.create(np.asarray(system.atoms.cell), system.atoms.pbc)
     precision = spec.precision
     policy = PrecisionPolicy(precision.state, precision.force, precision.decision, precision.accumulate)
-    extent = _extent(cell, system.atoms.positions)
+    reach = cell.reach(np.asarray(system.atoms.positions, np.float64))
     if spec.cutoff is not None:
         model = _pair_model(system)
         radii = tuple(float(r) for r in np.asarray(model.r_cut))
-        decider = PairDecider(radii, spec.cutoff.compare, precision.decision, extent)
+        decider = PairDecider(radii, spec.cutoff.compare, precision.decision, reach, precision.state)
     else:
         if policy != PrecisionPolicy():
             raise InputError(
@@ -280,7 +276,7 @@ def build(system: System | str, overrides: Mapping[str, Any] | None = None) -> S
                 remedy="Remove the [precision] table",
             )
         model = _many_body_model(system)
-        decider = PairDecider((float(model.r_cut),), "r <", "float64", extent)
+        decider = PairDecider((float(model.r_cut),), "r <", "float64", reach)
     check_radius(cell, max(decider.r_cut), spec.skin)
     rebuild = spec.neighbors.rebuild
     builder = spec.neighbors.builder

@@ -9,8 +9,9 @@ import pytest
 from oracles import COMPARISONS, exact_inside
 
 from mdnum.errors import InputError
+from mdnum.md.cell import Cell
 from mdnum.md.decide import PairDecider
-from mdnum.precision import distance_bound, squared_distance_bound
+from mdnum.precision import Reach, distance_bound, squared_distance_bound
 from mdnum.precision.exact import zero_bits
 
 
@@ -49,7 +50,7 @@ def test_jit_and_host_compute_one_quantity_and_one_decision(dtype, compare):
 
 @pytest.mark.parametrize("compare", COMPARISONS)
 def test_beyond_the_bound_the_decision_is_that_of_real_arithmetic(compare):
-    decider = PairDecider((2.5,), compare, extent=(4.0, 4.0, 4.0))
+    decider = PairDecider((2.5,), compare, reach=Reach(((4.0, 0.0, 0.0), (0.0, 4.0, 0.0), (0.0, 0.0, 4.0))))
     d = displacements(np.float64, count=2000)
     quantity = decider.host_quantity(*d)
     margin, bound = decider.thresholds[0].margin(quantity), decider.bounds[0]
@@ -76,14 +77,15 @@ def test_thresholds_are_the_numbers_the_program_compares_with():
 
 
 def test_bounds_are_those_of_the_space():
-    extent = (10.0, 11.0, 12.0)
-    for dtype in ("float64", "float32"):
-        squared = PairDecider((2.5,), "r2 <", dtype, extent).bounds[0]
-        plain = PairDecider((2.5,), "r <", dtype, extent).bounds[0]
-        assert squared == squared_distance_bound(2.5, extent, np.dtype(dtype))
-        assert plain == distance_bound(2.5, extent, np.dtype(dtype))
+    reach = Cell.create([10.0, 11.0, 12.0]).reach(np.zeros((0, 3)))
+    for dtype in (np.dtype("float64"), np.dtype("float32")):
+        squared = PairDecider((2.5,), "r2 <", dtype.name, reach, dtype.name).bounds[0]
+        plain = PairDecider((2.5,), "r <", dtype.name, reach, dtype.name).bounds[0]
+        # a threshold of 2.5 or 6.25 is a number of every dtype
+        assert squared == squared_distance_bound(1.001 * 2.5, reach, dtype, dtype)
+        assert plain == distance_bound(1.001 * 2.5, reach, dtype, dtype)
         # d(r²) = 2 r dr
-        assert squared / plain == pytest.approx(2 * 2.5, rel=0.6)
+        assert squared / plain == pytest.approx(2 * 2.5, rel=0.1)
 
 
 def test_an_unknown_convention_is_refused():

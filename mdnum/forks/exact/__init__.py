@@ -15,7 +15,6 @@ from mdnum.forks.exact.bounds import (
     ShadowHorizon,
     certified_horizon,
     exact_margin,
-    margin_bounds,
     shadow_horizon,
 )
 from mdnum.forks.exact.horizon import POLICIES, Certificate, PolicyHorizon, Taped, certify, taped
@@ -45,7 +44,6 @@ __all__ = [
     "exact_margin",
     "first_difference",
     "installed",
-    "margin_bounds",
     "shadow_horizon",
     "taped",
     "why_not",

@@ -20,7 +20,7 @@ from mdnum.forks.exact.program import ExactProgram, why_not, with_policy
 from mdnum.forks.exact.tape import Difference, Tape, first_difference
 from mdnum.md.cell import Cell, HostCell
 from mdnum.md.decide import PairDecider
-from mdnum.precision import PrecisionPolicy, gamma, unit_roundoff
+from mdnum.precision import PrecisionPolicy
 from mdnum.rollout.engine import Engine, Segment, Start, first_state
 from mdnum.systems.build import Simulation
 
@@ -97,36 +97,6 @@ class ShadowHorizon:
         return None if self.difference is None else self.difference.step
 
 
-def margin_bounds(
-    decider: PairDecider, state: str = "float64", largest: float | Float[np.ndarray, "3"] = 0.0
-) -> tuple[float, ...]:
-    """Bound on |computed margin - exact margin| given the state, by pair type.
-
-    Positions that are narrowed for the decision are off by u |x| each; the rest is the analysis of
-    `precision.squared_distance_bound`: u per subtraction of a component and of up to three lattice vectors,
-    gamma_3 for squares and sums. A square root halves the relative error and adds one rounding. Evaluated a
-    thousandth beyond r_cut: it holds for every pair up to there.
-
-    Args:
-        decider: the convention and the dtype of the decision.
-        state: dtype of the positions.
-        largest: largest |coordinate| per axis of the state, length; only where the state is the wider one.
-    """
-    dtype = np.dtype(decider.dtype)
-    u = unit_roundoff(dtype)
-    component = gamma(7, dtype) * float(np.linalg.norm(decider.extent))
-    if unit_roundoff(state) < u:
-        component += 2 * u * (1 + u) * float(np.linalg.norm(np.broadcast_to(largest, 3)))
-    bounds = []
-    for r_cut in decider.r_cut:
-        radius = 1.001 * r_cut
-        bound = 2 * radius * component + component**2 + gamma(3, dtype) * (radius + component) ** 2
-        if decider.space == "r":
-            bound = bound / r_cut + u * radius
-        bounds.append(float(bound))
-    return tuple(bounds)
-
-
 def exact_margin(
     decider: PairDecider,
     cell: Cell,
@@ -136,22 +106,23 @@ def exact_margin(
 ) -> tuple[Fraction, bool]:
     """The margin of a pair without rounding, and the decision that it asks for.
 
-    Positions are the floats of the state; the threshold and the lattice vectors are those that the decision
-    holds in its dtype. In the space of r the margin is good to 400 binary digits, the decision exact.
+    Positions are the floats of the state; the threshold and the lattice vectors are the doubles of the
+    system, as in the exact program, whatever the decision holds. In the space of r the margin is good to 400
+    binary digits, the decision exact.
 
     Args:
         start, end: positions, length.
         kind: pair type.
     """
-    held = np.asarray(cell.matrix, decider.dtype)
+    matrix = np.asarray(cell.matrix, np.float64)
     inverse = [[Fraction(float(c)) for c in row] for row in np.asarray(cell.inverse)]
     d = [Fraction(float(b)) - Fraction(float(a)) for a, b in zip(start, end, strict=True)]
     n = [round(sum((d[c] * inverse[c][k] for c in range(3)), start=Fraction(0))) for k in range(3)]
     for k in range(3):
         if cell.pbc[k]:
-            d = [d[c] - n[k] * Fraction(float(held[k, c])) for c in range(3)]
+            d = [d[c] - n[k] * Fraction(float(matrix[k, c])) for c in range(3)]
     squared = sum((c * c for c in d), start=Fraction(0))
-    value = Fraction(decider.thresholds[kind].value)
+    value = Fraction(decider.exact_thresholds[kind])
     against = value * value if decider.space == "r" else value
     inside = squared <= against if decider.compare.endswith("<=") else squared < against
     quantity = _root(squared) if decider.space == "r" else squared
@@ -189,13 +160,7 @@ def certified_horizon(
     horizon = wrong = None
     bounds: tuple[float, ...] = ()
     for segment in Engine(simulation, last, start=start).segments():
-        x = segment.rows_of("x")
-        with np.errstate(invalid="ignore"):
-            largest = np.abs(x.astype(np.float64)).max(axis=(0, 2))
-        # atoms may leave the region in which they started along a free axis
-        extent = np.where(simulation.pbc, simulation.decider.extent, 2 * largest)
-        wide = replace(simulation.decider, extent=tuple(float(c) for c in extent))
-        bounds = margin_bounds(wide, simulation.policy.state, largest)
+        bounds = _bounds(simulation.decider, segment.rows_of("x"))
         nearest = segment.rows_of("nearest")
         closest.append(nearest)
         for row in np.flatnonzero(nearest <= max(bounds)):
@@ -210,6 +175,14 @@ def certified_horizon(
         if progress is not None:
             progress(reached, last)
     return CertifiedHorizon(reached, horizon, wrong, total, tuple(listed), bounds, np.concatenate(closest))
+
+
+def _bounds(decider: PairDecider, x: Float[np.ndarray, "rows 3 atoms"]) -> tuple[float, ...]:
+    """The decider's bounds, for atoms that may have left the region in which they started."""
+    with np.errstate(invalid="ignore"):
+        largest = np.abs(x.astype(np.float64)).max(axis=(0, 2))
+    a, b, c = np.fmax(decider.reach.coordinate, largest).tolist()
+    return replace(decider, reach=replace(decider.reach, coordinate=(a, b, c))).bounds
 
 
 def _check(simulation: Simulation) -> None:

@@ -369,4 +369,5 @@ def _wide(simulation: Simulation) -> Simulation:
 
 def with_policy(simulation: Simulation, policy: PrecisionPolicy) -> Simulation:
     """The same system under another precision policy."""
-    return replace(simulation, policy=policy, decider=replace(simulation.decider, dtype=policy.decision))
+    decider = replace(simulation.decider, dtype=policy.decision, state=policy.state)
+    return replace(simulation, policy=policy, decider=decider)
