@@ -51,7 +51,7 @@ class _System(Protocol):
 
 
 #: Of a system file: words, what is hashed by itself, and what is asked about the run.
-_NOT_THE_PROGRAM = {"name", "about", "structure", "gradient", "variants"}
+_NOT_THE_PROGRAM = {"name", "about", "structure", "gradient", "variants", "fork"}
 
 
 def collect(system: _System) -> dict[str, Any]:

@@ -8,7 +8,7 @@ over the whole (slots, atoms) array takes twice the time at 4,000 atoms and ten 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -17,6 +17,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int, UInt8
 
 from mdnum.md.cell import Cell
+from mdnum.md.cutoffs import AtCutoff
 from mdnum.md.decide import (
     Decisions,
     PairDecider,
@@ -29,7 +30,7 @@ from mdnum.md.decide import (
 )
 from mdnum.md.potentials import CutPotential
 from mdnum.precision import PrecisionPolicy
-from mdnum.precision.exact import zero_bits
+from mdnum.precision.exact import fence, rounded, zero_bits
 from mdnum.precision.reductions import Reduction, Sequential
 
 
@@ -81,6 +82,20 @@ class PairForce(eqx.Module):
             reduction,
         )
 
+    @property
+    def law(self) -> CutPotential | _Rounded:
+        """The potential as the policy computes it: in sixteen bits it is rounded after every operation."""
+        return _Rounded(self.model, self.zero) if self._short else self.model
+
+    @property
+    def _short(self) -> bool:
+        return self.policy.dtype("force").itemsize == 2
+
+    def _in_force_dtype(self, x: Any) -> Float[Array, "..."]:
+        """A number as the force's dtype holds it; XLA would widen sixteen bits again without rounding."""
+        x = x.astype(self.policy.dtype("force"))
+        return fence(x, self.zero) if self._short else x
+
     def decide(self, positions: Float[Array, "3 atoms"], tables: Tables) -> Decisions:
         """The decisions of a list at given positions, without forces."""
         return decide_table(self.decider, self.cell, self.zero, positions, tables)
@@ -105,11 +120,12 @@ class PairForce(eqx.Module):
             where: act on those given only at the slots whose bit is set here, and on its own elsewhere.
         """
         judge = SlotJudge(self.decider, self.cell, self.zero, positions)
-        force_dtype, accumulate = self.policy.dtype("force"), self.policy.dtype("accumulate")
-        same = self.policy.dtype("decision") == force_dtype
-        cell = self.cell.astype(force_dtype)
-        components = tuple(positions.astype(force_dtype))
-        at = self.model.at_cutoff()
+        geometry, accumulate = self.policy.geometry, self.policy.dtype("accumulate")
+        same = self.policy.dtype("decision") == geometry
+        cell = self.cell.astype(geometry)
+        components = tuple(positions.astype(geometry))
+        law, exactly = self.law, self._in_force_dtype
+        at = law.at_cutoff()
 
         def block(carry, listed):
             totals, nearest = carry
@@ -128,11 +144,12 @@ class PairForce(eqx.Module):
             else:
                 r2 = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
             # the argument is masked, not only the result: a padded slot may be at distance zero
-            r2 = jnp.where(inside, r2, jnp.ones((), force_dtype))
-            energy, slope = self.model.evaluate(r2, types, at)
+            r2 = exactly(jnp.where(inside, r2, jnp.ones((), geometry)))
+            energy, slope = law.evaluate(r2, types, at)
             energy, slope = jnp.where(inside, energy, 0), jnp.where(inside, slope, 0)
             pull = slope + slope
-            terms = [q.astype(accumulate) for q in (*(pull * c for c in d), energy, pull * r2)]
+            products = (*(pull * exactly(c) for c in d), energy, pull * r2)
+            terms = [exactly(q).astype(accumulate) for q in products]
             summed = [
                 self.reduction.within(total, list(term)) for total, term in zip(totals, terms, strict=True)
             ]
@@ -156,23 +173,42 @@ class PairForce(eqx.Module):
     def virial_tensor(self, positions: Float[Array, "3 atoms"], tables: Tables) -> Float[Array, "3 3"]:
         """Sum over pairs of r_ij ⊗ F_ij, energy; minus the derivative of the energy by strain."""
         judge = SlotJudge(self.decider, self.cell, self.zero, positions)
-        force_dtype = self.policy.dtype("force")
-        cell = self.cell.astype(force_dtype)
-        components = tuple(positions.astype(force_dtype))
-        at = self.model.at_cutoff()
+        geometry, law = self.policy.geometry, self.law
+        cell = self.cell.astype(geometry)
+        components = tuple(positions.astype(geometry))
+        at = law.at_cutoff()
 
         def block(totals, listed):
             j, types = listed
             _, _, inside, _ = judge.group(j, types)
             d = displacements(components, cell, j)
-            r2 = jnp.where(inside, d[0] * d[0] + d[1] * d[1] + d[2] * d[2], jnp.ones((), force_dtype))
-            slope = jnp.where(inside, self.model.evaluate(r2, types, at)[1], 0)
+            r2 = jnp.where(inside, d[0] * d[0] + d[1] * d[1] + d[2] * d[2], jnp.ones((), geometry))
+            slope = law.evaluate(self._in_force_dtype(r2), types, at)[1]
+            slope = jnp.where(inside, slope, 0).astype(geometry)
             sums = [jnp.sum(slope * d[a] * d[b], axis=0) for a, b in _VOIGT]
             return tuple(total + q for total, q in zip(totals, sums, strict=True)), None
 
-        totals, _ = lax.scan(block, (jnp.zeros(judge.atoms, force_dtype),) * 6, tables.groups())
+        totals, _ = lax.scan(block, (jnp.zeros(judge.atoms, geometry),) * 6, tables.groups())
         xx, yy, zz, yz, xz, xy = (-jnp.sum(total, dtype=jnp.float64) for total in totals)
         return jnp.stack([jnp.stack([xx, xy, xz]), jnp.stack([xy, yy, yz]), jnp.stack([xz, yz, zz])])
+
+
+class _Rounded(eqx.Module):
+    """A cut potential whose results are rounded after every operation.
+
+    Attributes:
+        model: the potential, in sixteen bits.
+        zero: an integer zero that XLA must not know.
+    """
+
+    model: CutPotential
+    zero: Int[Array, ""]
+
+    def at_cutoff(self) -> AtCutoff:
+        return rounded(self.model.at_cutoff, self.zero)()
+
+    def evaluate(self, r2, types, at: AtCutoff):
+        return rounded(self.model.evaluate, self.zero)(r2, types, at)
 
 
 _VOIGT = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))

@@ -19,6 +19,14 @@ ALL: Mapping[str, np.dtype] = {
 _ROUNDINGS = ("nearest", "stochastic")
 
 
+#: Roles of molecular dynamics that sixteen bits cannot play, and why.
+_TOO_SHORT: Mapping[str, str] = {
+    "state": "a step moves an atom by less than the spacing of such coordinates, so nothing would move",
+    "decision": "such coordinates are some hundredths of a distance apart, and their grid would decide",
+    "accumulate": "it keeps two or three digits of a sum of some hundred terms, and the small ones are lost",
+}
+
+
 def _check(policy: object, roles: tuple[str, ...], known: Mapping[str, np.dtype]) -> None:
     for role in roles:
         value = getattr(policy, role)
@@ -28,13 +36,31 @@ def _check(policy: object, roles: tuple[str, ...], known: Mapping[str, np.dtype]
             )
 
 
+def check_role(role: str, dtype: str) -> None:
+    """Refuse a dtype that a role of molecular dynamics cannot have.
+
+    Raises:
+        InputError: no dtype is called that, or it has sixteen bits and the role needs more.
+    """
+    known = ALL if role == "force" else WIDE
+    if dtype in ALL and dtype not in known:
+        raise InputError(
+            f"{dtype} cannot be the {role} of molecular dynamics: {_TOO_SHORT[role]}",
+            where=f"precision.{role}",
+            remedy=f"Use {' or '.join(WIDE)}; pair forces may be {dtype} (precision.force)",
+        )
+    if dtype not in known:
+        raise InputError(f"unknown dtype {dtype!r}; known are {', '.join(known)}", where=f"precision.{role}")
+
+
 @dataclass(frozen=True)
 class PrecisionPolicy:
     """The dtype of each role of a number in a rollout of molecular dynamics.
 
     Attributes:
         state: positions and velocities as they are carried from step to step.
-        force: distances and pair terms that enter forces and energies.
+        force: distances and pair terms that enter forces and energies. In bfloat16 or float16 displacements
+            are those of the decision, rounded, and all that follows has sixteen bits up to the sum.
         decision: the quantity and the threshold that a decision compares.
         accumulate: the sums over neighbors.
     """
@@ -45,11 +71,21 @@ class PrecisionPolicy:
     accumulate: str = "float64"
 
     def __post_init__(self):
-        _check(self, ("state", "force", "decision", "accumulate"), WIDE)
+        for role in ("state", "force", "decision", "accumulate"):
+            check_role(role, getattr(self, role))
 
     def dtype(self, role: str) -> np.dtype:
         """The numpy dtype of a role ("state", "force", "decision" or "accumulate")."""
-        return WIDE[getattr(self, role)]
+        return ALL[getattr(self, role)]
+
+    @property
+    def geometry(self) -> np.dtype:
+        """The dtype of the displacements that forces are made from.
+
+        That of the force; of a force in sixteen bits that of the decision, because a difference of two such
+        coordinates has no digits left.
+        """
+        return self.dtype("force") if self.force in WIDE else self.dtype("decision")
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from mdnum.references.findings import finding, plain
 from mdnum.references.trajectory import trajectory
 from mdnum.systems import System, build, schema
 
-AGREEMENT = {"float64": 1e-9, "float32": 1e-2}
+AGREEMENT = {"float64": 1e-9, "float32": 1e-2, "float16": 1e-1, "bfloat16": 1e-1}
 """Largest deviation of a position after 100 steps, in units of r_cut.
 
 Rounding starts near 1e-16 (6e-8) and chaos multiplies it, by e³ per LJ time in a liquid; five orders of

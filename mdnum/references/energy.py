@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from ase import Atoms
 
+from mdnum.precision import unit_roundoff
 from mdnum.references.ase_models import Reference, evaluate, independent, reference
 from mdnum.references.closed_forms import pair_forms
 from mdnum.references.findings import finding, plain
@@ -191,7 +192,7 @@ def narrowest(system: System) -> str:
     """The narrowest float type among the roles that energies and forces depend on."""
     precision = system.spec.precision
     roles = (precision.state, precision.force, precision.accumulate)
-    return "float32" if "float32" in roles else "float64"
+    return max(roles, key=unit_roundoff)
 
 
 def _named(frames: Mapping[str, Atoms] | Sequence[Atoms] | None, simulation: Any) -> dict[str, Atoms]:
@@ -283,7 +284,7 @@ class _Scales:
         cls, system: System, simulation: Any, atoms: Atoms, mine: Any, theirs: Mapping[str, Any]
     ) -> _Scales:
         """Scales of a frame; pair by pair where there are pairs, else from the totals."""
-        unit = 2.0**-24 if narrowest(system) == "float32" else 2.0**-53
+        unit = unit_roundoff(narrowest(system))
         largest_force = float(np.abs(theirs["forces"]).max(initial=0.0))
         volume = atoms.get_volume() if atoms.cell.rank == 3 else float("inf")
         positions, cell = atoms.get_positions(), np.asarray(atoms.cell)

@@ -13,6 +13,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float
 
+from mdnum.precision import unit_roundoff
 from mdnum.systems.build import Simulation
 
 # a missed flip shows as one jump; rounding of the sums must stay far below it
@@ -73,7 +74,7 @@ class EnergyBudget:
         if self._reference is not self.simulation:
             jumps = np.abs(self.simulation.jumps()[0])
             return _SHARE_OF_A_JUMP * float(jumps[jumps > 0].min())
-        eps = float(np.finfo(self.simulation.policy.dtype("force")).eps)
+        eps = 2 * unit_roundoff(self.simulation.policy.dtype("force"))
         return 1e3 * eps * max(1.0, abs(self._reference.evaluate().energy))
 
     @property

@@ -41,6 +41,7 @@ __all__ = [
     "Dynamics",
     "EmbeddedAtom",
     "FileStructure",
+    "Fork",
     "Langevin",
     "LennardJones",
     "ManyBodyPotential",
@@ -62,6 +63,7 @@ __all__ = [
 ]
 
 FloatName = Literal["float64", "float32"]
+ForceFloatName = Literal["float64", "float32", "bfloat16", "float16"]
 ReductionName = Literal[
     "sequential",
     "reversed",
@@ -206,12 +208,28 @@ class Precision(Table):
     """Which float plays which role."""
 
     state: FloatName = Field(default="float64", description="positions and velocities")
-    force: FloatName = Field(default="float64", description="pair distances, energies and forces")
+    force: ForceFloatName = Field(
+        default="float64",
+        description="pair distances, energies and forces; in bfloat16 and float16 distances are those of the "
+        "decision, rounded",
+    )
     decision: FloatName = Field(default="float64", description="the quantity compared with a threshold")
     accumulate: FloatName = Field(default="float64", description="sums over pairs")
     reduction: ReductionName = Field(
         default="sequential",
         description="order of the sums; exact and fixed-point give the same bits in every order of neighbors",
+    )
+
+
+class Fork(Table):
+    """What `mdnum fork` does with this system where the command line does not say."""
+
+    vary: str | None = Field(
+        default=None, description='the choice to vary, such as "precision" or "reduction=exact"'
+    )
+    steps: int | None = Field(default=None, ge=1, description="last step; default dynamics.steps")
+    split: float | None = Field(
+        default=None, gt=0, description="separation that counts as split (Å or σ); default 0.04 of the cutoff"
     )
 
 
@@ -236,6 +254,7 @@ class SystemSpec(Table):
     dynamics: Dynamics
     precision: Precision = Field(default_factory=lambda: Precision())
     record: Record = Field(default_factory=lambda: Record())
+    fork: Fork | None = Field(default=None, description="a question about this system; not about its runs")
 
     @model_validator(mode="after")
     def _cutoff_fits_potential(self) -> SystemSpec:

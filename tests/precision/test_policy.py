@@ -27,7 +27,13 @@ def test_what_no_float_is_called_is_refused():
         RolePrecision(seed=-1)
 
 
-def test_molecular_dynamics_knows_two_dtypes_only():
+def test_sixteen_bits_are_for_pair_forces_alone():
     assert PrecisionPolicy(state="float32").dtype("state") == np.float32
-    with pytest.raises(InputError, match=r"precision\.force.*float16"):
-        PrecisionPolicy(force="float16")
+    short = PrecisionPolicy(decision="float32", force="bfloat16")
+    assert short.dtype("force") == ml_dtypes.bfloat16 and short.geometry == np.float32
+    assert PrecisionPolicy(decision="float64", force="float32").geometry == np.float32
+    for role in ("state", "decision", "accumulate"):
+        with pytest.raises(InputError, match=rf"precision\.{role}.*bfloat16 cannot be.*precision.force"):
+            PrecisionPolicy(**{role: "bfloat16"})
+    with pytest.raises(InputError, match=r"precision\.force.*'half'.*known are.*bfloat16"):
+        PrecisionPolicy(force="half")

@@ -8,7 +8,7 @@ from mdnum.errors import InputError
 from mdnum.forks.choices.base import ORDERLESS, check, is_pairwise, summed, varied
 from mdnum.forks.twin import Twin
 from mdnum.precision import reductions
-from mdnum.precision.policy import WIDE
+from mdnum.precision.policy import ALL, WIDE, check_role
 from mdnum.systems.build import build
 from mdnum.systems.load import System
 
@@ -21,12 +21,12 @@ _ARITHMETIC = ("force", "decision", "accumulate")
 class Precision:
     """Another float in one role, or in all but the state.
 
-    A rollout of molecular dynamics knows float64 and float32: pair distances in bfloat16 have two or three
-    digits, which is another model rather than another rounding.
+    Sixteen bits are for pair forces alone: in any other role of molecular dynamics they make another model
+    rather than another rounding (`mdnum.precision.policy.check_role` says why).
 
     Attributes:
         roles: of "state", "force", "decision" and "accumulate".
-        dtype: "float32" or "float64".
+        dtype: "float32" or "float64"; of the force also "bfloat16" or "float16".
     """
 
     roles: tuple[str, ...] = _ARITHMETIC
@@ -40,8 +40,12 @@ class Precision:
                     where="precision",
                     remedy="Write precision, or precision.force=float32",
                 )
-        if self.dtype not in WIDE:
-            raise InputError(f"unknown dtype {self.dtype!r}; known are {', '.join(WIDE)}", where=self.name)
+        if self.dtype not in ALL:
+            raise InputError(f"unknown dtype {self.dtype!r}; known are {', '.join(ALL)}", where=self.name)
+        if self.dtype not in WIDE and self.roles == _ARITHMETIC:
+            object.__setattr__(self, "roles", ("force",))
+        for role in self.roles:
+            check_role(role, self.dtype)
 
     @property
     def name(self) -> str:

@@ -16,6 +16,7 @@ from mdnum.forks.exact.program import Exact, ExactProgram, why_not, with_policy
 from mdnum.forks.exact.tape import Difference, Tape, first_difference
 from mdnum.md.cell import HostCell
 from mdnum.precision import PrecisionPolicy
+from mdnum.precision.policy import WIDE
 from mdnum.rollout.engine import FAILURES, Engine, Start, first_state
 from mdnum.rollout.flips import PairRecorder, decided_pairs
 from mdnum.rollout.frame import Frame
@@ -33,6 +34,7 @@ POLICIES: Mapping[str, PrecisionPolicy] = {
     "float32, decision and accumulate float64": replace(_NARROW, decision="float64", accumulate="float64"),
     "float32, state float64": replace(_NARROW, state="float64"),
     "float64, force float32": PrecisionPolicy("float64", "float32", "float64", "float64"),
+    "float64, force bfloat16": PrecisionPolicy("float64", "bfloat16", "float64", "float64"),
     "float64": PrecisionPolicy(),
 }
 
@@ -338,13 +340,23 @@ def _says(rows: list[PolicyHorizon], last: int, per_bit: float) -> tuple[str, ..
         sentence = f"{row.name} {kept}"
         if row.failed:
             sentence += f" (its run ended in a {row.failed})"
-        promoted = row.policy not in (_NARROW, PrecisionPolicy())
-        if promoted and base is not None and base.horizon is not None:
+        other = row.policy not in (_NARROW, PrecisionPolicy())
+        if other and row.policy.force not in WIDE and base is not None and base.horizon is not None:
+            sentence += ": " + _lost(row, base.horizon)
+        elif other and base is not None and base.horizon is not None:
             sentence += ": " + _gained(row, base.horizon, last, at_most)
         sentences.append(sentence + ".")
     if np.isfinite(per_bit):
         sentences.append(f"One more bit in every number is worth about {per_bit:.0f} steps here.")
     return tuple(sentences)
+
+
+def _lost(row: PolicyHorizon, base: int) -> str:
+    """What sixteen bits cost, against single precision throughout."""
+    if row.horizon is None or row.horizon >= base:
+        return f"{row.policy.force} pair forces cost nothing here that single precision does not"
+    lost = f"{row.policy.force} pair forces cost {base - row.horizon} of the {base} steps of single precision"
+    return lost if np.isnan(row.closer) else f"{lost}; its positions are {-row.closer:.1f} bits further off"
 
 
 def _gained(row: PolicyHorizon, base: int, last: int, at_most: str) -> str:
