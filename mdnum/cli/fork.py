@@ -22,7 +22,8 @@ def fork(
     vary: str | None = typer.Option(
         None,
         metavar="CHOICE",
-        help="What to vary: precision, reduction=exact, ...; all screens every choice.",
+        help="What to vary: precision, reduction=exact, ...; all screens every choice. "
+        "By default what the system file says.",
     ),
     steps: int | None = typer.Option(None, min=1, help="Steps to follow, instead of the system's own."),
     split: float | None = typer.Option(
@@ -116,10 +117,8 @@ def fork(
             )
         if benign and vary is not None:
             return fork_questions.consistent(system, vary, steps, overrides, as_json=as_json)
-    if vary is None:
-        return _choices(system, as_json)
     if system is None:
-        raise InputError("no system given", remedy="`mdnum systems list` names those that come with mdnum")
+        return _choices(as_json)
     from mdnum.workflow import fork as compare
 
     try:
@@ -150,12 +149,8 @@ def fork(
     return output.exit_code(summary.get("findings", ()), ok=summary.get("status") == "complete")
 
 
-def _choices(system: str | None, as_json: bool) -> int:
+def _choices(as_json: bool) -> int:
     """What can be varied, for somebody who did not say."""
-    if system is not None:
-        raise InputError(
-            "nothing to vary", remedy="Add --vary CHOICE, or --vary all; `mdnum fork` alone lists the choices"
-        )
     from mdnum.forks.choices import BY_NAME
 
     rows = [

@@ -49,7 +49,7 @@ class Asked:
 
 def fork(
     system: System | str | Path,
-    vary: str,
+    vary: str | None = None,
     *,
     steps: int | None = None,
     split: float | None = None,
@@ -68,7 +68,8 @@ def fork(
 
     Args:
         system: a loaded system, a shipped name or the path of a system file.
-        vary: the choice, such as "precision" or "reduction=exact"; "all" screens every choice.
+        vary: the choice, such as "precision" or "reduction=exact"; "all" screens every choice. Default what
+            the [fork] table of the system file says, as for steps and split.
         steps: last step; default the system's own.
         split: separation that counts as split, length; default 0.04 of the longest cutoff.
         repeats: further runs with perturbed starts, to tell a delay from chance.
@@ -89,6 +90,7 @@ def fork(
         FolderError: the folder cannot be used.
     """
     system = _loaded(system, overrides)
+    vary, steps, split = _as_in_file(system, vary, steps, split)
     _check(steps, split, repeats)
     if pin is not None:
         from mdnum.forks.take_back import parse_pin
@@ -205,6 +207,25 @@ def _loaded(system: System | str | Path, overrides: Mapping[str, Any] | None) ->
             )
         return system
     return load(system, overrides, world="md")
+
+
+def _as_in_file(
+    system: System, vary: str | None, steps: int | None, split: float | None
+) -> tuple[str, int | None, float | None]:
+    """What was asked, and what the system file asks where nothing was said."""
+    table = system.spec.fork
+    if table is not None:
+        vary = table.vary if vary is None else vary
+        steps = table.steps if steps is None else steps
+        split = table.split if split is None else split
+    if vary is None:
+        raise InputError(
+            "nothing to vary",
+            where=system.name,
+            remedy="Add --vary CHOICE, or --vary all; `mdnum fork` alone lists the choices. A system file "
+            "says it as vary in a table [fork]",
+        )
+    return vary, steps, split
 
 
 def _check(steps: int | None, split: float | None, repeats: int) -> None:
