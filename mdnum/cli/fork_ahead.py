@@ -42,7 +42,7 @@ def _print_certified(summary: Mapping[str, Any]) -> None:
                 row["name"],
                 f"beyond step {summary['steps']:,}" if row["horizon"] is None else f"step {row['horizon']:,}",
                 None if row["pair"] is None else f"{row['pair'][0]}–{row['pair'][1]}",
-                row["growth_rate"],
+                None if row["growth_rate"] is None else f"{row['growth_rate']:.3g}",
                 doubt["total"],
                 None if doubt["horizon"] is None else f"step {doubt['horizon']:,}",
                 row["failed"] or "",

@@ -81,11 +81,7 @@ def fork_certify(
     folder = opened(system, "certify", out)
     try:
         note = Log(folder, progress)
-        found = certify(
-            simulation,
-            last,
-            progress=lambda at, end: note(at, end, {"phase": "in exact arithmetic"} | _STEPS),
-        )
+        found = certify(simulation, last, policies=policies, progress=lambda at, end: note(at, end, _EXACT))
         ambiguous = _ambiguous(simulation, found, note)
         _write(folder, found, ambiguous)
         for sentence in found.says:

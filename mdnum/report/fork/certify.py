@@ -16,7 +16,7 @@ from mdnum.report.fork.findings import Verdict
 from mdnum.report.fork.question import Drawn, Question, declared, load, size_of, took, verdict, write_page
 from mdnum.report.svg import FIRST, HALO, INK, MUTED
 from mdnum.report.verdict import Finding
-from mdnum.report.words import count, many, number
+from mdnum.report.words import count, many, number, typeset
 from mdnum.store import RunFolder
 
 _ROLES = ("first", "second", "third", "bad", "ink", "muted")
@@ -79,7 +79,7 @@ def judge(run: Question) -> Verdict:
     elif kept:
         first = min(left, key=lambda row: row["horizon"])
         headline = (
-            f"{count(kept)} of {many(len(policies), 'precision')} keep the exact history of "
+            f"{count(kept)} of {many(len(policies), 'precision')} keep{'s' * (kept == 1)} the exact history of "
             f"{many(run.steps, 'step')}; {first['name']} leaves it first, at step {count(first['horizon'])}."
         )
     else:
@@ -88,7 +88,8 @@ def judge(run: Question) -> Verdict:
             f"No precision keeps the exact history of {many(run.steps, 'step')}: {best['name']} leaves it at "
             f"step {count(best['horizon'])}, {worst['name']} at step {count(worst['horizon'])}."
         )
-    return verdict(headline, run.summary["says"], _findings(run), plain_tone="info" if left else "good")
+    says = [typeset(sentence) for sentence in run.summary["says"]]
+    return verdict(headline, says, _findings(run), plain_tone="info" if left else "good")
 
 
 def _findings(run: Question) -> Iterator[Finding]:
@@ -106,7 +107,7 @@ def _findings(run: Question) -> Iterator[Finding]:
         yield Finding(
             "WRONG_DECISION",
             "info",
-            f"{name} decides wrongly at step {count(one['wrong'])}",
+            f"a wrong decision in {name}, at step {count(one['wrong'])}",
             "From its own positions at that step, exact arithmetic decides otherwise: it is the rounding of "
             "the decision itself, not of the path to it.",
         )
@@ -149,7 +150,7 @@ def _bars(run: Question, figure: Figure) -> None:
     axes.set_ylim(-0.6, len(rows) - 0.4)
     axes.xaxis.set_major_formatter(lambda value, _: f"{value:,.0f}")
     axes.locator_params(axis="x", nbins=7 if wide else 4)
-    axes.set_xlabel("step up to which every decision is the exact one", color=INK)
+    axes.set_xlabel("leaves the exact history at step", color=INK)
 
 
 def separations(run: Question) -> Plot | None:

@@ -12,7 +12,7 @@ from mdnum.ball.demos.base import Plot, Series
 from mdnum.report.fork.findings import Verdict
 from mdnum.report.fork.question import Question, declared, load, size_of, took, verdict, write_page
 from mdnum.report.verdict import Finding
-from mdnum.report.words import count, listed, many, number
+from mdnum.report.words import count, many, number
 from mdnum.store import RunFolder
 
 _ROLES: tuple[Literal["first", "second", "third", "bad", "ink", "muted"], ...] = (
@@ -20,7 +20,7 @@ _ROLES: tuple[Literal["first", "second", "third", "bad", "ink", "muted"], ...] =
 )  # fmt: skip
 _PROGRAMS = {
     "scan": "one compiled loop over the steps",
-    "rollout": "mdnum’s own epochs, as `mdnum run` runs them",
+    "rollout": "mdnum’s own epochs, those of any run",
     "vmap": "the first of a batch of equal copies",
     "grad": "the primal inside value_and_grad",
     "eager": "operation by operation, nothing compiled together",
@@ -81,7 +81,8 @@ def judge(run: Question) -> Verdict:
             f"the first bits differ at step {count(min(seeds))}."
         )
     tone = "good" if len(clusters) == 1 and ran > 1 else "info"
-    return verdict(headline, summary["causes"], _findings(run), plain_tone=tone)
+    causes = [sentence.replace("'", "’") for sentence in summary["causes"]]
+    return verdict(headline, causes, _findings(run), plain_tone=tone)
 
 
 def _findings(run: Question) -> Iterator[Finding]:
@@ -119,7 +120,7 @@ def separations(run: Question) -> Plot | None:
             continue
         role = _ROLES[(number_ - 1) % len(_ROLES)]
         shown = np.where(apart > 0, apart, np.nan)
-        series.append(Series(listed(names), step, shown, mark="line", role=role))
+        series.append(Series("; ".join(names), step, shown, mark="line", role=role))
     if not series:
         return None
     return Plot(
@@ -144,7 +145,8 @@ def _key_figures(run: Question) -> Iterator[tuple[str, str, str]]:
     summary = run.summary
     rows = [row for row in summary["variants"] if not row["failed"]]
     seeds = [row["seed"] for row in rows if row["seed"] is not None]
-    yield "Programs", count(len(rows)), f"{count(len(summary['failed_variants']))} more did not run"
+    failed = len(summary["failed_variants"])
+    yield "Programs", count(len(rows)), f"{count(failed)} more did not run" if failed else "all ran"
     yield "Trajectories", count(len(summary["clusters"])), "that differ in a bit"
     yield "With the reference", count(len(summary["clusters"][0])), f"{summary['reference']} included"
     yield "First bit", f"step {count(min(seeds))}" if seeds else "–", "differs" if seeds else "none differs"
@@ -159,8 +161,6 @@ def _key_figures(run: Question) -> Iterator[tuple[str, str, str]]:
 def _row(run: Question, row: Mapping[str, Any]) -> dict[str, str]:
     """A variant as text."""
     told = [_PROGRAMS[row["program"]]]
-    if row["flags"]:
-        told.append(f"XLA_FLAGS {row['flags']}")
     if row["reduction"]:
         told.append(f"force sums {row['reduction']}")
     reference = row["variant"] == run.summary["reference"]
@@ -169,6 +169,7 @@ def _row(run: Question, row: Mapping[str, Any]) -> dict[str, str]:
         "cluster": "–" if row["cluster"] is None else count(row["cluster"] + 1),
         "variant": row["variant"],
         "about": "; ".join(told),
+        "flags": row["flags"],
         "failed": row["failed"],
         "seed": "–" if row["failed"] else "reference" if reference else leaves,
         "steps": "–" if row["failed"] else count(row["steps"]),
