@@ -78,8 +78,9 @@ def judge(run: Question) -> Verdict:
         headline = f"Every precision keeps the exact history of {many(run.steps, 'step')}."
     elif kept:
         first = min(left, key=lambda row: row["horizon"])
+        verb = "keeps" if kept == 1 else "keep"
         headline = (
-            f"{count(kept)} of {many(len(policies), 'precision')} keep{'s' * (kept == 1)} the exact history of "
+            f"{count(kept)} of {many(len(policies), 'precision')} {verb} the exact history of "
             f"{many(run.steps, 'step')}; {first['name']} leaves it first, at step {count(first['horizon'])}."
         )
     else:
