@@ -161,7 +161,9 @@ def halves_of(bits: UInt8[Array, "words atoms"]) -> UInt8[Array, "groups atoms"]
 
 def unpacked(half: UInt8[Array, "atoms"]) -> Bool[Array, "4 atoms"]:
     """The decisions of one group."""
-    return (half[None, :] >> jnp.arange(GROUP, dtype=jnp.uint8)[:, None]) & jnp.uint8(1) == 1
+    # slot by slot: shifted all at once, by a vector, the loops that use them are not vectorized and take
+    # twice the time
+    return jnp.stack([half & jnp.uint8(1 << k) != 0 for k in range(GROUP)])
 
 
 class SlotJudge:
