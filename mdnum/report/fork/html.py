@@ -105,11 +105,21 @@ def _key_figures(run: ForkFolder) -> Iterator[tuple[str, str, str]]:
         else f"per {time}, while they part"
     )
     yield "Growth rate", rate, small
-    nats = summary.get("nats")
-    # an infinite share has no place in JSON
-    worth = "∞" if nats is None and run.word == "cause" else number(nats, 3)
-    yield "The flips were worth", worth, "nats: growth rate × steps gained" if worth != "–" else "not known"
+    worth, small = _worth(run)
+    yield "The flips were worth", worth, small
     yield "Cross-run flips", count(summary.get("cross_flips")), "of pairs in one run only"
+
+
+def _worth(run: ForkFolder) -> tuple[str, str]:
+    """How much later the runs would have split without the flips, in nats; and what that is."""
+    what = "nats: growth rate × steps gained"
+    nats = run.summary.get("nats")
+    if nats is None and run.word == "cause":
+        # no split in sight: the share is at least what was followed
+        known = (share for share in run.summary.get("shares") or () if share["what"] == "decisions")
+        least = next((share["nats"] for share in known if share["reference"] == "A"), None)
+        return ("∞", what) if least is None else (f"> {number(least, 3)}", what)
+    return number(nats, 3), what if nats is not None else "not known"
 
 
 def _changes(changes: Mapping[str, Any]) -> list[tuple[str, str]]:

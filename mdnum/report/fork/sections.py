@@ -83,19 +83,19 @@ def runs(run: ForkFolder) -> Iterator[dict[str, str]]:
 def _cell(cell: Mapping[str, Any]) -> str:
     if cell["same"]:
         return f"is {cell['from']}"
-    return f"not by {count(cell['until'])}" if cell["split"] is None else count(cell["split"])
+    return f"> {count(cell['until'])}" if cell["split"] is None else count(cell["split"])
 
 
-def shares(run: ForkFolder) -> list[dict[str, str]]:
-    """What decisions and arithmetic contributed: a row each, seen from A and from B."""
-    rows: dict[str, dict[str, str]] = {}
+def shares(run: ForkFolder) -> list[dict[str, Any]]:
+    """What decisions and arithmetic contributed: a row each, lines of text as seen from A and from B."""
+    rows: dict[str, dict[str, list[str]]] = {}
     for share in run.summary.get("shares") or ():
         more = "> " if share["at_least"] else ""
-        text = f"{more}{many(share['steps'], 'step') if share['steps'] else '0 steps'}"
+        lines = [f"{more}{count(share['steps'])} {'step' if abs(share['steps']) == 1 else 'steps'}"]
         if share["nats"] is not None:
-            text += f", {more}{number(share['nats'], 3)} nats"
-        rows.setdefault(share["what"], {})[share["reference"]] = text
-    return [{"what": what, **{name: texts.get(name, "–") for name in "AB"}} for what, texts in rows.items()]
+            lines.append(f"{more}{number(share['nats'], 3)} nats")
+        rows.setdefault(share["what"], {})[share["reference"]] = lines
+    return [{"what": what, **{name: texts.get(name, ["–"]) for name in "AB"}} for what, texts in rows.items()]
 
 
 def certain(run: ForkFolder) -> Iterator[tuple[str, str]]:
