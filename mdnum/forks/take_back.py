@@ -13,7 +13,7 @@ from jaxtyping import Float
 from mdnum.errors import InputError
 from mdnum.events.forks import split_of
 from mdnum.forks.pair import Fork
-from mdnum.md.cell import HostCell
+from mdnum.rollout.compared import Apart
 from mdnum.rollout.engine import Engine, Segment, Start
 from mdnum.rollout.flips import PairRecorder, decided_pairs
 from mdnum.rollout.lockstep import apart
@@ -139,7 +139,7 @@ def pinned(
     told = decided(twin.a, keys, last_step, twin.start_a)
     a = Track(twin.a, last_step, twin.start_a, flips=False)
     b = Track(twin.b, last_step, twin.start_b, flips=False, pins=told.pins(keys, *window))
-    cell = HostCell(twin.a.cell)
+    cell = Apart(twin.a.cell)
     parts = []
     while a.segment() is not None:
         end = a.ready

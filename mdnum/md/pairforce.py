@@ -135,9 +135,10 @@ class PairForce(eqx.Module):
             if decisions:
                 bits, nearest = judge.tally(nearest, quantity, inside, threshold)
             if told is not None:
-                inside = (
-                    unpacked(told) if pinned is None else jnp.where(unpacked(pinned), unpacked(told), inside)
-                )
+                # a mask that depends on its own as well: one that is only unpacked lets the compiler work out
+                # distances twice and not vectorize, and the step takes twice the time
+                asked = inside ^ unpacked(told)
+                inside = inside ^ (asked if pinned is None else asked & unpacked(pinned))
             d = d if same else displacements(components, cell, j)
             if same and self.decider.space == "r2":
                 r2 = quantity

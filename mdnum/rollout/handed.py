@@ -15,10 +15,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
 from mdnum.errors import InputError
-from mdnum.md.cell import HostCell
+from mdnum.md.potentials import pair_type
 from mdnum.md.verlet import PairTable
+from mdnum.rollout.compared import Apart, in_user_order
 from mdnum.rollout.engine import Engine, Segment, Start
-from mdnum.rollout.epoch import State, empty_record, run_epoch
+from mdnum.rollout.epoch import Record, State, empty_record, run_epoch
 from mdnum.rollout.frame import Frame
 from mdnum.rollout.tracks import Rows, joined
 from mdnum.systems.build import Simulation
@@ -74,14 +75,15 @@ class Handed:
         self.simulation = simulation
         self._engine = Engine(simulation, 0, start=start)
         self.state: State = self._engine.start.state
-        rule, led = simulation.rule, leader.rule
         # with the same kind of list the leader's own lists serve, and its rebuilds with them
         self.frame = frame or Frame.same(simulation.atoms)
-        self._shares = self.frame.is_same and (rule, simulation.builder) == (led, leader.builder)
+        self._shares = self.frame.is_same and simulation.lists == leader.lists
         self._flat = self._program(shared=self._shares)
         self._own: tuple[PairTable, Any, int] | None = None
         self._led: PairTable | None = None
-        self._cell = HostCell(simulation.cell)
+        self._apart = Apart(simulation.cell)
+        self._r_cut = _by_species(simulation)
+        self._record: Record | None = None
         self.failed = ""
 
     def follow(self, segment: Segment) -> tuple[Rows, Overridden]:
@@ -104,11 +106,15 @@ class Handed:
             told = jnp.roll(told, -row, axis=0)
         if self._shares:
             table, reference, built = segment.table, segment.reference, segment.built
-            tables = simulation.tables(table)
+            if self._led is not table:
+                self._led, self._tables = table, simulation.tables(table)
+            tables = self._tables
         else:
             table, reference, built, tables, place = self._list(segment)
             told = _mapped(told, place)
-        record = empty_record(told.shape[0], told.shape[1], simulation.atoms, dtype, True)
+        held, self._record = self._record, None
+        if held is None or held.bits.shape != told.shape:
+            held = empty_record(told.shape[0], told.shape[1], simulation.atoms, dtype, True)
         leaves, structure = self._flat
         outcome, record = run_epoch(
             leaves,
@@ -119,7 +125,7 @@ class Handed:
             jnp.asarray(built, jnp.int64),
             jnp.asarray(segment.last, jnp.int64),
             jnp.asarray(False),
-            record,
+            held,
             told,
         )
         count, due, finite, runaway = np.asarray(outcome.flags).tolist()
@@ -128,10 +134,21 @@ class Handed:
         if due and not self._shares:
             self._own = None
         first = segment.first + row
-        order = np.argsort(table.order)
-        x, v = (np.asarray(getattr(record, name))[:count].astype(np.float64)[:, :, order] for name in "xv")
+        x, v = (np.asarray(getattr(record, name))[:count] for name in "xv")
         energy = (np.asarray(record.potential) + np.asarray(record.kinetic))[:count]
-        note = self._overridden(table, np.asarray(told)[:count], record, count)
+        note = Overridden(
+            *self._apart.overridden(
+                np.asarray(record.bits)[:count],
+                np.asarray(told)[:count],
+                table,
+                x,
+                simulation.species,
+                self._r_cut,
+            )
+        )
+        # copies: the record is filled anew by the next stretch
+        x, v = (in_user_order(part, table.order) for part in (x, v))
+        self._record = record
         return Rows(first, self.frame.positions(x), self.frame.vectors(v), energy, self.failed), note
 
     def _program(self, *, shared: bool) -> tuple[tuple[Array, ...], Any]:
@@ -157,28 +174,15 @@ class Handed:
             self._tables = simulation.tables(table)
         return table, reference, built, self._tables, self._place
 
-    def _overridden(self, table: PairTable, told, record, count: int) -> Overridden:
-        """How many own decisions differ from those told, and how far the furthest is from the cutoff."""
-        own = np.asarray(record.bits)[:count]
-        differ = own ^ told
-        rows = np.flatnonzero(differ.any(axis=(1, 2)))
-        counts, furthest = np.zeros(count, np.int64), np.zeros(count)
-        atoms = self.simulation.atoms
-        r_cut = np.array(self.simulation.decider.r_cut)
-        for row in rows:
-            bits = np.unpackbits(differ[row], axis=0, bitorder="little")
-            # words and columns: bit k of word w is slot 8 w + k
-            slot, column = np.nonzero(bits.reshape(-1, atoms))
-            i, j = table.order[column], table.order[table.index[slot, column]]
-            keep = i < j
-            place = np.argsort(table.order)
-            x = np.asarray(record.x)[row].astype(np.float64)[:, place].T
-            d = self._cell.displacement(x[i[keep]], x[j[keep]])
-            distance = np.sqrt(sum(c * c for c in d))
-            counts[row] = keep.sum()
-            kinds = self.simulation.type_of(i[keep], j[keep])
-            furthest[row] = np.max(np.abs(distance - r_cut[kinds]), initial=0.0)
-        return Overridden(counts, furthest)
+
+def _by_species(simulation: Simulation) -> Float[np.ndarray, "species species"]:
+    """The cutoff of each pair of species, length."""
+    radii = np.array(simulation.decider.r_cut)
+    count = len(simulation.system.species)
+    if len(radii) == 1:
+        return np.full((count, count), radii[0])
+    first, second = np.indices((count, count))
+    return radii[pair_type(first, second, count)]
 
 
 def _places(

@@ -13,36 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from mdnum.md.cell import HostCell
+from mdnum.rollout.compared import Apart, differ
+from mdnum.rollout.crossing import CrossFlip, Crossing
 from mdnum.rollout.engine import Segment, Start
 from mdnum.rollout.flips import Ambiguous
 from mdnum.rollout.frame import Frame
 from mdnum.rollout.handed import Handed, Overridden
-from mdnum.rollout.tracks import Flip, Rows, Track, joined
+from mdnum.rollout.tracks import Rows, Track, joined
 from mdnum.systems.build import Simulation
-
-
-@dataclass(frozen=True)
-class CrossFlip:
-    """A pair that the two runs decide differently from this step on, or no longer.
-
-    Attributes:
-        step: of the flip.
-        i, j: the pair, labels of the first run, i < j.
-        differs: whether the decisions differ now.
-        run: which run flipped at this step: "A" or "B".
-        entered: whether the pair entered its cutoff there.
-        margin, bound: of that run's decision, in the quantity's space.
-    """
-
-    step: int
-    i: int
-    j: int
-    differs: bool
-    run: str
-    entered: bool
-    margin: float
-    bound: float
 
 
 @dataclass(frozen=True)
@@ -71,7 +49,7 @@ class Stretch:
     bits: np.ndarray
     energy: dict[str, Float[np.ndarray, "rows"]]
     cross: Int[np.ndarray, "rows"]
-    flips: tuple[CrossFlip, ...]
+    flips: Sequence[CrossFlip]
     overridden: dict[str, Float[np.ndarray, "rows"]]
     furthest: dict[str, Float[np.ndarray, "rows"]]
     nearest: dict[str, Float[np.ndarray, "rows"]]
@@ -120,19 +98,19 @@ def lockstep(
     leader = Track(a, last, start_a, listener=forward)
     follower = Track(b, last, start_b, frame, listener=backward)
     others = {f"B {k + 1}": Track(b, last, start, frame, flips=False) for k, start in enumerate(repeats)}
-    cell_a = HostCell(a.cell)
-    differing: set[int] | None = None
+    cell_a = Apart(a.cell)
+    crossing: Crossing | None = None
     while leader.segment() is not None:
         end = leader.ready
         rows_a, flips_a = leader.until(end)
         rows_b, flips_b = follower.until(end)
         assert rows_a is not None
-        opening = []
-        if differing is None:
+        opening: list[CrossFlip] = []
+        if crossing is None:
             assert leader.first_pairs is not None and follower.first_pairs is not None
-            differing = set(np.setxor1d(leader.first_pairs, follower.first_pairs).tolist())
-            opening = [_opening(key, a.atoms) for key in sorted(differing)]
-        cross, flips = _cross(differing, rows_a, flips_a, flips_b, a.atoms)
+            crossing = Crossing(leader.first_pairs, follower.first_pairs, a.atoms)
+            opening = crossing.opening()
+        cross, flips = crossing.take(rows_a.first, len(rows_a), flips_a, flips_b)
         separation = {"B": apart(cell_a, rows_a, rows_b)}
         energy = {"A": rows_a.energy, "B": _energy(rows_a, rows_b)}
         failed = {"A": leader.failed, "B": follower.failed}
@@ -170,7 +148,7 @@ def lockstep(
             _bits_differ(rows_a, rows_b),
             energy,
             cross,
-            tuple(opening + flips),
+            [*opening, *flips] if opening else flips,
             overridden,
             furthest,
             nearest,
@@ -239,65 +217,20 @@ def _in_frame(rows: Rows, frame: Frame) -> Rows:
     return Rows(rows.first, frame.positions(rows.x), frame.vectors(rows.v), rows.energy, rows.failed)
 
 
-def _opening(key: int, atoms: int) -> CrossFlip:
-    i, j = divmod(key, atoms)
-    return CrossFlip(0, i, j, True, "B", False, np.nan, np.nan)
-
-
-def _cross(
-    differing: set[int], rows: Rows, flips_a: list[Flip], flips_b: list[Flip], atoms: int
-) -> tuple[np.ndarray, list[CrossFlip]]:
-    """Pairs that differ at each step, and how that came about; updates the set of those that differ."""
-    every = sorted(
-        [(flip.step, flip.key, "A", flip) for flip in flips_a]
-        + [(flip.step, flip.key, "B", flip) for flip in flips_b],
-        key=lambda row: row[:3],
-    )
-    counts = np.full(len(rows), -1, np.int64)
-    before = len(differing)
-    out: list[CrossFlip] = []
-    at = 0
-    while at < len(every):
-        step, key, name, flip = every[at]
-        together = at + 1 < len(every) and every[at + 1][:2] == (step, key)
-        # both runs flipped the pair at one step: what differed still does, and what did not does not
-        if together:
-            at += 2
-            continue
-        differing ^= {key}
-        i, j = divmod(key, atoms)
-        out.append(CrossFlip(step, i, j, key in differing, name, flip.entered, flip.margin, flip.bound))
-        if step >= rows.first:
-            counts[step - rows.first] = len(differing)
-        at += 1
-    last = before
-    for row in range(len(rows)):
-        last = counts[row] if counts[row] >= 0 else last
-        counts[row] = last
-    return counts, out
-
-
-def apart(cell: HostCell, a: Rows | None, b: Rows | None) -> Float[np.ndarray, "rows"]:
+def apart(cell: Apart, a: Rows | None, b: Rows | None) -> Float[np.ndarray, "rows"]:
     """Largest distance between the same atoms of two runs at each step; NaN where the second has ended."""
     out = np.full(0 if a is None else len(a), np.nan)
-    if a is None or b is None:
-        return out
-    count = min(len(a), len(b))
-    shape = (count * a.x.shape[2], 3)
-    start, end = (rows.x[:count].transpose(0, 2, 1).reshape(shape) for rows in (a, b))
-    dx, dy, dz = cell.displacement(start, end)
-    squares = (dx * dx + dy * dy + dz * dz).reshape(count, -1)
-    out[:count] = np.sqrt(squares.max(axis=1))
+    if a is not None and b is not None:
+        count = min(len(a), len(b))
+        out[:count] = cell(a.x[:count], b.x[:count])
     return out
 
 
 def _bits_differ(a: Rows, b: Rows | None) -> np.ndarray:
     out = np.ones(len(a), bool)
-    if b is None:
-        return out
-    count = min(len(a), len(b))
-    same = (a.x[:count] == b.x[:count]) & (a.v[:count] == b.v[:count])
-    out[:count] = ~same.all(axis=(1, 2))
+    if b is not None:
+        count = min(len(a), len(b))
+        out[:count] = differ(a.v[:count], b.v[:count], differ(a.x[:count], b.x[:count]))
     return out
 
 

@@ -6,9 +6,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from mdnum.events import Ledger
+from mdnum.rollout.compared import in_user_order
+from mdnum.rollout.crossing import Flips
 from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, first_state
 from mdnum.rollout.flips import Ambiguous, PairRecorder, decided_pairs
 from mdnum.rollout.frame import Frame
@@ -63,17 +65,6 @@ def joined(parts: list[Rows]) -> Rows:
     )
 
 
-@dataclass(frozen=True)
-class Flip:
-    """A pair whose decision changed in one run: what a comparison needs to know of it."""
-
-    step: int
-    key: int
-    entered: bool
-    margin: float
-    bound: float
-
-
 class Track:
     """One run, read forward.
 
@@ -106,7 +97,7 @@ class Track:
         self._recorder = PairRecorder(simulation) if flips else None
         self._listener = listener
         self._ahead: list[Rows] = []
-        self._flips: list[Ledger] = []
+        self._flips: list[Flips] = []
         self._doubts: list[Ambiguous] = []
         self.first_pairs: Int[np.ndarray, "pairs"] | None = None
         self.failed = ""
@@ -121,7 +112,7 @@ class Track:
         if self._recorder is not None:
             if self.first_pairs is None:
                 self.first_pairs = self.frame.keys(decided_pairs(self.simulation, segment, 0))
-            self._flips.append(self._recorder.flips(segment))
+            self._flips.append(_flips_of(self._recorder.flips(segment), self.frame))
             self._doubts.append(self._recorder.doubtful(segment))
         failed = segment.closes if segment.closes in FAILURES else ""
         self.failed = failed or ""
@@ -133,7 +124,7 @@ class Track:
         """The last step that has been read."""
         return self._ahead[-1].first + len(self._ahead[-1]) - 1
 
-    def until(self, last: int) -> tuple[Rows | None, list[Flip]]:
+    def until(self, last: int) -> tuple[Rows | None, Flips]:
         """The rows not yet handed out up to a step, and the flips among them; fewer where the run ends."""
         while not self._ahead or self._ahead[-1].first + len(self._ahead[-1]) - 1 < last:
             if self.segment() is None:
@@ -145,15 +136,9 @@ class Track:
                 rows, rest = rows.cut(last - rows.first + 1)
                 self._ahead.insert(0, rest)
             taken.append(rows)
-        flips: list[Flip] = []
-        kept: list[Ledger] = []
-        for ledger in self._flips:
-            chosen = ledger.step <= last
-            flips += self._plain(ledger, chosen)
-            if not chosen.all():
-                kept.append(_part(ledger, ~chosen))
-        self._flips = kept
-        return (joined(taken) if taken else None), flips
+        every = Flips.joined(self._flips)
+        self._flips = [every.where(every.step > last)]
+        return (joined(taken) if taken else None), every.where(every.step <= last)
 
     def doubts(self, last: int) -> Ambiguous:
         """The ambiguous decisions up to a step that were not yet asked for, in the first run's labels."""
@@ -163,37 +148,16 @@ class Track:
         i, j = np.divmod(self.frame.keys_of(taken.i, taken.j), self.simulation.atoms)
         return taken._replace(i=i, j=j)
 
-    def _plain(self, ledger: Ledger, chosen: Bool[np.ndarray, "flips"]) -> list[Flip]:
-        keys = self.frame.keys_of(ledger.subject[chosen, 0], ledger.subject[chosen, 1])
-        return [
-            Flip(*row)
-            for row in zip(
-                ledger.step[chosen].tolist(),
-                keys.tolist(),
-                ledger.entered[chosen].tolist(),
-                ledger.margin[chosen].tolist(),
-                ledger.bound[chosen].tolist(),
-                strict=True,
-            )
-        ]
 
-
-def _part(ledger: Ledger, chosen: Bool[np.ndarray, "flips"]) -> Ledger:
-    return Ledger(
-        ledger.channel,
-        ledger.step[chosen],
-        ledger.subject[chosen],
-        ledger.entered[chosen],
-        ledger.margin[chosen],
-        ledger.bound[chosen],
-        ledger.jump[chosen],
-    )
+def _flips_of(ledger: Ledger, frame: Frame) -> Flips:
+    """The columns that a comparison needs, in the labels of the first run."""
+    keys = frame.keys_of(ledger.subject[:, 0], ledger.subject[:, 1])
+    return Flips(ledger.step, keys, ledger.entered, ledger.margin, ledger.bound)
 
 
 def rows_of(segment: Segment, frame: Frame, failed: str) -> Rows:
     """A segment's rows in the user's order of atoms."""
-    place = np.argsort(segment.table.order)
-    x, v = (segment.rows_of(name).astype(np.float64)[:, :, place] for name in ("x", "v"))
+    x, v = (in_user_order(segment.rows_of(name), segment.table.order) for name in ("x", "v"))
     energy = segment.rows_of("potential") + segment.rows_of("kinetic")
     nearest = segment.rows_of("nearest").astype(np.float64)
     return Rows(segment.first, frame.positions(x), frame.vectors(v), energy, failed, nearest)
