@@ -109,9 +109,14 @@ class RunFolder:
             raise FolderError("no such folder", remedy="Give the folder of a run", where=str(path))
         if not any((folder.path / name).exists() for name in (*_FILES, "parts")):
             raise FolderError("holds no run", remedy="Give the folder of a run", where=str(path))
-        for world, tables in TABLES.items():
-            if any((folder.path / f"{name}.parquet").exists() for name in tables):
-                folder.world = world
+
+        def share(world: str) -> float:
+            there = [(folder.path / f"{name}.parquet").exists() for name in TABLES[world]]
+            return sum(there) / len(there)
+
+        # some tables are those of two worlds, and a folder from before has not all that there are now
+        likeliest = max(TABLES, key=share)
+        folder.world = likeliest if share(likeliest) > 0 else folder.world
         return folder
 
     # -- writing ---------------------------------------------------------------------------------

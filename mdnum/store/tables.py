@@ -108,7 +108,6 @@ TABLES: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         "md": ("series", "flips", "epochs"),
         "ball": ("steps", "contacts", "solver", "heights", "separations"),
-        # before "fork", as which a finished one is opened: they have their tables in common
         "ball-fork": ("separation", "cross_flips", "around"),
         "fork": ("separation", "cross_flips", "ambiguous_pairs", "neighborhood"),
         "along": ("boundaries", "intervals", "points"),
