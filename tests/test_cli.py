@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from command_line import call
 
 import mdnum.workflow
 from mdnum.cli import main, output
@@ -65,14 +66,6 @@ def rollout(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Recorder:
     monkeypatch.setattr(mdnum.workflow, "run", recorder)
     monkeypatch.chdir(tmp_path)
     return recorder
-
-
-def call(*arguments: str) -> int:
-    """The exit code of `mdnum ARGUMENTS`."""
-    with pytest.raises(SystemExit) as stopped:
-        main(list(arguments))
-    assert isinstance(stopped.value.code, int)
-    return stopped.value.code
 
 
 def test_run_passes_on_what_was_asked(rollout: Recorder):

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from command_line import call
 
 import mdnum.workflow
 from mdnum.ball import demos
 from mdnum.ball.demos import Check, Demo, Table
-from mdnum.cli import main
 from mdnum.cli.progress import ProgressBar
 from mdnum.errors import InputError
 
@@ -74,14 +74,6 @@ def bounce(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Recorder:
     monkeypatch.setattr(mdnum.workflow, "bounce", recorder)
     monkeypatch.chdir(tmp_path)
     return recorder
-
-
-def call(*arguments: str) -> int:
-    """The exit code of `mdnum ARGUMENTS`."""
-    with pytest.raises(SystemExit) as stopped:
-        main(list(arguments))
-    assert isinstance(stopped.value.code, int)
-    return stopped.value.code
 
 
 def test_ball_passes_on_what_was_asked(bounce: Recorder):

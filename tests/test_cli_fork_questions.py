@@ -7,19 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import call
 
-from mdnum.cli import main
 from mdnum.cli.fork_map import interval
 from mdnum.errors import InputError
 from mdnum.rollout.run import run
 from mdnum.store import RunFolder
-
-
-def call(*arguments: str) -> int:
-    with pytest.raises(SystemExit) as stopped:
-        main(list(arguments))
-    assert isinstance(stopped.value.code, int)
-    return stopped.value.code
 
 
 def test_an_interval_is_a_key_and_two_numbers():

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import typer
 
-from mdnum.cli import fork_ahead, fork_map, fork_processes, fork_questions, output
+from mdnum.cli import fork_ahead, fork_ball, fork_map, fork_processes, fork_questions, output
 from mdnum.cli.fork_print import print_fork
 from mdnum.cli.progress import ProgressBar
 from mdnum.errors import InputError
@@ -89,6 +89,17 @@ def fork(
     if sum(asked.values()) > 1:
         given = " and ".join(name for name, is_asked in asked.items() if is_asked)
         raise InputError(f"{given} are different questions", remedy="Ask one at a time")
+    if system is not None and other is None and fork_ball.is_ball(system):
+        foreign = {
+            "--along": along is not None, "--most": most is not None, "--processes": processes,
+            "--forecast": forecast is not None, "--benign": benign, "--minimal": minimal,
+            "--pin": pin is not None, "--no-back": no_back, "--no-lyapunov": no_lyapunov,
+        }  # fmt: skip
+        return fork_ball.fork(
+            system, vary, foreign=foreign, certify=certify, steps=steps, split=split, repeats=repeats,
+            counterfactual=not no_counterfactual, out=out, overrides=overrides, report=not no_report,
+            as_json=as_json,
+        )  # fmt: skip
     for name, is_asked in (("--benign", benign), ("--minimal", minimal), ("--pin", pin is not None)):
         if is_asked and vary is None:
             raise InputError(f"{name} needs a choice", remedy="Add --vary CHOICE")
@@ -151,15 +162,23 @@ def fork(
 
 def _choices(as_json: bool) -> int:
     """What can be varied, for somebody who did not say."""
+    from mdnum.forks.bounce import choices as of_a_ball
     from mdnum.forks.choices import BY_NAME
 
-    rows = [
-        {"name": name, "about": choice.about, "must_hold": choice.must_hold}
-        for name, choice in BY_NAME.items()
-    ]
+    worlds = {"choices": ("", BY_NAME), "ball_choices": (" of a ball", of_a_ball.BY_NAME)}
+    rows = {
+        key: [
+            {"name": name, "about": choice.about, "must_hold": choice.must_hold}
+            for name, choice in known.items()
+        ]
+        for key, (_, known) in worlds.items()
+    }
     if as_json:
-        output.print_json({"choices": rows})
-    else:
-        lines = [(row["name"], "must hold" if row["must_hold"] else "", row["about"]) for row in rows]
-        output.print_table("choices: `mdnum fork SYSTEM --vary CHOICE`", ("choice", "", "about"), lines)
+        output.print_json(rows)
+        return output.EXIT_FINE
+    for key, (whose, _) in worlds.items():
+        lines = [(row["name"], "must hold" if row["must_hold"] else "", row["about"]) for row in rows[key]]
+        output.print_table(
+            f"choices{whose}: `mdnum fork SYSTEM --vary CHOICE`", ("choice", "", "about"), lines
+        )
     return output.EXIT_FINE

@@ -13,7 +13,8 @@ from mdnum.store import RunFolder
 from mdnum.store.naming import default_folder
 
 if TYPE_CHECKING:
-    from mdnum.forks import Fork
+    from mdnum.forks import BallFork, Fork
+    from mdnum.systems import BallSystem
     from mdnum.systems.load import System
 
 Progress = Callable[[int, int, dict[str, Any]], None]
@@ -34,7 +35,7 @@ class ForkResult:
     """
 
     folder: Path
-    fork: Fork | None
+    fork: Fork | BallFork | None
     summary: dict[str, Any]
 
 
@@ -48,7 +49,7 @@ class Asked:
 
 
 def fork(
-    system: System | str | Path,
+    system: System | BallSystem | str | Path,
     vary: str | None = None,
     *,
     steps: int | None = None,
@@ -67,7 +68,8 @@ def fork(
     """Run a system and its twin that differs in one choice, and say where, why and whether they part.
 
     Args:
-        system: a loaded system, a shipped name or the path of a system file.
+        system: a loaded system, a shipped name or the path of a system file; of molecular dynamics or a
+            ball. A ball has choices of its own, and of the options those that are said to be of any system.
         vary: the choice, such as "precision" or "reduction=exact"; "all" screens every choice. Default what
             the [fork] table of the system file says, as for steps and split.
         steps: last step; default the system's own.
@@ -89,7 +91,18 @@ def fork(
         InputError: the system cannot be run, or the choice is unknown or does not apply to it.
         FolderError: the folder cannot be used.
     """
-    system = _loaded(system, overrides)
+    from mdnum.systems import BallSystem
+
+    loaded = _loaded(system, overrides)
+    if isinstance(loaded, BallSystem):
+        _check(steps, split, repeats)
+        from mdnum.workflow.fork_ball import fork_ball
+
+        return fork_ball(
+            loaded, vary, steps=steps, split=split, repeats=repeats, counterfactual=counterfactual, out=out,
+            report=report, progress=progress,
+        )  # fmt: skip
+    system = loaded
     vary, steps, split = _as_in_file(system, vary, steps, split)
     _check(steps, split, repeats)
     if pin is not None:
@@ -191,14 +204,13 @@ def say(progress: Progress | None, step: int, phase: str) -> None:
         progress(step, 0, {"phase": phase})
 
 
-def _loaded(system: System | str | Path, overrides: Mapping[str, Any] | None) -> System:
+def _loaded(
+    system: System | BallSystem | str | Path, overrides: Mapping[str, Any] | None
+) -> System | BallSystem:
+    """A system of either world."""
     from mdnum.systems import BallSystem, System, load
 
-    if isinstance(system, BallSystem):
-        raise InputError(
-            "this system is a ball", where=system.name, remedy="Compare variants of it with mdnum.bounce"
-        )
-    if isinstance(system, System):
+    if isinstance(system, System | BallSystem):
         if overrides:
             raise InputError(
                 "overrides change a system while it is loaded",
@@ -206,7 +218,7 @@ def _loaded(system: System | str | Path, overrides: Mapping[str, Any] | None) ->
                 where=system.name,
             )
         return system
-    return load(system, overrides, world="md")
+    return load(system, overrides)
 
 
 def _as_in_file(

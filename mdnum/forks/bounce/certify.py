@@ -15,7 +15,10 @@ from mdnum.systems.ball_system import BallSystem
 
 #: What is ranked: every role in one format, or one role alone in float32.
 POLICIES: Mapping[str, Mapping[str, str]] = {
-    **{name: dict.fromkeys(("state", "arithmetic", "decision", "accumulate"), name) for name in DTYPES},
+    **{
+        name: dict.fromkeys(("state", "arithmetic", "decision", "accumulate"), name)
+        for name in sorted(DTYPES, key=lambda name: -DTYPES[name].itemsize)
+    },
     **{f"{role} in float32": {role: "float32"} for role in ("state", "arithmetic", "decision", "accumulate")},
 }
 
@@ -63,7 +66,7 @@ class BallCertificate:
 def certify(
     system: BallSystem,
     steps: int | None = None,
-    policies: Mapping[str, Mapping[str, str]] = POLICIES,
+    policies: Mapping[str, Mapping[str, str]] | None = None,
     progress: Callable[[int, int, dict[str, Any]], None] | None = None,
 ) -> BallCertificate:
     """Date when a system's runs leave the exact history of the program in double precision.
@@ -74,12 +77,13 @@ def certify(
     Args:
         system: as loaded; its own precision is not used.
         steps: to make; default the system's own.
-        policies: formats by role, by the name of the precision.
+        policies: formats by role, by the name of the precision; default all that ship.
         progress: called with runs done, how many, and the phase.
 
     Raises:
         InputError: a program whose steps are not sums and products.
     """
+    policies = POLICIES if policies is None else policies
     system = system if steps is None else system.for_steps(steps)
     wide = {f"precision.{role}": "float64" for role in ("state", "arithmetic", "decision", "accumulate")}
     exact = program(varied(system, {**wide, "precision.rounding": "nearest"}, "float64"))

@@ -8,6 +8,7 @@ from functools import partial
 from typing import Literal
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from mdnum.ball.demos.base import Plot, Series
 from mdnum.report import plots
@@ -41,7 +42,12 @@ def drawn(
         ("energy", energy(run)),
     ):
         if made is not None:
-            yield name, made.title, partial(plots.draw, made), plots.notes(made)
+            span = None if name == "around" else (0.0, float(run.steps))
+            yield name, made.title, partial(_draw, made, span), plots.notes(made)
+
+
+def _draw(plot: Plot, span: tuple[float, float] | None, width: float) -> Figure:
+    return plots.draw(plot, width, span)
 
 
 def near(run: ForkFolder, around: dict[str, np.ndarray]) -> Plot | None:

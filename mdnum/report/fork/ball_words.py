@@ -35,6 +35,11 @@ def headline(run: ForkFolder) -> str:
         names = listed([f"{name} ended in a {word}" for name, word in summary["failed"].items()])
         at = f"they fork at step {count(dates['fork'])}" if made else "no decision differs before"
         return f"Run {names} after step {count(run.steps)}; {at}."
+    if run.word == "same" and made is not None:
+        return (
+            f"No bit of a height or a velocity differs in {steps}, though the {_what_forks(made)} does at "
+            f"step {count(made['step'])}."
+        )
     if run.word == "same":
         return f"The same trajectory: no bit differs in {steps}."
     if made is None:

@@ -10,7 +10,7 @@ from mdnum.errors import InputError
 from mdnum.forks.bounce.choices.arithmetic import ROLES, RULES, Precision, Stopping, Summation
 from mdnum.forks.bounce.choices.base import Choice, whole
 from mdnum.forks.bounce.choices.decisions import ContactStep, Inverted, Iterations
-from mdnum.forks.bounce.choices.inputs import Cap, StartUlp, Ulps
+from mdnum.forks.bounce.choices.inputs import OFTEN, Cap, StartUlp, Ulps
 from mdnum.forks.bounce.choices.order import BOTH, BatchOrder
 from mdnum.precision import reductions
 
@@ -24,22 +24,7 @@ _SHIPPED: tuple[Choice, ...] = (
     *(Stopping(rule) for rule in RULES),
     BatchOrder(),
     *(BatchOrder(both=word) for word in BOTH),
-    *(
-        Ulps(key)
-        for key in (
-            "contact.k",
-            "contact.damping",
-            "contact.eps",
-            "contact.alpha",
-            "contact.restitution",
-            "contact.rest_speed",
-            "contact.hysteresis",
-            "stop.tol",
-            "stop.enter",
-            "integrator.timestep",
-            "flight.gravity",
-        )
-    ),
+    *(Ulps(key) for key in OFTEN),
     StartUlp(),
     StartUlp(what="velocity"),
     Cap(),

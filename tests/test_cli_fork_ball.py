@@ -1,0 +1,98 @@
+"""`mdnum fork` of a ball from the command line."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from command_line import call, printed
+
+from mdnum.forks.bounce import certify, choices
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            ("--along", "contact.k=1:2"),
+            "--along is a question for molecular dynamics, and ball/drop is a ball",
+        ),
+        (("--vary", "precision", "--benign"), "--benign is a question for molecular dynamics"),
+        (("--forecast", "1e-6"), "the margin that `mdnum ball` records"),
+        (("--processes",), "demo determinism"),
+        (("--vary", "start", "--minimal"), "contact=STEP:BALL"),
+        (("--vary", "start", "--no-back"), "--no-counterfactual"),
+        (("--vary", "skin"), "no choice 'skin' of a ball"),
+        (("--vary", "reduction=exact"), "its steps solve nothing"),
+        (("--vary", "start", "--steps", "0"), "--steps"),
+        (("--vary", "start", "--split", "-1"), "split = -1"),
+        (("--vary", "start", "--certify"), "different questions"),
+        ((), "nothing to vary"),
+    ],
+)
+def test_what_cannot_be_asked_of_a_ball_is_refused_in_one_line(
+    arguments, message, capsys, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    assert call("fork", "ball/drop", *arguments) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_unknown_choice_names_those_of_a_ball_and_no_others(capsys):
+    assert call("fork", "ball/drop", "--vary", "rebuild", "--json") == 2
+    error = json.loads(capsys.readouterr().out)["error"]
+    assert all(name in error["remedy"] for name in choices.names())
+    assert "builder" not in error["remedy"]
+
+
+def test_a_fork_of_a_ball_is_printed_and_told_as_json(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    asked = ("fork", "ball/stiff", "--vary", "contact=earlier", "--steps", "300", "--repeats", "1", "-o")
+    assert call(*asked, "here", "--no-report") == 0
+    lines = printed(capsys)
+    assert lines[0].startswith("The ")
+    at = next(line for line in lines if line.startswith("fork step"))
+    assert "first decision differs" in at
+    assert any(line.startswith("decision contact in B only, ball 0") for line in lines)
+    assert any(line.startswith("margin in A -") and "not ambiguous" in line for line in lines)
+    assert "A its own is A" in " ".join(lines)
+    assert lines[-1] == "wrote here"
+    assert call(*asked, "there", "--no-report", "--json") == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["folder"] == "there" and document["decision"]["decided"] == {"A": 0, "B": 1}
+    assert f"step {document['fork']:,}," in at
+
+
+def test_the_exact_history_of_a_ball(capsys, monkeypatch):
+    asked = ("float64", "bfloat16", "decision in float32")
+    monkeypatch.setattr(certify, "POLICIES", {name: certify.POLICIES[name] for name in asked})
+    small = (
+        "--set",
+        "contact.k=512",
+        "--set",
+        "integrator.timestep=0.015625",
+        "--set",
+        "start.height=0.40625",
+    )
+    gravity = ("--set", "flight.gravity=9.75")
+    assert call("fork", "ball/drop", "--certify", "--steps", "80", *small, *gravity, "--json") == 0
+    document = json.loads(capsys.readouterr().out)
+    found = {row["policy"]: row["horizon"] for row in document["ranking"]}
+    # sixteen bits leave where plain rationals say that they do
+    assert found["bfloat16"] == 66 and found["float64"] is None and found["decision in float32"] is None
+    assert [row["policy"] for row in document["ranking"]] == ["float64", "decision in float32", "bfloat16"]
+    assert any("Leave the exact history: bfloat16 at step 66" in said for said in document["says"])
+    assert call("fork", "ball/zeno", "--certify") == 2
+    assert "more than sums and products" in capsys.readouterr().err
+
+
+def test_choices_of_both_worlds_are_listed(capsys):
+    assert call("fork", "--json") == 0
+    document = json.loads(capsys.readouterr().out)
+    assert [one["name"] for one in document["ball_choices"]] == choices.names()
+    assert {one["name"] for one in document["ball_choices"] if one["must_hold"]} == {
+        "order@exact",
+        "order@alone",
+    }
