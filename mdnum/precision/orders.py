@@ -129,12 +129,12 @@ def _adder(zero: jax.Array | None) -> Add:
     return jnp.add if zero is None else lambda a, b: fence(a + b, zero)
 
 
-def in_order(terms, add):
-    """((0 + t0) + t1) + ..., a scan: XLA does not reorder it. Unrolled, since a step of a loop costs more
-    than an addition."""
+def in_order(terms, add, start=None):
+    """((0 + t0) + t1) + ..., or from another start: a scan, which XLA does not reorder. Unrolled, since a
+    step of a loop costs more than an addition."""
     total, _ = lax.scan(
         lambda total, term: (add(total, term), None),
-        jnp.zeros(terms.shape[1:], terms.dtype),
+        jnp.zeros(terms.shape[1:], terms.dtype) if start is None else start,
         terms,
         unroll=min(16, terms.shape[0]),
     )
@@ -252,6 +252,44 @@ class Permuted(Whole):
         """In the order drawn for this many terms."""
         order = np.random.default_rng(self.seed).permutation(terms.shape[0])
         return in_order(terms[order], add)
+
+
+@dataclass(frozen=True)
+class Halves(Whole):
+    """Two loops side by side, over the first half of the terms and over the second, added at the end.
+
+    What two scatters do, one for each end of a pair, where each pair is held once. Error: at most
+    gamma_{n/2} * sum |terms|.
+    """
+
+    def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
+        """An odd term is in the second half."""
+        half = terms.shape[0] // 2
+        if half == 0:
+            return in_order(terms, add)
+        return add(in_order(terms[:half], add), in_order(terms[half:], add))
+
+    def depth(self, n: int) -> int:
+        """The longer loop, and the last addition."""
+        return n - n // 2 if n > 1 else 0
+
+
+@dataclass(frozen=True)
+class Twice(Whole):
+    """Every term twice, halved: a loop, and the same loop once more onto its result.
+
+    What a scatter onto the sums of a dense list does, where each pair is held from both ends. Error: at most
+    gamma_{2n} * sum |terms|, where no half of a term is subnormal.
+    """
+
+    def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
+        """Halving is exact."""
+        halves = terms * jnp.asarray(0.5, terms.dtype)
+        return in_order(halves, add, in_order(halves, add))
+
+    def depth(self, n: int) -> int:
+        """Both loops."""
+        return max(2 * n - 1, 0)
 
 
 @dataclass(frozen=True)

@@ -61,6 +61,8 @@ def test_every_shipped_choice_is_parsed_from_its_name():
     "word",
     [
         "precision.force=float64",
+        "precision.force=bfloat16",
+        "format=sparse@fixed-point",
         "reduction=permuted:3",
         "skin=0.5",
         "skin=0.5@exact",
@@ -86,7 +88,11 @@ def test_arguments_are_read_and_written_alike(word: str):
         ("reductoin", "Did you mean"),
         ("nonsense", "There are precision, precision.state"),
         ("precision.mass", "no role 'mass'; there are state, force, decision, accumulate"),
-        ("precision=bfloat16", "known are float64, float32"),
+        ("precision=half", "known are float64, float32, float16, bfloat16"),
+        ("precision.state=bfloat16", "bfloat16 cannot be the state of molecular dynamics: a step moves"),
+        ("precision.decision=float16", "their grid would decide"),
+        ("precision.accumulate=bfloat16", "small ones are lost"),
+        ("format=coo", "no format 'coo'; there are dense, sparse, ordered-sparse"),
         ("reduction=karatsuba", "no reduction called"),
         ("order@karatsuba", "no reduction called"),
         ("ulps", "ulps=cutoff.radius"),
@@ -119,6 +125,7 @@ def test_what_is_no_choice_is_refused_with_those_there_are(word: str, says: str)
         ("silicon/tersoff-512", "precision", "float64 only"),
         (CRYSTAL, "precision=float64", "float64 already"),
         (CRYSTAL, "reduction=sequential", "already"),
+        ("silicon/tersoff-512", "format", "a format of its own"),
         (CRYSTAL, "rebuild=half-skin", "already"),
         (CRYSTAL, "skin=0.3", "already"),
         (CRYSTAL, "builder=host", "already"),
@@ -291,6 +298,7 @@ def test_another_noise_is_another_key_and_the_same_start():
         "order@fixed-point",
         "relabel@exact",
         "skin@exact",
+        "format=ordered-sparse@exact",
         # a list and a program for every step
         pytest.param("rebuild=every:1@exact", marks=pytest.mark.slow),
         pytest.param("builder@exact", marks=pytest.mark.slow),
@@ -303,7 +311,8 @@ def test_what_must_hold_holds_to_the_last_bit(crystal: System, word: str):
 
 
 def test_the_same_choices_without_such_sums_do_not_hold(crystal: System):
-    rows = screen(crystal, 200, [parse(word) for word in ("order", "relabel", "skin", "rotate")])
+    words = ("order", "relabel", "skin", "rotate", "format", "format=dense")
+    rows = screen(crystal, 200, [parse(word) for word in words])
     assert {row.seed for row in rows} == {1}
     assert not any(row.must_hold or row.held or row.finding for row in rows)
 

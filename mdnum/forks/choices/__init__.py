@@ -5,6 +5,7 @@ from __future__ import annotations
 from mdnum.forks.choices.arithmetic import Precision, Summation
 from mdnum.forks.choices.base import Choice
 from mdnum.forks.choices.energy import EnergyShift
+from mdnum.forks.choices.formats import Format
 from mdnum.forks.choices.frames import Images, Relabel, Rotate, Translate
 from mdnum.forks.choices.inputs import Noise, StartUlp, Ulps
 from mdnum.forks.choices.lists import Builder, Order, Rebuild, Skin
@@ -16,6 +17,7 @@ __all__ = [
     "Builder",
     "Choice",
     "EnergyShift",
+    "Format",
     "Images",
     "Noise",
     "Order",

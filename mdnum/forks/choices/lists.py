@@ -61,6 +61,11 @@ class ShuffledSimulation(Simulation):
         same = {field.name: getattr(simulation, field.name) for field in fields(Simulation)}
         return cls(**same, shuffle=seed)
 
+    @property
+    def lists(self):
+        """Shuffled lists are other lists."""
+        return (*super().lists, self.shuffle)
+
     def verlet_list(self, skin: float | None = None) -> VerletList:
         """As the simulation's own, shuffled."""
         made = super().verlet_list(skin)

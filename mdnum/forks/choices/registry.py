@@ -9,6 +9,7 @@ from mdnum.errors import InputError
 from mdnum.forks.choices.arithmetic import ROLES, Precision, Summation
 from mdnum.forks.choices.base import ORDERLESS, Choice, real, whole
 from mdnum.forks.choices.energy import EnergyShift
+from mdnum.forks.choices.formats import FORMATS, Format
 from mdnum.forks.choices.frames import Images, Relabel, Rotate, Translate
 from mdnum.forks.choices.inputs import Noise, StartUlp, Ulps
 from mdnum.forks.choices.lists import Builder, Order, Rebuild, Skin
@@ -17,8 +18,10 @@ from mdnum.precision import reductions
 _SHIPPED: tuple[Choice, ...] = (
     Precision(),
     *(Precision((role,)) for role in ROLES),
+    Precision(("force",), "bfloat16"),
     *(Summation(word) for word in reductions.BY_NAME),
     Order(),
+    *(Format(word) for word in FORMATS),
     Builder(),
     Skin(),
     Rebuild(1),
@@ -31,6 +34,7 @@ _SHIPPED: tuple[Choice, ...] = (
     Images(1),
     EnergyShift(),
     *(Order(both=word) for word in ORDERLESS),
+    Format(both="exact"),
     *(one(both="exact") for one in (Builder, Skin, Rebuild, Relabel, Rotate)),
     *(
         Ulps(key)
@@ -61,9 +65,10 @@ def parse(text: str) -> Choice:
 
     Args:
         text: a name, or a family with an argument: "reduction=permuted:3", "skin=0.5", "precision=float32",
-            "precision.force=float32", "rebuild=every:10", "ulps=cutoff.radius:+1", "start=17:0:+1" (atom,
-            axis, ulps), "order=3", "translate=0.5", "rotate=yxz", "noise=7". A last "@exact" gives both runs
-            that reduction, where the order of neighbors is what is chosen.
+            "precision.force=bfloat16", "format=sparse", "rebuild=every:10", "ulps=cutoff.radius:+1",
+            "start=17:0:+1" (atom, axis, ulps), "order=3", "translate=0.5", "rotate=yxz", "noise=7". A last
+            "@exact" gives both runs that reduction, where the order of neighbors is what is chosen.
+            "precision=bfloat16" is that of the force: no other role can have it.
 
     Raises:
         InputError: no such choice, or an argument that it cannot have.
@@ -136,6 +141,7 @@ def _translate(argument: str, both: str | None) -> Choice:
 
 _SUMMED: Mapping[str, Callable[[str, str | None], Choice]] = {
     "order": lambda argument, both: Order(whole(argument, "order") if argument else 1, both),
+    "format": lambda argument, both: Format(argument or "ordered-sparse", both),
     "builder": lambda argument, both: Builder(argument or None, both),
     "skin": lambda argument, both: Skin(real(argument, "skin") if argument else None, both),
     "rebuild": _rebuild,
