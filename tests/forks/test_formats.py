@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -39,7 +40,7 @@ def rows(simulation: Simulation) -> np.ndarray:
     return np.sort(simulation.verlet_list().build(wrapped, simulation.cell).unsorted(), axis=1)
 
 
-def forces_of_jax_md(simulation: Simulation, rows: np.ndarray, format: str):
+def forces_of_jax_md(simulation: Simulation, rows: np.ndarray, format: Any):
     """A function from a list's indices to jax-md's forces, minus the gradient of its energy; and the list."""
     jax_md = upstream()
     metric = jax_md.space.canonicalize_displacement_or_metric(
@@ -47,7 +48,7 @@ def forces_of_jax_md(simulation: Simulation, rows: np.ndarray, format: str):
     )
     energy = jax_md.smap.pair_neighbor_list(lennard_jones, metric)
     x = jnp.asarray(wrap_positions(simulation.cell, simulation.positions)[0])
-    held = as_neighbor_list(rows, np.asarray(x), format)
+    held: Any = as_neighbor_list(rows, np.asarray(x), format)
 
     @jax.jit
     def forces(idx):
