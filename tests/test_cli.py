@@ -56,7 +56,7 @@ class Recorder:
         if self.error is not None:
             raise self.error
         options["progress"](1, 200, {"phase": "run", "steps_per_second": 10.0, "flips": 1, "rebuilds": 0})
-        return types.SimpleNamespace(folder=options["out"], summary=self.summary)
+        return types.SimpleNamespace(folder=options["out"] or options["resume"], summary=self.summary)
 
 
 @pytest.fixture

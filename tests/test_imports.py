@@ -51,6 +51,16 @@ def test_importing_brings_in_neither_jax_nor_jax_md(code: str):
     assert not {"jax", "jaxlib", "jax_md", "ase", "matplotlib"} & _modules_after(code)
 
 
+def test_a_fork_of_a_ball_brings_in_no_molecular_dynamics():
+    """Every module that it runs, those that are imported late included."""
+    loaded = _modules_after(
+        "import mdnum.cli.fork_ball, mdnum.workflow.fork_ball, mdnum.forks.bounce.choices\n"
+        "import mdnum.forks.bounce.certify, mdnum.report.fork.ball\n"
+        "assert not [name for name in sys.modules if name.startswith(('mdnum.md', 'mdnum.rollout'))]\n"
+    )
+    assert "jax" in loaded and "jax_md" not in loaded
+
+
 def test_help_imports_nothing_heavy():
     """What makes help fast is what it does not import; a wall clock would measure the machine."""
     loaded = _modules_after("from mdnum.cli import main; main()", "--help")
@@ -58,7 +68,9 @@ def test_help_imports_nothing_heavy():
     assert not HEAVY & loaded
 
 
-@pytest.mark.parametrize("verb", [["run"], ["ball"], ["check", "pairs"], ["systems"], ["report"], ["doctor"]])
+@pytest.mark.parametrize(
+    "verb", [["run"], ["ball"], ["fork"], ["check", "pairs"], ["systems"], ["report"], ["doctor"]]
+)
 def test_help_of_a_verb_imports_nothing_that_it_would_run(verb: list[str]):
     """typer itself imports pydantic to read the options of a verb, in some versions."""
     loaded = _modules_after("from mdnum.cli import main; main()", *verb, "--help")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from mdnum.cli import output
-from mdnum.cli.progress import ProgressBar
+from mdnum.cli.progress import watched
 from mdnum.errors import InputError
 
 if TYPE_CHECKING:
@@ -54,34 +54,23 @@ def ball(
     from mdnum.workflow import bounce
 
     out = default_folder(system) if out is None else out
-    try:
-        with ProgressBar() as progress:
-            result = bounce(
-                system,
-                out=out,
-                steps=steps,
-                overrides=overrides,
-                against=against or (),
-                report=not no_report,
-                progress=progress,
-            )
-    except KeyboardInterrupt:
-        raise output.Stopped("stopped") from None
-    summary = dict(result.summary)
-    if as_json:
-        output.print_json({"folder": result.folder, **summary})
-    else:
-        _print_summary(summary, result.folder)
-    return output.exit_code(summary.get("findings", ()), ok=summary.get("status") == "complete")
+    with watched() as progress:
+        result = bounce(
+            system,
+            out=out,
+            steps=steps,
+            overrides=overrides,
+            against=against or (),
+            report=not no_report,
+            progress=progress,
+        )
+    return output.answer(result.folder, result.summary, _print_rows, as_json=as_json)
 
 
 # --- a run --------------------------------------------------------------------------------------------
 
 
-def _print_summary(summary: Mapping[str, Any], folder: Path) -> None:
-    out = output.console()
-    if verdict := summary.get("verdict"):
-        out.print(verdict, style="bold", markup=False)
+def _print_rows(summary: Mapping[str, Any]) -> None:
     balls, steps = summary["balls"], summary["steps"]
     rows = [
         ("system", f"{summary['system']}, {_many(balls, 'ball')}, {_many(steps, 'step')}"),
@@ -113,9 +102,6 @@ def _print_summary(summary: Mapping[str, Any], folder: Path) -> None:
             ("variant", "seed", "fork", "decision", "margins", "apart at the end", "loss", *_slopes(summary)),
             [_variant(made, summary) for made in summary["variants"]],
         )
-    output.print_findings(summary.get("findings", ()))
-    report = folder / "report.html"
-    out.print(f"wrote {report if report.exists() else folder}", markup=False)
 
 
 def _solver(summary: Mapping[str, Any]) -> tuple[str, str]:
@@ -214,21 +200,18 @@ def _demonstrate(name: str, out: Path | None, no_report: bool, as_json: bool) ->
     # an unknown name is refused before anything runs
     functions = [(one, demos.find(one)) for one in asked]
     done: list[Demo] = []
-    try:
-        with ProgressBar() as progress:
-            for number, (one, run) in enumerate(functions):
-                progress(number, len(functions), {"phase": f"demonstration {one}"})
-                done.append(run())
-            page = None
-            if not no_report:
-                from mdnum.report.ball.demos import write_report
-                from mdnum.store.naming import default_folder
+    with watched() as progress:
+        for number, (one, run) in enumerate(functions):
+            progress(number, len(functions), {"phase": f"demonstration {one}"})
+            done.append(run())
+        page = None
+        if not no_report:
+            from mdnum.report.ball.demos import write_report
+            from mdnum.store.naming import default_folder
 
-                progress(len(functions), len(functions), {"phase": "report"})
-                folder = default_folder(f"demo-{name}") if out is None else out
-                page = write_report(folder, done)
-    except KeyboardInterrupt:
-        raise output.Stopped("stopped") from None
+            progress(len(functions), len(functions), {"phase": "report"})
+            folder = default_folder(f"demo-{name}") if out is None else out
+            page = write_report(folder, done)
     ok = all(one.ok for one in done)
     if as_json:
         documents = [_document(one) for one in done]

@@ -7,13 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from mdnum.cli import output
-from mdnum.cli.progress import ProgressBar
+from mdnum.cli.progress import watched
 from mdnum.errors import InputError
 
 #: What a ball offers in place of an option of molecular dynamics.
 _INSTEAD = {
-    "--along": "where a ball's decisions change along a number is found by mdnum.ball.boundaries, in Python",
-    "--most": "it belongs to --along",
     "--processes": "whether a ball's bits depend on the program around it is shown by "
     "`mdnum ball --demo determinism`",
     "--forecast": "how far each contact is from another step is the margin that `mdnum ball` records",
@@ -63,22 +61,19 @@ def fork(
         return _certify(system, steps, overrides, as_json=as_json)
     from mdnum.workflow import fork as compare
 
-    try:
-        with ProgressBar() as progress:
-            result = compare(
-                system,
-                vary,
-                steps=steps,
-                split=split,
-                repeats=repeats,
-                counterfactual=counterfactual,
-                out=out,
-                overrides=overrides,
-                report=report,
-                progress=progress,
-            )
-    except KeyboardInterrupt:
-        raise output.Stopped("stopped") from None
+    with watched() as progress:
+        result = compare(
+            system,
+            vary,
+            steps=steps,
+            split=split,
+            repeats=repeats,
+            counterfactual=counterfactual,
+            out=out,
+            overrides=overrides,
+            report=report,
+            progress=progress,
+        )
     return output.answer(result.folder, result.summary, print_rows, as_json=as_json)
 
 
@@ -160,7 +155,7 @@ def _certify(system: str, steps: int | None, overrides: Mapping[str, str], *, as
     from mdnum.forks.bounce.certify import certify
     from mdnum.systems import load
 
-    with ProgressBar() as progress:
+    with watched() as progress:
         found = certify(load(system, overrides, world="ball"), steps, progress=progress)
     rows = [
         {

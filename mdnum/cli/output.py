@@ -192,13 +192,16 @@ def answer(
         print_rows: prints what stands between the headline and the findings.
     """
     findings = summary.get("findings", ())
+    code = exit_code(findings, ok=summary.get("status", "complete") == "complete")
     if as_json:
         print_json({"folder": folder, **summary})
-        return exit_code(findings, ok=summary.get("status") == "complete")
+        return code
     out = console()
-    out.print(summary.get("headline", ""), style="bold", markup=False)
+    # a comparison has a headline beside the word of its verdict, a run a verdict in words
+    if head := summary.get("headline") or summary.get("verdict"):
+        out.print(head, style="bold", markup=False)
     print_rows(summary)
     print_findings(findings)
     report = folder / "report.html"
     out.print(f"wrote {report if report.exists() else folder}", markup=False)
-    return exit_code(findings, ok=summary.get("status") == "complete")
+    return code

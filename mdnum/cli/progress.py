@@ -5,8 +5,12 @@ from __future__ import annotations
 import sys
 import threading
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self, TextIO
+
+from mdnum.cli.output import Stopped
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
@@ -18,6 +22,23 @@ _WORDS = {
     "check": "checking",
     "report": "writing the report",
 }
+
+
+@contextmanager
+def watched(remedy: Callable[[], str | None] | None = None) -> Iterator[ProgressBar]:
+    """A progress bar around a run; control-C becomes the error that ends the command line.
+
+    Args:
+        remedy: asked then what to do about it.
+
+    Raises:
+        Stopped: somebody pressed control-C.
+    """
+    try:
+        with ProgressBar() as progress:
+            yield progress
+    except KeyboardInterrupt:
+        raise Stopped("stopped", remedy=remedy() if remedy is not None else None) from None
 
 
 class ProgressBar:

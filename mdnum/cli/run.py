@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import typer
 
 from mdnum.cli import output
-from mdnum.cli.progress import ProgressBar
+from mdnum.cli.progress import watched
 from mdnum.errors import InputError
 
 
@@ -52,39 +53,32 @@ def run(
 
     from mdnum.workflow import run as run_system
 
-    try:
-        with ProgressBar() as progress:
-            result = run_system(
-                system,
-                out=out,
-                steps=steps,
-                save_every=save_every,
-                overrides=overrides,
-                resume=resume,
-                check=not no_check,
-                report=not no_report,
-                progress=progress,
-            )
-    except KeyboardInterrupt:
-        folder = resume or out
+    folder = resume or out
+
+    def go_on() -> str | None:
         written = folder is not None and folder.exists()
-        raise output.Stopped(
-            "stopped", remedy=f"Continue with `mdnum run --resume {folder}`" if written else None
-        ) from None
-    summary = dict(result.summary)
-    if as_json:
-        output.print_json({"folder": result.folder, **summary})
-    else:
-        _print_summary(summary, result.folder)
-    return output.exit_code(summary.get("findings", ()), ok=summary.get("status", "complete") == "complete")
+        return f"Continue with `mdnum run --resume {folder}`" if written else None
+
+    with watched(go_on) as progress:
+        result = run_system(
+            system,
+            out=out,
+            steps=steps,
+            save_every=save_every,
+            overrides=overrides,
+            resume=resume,
+            check=not no_check,
+            report=not no_report,
+            progress=progress,
+        )
+    return output.answer(result.folder, result.summary, _print_rows, as_json=as_json)
 
 
 def _speed(rate: float | None) -> str:
     return "too short a run to tell" if rate is None else f"{output.show(rate)} steps/s"
 
 
-def _print_summary(summary: dict[str, Any], folder: Path | None) -> None:
-    out = output.console()
+def _print_rows(summary: Mapping[str, Any]) -> None:
     ase = summary.get("ase") or {}
     rows = [
         ("system", f"{summary.get('system')}, {summary.get('atoms')} atoms, {summary.get('steps'):,} steps"),
@@ -106,16 +100,10 @@ def _print_summary(summary: dict[str, Any], folder: Path | None) -> None:
         ),
         ("speed", _speed(summary.get("steps_per_second"))),
     ]
-    if verdict := summary.get("verdict"):
-        out.print(verdict, style="bold", markup=False)
     output.print_table("", ("", ""), rows)
-    output.print_findings(summary.get("findings", ()))
-    if folder is not None:
-        report = folder / "report.html"
-        out.print(f"wrote {report if report.exists() else folder}", markup=False)
 
 
-def _budget(summary: dict[str, Any]) -> str:
+def _budget(summary: Mapping[str, Any]) -> str:
     closes = summary.get("energy_budget_closes")
     residual = output.show(summary.get("energy_budget_residual"))
     if closes is None:
