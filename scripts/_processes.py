@@ -40,11 +40,16 @@ def start_up() -> dict[str, float]:
             "-o",
             f"{scratch}/run",
         ]
-        before, begin = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+        before, begin = children_seconds(), time.perf_counter()
         subprocess.run([sys.executable, "-m", "mdnum", *words], check=True, stdout=subprocess.DEVNULL)
-        wall, after = time.perf_counter() - begin, resource.getrusage(resource.RUSAGE_CHILDREN)
-    busy = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    return {"seconds": wall, "cpu_seconds": busy}
+        wall = time.perf_counter() - begin
+    return {"seconds": wall, "cpu_seconds": children_seconds() - before}
+
+
+def children_seconds() -> float:
+    """CPU seconds of all processes that this one has started and seen end."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def memory(atoms: int, steps: int) -> list[dict[str, float]]:

@@ -17,6 +17,8 @@ STUDIES = (
     "ball_sensitivity",
     "benchmark",
     "cutoff_sensitivity",
+    "fork_atlas",
+    "fork_benchmark",
     "precision_fork",
     "reduction_order",
     "skin_sensitivity",
@@ -213,4 +215,39 @@ def test_sums_without_an_order_are_told_from_those_with_one(tmp_path: Path) -> N
     assert own[column("shuffled")] == other[column("shuffled")] == "1" and exact[column("shuffled")] == "-"
     assert float(exact[column("error")]) == 0 < float(own[column("error")]) < 1000
     assert 0 < float(other[column("end")]) < 1e-10
+    assert is_png(tmp_path / "r.png")
+
+
+def test_an_atlas_goes_on_where_it_stopped_and_draws_all_of_it(tmp_path: Path) -> None:
+    columns = "system,cutoff,choice,asked,repeats,verdict,seed,fork,split,told,nats,steps,seconds,note"
+    kept = "argon/crystal-108,hard,start,60,0,cause,0,7,11,,2.5,60,1.0,made up"
+    # the second line is what a killed process leaves behind, the third what failed
+    torn = "argon/crystal-108,hard,translate=0.25,60,0,bysta"
+    failed = "argon/crystal-108,hard,order,60,0,failed,,,,,,0,0.1,no memory"
+    (tmp_path / "m.csv").write_text("\n".join((columns, kept, failed, torn)))
+    words = ["--quick", "--steps", "60", "--kinds", "hard"]
+    words += ["--choices", "start", "order", "translate=0.25", "noise", "-o", "m.png"]
+    table = study("fork_atlas", *words, cwd=tmp_path)
+    column = ["system", "cutoff", "choice", "verdict", "seed", "fork", "split", "told", "nats"].index
+    name = ("argon/crystal-108", "hard")
+    start, order = row(table, *name, "start"), row(table, *name, "order")
+    assert start[column("verdict") : column("told")] == ["cause", "0", "7", "11"]
+    assert order[column("verdict") : column("told")] == ["no fork", "1", "-", "-"]
+    assert row(table, *name, "translate=0.25")[column("verdict")] in ("same", "no fork")
+    assert "finding" not in table
+    lines = (tmp_path / "m.csv").read_text().splitlines()
+    assert lines[:2] == [columns, kept] and torn not in lines
+    # a choice that does not apply is kept with the reason
+    assert any(line.split(",")[5] == "does not apply" for line in lines)
+    assert is_png(tmp_path / "m.png")
+
+
+def test_the_cost_of_a_comparison_is_a_ratio(tmp_path: Path) -> None:
+    words = ["--quick", "--no-answers", "--json", "-o", "r.png"]
+    made = json.loads(study("fork_benchmark", *words, cwd=tmp_path))
+    (one,) = made["ratios"]
+    assert one["system"] == "argon/crystal-108" and one["atoms"] == 108
+    # three runs; on a busy machine a clock can say anything
+    assert 1 < one["cpu_ratio"] < 30
+    assert one["triple_compile"] > 0
     assert is_png(tmp_path / "r.png")
