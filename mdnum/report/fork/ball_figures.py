@@ -121,6 +121,8 @@ def captions(run: ForkFolder) -> dict[str, str]:
         if run.has("handed")
         else ""
     )
+    if handed and run.summary.get("handed_largest") == 0:
+        handed += " Here it has no line: no bit of a height differs."
     return {
         "separation": f"Largest difference between the height of a ball in A and in B{ticks}.{handed}",
         "around": "The ball whose decision differs first, in both runs; points where it is in contact.",

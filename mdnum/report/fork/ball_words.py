@@ -37,8 +37,8 @@ def headline(run: ForkFolder) -> str:
         return f"Run {names} after step {count(run.steps)}; {at}."
     if run.word == "same" and made is not None:
         return (
-            f"No bit of a height or a velocity differs in {steps}, though the {_what_forks(made)} does at "
-            f"step {count(made['step'])}."
+            f"No bit of a height or a velocity differs in {steps}, though a decision does at step "
+            f"{count(made['step'])}: {decided(made)}."
         )
     if run.word == "same":
         return f"The same trajectory: no bit differs in {steps}."
@@ -144,7 +144,7 @@ def _findings(run: ForkFolder) -> Iterator[Finding]:
             f"the decision at the fork is ambiguous: the {_what_forks(made)}",
             f"Its margin is within the rounding bound of what was compared: {listed(sizes)}.",
         )
-    if made is not None and "split" not in dates and not summary.get("failed"):
+    if run.word == "open" and "split" not in dates and not summary.get("failed"):
         guess = summary.get("predicted_split")
         yield Finding(
             "HORIZON_SHORT",

@@ -150,7 +150,7 @@ def test_what_a_choice_changes_and_what_it_must_not(name, systems):
         assert choice.must_hold == ("@" in name)
     else:
         assert twin.order is None and not choice.must_hold
-        assert moved == {"start": {"y0"}, "start=:velocity:+1": {"v0"}}.get(name, set())
+        assert moved == {"start": {"y0"}, "start=velocity:+1": {"v0"}}.get(name, set())
         assert changed or moved
     # every number of the program but those that the keys mean
     meant = {key.rpartition(".")[2].replace("timestep", "h").replace("hysteresis", "lift") for key in changed}

@@ -139,10 +139,11 @@ class StartUlp:
 
     @property
     def name(self) -> str:
-        """Such as "start" or "start=3:velocity:-1"."""
+        """Such as "start", "start=velocity:+1" or "start=3:height:-1"."""
         if self == StartUlp():
             return "start"
-        return f"start={'' if self.ball is None else self.ball}:{self.what}:{self.ulps:+d}"
+        which = "" if self.ball is None else f"{self.ball}:"
+        return f"start={which}{self.what}:{self.ulps:+d}"
 
     @property
     def about(self) -> str:

@@ -48,8 +48,9 @@ def parse(text: str) -> Choice:
     Args:
         text: a name, or a family with an argument: "precision=bfloat16", "precision.state=float16",
             "reduction=permuted:3", "stop=maximum", "order=3@alone", "ulps=contact.k:-2",
-            "start=3:velocity:+1" (ball, what, ulps), "max_iter=+2", "iterations=+1:57:3" (more, step, ball),
-            "contact=later:2" (of the second contact), "contact=57:0" (inverted at a step, for a ball).
+            "start=3:velocity:+1" (ball, what, ulps), "start=velocity:+1" (of the fastest), "max_iter=+2",
+            "iterations=+1:57:3" (more, step, ball), "contact=later:2" (of the second contact),
+            "contact=57:0" (inverted at a step, for a ball).
 
     Raises:
         InputError: no such choice, or an argument that it cannot have.
@@ -80,11 +81,10 @@ def _ulps(argument: str) -> Choice:
 
 
 def _start(argument: str) -> Choice:
-    ball, _, rest = argument.partition(":")
-    what, _, count = rest.partition(":")
-    return StartUlp(
-        whole(ball, "start") if ball else None, what or "height", whole(count, "start") if count else 1
-    )
+    head, _, rest = argument.partition(":")
+    ball = whole(head, "start") if head.lstrip("+-").isdecimal() else None
+    what, _, count = (argument if ball is None else rest).partition(":")
+    return StartUlp(ball, what or "height", whole(count, "start") if count else 1)
 
 
 def _contact(argument: str) -> Choice:
