@@ -211,7 +211,7 @@ def test_mistakes_exit_2(compare: Recorder, capsys):
     assert json.loads(capsys.readouterr().out)["error"]["message"] == "no choice 'x'"
     assert call("fork", "argon/crystal-108", "--vary", "x", "--steps", "0") == 2
     assert call("fork", "argon/crystal-108", "--minimal", "--along", "cutoff.radius=1.4:1.5") == 2
-    assert "--minimal needs a choice" in capsys.readouterr().err
+    assert "--minimal is asked of two runs" in capsys.readouterr().err
     compare.error = KeyboardInterrupt()
     assert call("fork", "argon/crystal-108", "--vary", "precision") == 130
 

@@ -100,9 +100,11 @@ def fork(
             counterfactual=not no_counterfactual, out=out, overrides=overrides, report=not no_report,
             as_json=as_json,
         )  # fmt: skip
-    for name, is_asked in (("--benign", benign), ("--minimal", minimal), ("--pin", pin is not None)):
-        if is_asked and vary is None:
-            raise InputError(f"{name} needs a choice", remedy="Add --vary CHOICE")
+    if benign and vary is None:
+        raise InputError("--benign needs a choice", remedy="Add --vary CHOICE")
+    for name, is_asked in (("--minimal", minimal), ("--pin", pin is not None)):
+        if is_asked and vary is None and any(asked.values()):
+            raise InputError(f"{name} is asked of two runs", remedy="Add it to --vary CHOICE")
     if most is not None and along is None:
         raise InputError("--most needs a number to go along", remedy="Add --along KEY=LOW:HIGH")
     if any(asked.values()) and system is None:

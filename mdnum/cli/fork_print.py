@@ -100,7 +100,8 @@ def _certain(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
 def _print_two_by_two(summary: Mapping[str, Any]) -> None:
     """Splits by arithmetic and decisions, from either run, and what each of the two contributed."""
     cells = summary.get("table") or ()
-    if len({(cell["arithmetic"], cell["decisions"]) for cell in cells}) < 3:
+    runs = {(cell["arithmetic"], cell["decisions"]) for cell in cells}
+    if len(runs) < 3 or all(cell["split"] is None for cell in cells):
         return
     by_run: dict[tuple[str, str], dict[str, str]] = {}
     for cell in cells:

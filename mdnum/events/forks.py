@@ -175,6 +175,8 @@ def judge(
         if seen < _PATIENCE * dates.split:
             more = (
                 f"only {seen - dates.split} steps follow the split; run longer to tell a cause from a delay"
+                if seen > dates.split
+                else "where it was ended"
             )
             return Verdict("open", dates.split, None, noise, None, (text, more))
         late = _expected(handed, tolerance, seen)

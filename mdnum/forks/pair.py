@@ -82,7 +82,8 @@ class Fork:
         table: splits of either arithmetic under either decisions.
         shares: what the decisions and what the arithmetic contributed to the split.
         verdict: on the flips.
-        failed: runs that ended in "blow-up" or "runaway".
+        failed: runs that ended in "blow-up" or "runaway". Where a free run does, the comparison ends with it;
+            where only one of them does, that is the fork at the latest.
     """
 
     twin: Twin
@@ -238,9 +239,19 @@ def _judged(
 ) -> Fork:
     series = _series(gathered)
     bits = np.concatenate([stretch.bits for stretch in gathered])
+    if gathered[-1].failed["A"] or gathered[-1].failed["B"]:
+        # what one run does after the other has ended is no comparison
+        end = int(np.flatnonzero(np.isfinite(series["B"])).max(initial=0)) + 1
+        series, bits = {name: values[:end] for name, values in series.items()}, bits[:end]
+        total -= sum(flip.step >= end for flip in flips)
+        flips = tuple(flip for flip in flips if flip.step < end)
     free = series["B"]
     splits = {name: split_of(series[name], tolerance) for name in series if name[0] in "AB"}
     first = next((flip.step for flip in flips), None)
+    ended = [name for name in ("A", "B") if gathered[-1].failed[name]]
+    if first is None and len(ended) == 1:
+        # that one run can go on and the other cannot is a fork if anything is
+        first = len(free) - 1
     failed = {name: word for stretch in gathered[-1:] for name, word in stretch.failed.items() if word}
     dates = Dates(int(bits.argmax()) if bits.any() else None, first, splits["B"])
     handed = series.get("B|A")

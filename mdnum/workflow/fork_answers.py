@@ -14,9 +14,9 @@ if TYPE_CHECKING:
 
 Progress = Callable[[int, int, dict[str, Any]], None]
 
-#: A tangent is carried for so many steps at most, and for so large a share of those that were followed: its
-#: step costs as much as two or three of a run.
-_STEPS, _SHARE = 2_000, 0.5
+#: A tangent is carried for a share of the steps that were followed, but not for fewer nor for more than this:
+#: its step costs as much as six of a run, so it takes a tenth as long as the runs that are compared.
+_SHARE, _FEWEST, _MOST = 0.25, 400, 2_000
 
 
 def exponent(fork: Fork) -> dict[str, Any]:
@@ -30,7 +30,9 @@ def exponent(fork: Fork) -> dict[str, Any]:
     a, seen = fork.twin.a, fork.growth["B"]
     if fork.dates.seed is None:
         return _none("no bit differs: nothing grows")
-    steps = min(fork.steps, max(100, min(_STEPS, round(_SHARE * fork.steps))))
+    if not a.pairwise:
+        return _none("tangents are carried through pair potentials only")
+    steps = min(fork.steps, max(_FEWEST, min(_MOST, round(_SHARE * fork.steps))))
     try:
         found = lyapunov(a, steps)
     except InputError as error:

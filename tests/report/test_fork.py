@@ -181,7 +181,17 @@ def test_ticks_stand_where_only_one_run_flips(folder):
             "good",
             "The same trajectory: no bit differs in 1,500 steps.",
         ),
-        ({"failed": {"B": "blow-up"}, "status": "failed"}, "warning", "Run B ended in a blow-up"),
+        (
+            {"failed": {"B": "blow-up"}, "status": "failed"},
+            "warning",
+            "Run B ended in a blow-up at step 1,500 and run A did not; they fork at step 400.",
+        ),
+        ({"failed": {"A": "runaway"}, "decision": None}, "warning", "run B did not: that is the fork."),
+        (
+            {"failed": {"A": "runaway", "B": "blow-up"}},
+            "warning",
+            "Both runs ended at step 1,500, A in a runaway and B in a blow-up.",
+        ),
         ({"must_hold": True}, "error", "The flip at step 400"),
     ],
 )
@@ -201,6 +211,7 @@ def test_findings_are_those_that_apply(tmp_path):
     assert codes("doubt", decision=doubtful) == {"AMBIGUOUS_FORK": "info"}
     assert codes("short", split=None, verdict="open") == {"HORIZON_SHORT": "info"}
     assert codes("guard", handed_until=900) == {"GUARD": "info"}
+    assert codes("told", handed_until=900, failed_told={"B|A": "runaway"}) == {"GUARD": "info"}
     assert codes("alone", verdict="hurried", repeats_run=0) == {"NO_REPEATS": "info"}
     assert codes("held", must_hold=True) == {"MUST_HOLD_FORKED": "error"}
     kept = {"code": "OF_OTHERS", "severity": "warning", "title": "look", "text": "there"}

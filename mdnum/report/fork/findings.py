@@ -75,9 +75,7 @@ def _headline(run: ForkFolder) -> str:
     summary, dates = run.summary, run.dates
     steps = many(run.steps, "step")
     if run.summary.get("failed"):
-        names = listed([f"{name} ended in a {word}" for name, word in run.summary["failed"].items()])
-        at = f"they fork at step {count(dates['fork'])}" if "fork" in dates else "no decision differs before"
-        return f"Run {names} at step {count(run.steps)}; {at}."
+        return _ended(run)
     if run.word == "same":
         return f"The same trajectory: no bit differs in {steps}."
     if run.word == "no fork":
@@ -110,6 +108,20 @@ def _headline(run: ForkFolder) -> str:
     guess = summary.get("predicted_split")
     tail = f"; the growth so far puts it at about step {count(guess)}" if guess is not None else ""
     return f"The runs fork at step {fork} and have not split in {steps}{tail}."
+
+
+def _ended(run: ForkFolder) -> str:
+    """A comparison in which a run blew up."""
+    failed, fork = run.summary["failed"], run.dates.get("fork")
+    if len(failed) > 1:
+        words = listed([f"{name} in a {word}" for name, word in failed.items()])
+        return f"Both runs ended at step {count(run.steps)}, {words}."
+    ((name, word),) = failed.items()
+    other = "B" if name == "A" else "A"
+    ended = f"Run {name} ended in a {word} at step {count(run.steps)} and run {other} did not"
+    if run.decision is None or fork is None:
+        return f"{ended}: that is the fork."
+    return f"{ended}; they fork at step {count(fork)}."
 
 
 def _evidence(run: ForkFolder) -> Iterator[str]:
@@ -167,8 +179,7 @@ def _findings(run: ForkFolder) -> Iterator[Finding]:
             "RUN_FAILED",
             "warning",
             f"run {name} ended in a {word} at step {count(run.steps)}",
-            f"The comparison ends there, {count(summary.get('steps_asked'))} steps were asked for. "
-            "Where only one run ends so, that is the fork.",
+            f"The comparison ends there, {count(summary.get('steps_asked'))} steps were asked for.",
             "Use a smaller time step, or look at the decisions before it.",
         )
     made = run.decision
@@ -196,11 +207,14 @@ def _findings(run: ForkFolder) -> Iterator[Finding]:
         yield Finding("HORIZON_SHORT", "info", "the horizon is too short for a split", text, more)
     until = summary.get("handed_until")
     if until is not None and until < run.steps and not summary.get("failed"):
+        word = (summary.get("failed_told") or {}).get("B|A")
         yield Finding(
             "GUARD",
             "info",
             f"the run under A’s decisions was ended at step {count(until)}",
-            "A decision that it was told was no longer near its threshold in its own positions: "
+            f"It was on its way to a {word}."
+            if word
+            else "A decision that it was told was no longer near its threshold in its own positions: "
             "nothing that rounding could have changed.",
         )
     if run.word in ("hurried", "bystander") and not summary.get("repeats_run"):

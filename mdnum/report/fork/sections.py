@@ -71,7 +71,7 @@ def runs(run: ForkFolder) -> Iterator[dict[str, str]]:
     rows: dict[tuple[str, str], dict[str, str]] = {}
     for cell in cells:
         rows.setdefault((cell["arithmetic"], cell["decisions"]), {})[cell["from"]] = _cell(cell)
-    if len(rows) < 3:
+    if len(rows) < 3 or all(cell["split"] is None for cell in cells):
         return
     for (arithmetic, decisions), texts in rows.items():
         whose = "its own" if arithmetic == decisions else f"{decisions}’s"
