@@ -10,6 +10,7 @@ import numpy as np
 from ase import Atoms
 
 from mdnum.precision import unit_roundoff
+from mdnum.precision.policy import WIDE
 from mdnum.references.ase_models import Reference, evaluate, independent, reference
 from mdnum.references.closed_forms import pair_forms
 from mdnum.references.findings import finding, plain
@@ -195,6 +196,14 @@ def narrowest(system: System) -> str:
     return max(roles, key=unit_roundoff)
 
 
+def _places(system: System) -> str:
+    """The narrowest float type of places: a force in sixteen bits has the displacements of the decision."""
+    precision = system.spec.precision
+    if precision.force in WIDE:
+        return narrowest(system)
+    return max((precision.state, precision.decision), key=unit_roundoff)
+
+
 def _named(frames: Mapping[str, Atoms] | Sequence[Atoms] | None, simulation: Any) -> dict[str, Atoms]:
     if isinstance(frames, Mapping):
         return dict(frames)
@@ -284,12 +293,12 @@ class _Scales:
         cls, system: System, simulation: Any, atoms: Atoms, mine: Any, theirs: Mapping[str, Any]
     ) -> _Scales:
         """Scales of a frame; pair by pair where there are pairs, else from the totals."""
-        unit = unit_roundoff(narrowest(system))
+        unit, places = unit_roundoff(narrowest(system)), unit_roundoff(_places(system))
         largest_force = float(np.abs(theirs["forces"]).max(initial=0.0))
         volume = atoms.get_volume() if atoms.cell.rank == 3 else float("inf")
         positions, cell = atoms.get_positions(), np.asarray(atoms.cell)
         # a displacement is a difference of coordinates of this size, each rounded once or twice
-        shift = rounding_bound(positions, cell, 0.0, unit_roundoff=unit) / 8.0
+        shift = rounding_bound(positions, cell, 0.0, unit_roundoff=places) / 8.0
         i, j, r = (np.asarray(array) for array in (mine.i, mine.j, mine.distance))
         if system.spec.cutoff is None:
             # many-body potentials need not split their energy by atom
@@ -307,6 +316,9 @@ class _Scales:
                 8.0 * unit * force + 4.0 * shift * stiff,
                 0,
             )
+        if places < unit:
+            # the distance itself is rounded, too
+            shift = shift + unit * r
         model = PairModel(pair_forms(system.spec, system.species))
         edges = Edges(np.array(atoms.get_chemical_symbols()), i, j, np.zeros((len(i), 3)), r)
         energies, forces, stiffness = np.zeros(len(i)), np.zeros(len(i)), np.zeros(len(i))
@@ -331,7 +343,7 @@ class _Scales:
             float((forces * r).sum()) / volume,
             float(energy_expected),
             float(np.sqrt(per_atom.max(initial=0.0))) + 4.0 * unit * force,
-            _ambiguous(model, atoms, unit),
+            _ambiguous(model, atoms, places),
         )
 
 
