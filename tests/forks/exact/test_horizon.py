@@ -38,7 +38,8 @@ def liquid(seed: int = 3) -> Simulation:
 
 def test_single_precision_leaves_early_and_double_does_not():
     simulation = liquid()
-    chosen = {name: POLICIES[name] for name in ("float64", "float32", "float32, accumulate float64")}
+    names = ("float64", "float32", "float32, accumulate float64", "float64, force bfloat16")
+    chosen = {name: POLICIES[name] for name in names}
     certificate = certify(simulation, 400, policies=chosen)
     assert certificate.ranking[0].name == "float64"
     wide, narrow = certificate.of("float64"), certificate.of("float32")
@@ -57,6 +58,11 @@ def test_single_precision_leaves_early_and_double_does_not():
     # 29 bits more, of which some are lost in rounding more than one number a step
     assert 24 < wide.closer < 34 and abs(promoted.closer) < 1
     assert any("accumulate float64" in word and "gains nothing" in word for word in certificate.says)
+    short = certificate.of("float64, force bfloat16")
+    assert certificate.ranking[-1] is short and short.horizon is not None
+    # eight bits instead of twenty-four, in the pair forces alone
+    assert 3 <= short.horizon < narrow.horizon / 5 and short.closer < -6
+    assert any("bfloat16 pair forces cost" in word for word in certificate.says)
     assert certificate.steps_per_bit == pytest.approx(np.log(2) / 0.024, rel=0.3)
     assert json.loads(json.dumps(certificate.summary()))["policies"][0]["horizon"] is None
     assert any(word.startswith("float64 keeps every decision") for word in certificate.says)
