@@ -13,10 +13,8 @@ from mdnum.forks.bounce import certify, choices
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (
-            ("--along", "contact.k=1:2"),
-            "--along is a question for molecular dynamics, and ball/drop is a ball",
-        ),
+        (("--along", "spring=1:2"), "'spring' is no number that can be turned"),
+        (("--along", "k=2:1"), "nothing between 2.0 and 1.0"),
         (("--vary", "precision", "--benign"), "--benign is a question for molecular dynamics"),
         (("--forecast", "1e-6"), "the margin that `mdnum ball` records"),
         (("--processes",), "demo determinism"),

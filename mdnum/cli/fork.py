@@ -89,9 +89,10 @@ def fork(
     if sum(asked.values()) > 1:
         given = " and ".join(name for name, is_asked in asked.items() if is_asked)
         raise InputError(f"{given} are different questions", remedy="Ask one at a time")
-    if system is not None and other is None and fork_ball.is_ball(system):
+    # along a number is the one question that is the same in both worlds
+    if system is not None and other is None and along is None and fork_ball.is_ball(system):
         foreign = {
-            "--along": along is not None, "--most": most is not None, "--processes": processes,
+            "--most": most is not None, "--processes": processes,
             "--forecast": forecast is not None, "--benign": benign, "--minimal": minimal,
             "--pin": pin is not None, "--no-back": no_back, "--no-lyapunov": no_lyapunov,
         }  # fmt: skip

@@ -69,16 +69,26 @@ def _print(summary: Mapping[str, Any]) -> None:
         (
             f"{row['below']!r}\n{row['above']!r}",
             f"{row['step']:,}",
-            f"{row['i']}–{row['j']}",
+            f"{row['who']}\n{row['way']}",
             f"{row['margin_below']:+.2e}\n{row['margin_above']:+.2e}",
             f"{row['jump']:+.3e}",
-            f"{row['apart']:.2e}",
+            *(() if row["apart"] is None else (f"{row['apart']:.2e}",)),
             row["confirmed"],
         )
         for row in summary["boundaries"]
     ]
     if table:
-        columns = ("below, above", "step", "pair", "margins", f"jump of the loss{unit}", "apart", "confirmed")
+        columns = [
+            "below, above",
+            "step",
+            "decision",
+            "margins",
+            f"jump of the loss{unit}",
+            "apart",
+            "confirmed",
+        ]
+        if summary["apart_largest"] is None:
+            columns.remove("apart")
         output.print_table("", columns, table)
     counts = [
         ("histories", f"{summary['histories']:,}"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import subprocess
 import sys
@@ -9,19 +10,25 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from threading import Lock
 from typing import Any
 
+import numpy as np
+
+from mdnum.ball.problem import START, Problem
 from mdnum.errors import MdnumError
 from mdnum.forks.dials import dial
 from mdnum.forks.histories import history
+from mdnum.systems.ball_system import BallSystem
 from mdnum.systems.build import build
+from mdnum.systems.build_ball import build_ball
 from mdnum.systems.load import System, load
 
 
 def digests_elsewhere(
-    system: System,
+    system: System | BallSystem,
     key: str,
     steps: int,
     values: Sequence[float],
@@ -92,19 +99,37 @@ def _answered(asked: dict[str, Any], values: Sequence[float], tell: Callable[[],
     return found
 
 
-def digests(system: System, key: str, steps: int, values: Sequence[float]) -> Iterator[str]:
+def digests(system: System | BallSystem, key: str, steps: int, values: Sequence[float]) -> Iterator[str]:
     """The same in this process, by the program that a user runs."""
+    if isinstance(system, BallSystem):
+        problem = build_ball(system, steps=steps).problem
+        for value in values:
+            yield ball_digest(at_value(problem, key, value))
+        return
     simulation = build(system)
     proper = dial(simulation, key).proper
     for value in values:
         yield history(proper(simulation, value), steps).digest
 
 
+def at_value(problem: Problem, name: str, value: float) -> Problem:
+    """A ball's problem at a value of a parameter; a start moves the whole batch there."""
+    if name in START:
+        return replace(problem, **{name: np.full(np.atleast_1d(np.asarray(problem.y0)).shape, value)})
+    return problem.with_values({name: value})
+
+
+def ball_digest(problem: Problem) -> str:
+    """All decisions of a ball's rollout in one word."""
+    run = problem.run(keep=False)
+    return hashlib.blake2b(run.contact.tobytes() + run.iterations.tobytes(), digest_size=16).hexdigest()
+
+
 def main() -> None:
     """Answer one question, asked as JSON on standard input, a line for each value."""
     asked = json.load(sys.stdin)
     values = [float.fromhex(value) for value in asked["values"]]
-    for found in digests(load(asked["path"], world="md"), asked["key"], asked["steps"], values):
+    for found in digests(load(asked["path"]), asked["key"], asked["steps"], values):
         print(found, flush=True)
 
 

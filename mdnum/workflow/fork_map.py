@@ -10,12 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mdnum.store import RunFolder
-from mdnum.workflow.fork_question import Log, Progress, basics, finish, loaded, opened, steps_of
+from mdnum.errors import InputError
+from mdnum.store import COLUMNS, RunFolder
+from mdnum.workflow.fork_question import Log, Progress, basics, finish, is_ball, loaded, opened, steps_of
 
 if TYPE_CHECKING:
     from mdnum.forks.boundaries import Boundary, BoundaryMap
     from mdnum.forks.histories import Loss
+    from mdnum.systems.ball_system import BallSystem
     from mdnum.systems.load import System
 
 #: What boundaries.parquet says of a boundary that was or was not found again by a fresh process.
@@ -28,17 +30,17 @@ class MapResult:
 
     Attributes:
         folder: the fork folder.
-        map: intervals of one history each, and the boundaries between them.
+        map: intervals of one history each, and the boundaries between them; None of a ball.
         summary: what summary.json says, findings included.
     """
 
     folder: Path
-    map: BoundaryMap
+    map: BoundaryMap | None
     summary: dict[str, Any]
 
 
 def fork_map(
-    system: System | str | Path,
+    system: System | BallSystem | str | Path,
     key: str,
     low: float,
     high: float,
@@ -56,14 +58,14 @@ def fork_map(
     """Where the history of a run's decisions changes along a number, to adjacent floats.
 
     Args:
-        system: a loaded system, a shipped name or the path of a system file.
-        key: the number, such as "potential.sigma", "timestep" or "position.17.x".
+        system: a loaded system, a shipped name or the path of a system file; a ball too.
+        key: the number, such as "potential.sigma", "timestep" or "position.17.x"; of a ball "k", "tol", "y0".
         low, high: the interval, in the units of the system's file; both belong to it.
-        steps: last step of every run; default the system's own, but no more than 500.
+        steps: last step of every run; default the system's own, but no more than 500 of molecular dynamics.
         cells: of the grid that tells where to look.
-        most: stop after so many boundaries; default 24.
+        most: stop after so many boundaries; default 24, and of a ball 64.
         loss: of the final state, called with the simulation, unwrapped positions and velocities; default the
-            mean squared displacement from the start.
+            mean squared displacement from the start. That of a ball is the file's.
         confirm: whether to run both sides of every boundary again in a fresh process.
         out: the new fork folder; default runs/fork-<name>-<n>.
         overrides: dotted keys to values, such as {"cutoff.kind": "switched"}.
@@ -80,6 +82,11 @@ def fork_map(
     from mdnum.systems import build
 
     began = time.perf_counter()
+    if is_ball(system):
+        if loss is not None:
+            raise InputError("the loss of a ball is that of its system file", remedy="Leave out loss")
+        options = {"cells": cells, "most": most, "confirm": confirm}
+        return _ball(system, (key, low, high), steps, options, out, overrides, report, progress)
     system = loaded(system, overrides)
     last = steps_of(system, steps)
     # what cannot be is refused before there is a folder
@@ -95,7 +102,13 @@ def fork_map(
             loss=squared_displacement if loss is None else loss, confirm=confirm,
             progress=Log(folder, progress),
         )  # fmt: skip
-        _write(folder, found)
+        edges = [_row(edge) for edge in found.boundaries]
+        for name, rows in (
+            ("boundaries", edges),
+            ("intervals", _intervals(found)),
+            ("points", _points(found)),
+        ):
+            _write(folder, name, rows)
         folder.log(found.words)
         folder.finalize()
         units = system.units
@@ -106,7 +119,7 @@ def fork_map(
             "value": one.value,
             "loss": "mean squared displacement" if loss is None else getattr(loss, "__name__", "loss"),
             "loss_unit": f"{units.length}²" if loss is None else "",
-            **_summary(found, confirm),
+            **_summary(found, edges, confirm),
             "compiles": one.compiles,
             "seconds": time.perf_counter() - began,
         }
@@ -125,6 +138,10 @@ def _row(edge: Boundary) -> dict[str, Any]:
         "step": edge.step,
         "i": edge.i,
         "j": edge.j,
+        "who": f"{edge.i}–{edge.j}",
+        "says": f"pair {edge.i}–{edge.j} {'enters its cutoff' if above.inside else 'is left out'}",
+        "way": f"in {'above' if above.inside else 'below'}",
+        "channel": "pair",
         "inside": above.inside,
         "also": edge.also,
         "margin_below": below.margin,
@@ -140,22 +157,72 @@ def _row(edge: Boundary) -> dict[str, Any]:
     }
 
 
-def _write(folder: RunFolder, found: BoundaryMap) -> None:
-    """Puts boundaries, intervals and runs into the folder's tables."""
-    rows = [_row(edge) for edge in found.boundaries]
+def _ball(
+    system: Any, along: tuple[str, float, float], steps: int | None, options: dict[str, Any],
+    out: str | Path | None, overrides: Mapping[str, Any] | None, report: bool, progress: Progress | None,
+) -> MapResult:  # fmt: skip
+    """The map of a ball, in a folder of the same kind."""
+    from mdnum.systems import BallSystem, load
+    from mdnum.workflow.fork_map_ball import MOST, search
+
+    began = time.perf_counter()
+    if not isinstance(system, BallSystem):
+        system = load(system, overrides, world="ball")
+    system = system if steps is None else system.for_steps(steps)
+    options["most"] = MOST if options["most"] is None else options["most"]
+    say = progress if progress is not None else (lambda *_: None)
+    found, tables = search(system, *along, **options, tell=lambda phase: say(0, 0, {"phase": phase}))
+    folder = opened(system, "along", out)
+    try:
+        for name, rows in tables.items():
+            _write(folder, name, rows)
+        for edge in found["boundaries"]:
+            folder.log(f"from {edge['above']!r} on {edge['says']} in step {edge['step']}")
+        folder.finalize()
+        folder.write_summary(
+            {
+                "world": "fork",
+                "question": "along",
+                "system": system.name,
+                "about": system.spec.about,
+                "balls": system.balls,
+                "steps": system.spec.integrator.steps,
+                "timestep": system.spec.integrator.timestep,
+                "units": "ball",
+                **found,
+                "findings": [],
+                "status": "complete",
+                "seconds": time.perf_counter() - began,
+            }
+        )
+    except BaseException:
+        folder.close()
+        raise
+    return MapResult(folder.path, None, finish(folder, report, progress))
+
+
+def _write(folder: RunFolder, table: str, rows: list[dict[str, Any]]) -> None:
+    """Appends rows to a table of the folder, of each what the table has a column for."""
     if rows:
-        folder.append("boundaries", {name: np.array([row[name] for row in rows]) for name in rows[0]})
+        names = [name for name in rows[0] if name in COLUMNS[table] or name.startswith("gradient")]
+        folder.append(table, {name: np.array([row[name] for row in rows]) for name in names})
+
+
+def _intervals(found: BoundaryMap) -> list[dict[str, Any]]:
     names = ("low", "high", "history", "digest", "loss_low", "loss_high", "runs", "gap")
-    folder.append(
-        "intervals", {name: np.array([getattr(one, name) for one in found.intervals]) for name in names}
-    )
-    starts = np.array([one.low for one in found.intervals])
-    numbers = np.array([one.history for one in found.intervals])
-    history = numbers[np.searchsorted(starts, found.at, side="right") - 1]
-    folder.append("points", {"at": found.at, "history": history, "loss": found.loss, "energy": found.energy})
+    return [{name: getattr(one, name) for name in names} for one in found.intervals]
 
 
-def _summary(found: BoundaryMap, confirm: bool) -> dict[str, Any]:
+def _points(found: BoundaryMap) -> list[dict[str, Any]]:
+    starts = [one.low for one in found.intervals]
+    pieces = np.searchsorted(starts, found.at, side="right") - 1
+    return [
+        {"at": at, "history": found.intervals[piece].history, "loss": loss, "energy": energy}
+        for at, piece, loss, energy in zip(found.at, pieces, found.loss, found.energy, strict=True)
+    ]
+
+
+def _summary(found: BoundaryMap, rows: list[dict[str, Any]], confirm: bool) -> dict[str, Any]:
     edges = found.boundaries
     return {
         "low": found.low,
@@ -169,17 +236,9 @@ def _summary(found: BoundaryMap, confirm: bool) -> dict[str, Any]:
         "confirmed": sum(edge.confirmed is True for edge in edges) if confirm else None,
         "jump_largest": max((abs(edge.jump) for edge in edges), default=None),
         "apart_largest": max((edge.apart for edge in edges), default=None),
-        "boundaries": [_row(edge) for edge in edges],
+        "boundaries": rows,
         "intervals": [
-            {
-                "low": one.low,
-                "high": one.high,
-                "history": one.history,
-                "loss_low": one.loss_low,
-                "loss_high": one.loss_high,
-                "runs": one.runs,
-            }
-            for one in found.intervals
+            {name: row[name] for name in row if name not in ("digest", "gap")} for row in _intervals(found)
         ],
         "unresolved": [list(ends) for ends in found.unresolved],
         "says": found.words,

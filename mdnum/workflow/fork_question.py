@@ -11,6 +11,7 @@ from mdnum.store import RunFolder
 from mdnum.store.naming import default_folder
 
 if TYPE_CHECKING:
+    from mdnum.systems.ball_system import BallSystem
     from mdnum.systems.load import System
 
 Progress = Callable[[int, int, dict[str, Any]], None]
@@ -19,7 +20,17 @@ Progress = Callable[[int, int, dict[str, Any]], None]
 FEW_STEPS = 500
 
 
-def loaded(system: System | str | Path, overrides: Mapping[str, Any] | None) -> System:
+def is_ball(system: Any) -> bool:
+    """Whether a system, or what is there under a name, is a ball."""
+    from mdnum.systems import BallSystem, System
+    from mdnum.systems.find import world_of
+
+    if isinstance(system, System | BallSystem):
+        return isinstance(system, BallSystem)
+    return world_of(system) == "ball"
+
+
+def loaded(system: System | BallSystem | str | Path, overrides: Mapping[str, Any] | None) -> System:
     """The system of molecular dynamics that is meant.
 
     Raises:

@@ -83,7 +83,7 @@ def test_the_page_says_what_the_folder_holds(mapped):
     assert sorted(path.stem for path in (mapped.folder / "figures").iterdir()) == ["detail", "jumps", "map"]
     words = re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", text))
     for edge in mapped.summary["boundaries"]:
-        assert f"{edge['below']!r} {edge['above']!r} {edge['step']} 0–1 inside above" in words
+        assert f"{edge['below']!r} {edge['above']!r} {edge['step']} 0–1 in above" in words
         # in the figure, beside its line
         assert f"0–1, step {edge['step']}" in words
     assert "change at 3 places between dynamics.timestep = 0.06 and 0.105" in words
@@ -155,6 +155,41 @@ def test_from_the_command_line(mapped, tmp_path, monkeypatch, capsys):
     said = capsys.readouterr().out
     assert all(repr(side.at) in said for edge in edges for side in (edge.below, edge.above))
     assert "wrote runs/fork-" in said and asked[1][4] == MOST
+
+
+def test_a_ball_has_a_map_too(tmp_path, capsys):
+    """Solver iterations along the tolerance: each cuts what is left to 1 - alpha k of it."""
+    asked = [
+        "fork",
+        "ball/batch-on-the-boundary",
+        "--along",
+        "stop.tol=0.0005:0.002",
+        "-o",
+        str(tmp_path / "one"),
+    ]
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as stopped:
+        patch.setattr("mdnum.forks.confirm._answered", lambda asked, values, tell: ["other"] * len(values))
+        main([*asked, "--json"])
+    answer = json.loads(capsys.readouterr().out)
+    assert stopped.value.code == 1 and answer["key"] == "tol" and answer["loss"] == "residual penetration"
+    whole = answer["value"]
+    edges = answer["boundaries"]
+    assert [
+        edge["above"] > whole * 0.75**k >= edge["below"] for k, edge in zip((2, 1, 0), edges, strict=True)
+    ]
+    np.testing.assert_allclose(
+        [edge["below"] for edge in edges], [whole * 0.75**k for k in (2, 1, 0)], rtol=1e-6
+    )
+    for edge in edges:
+        assert np.nextafter(np.float32(edge["below"]), np.float32(1)) == np.float32(edge["above"])
+        assert edge["channel"] == "stop" and edge["confirmed"] == "no" and edge["jump"] > 0
+    assert edges[-1]["says"] == "the solver makes 0 iterations instead of 1"
+    pieces = RunFolder.open(tmp_path / "one").read("intervals")
+    assert pieces["low"][1:].tolist() == [edge["above"] for edge in edges]
+    # the loss is what the solver leaves: the same on a whole interval, a step up at each boundary
+    np.testing.assert_array_equal(pieces["loss_low"], pieces["loss_high"])
+    page = (tmp_path / "one/report.html").read_text(encoding="utf-8")
+    assert "solver<br>1 → 0" in page
 
 
 def test_what_cannot_be_is_refused_before_there_is_a_folder(tmp_path):

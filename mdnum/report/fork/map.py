@@ -38,6 +38,7 @@ def write_report(folder: RunFolder | str | Path) -> Path:
         boundaries=[_boundary(edge) for edge in run.summary["boundaries"]],
         bounds=_bounds(run.summary["boundaries"]),
         numbered=numbered(run),
+        ball="balls" in run.summary,
         intervals=[_interval(one) for one in run.summary["intervals"]],
         unresolved=[f"{low!r} to {high!r}" for low, high in run.summary["unresolved"]],
         what=list(_what(run)),
@@ -83,7 +84,7 @@ def _evidence(run: Question) -> Iterator[str]:
         yield (
             f"The largest jump of the {summary['loss']} is "
             f"{number(largest['jump'], 3, signed=True)} {summary['loss_unit']}".rstrip()
-            + f", where {_decision(largest)} at step {count(largest['step'])}."
+            + f", where {largest['says']} at step {count(largest['step'])}."
         )
         total = sum(edge["jump"] for edge in edges)
         ends = summary["intervals"][-1]["loss_high"] - summary["intervals"][0]["loss_low"]
@@ -108,10 +109,6 @@ def _evidence(run: Question) -> Iterator[str]:
         )
 
 
-def _decision(edge: Mapping[str, Any]) -> str:
-    return f"pair {edge['i']}–{edge['j']} {'enters its cutoff' if edge['inside'] else 'is left out'}"
-
-
 def _findings(run: Question) -> Iterator[Finding]:
     summary, edges = run.summary, run.summary["boundaries"]
     moved = [edge for edge in edges if edge["confirmed"] == "no"]
@@ -122,7 +119,9 @@ def _findings(run: Question) -> Iterator[Finding]:
             "warning",
             f"{many(len(moved), 'boundary', 'boundaries')} elsewhere in a fresh process",
             f"A process of its own decides otherwise beside {places}: the two programs do not round alike.",
-            "Run `mdnum fork SYSTEM --processes`: it tells which programs agree.",
+            ""
+            if "balls" in summary
+            else "Run `mdnum fork SYSTEM --processes`: it tells which programs agree.",
         )
     if edges and not summary["confirm"]:
         yield Finding(
@@ -166,7 +165,10 @@ def _key_figures(run: Question) -> Iterator[tuple[str, str, str]]:
         number(summary["jump_largest"], 3),
         f"of the {summary['loss']}{', ' + summary['loss_unit'] if summary['loss_unit'] else ''}",
     )
-    yield "Final states", number(summary["apart_largest"], 3), f"{run.units.length} apart at most"
+    if summary["apart_largest"] is None:
+        yield "Resolution", number(summary["resolution"], 2), f"of the grid, {summary['key']}"
+    else:
+        yield "Final states", number(summary["apart_largest"], 3), f"{run.units.length} apart at most"
     sure = summary["confirmed"]
     yield "Confirmed", "–" if sure is None else f"{count(sure)} of {count(len(edges))}", "in a fresh process"
     yield "Runs", count(summary["evaluations"]), f"{number(summary.get('seconds'), 2)} s in all"
@@ -178,21 +180,23 @@ def _boundary(edge: Mapping[str, Any]) -> dict[str, Any]:
         "below": repr(edge["below"]),
         "above": repr(edge["above"]),
         "step": count(edge["step"]),
-        "pair": f"{edge['i']}–{edge['j']}",
-        "way": "in above" if edge["inside"] else "in below",
+        "who": edge["who"],
+        "way": edge["way"],
         "also": f"+ {count(edge['also'])}" if edge["also"] else "",
         "margin_below": number(edge["margin_below"], 2, signed=True),
         "margin_above": number(edge["margin_above"], 2, signed=True),
         "jump": number(edge["jump"], 3, signed=True),
         "apart": number(edge["apart"], 2),
+        "gradient_below": number(edge.get("gradient_below"), 3, signed=True),
+        "gradient_above": number(edge.get("gradient_above"), 3, signed=True),
         "confirmed": edge["confirmed"],
     }
 
 
 def _bounds(edges: Sequence[Mapping[str, Any]]) -> str:
     """The rounding bounds of the margins, in words; they differ from one kind of pair to another only."""
-    known = sorted({number(edge["bound"], 2) for edge in edges})
-    return f"{'s' if len(known) > 1 else ''} {listed(known)}" if known else ""
+    known = sorted({number(edge["bound"], 2) for edge in edges if edge["bound"] is not None})
+    return f"; rounding bound{'s' if len(known) > 1 else ''} {listed(known)}" if known else ""
 
 
 def _interval(one: Mapping[str, Any]) -> dict[str, str]:
@@ -214,6 +218,10 @@ def _what(run: Question) -> Iterator[tuple[str, str]]:
     own = f"; the system’s own is {summary['value']!r}" if summary.get("value") is not None else ""
     yield "Number", f"{with_unit(summary['key'], unit)} from {summary['low']!r} to {summary['high']!r}{own}"
     yield "Loss", f"{with_unit(summary['loss'], summary['loss_unit'])} of the last step"
+    if "balls" in summary:
+        yield "Program", "a grid at once by a vectorized one; bisection by the one that `mdnum ball` runs"
+        yield took(run)
+        return
     program = (
         "searched in a twin of the program that is given the cutoff, as the program proper is compiled for "
         "each; confirmed in the program proper"

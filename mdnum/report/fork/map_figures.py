@@ -99,7 +99,7 @@ def labels(run: Question) -> list[str]:
     """What stands beside the boundaries: pair and step, or their numbers where that would be too much."""
     edges = run.summary["boundaries"]
     if not numbered(run):
-        return [f"{edge['i']}–{edge['j']}, step {edge['step']:,}" for edge in edges]
+        return [f"{edge['who']}, step {edge['step']:,}" for edge in edges]
     return [f"{place}" for place in range(1, len(edges) + 1)]
 
 
@@ -117,17 +117,19 @@ def jumps(run: Question) -> Plot | None:
         return None
     at = np.array([edge["above"] for edge in edges])
     size = np.abs([edge["jump"] for edge in edges])
-    apart = np.array([edge["apart"] for edge in edges])
+    apart = np.array([np.nan if edge["apart"] is None else edge["apart"] for edge in edges])
     summary, length = run.summary, run.units.length
     loss = with_unit(f"jump of the {summary['loss']}", summary["loss_unit"])
+    series = [Series(loss, at, size, mark="points", role="bad")]
+    if np.isfinite(apart).any():
+        series.append(
+            Series(f"furthest atom in the final state ({length})", at, apart, mark="points", role="muted")
+        )
     return Plot(
         "What changes at each boundary",
         with_unit(summary["key"], summary["key_unit"]),
         "across the boundary",
-        (
-            Series(loss, at, size, mark="points", role="bad"),
-            Series(f"furthest atom in the final state ({length})", at, apart, mark="points", role="muted"),
-        ),
+        tuple(series),
         y_scale="log",
     )  # fmt: skip
 
@@ -140,11 +142,11 @@ def captions(run: Question) -> dict[str, str]:
     which = (
         "the boundary of this number in the table"
         if numbered(run)
-        else "this pair is the first to be decided otherwise, at this step"
+        else "this decision is the first that comes out otherwise, at this step"
     )
     return {
         "map": "A line for each stretch with one history of decisions; dots are runs, which crowd where a "
         f"boundary was closed in. Upright: between two adjacent floats, {which}.",
-        "detail": "The same runs, with a cubic in the number taken off: what is left are the jumps.",
-        "jumps": "Sizes, whatever their sign. A flip at the last steps has had no time to move anything.",
+        "detail": "The same runs, with a cubic in the number taken off: what is left are jumps and kinks.",
+        "jumps": "Sizes, whatever their sign. A decision of the last steps has had no time to move anything.",
     }

@@ -129,7 +129,9 @@ def size_of(run: Question) -> list[tuple[str, str]]:
     """Rows on the system: what, words."""
     summary = run.summary
     rows = [("System", str(summary["about"]))] if summary.get("about") else []
-    size = f"{many(summary.get('atoms'), 'atom')}, {many(run.steps, 'step')}"
+    balls = summary.get("balls")
+    parts = many(summary.get("atoms"), "atom") if balls is None else many(balls, "ball")
+    size = f"{parts}, {many(run.steps, 'step')}"
     return [*rows, ("Size", f"{size} of {plain(summary.get('timestep'))} {run.units.time}")]
 
 
