@@ -94,6 +94,16 @@ def test_float32_is_compared_in_units_of_its_rounding(precision: dict):
     assert [one["code"] for one in report.findings] == ["narrow-precision"]
 
 
+def test_a_force_in_sixteen_bits_has_rounded_terms_at_places_that_are_not():
+    atoms = crystal()
+    short = make(atoms, LENNARD_JONES, HARD, precision={"force": "bfloat16"})
+    report = check_energy(short, {"initial": atoms})
+    (frame,) = report.frames
+    assert report.ok and report.precision == "bfloat16" and frame.ambiguous == 0
+    assert 1e-5 < frame.energy_rel < 1e-2
+    assert 0.05 < frame.force_roundings < 2.0 and frame.energy_roundings < 2.0
+
+
 class Faulty:
     """A simulation whose results are changed on the way out."""
 
