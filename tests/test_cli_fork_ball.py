@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+import pyarrow.parquet as pq
 import pytest
 from command_line import call, printed
 
@@ -61,6 +62,26 @@ def test_a_fork_of_a_ball_is_printed_and_told_as_json(capsys, tmp_path, monkeypa
     document = json.loads(capsys.readouterr().out)
     assert document["folder"] == "there" and document["decision"]["decided"] == {"A": 0, "B": 1}
     assert f"step {document['fork']:,}," in at
+
+
+def test_two_finished_runs_of_a_ball(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    small = ("--no-report", "--steps", "480", "--set", "gradient.of=[]", "--set", "variants={}")
+    for name, more in (("a", ()), ("b", ("--set", "start.height=1.01")), ("c", ())):
+        assert call("ball", "ball/drop", *small, *more, "-o", name) == 0
+    capsys.readouterr()
+    assert call("fork", "a", "b", "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["differences"] == [["start.height", 1.0, 1.01]] and found["seed"] == 0
+    ledgers = [pq.read_table(tmp_path / name / "contacts.parquet").to_pydict() for name in "ab"]
+    # the lower ball touches first
+    assert found["fork"] == ledgers[0]["step"][0] < ledgers[1]["step"][0] and found["channel"] == "contact"
+    (flip,) = found["decisions"]
+    assert (flip["run"], flip["ball"], flip["entered"]) == ("A", 0, True)
+    assert flip["margin"] == ledgers[0]["margin"][0]
+    assert call("fork", "a", "c") == 0
+    lines = printed(capsys)
+    assert lines[0] == "No stored number differs in 480 steps." and "fork none in 480" in lines
 
 
 def test_the_exact_history_of_a_ball(capsys, monkeypatch):

@@ -112,7 +112,8 @@ def fork(
         raise InputError("no system given", remedy="`mdnum systems list` names those that come with mdnum")
     if system is not None:
         if other is not None:
-            return fork_questions.folders(Path(system), other, as_json=as_json)
+            code = fork_ball.folders(system, other, as_json=as_json)
+            return fork_questions.folders(Path(system), other, as_json=as_json) if code is None else code
         if along is not None:
             return fork_map.along(
                 system, along, steps, most, overrides, out=out, report=not no_report, as_json=as_json
