@@ -347,6 +347,14 @@ def test_a_screen_ranks_by_fork_and_then_by_seed_with_what_does_not_apply_last(c
         screen(crystal, 10, [])
 
 
+def test_lists_of_another_order_are_not_those_of_the_leader(crystal: System):
+    """B under A's decisions has B's order of pairs: with A's lists it would be A."""
+    found = fork(parse("order").make(crystal), 30, repeats=0)
+    assert np.nanmax(found.series["B|A"]) > 0
+    held = fork(parse("order@exact").make(crystal), 30, repeats=0)
+    assert np.nanmax(held.series["B|A"]) == 0 and found.dates.seed == 1
+
+
 def test_a_choice_is_what_fork_takes(crystal: System):
     found = fork(parse("ulps=potential.epsilon:1099511627776").make(crystal), 150, repeats=0)
     assert found.dates.seed == 1 and found.twin.difference.startswith("potential.epsilon = ")

@@ -21,7 +21,7 @@ from mdnum.precision import reductions
 from mdnum.systems.build import Simulation
 from mdnum.systems.load import System, load
 
-CRYSTAL, BATH = "argon/crystal-108", "argon/langevin-500"
+CRYSTAL, BATH, MIXTURE = "argon/crystal-108", "argon/langevin-500", "binary/kob-andersen-1000"
 
 #: Words for what differs, by name. Keys of the system file stand as they are.
 CHANGES: Mapping[str, set[str]] = {
@@ -64,6 +64,30 @@ CHANGES: Mapping[str, set[str]] = {
     "start": {"positions"},
     "noise": {"key"},
 }
+
+SWITCHED = {"cutoff.kind": "switched", "cutoff.onset": 1.4}
+
+#: Choices with arguments, on the systems that they are for.
+MORE: tuple[tuple[str, str, dict[str, Any], set[str]], ...] = (
+    ("precision=float64", CRYSTAL, {"precision.force": "float32"}, {"precision.force", "policy"}),
+    ("precision=bfloat16", CRYSTAL, {}, {"precision.force", "policy"}),
+    ("precision.force=float16", CRYSTAL, {}, {"precision.force", "policy"}),
+    # a system file has no words for the number of a reduction
+    ("reduction=permuted:3", CRYSTAL, {}, {"reduction"}),
+    ("ulps=potential.pairs.Ni-P.epsilon:-3", MIXTURE, {}, {"potential.pairs.Ni-P.epsilon", "potential"}),
+    ("ulps=cutoff.onset:+2", CRYSTAL, SWITCHED, {"cutoff.onset", "radius"}),
+    ("ulps=dynamics.friction:+1", BATH, {}, {"dynamics.friction", "bath"}),
+    ("ulps=neighbors.skin:+1", CRYSTAL, {}, {"neighbors.skin", "lists"}),
+    ("noise=7", BATH, {}, {"key"}),
+    ("builder=jax-md", CRYSTAL, {}, {"neighbors.builder", "lists"}),
+    ("rebuild=every:25", CRYSTAL, {}, {"neighbors.rebuild.check", "neighbors.rebuild.every", "lists"}),
+    ("skin=0.5@fixed-point", CRYSTAL, {}, {"neighbors.skin", "lists"}),
+    ("relabel=4", CRYSTAL, {}, {"positions", "velocities", "frame"}),
+    ("rotate=zyx", CRYSTAL, {}, {"positions", "velocities", "frame"}),
+    ("translate=0.5@exact", CRYSTAL, {}, {"positions", "frame"}),
+    ("unwrapped=3", CRYSTAL, {}, {"positions"}),
+    ("start=17:0:-2", CRYSTAL, {}, {"positions"}),
+)
 
 #: A system that each applies to, where the crystal will not do, and what is set in it first.
 ON: Mapping[str, tuple[str, dict[str, Any]]] = {
@@ -143,13 +167,23 @@ def test_no_choice_is_shipped_without_a_row():
 @pytest.mark.parametrize("name", names())
 def test_a_choice_changes_what_it_names_and_nothing_else(crystal: System, name: str):
     file, given = ON.get(name, (CRYSTAL, {}))
+    assert changes(made(name, crystal, file, given)) == CHANGES[name]
+
+
+@pytest.mark.parametrize(("word", "file", "given", "expected"), MORE)
+def test_an_argument_changes_what_it_names(crystal, word: str, file: str, given: dict, expected: set[str]):
+    assert changes(made(word, crystal, file, given)) == expected
+
+
+def made(word: str, crystal: System, file: str, given: dict[str, Any]) -> Twin:
+    """The twin of a choice on a system with some keys set first."""
     system = crystal if file == CRYSTAL else load(file, world="md")
     system = varied(system, given) if given else system
-    choice = parse(name)
+    choice = parse(word)
     assert choice.why_not(system) is None
     twin = choice.make(system)
-    assert changes(twin) == CHANGES[name]
     assert twin.difference and twin.a.system.species == twin.b.system.species
+    return twin
 
 
 def test_what_must_hold_is_what_is_said_to():
