@@ -78,6 +78,9 @@ def fork(
 ) -> int:
     """Follow two runs that differ in one numerical choice, and judge the flip that parted them."""
     overrides = output.parse_overrides(settings)
+    if vary == "processes":
+        # what is varied then is no choice of two runs, but somebody may well ask so
+        vary, processes = None, True
     asked = {
         "RUN": other is not None,
         "--along": along is not None,
@@ -185,4 +188,7 @@ def _choices(as_json: bool) -> int:
         output.print_table(
             f"choices{whose}: `mdnum fork SYSTEM --vary CHOICE`", ("choice", "", "about"), lines
         )
+    output.console().print(
+        "jit, eager, vmap, grad and flags of XLA: `mdnum fork SYSTEM --processes`", markup=False
+    )
     return output.EXIT_FINE

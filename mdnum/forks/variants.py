@@ -276,7 +276,7 @@ def _causes(rows: Sequence[Ran]) -> list[str]:
     elif plain and not fused:
         told.append(f"{', '.join(plain)} agree with the reference: no fused multiply-add shows in it.")
     alike, without = same("eager", "scan"), same("eager", "AVX")
-    if alike and without:
+    if alike and without and fused:
         told.append("The eager program ran too few steps to tell which of the others it agrees with.")
     elif alike:
         told.append("The eager program has the reference's bits as far as it ran.")

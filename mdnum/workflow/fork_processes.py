@@ -88,6 +88,9 @@ def fork_processes(
         told(0, len(asked), "")
         found = variants(system, last, asked, told)
         _write(folder, found)
+        for row in found.rows:
+            if row.failed:
+                folder.log(f"{row.variant.name} failed: {row.failed}")
         for sentence in found.causes:
             folder.log(sentence)
         folder.finalize()

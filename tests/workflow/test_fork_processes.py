@@ -77,7 +77,8 @@ def test_from_the_command_line(compared, tmp_path, monkeypatch, capsys):
     assert stopped.value.code == 1 and answer["steps"] == STEPS
     assert len(answer["variants"]) == len(variants.VARIANTS)
     with pytest.raises(SystemExit):
-        main(["fork", "argon/crystal-108", "--processes", "--steps", str(STEPS), "--no-report"])
+        # the same question in other words
+        main(["fork", "argon/crystal-108", "--vary", "processes", "--steps", str(STEPS), "--no-report"])
     said = capsys.readouterr().out
     assert re.search(r"reversed +step 2 +6 +2\.\d+e-13", said) and "(the reference)" in said
     assert re.search(r"- +SSE4\.2 +took longer than 600 s", said)
