@@ -131,9 +131,8 @@ def _evaluated(force, x, tables):
     return force(x, tables, decisions=False)
 
 
-@pytest.mark.parametrize(
-    "format", [pytest.param(word, marks=pytest.mark.slow) for word in FORMATS[:2]] + ["ordered-sparse"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("format", FORMATS)
 def test_the_choice_adds_in_the_order_of_the_format(simulation, rows, format):
     made = FormattedSimulation.of(simulation, format)
     assert made.reduction == {"dense": Twice(), "sparse": Sequential(), "ordered-sparse": Halves()}[format]
