@@ -27,6 +27,7 @@ _CHECKED = [
     "mdnum.systems",
     "mdnum.rollout",
     "mdnum.forks",
+    "mdnum.gradients",
     "mdnum.doctor",
 ]
 typing_rules.keep_numba_whole()

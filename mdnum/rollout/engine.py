@@ -17,7 +17,7 @@ from jaxtyping import Float, Int, UInt8
 
 from mdnum.md.cell import wrap_positions
 from mdnum.md.verlet import PairTable, VerletList
-from mdnum.rollout.epoch import Program, Record, State, empty_record, run_epoch
+from mdnum.rollout.epoch import Outcome, Program, Record, State, empty_record, run_epoch
 from mdnum.rollout.pins import Pins
 from mdnum.systems.build import Simulation
 
@@ -208,42 +208,13 @@ class Engine:
         # the decisions of the step before: a new list looks back for them, one in use remembers them
         before: np.ndarray | None = None
         while True:
-            words = table.slots // 8
-            outcome, record = run_epoch(
-                self._leaves,
-                self._structure,
-                tables,
-                state,
-                home,
-                jnp.asarray(built, jnp.int64),
-                jnp.asarray(self.last, jnp.int64),
-                jnp.asarray(before is None),
-                self._take(turn, words),
-                *self._pinned(table, first, words),
-            )
+            outcome, record = self._advance(table, tables, state, home, first, built, before is None, turn)
             if waiting is not None:
                 # the device is at work: the caller may read the record before this one
                 yield waiting
                 self._records[1 - turn] = waiting.record
-            rows, rebuild, finite, runaway = np.asarray(outcome.flags).tolist()
-            closes = self._closes(first + rows, rebuild=rebuild, finite=finite, runaway=runaway)
-            if before is None and outcome.before is not None:
-                before = np.asarray(outcome.before)
-            waiting = Segment(
-                first,
-                rows,
-                record,
-                before,
-                table,
-                epoch,
-                built,
-                opens,
-                closes,
-                bool(rebuild),
-                float(outcome.moved),
-                outcome.state,
-                reference,
-            )
+            waiting = self._segment(outcome, record, before, table, first, epoch, built, opens, reference)
+            closes, rows = waiting.closes, waiting.rows
             state, first, turn, opens = outcome.state, first + rows, 1 - turn, False
             before = np.array(waiting.rows_of("bits")[-1]) if self.record and rows else None
             if closes == "end" or closes in FAILURES:
@@ -254,6 +225,85 @@ class Engine:
                 home, built, epoch, opens, before = state.x, first, epoch + 1, True, None
                 table = self.verlet.build(reference, cell)
                 tables = self.simulation.tables(table)
+
+    def again(self, start: Start) -> Segment:
+        """The one segment that begins at a start, made anew with the bits that it had.
+
+        Args:
+            start: where a segment of this engine began (`resume_point` of the one before).
+        """
+        state, cell = start.state, self.simulation.cell
+        self.verlet.slots = start.slots
+        table = self.verlet.build(start.reference, cell)
+        home = jnp.asarray(start.reference.T, self.simulation.policy.dtype("state"))
+        first = int(state.step)
+        outcome, record = self._advance(
+            table, self.simulation.tables(table), state, home, first, start.built, True, 0
+        )
+        made = self._segment(
+            outcome,
+            record,
+            None,
+            table,
+            first,
+            start.epoch,
+            start.built,
+            first == start.built,
+            start.reference,
+        )
+        self._records[0] = record
+        return made
+
+    def _advance(
+        self, table: PairTable, tables, state: State, home, first: int, built: int, look_back: bool, turn: int
+    ):
+        """Start the compiled loop on the device."""
+        words = table.slots // 8
+        return run_epoch(
+            self._leaves,
+            self._structure,
+            tables,
+            state,
+            home,
+            jnp.asarray(built, jnp.int64),
+            jnp.asarray(self.last, jnp.int64),
+            jnp.asarray(look_back),
+            self._take(turn, words),
+            *self._pinned(table, first, words),
+        )
+
+    def _segment(
+        self,
+        outcome: Outcome,
+        record: Record,
+        before,
+        table: PairTable,
+        first,
+        epoch,
+        built,
+        opens,
+        reference,
+    ) -> Segment:
+        """What the loop left behind; waits for it."""
+        rows, rebuild, finite, runaway = np.asarray(outcome.flags).tolist()
+        closes = self._closes(first + rows, rebuild=rebuild, finite=finite, runaway=runaway)
+        if before is None and outcome.before is not None:
+            before = np.asarray(outcome.before)
+        return Segment(
+            first,
+            rows,
+            record,
+            before,
+            table,
+            epoch,
+            built,
+            opens,
+            closes,
+            bool(rebuild),
+            float(outcome.moved),
+            outcome.state,
+            reference,
+        )
 
     def _pinned(self, table: PairTable, first: int, words: int) -> tuple[UInt8[np.ndarray, "..."], ...]:
         """What the rows of the next epoch are told, and where; nothing without pins."""

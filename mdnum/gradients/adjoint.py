@@ -1,0 +1,266 @@
+"""The reverse pass of a rollout, stretch by stretch: at the states and decisions that the run recorded.
+
+Inside jax.value_and_grad a compiler makes another forward pass, whose rounding, and after some thousand
+steps whose decisions, are not those of the run that was simulated. Here the run is made first, by the program
+that makes every run, and the reverse pass linearizes at what it recorded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from mdnum.errors import InputError
+from mdnum.gradients.crossings import Crossings, crossings, onto_crossings
+from mdnum.gradients.losses import Frame
+from mdnum.gradients.pairs import FORCE, MODEL, SCALE, pull_back
+from mdnum.gradients.parameters import Cotangents
+from mdnum.gradients.tape import Tape, frame_of, rows_of
+from mdnum.md.integrators import Integrator
+from mdnum.md.pairforce import PairForce
+from mdnum.md.potentials import CutPotential
+
+#: Everything that a run is made of.
+ALL = frozenset((MODEL, SCALE, FORCE))
+
+
+class Carry(NamedTuple):
+    """What the reverse pass carries from step to step.
+
+    Attributes:
+        x: cotangent of the positions at the step that comes next in time, shape (3, atoms).
+        v: of the half-kicked velocities that lead there, shape (3, atoms).
+        model, integrator: of parameters, so far.
+        scale: of a common factor of all distances, so far.
+        origin: of the frame of step 0 where the loss compares with it, user's order.
+        r_cut: of the cutoffs by the times of flips, so far, shape (types,).
+    """
+
+    x: Float[Array, "3 atoms"]
+    v: Float[Array, "3 atoms"]
+    model: CutPotential
+    integrator: Any
+    scale: Float[Array, ""]
+    origin: tuple[Float[Array, "3 atoms"], Float[Array, "3 atoms"]]
+    r_cut: Float[Array, "types"]
+
+
+def reverse(
+    tape: Tape,
+    *,
+    wanted: frozenset[str] = ALL,
+    saltation: bool = False,
+    guard: float = 0.0,
+    watch: Callable[[int, np.ndarray, np.ndarray], None] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[Cotangents, list[Crossings]]:
+    """Derivatives of a tape's loss by everything that the run is made of.
+
+    Args:
+        tape: the run.
+        wanted: what is wanted beyond the start: of MODEL, SCALE and FORCE (the integrator's numbers).
+        saltation: whether to add what every flip does through the time at which it happens.
+        guard: radial speed, length per internal time, below which a flip counts as grazing and adds nothing.
+        watch: called after every stretch with its first step and the cotangents of positions and velocities
+            there, user's order.
+        progress: called with the steps done and the last step.
+
+    Returns:
+        The derivatives, and the crossings of every stretch with their weights, last stretch first.
+
+    Raises:
+        InputError: a many-body potential.
+
+    Error: of the order of a rounding error times the growth of the adjoint; none of truncation, for the
+    program as it ran.
+    """
+    simulation = tape.simulation
+    force = simulation.force
+    if not isinstance(force, PairForce):
+        raise InputError(
+            "this reverse pass is one of pair potentials",
+            remedy="Use the method unrolled for a many-body potential",
+            where=simulation.system.name,
+        )
+    dtype = simulation.policy.dtype("state")
+    atoms = simulation.atoms
+    onto_total = jax.grad(lambda total: tape.loss.value(total, tape.frames))(tape.total)
+    nothing = jnp.zeros((3, atoms), dtype)
+    numbers, _ = eqx.partition(simulation.integrator, _is_number)
+    carry = Carry(
+        nothing,
+        nothing,
+        jax.tree.map(jnp.zeros_like, force.model),
+        jax.tree.map(jnp.zeros_like, numbers),
+        jnp.zeros((), force.policy.dtype("force")),
+        (nothing, nothing),
+        jnp.zeros(simulation.pair_types, jnp.float64),
+    )
+    found: list[Crossings] = []
+    for stretch in tape.backward():
+        order = stretch.table.order
+        met = None
+        if saltation:
+            assert stretch.ledger is not None, "made without flips"
+            met = crossings(
+                simulation, stretch.ledger, stretch.first, order, stretch.x, stretch.x_before, guard
+            )
+        carry, weights = _stretch(
+            force,
+            simulation.integrator,
+            jnp.asarray(simulation.masses[order]),
+            simulation.tables(stretch.table),
+            rows_of(stretch),
+            stretch.bits,
+            np.arange(len(stretch.x)) < stretch.rows,
+            tape.seen(stretch),
+            (tape.loss, tape.origin, tape.around, onto_total),
+            None if met is None else met.on_device(len(stretch.x), atoms),
+            carry._replace(x=carry.x[:, order], v=carry.v[:, order]),
+            wanted,
+        )
+        carry = carry._replace(x=_unsorted(carry.x, order), v=_unsorted(carry.v, order))
+        if met is not None:
+            found.append(met.weighed(np.asarray(weights)))
+        if watch is not None:
+            watch(stretch.first, np.asarray(carry.x), np.asarray(carry.v))
+        if progress is not None:
+            progress(tape.steps - stretch.first, tape.steps)
+    x = np.asarray(carry.x + carry.origin[0], np.float64)
+    v = np.asarray(carry.v + carry.origin[1], np.float64)
+    # distances stretch with the box; the velocities of the start do not
+    scale = float(carry.scale) - float(np.sum(v * np.asarray(simulation.velocities).T))
+    parts = Cotangents(carry.model, carry.integrator, x, v, scale, np.asarray(carry.r_cut))
+    return parts, found
+
+
+def _is_number(leaf: Any) -> bool:
+    return eqx.is_inexact_array(leaf)
+
+
+def _unsorted(a, order):
+    return jnp.zeros_like(a).at[:, order].set(a)
+
+
+@partial(jax.jit, static_argnames=("wanted",))
+def _stretch(
+    force: PairForce,
+    integrator: Integrator,
+    masses: Float[Array, "atoms"],
+    tables,
+    rows,
+    bits,
+    used,
+    seen,
+    looking,
+    crossed,
+    carry: Carry,
+    wanted: frozenset[str],
+):
+    loss, origin, around, onto_total = looking
+    order = tables.order
+    dtype = rows[1].dtype
+    mass_row = masses.astype(dtype)
+    # the noise of a thermostat belongs to the atom, and its size to the length that atoms are measured in
+    numbers, rest = eqx.partition(integrator, _is_number)
+
+    def drift(x, v, numbers, scale, step):
+        whole = eqx.combine(numbers, rest)
+        x, v, _ = whole.drift(x, v, masses * (scale * scale), step, order)
+        return x, v
+
+    def look(row):
+        """Cotangents of one frame and of the origin, from those of the sums."""
+
+        def seen_at(x, v, potential, virial, origin, length):
+            at = (row[0], x, v, row[3], potential, virial)
+            here = around._replace(matrix=around.matrix * length, volume=around.volume * length**3)
+            frame = frame_of(at, order, around.matrix)
+            scaled = frame._replace(x=frame.x * length.astype(dtype), v=frame.v * length.astype(dtype))
+            start = Frame(
+                origin_step, origin[0] * length.astype(dtype), origin[1] * length.astype(dtype), nan, nan
+            )
+            return loss.observe(scaled, start, here)
+
+        nan, origin_step = origin.potential, origin.step
+        one = jnp.ones((), jnp.float64)
+        _, back = jax.vjp(seen_at, row[1], row[2], row[4], row[5], (origin.x, origin.v), one)
+        return back(onto_total)
+
+    def blind(row):
+        return (
+            jnp.zeros_like(row[1]),
+            jnp.zeros_like(row[2]),
+            jnp.zeros_like(row[4]),
+            jnp.zeros_like(row[5]),
+            (jnp.zeros_like(origin.x), jnp.zeros_like(origin.v)),
+            jnp.zeros((), jnp.float64),
+        )
+
+    def step(carry: Carry, given):
+        row, told, use, see, met = given
+        number, x, v = row[0], row[1], row[2]
+        half = (0.5 * integrator.timestep).astype(dtype)
+        second = jnp.where(number == 0, jnp.zeros((), dtype), half)
+        one = jnp.ones((), jnp.float64)
+        # drift is linear in x and v, so where it is transposed does not matter to them
+        _, back = jax.vjp(lambda x, v: drift(x, v, numbers, one, number), x, v)
+        onto_x, onto_kicked = back((carry.x, carry.v))
+        loss_x, loss_v, onto_potential, onto_virial, onto_origin, onto_length = lax.cond(
+            see, look, blind, row
+        )
+        onto_v = onto_kicked + loss_v
+        w = (half * onto_kicked + second * onto_v) / mass_row
+        made = pull_back(force, x, tables, told, w, onto_potential, onto_virial, wanted)
+        model, numbers_bar, scale = carry.model, carry.integrator, carry.scale
+        if MODEL in wanted:
+            model = jax.tree.map(jnp.add, model, made.model)
+        if FORCE in wanted:
+            acceleration = made.force / mass_row
+            _, back = jax.vjp(
+                lambda numbers, scale: drift(x, v + half * acceleration, numbers, scale, number), numbers, one
+            )
+            by_numbers, by_scale = back((carry.x, carry.v))
+            kick = jnp.sum(onto_kicked * acceleration) + jnp.where(
+                number == 0, 0, jnp.sum(onto_v * acceleration)
+            )
+            by_numbers = eqx.tree_at(
+                lambda one: one.timestep,
+                by_numbers,
+                by_numbers.timestep + (0.5 * kick).astype(by_numbers.timestep.dtype),
+            )
+            numbers_bar = jax.tree.map(jnp.add, numbers_bar, by_numbers)
+            scale = scale + by_scale.astype(scale.dtype)
+        if SCALE in wanted:
+            scale = scale + made.scale + onto_length.astype(scale.dtype)
+        after = Carry(
+            onto_x + loss_x + made.x,
+            onto_v,
+            model,
+            numbers_bar,
+            scale,
+            jax.tree.map(jnp.add, carry.origin, onto_origin),
+            carry.r_cut,
+        )
+        weights = jnp.zeros(0)
+        if met is not None:
+            push, weights, by_radius = onto_crossings(
+                met, after.x, after.v, masses, integrator.timestep, carry.r_cut.shape[0]
+            )
+            after = after._replace(
+                x=after.x + push,
+                v=after.v - half * push,
+                r_cut=after.r_cut + by_radius,
+            )
+        kept = jax.tree.map(lambda new, old: jnp.where(use, new, old), after, carry)
+        return kept, weights
+
+    return lax.scan(step, carry, (rows, bits, used, seen, crossed), reverse=True)

@@ -1,0 +1,187 @@
+"""What a flip does to a gradient: the time at which a pair crosses its cutoff moves with everything else.
+
+Where the force jumps, a perturbed pair feels it earlier or later, and its momentum is another one ever
+after. Differentiating the steps of a program never sees that, because the steps do not move with the
+crossing; the error does not shrink with the time step. The term is the saltation term of mdnum.events, with
+the cutoff's sphere as the threshold, written for the reverse pass.
+
+Source: for a pair with the radial force jump f (positive: repulsive) and the radial speed s, a perturbation
+dr of the distance moves the crossing by -dr/s and the momentum along the pair by f dr/s.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from mdnum.events import Ledger
+from mdnum.md.cell import HostCell
+from mdnum.systems.build import Simulation
+
+
+class Met(NamedTuple):
+    """The crossings of some rows on the device, padded to one length.
+
+    Attributes:
+        i, j: sorted atoms; beyond the last one where there is no crossing, shape (rows, most).
+        normal: from i to j, shape (rows, 3, most).
+        push: signed force jump over radial speed, energy/length per (length/time); 0 where it is left out.
+        kind: pair type.
+    """
+
+    i: Int[Array, "*rows most"]
+    j: Int[Array, "*rows most"]
+    normal: Float[Array, "*rows 3 most"]
+    push: Float[Array, "*rows most"]
+    kind: Int[Array, "*rows most"]
+
+
+@dataclass(frozen=True)
+class Crossings:
+    """The flips of one stretch, as events with a time.
+
+    Attributes:
+        ledger: the flips.
+        row: row of each in its stretch. i, j: its atoms in the order of the stretch's list.
+        normal: unit vector from i to j at the crossing, shape (crossings, 3).
+        speed: radial speed there, length per internal time: negative where the pair enters.
+        force: radial force that the flip adds, energy/length.
+        kind: pair type.
+        grazing: slower than the guard: left out.
+        weight: derivative of the loss by the cutoff of this one crossing; NaN until the reverse pass has
+            been there. For one left out, what it would have been.
+    """
+
+    ledger: Ledger
+    row: Int[np.ndarray, "crossings"]
+    i: Int[np.ndarray, "crossings"]
+    j: Int[np.ndarray, "crossings"]
+    normal: Float[np.ndarray, "crossings 3"]
+    speed: Float[np.ndarray, "crossings"]
+    force: Float[np.ndarray, "crossings"]
+    kind: Int[np.ndarray, "crossings"]
+    grazing: Bool[np.ndarray, "crossings"]
+    weight: Float[np.ndarray, "crossings"]
+
+    def __len__(self) -> int:
+        return len(self.row)
+
+    def on_device(self, room: int, atoms: int) -> Met:
+        """Padded to the rows of the stretch."""
+        counts = np.bincount(self.row, minlength=room)
+        # a power of two, so that not every stretch is compiled for
+        most = 1 << max(3, int(counts.max(initial=0) - 1).bit_length())
+        order = np.argsort(self.row, kind="stable")
+        row = self.row[order]
+        place = np.arange(len(row)) - np.concatenate([[0], np.cumsum(counts)[:-1]])[row]
+        i, j = np.full((room, most), atoms), np.full((room, most), atoms)
+        normal, push = np.zeros((room, 3, most)), np.zeros((room, most))
+        kind = np.zeros((room, most), np.int64)
+        i[row, place], j[row, place] = self.i[order], self.j[order]
+        normal[row, :, place] = self.normal[order]
+        # what is left out still has its weight worked out: the sign tells the reverse pass not to apply it
+        push[row, place] = (self.force / self.speed)[order]
+        kind[row, place] = np.where(self.grazing, -1 - self.kind, self.kind)[order]
+        return Met(jnp.asarray(i), jnp.asarray(j), jnp.asarray(normal), jnp.asarray(push), jnp.asarray(kind))
+
+    def weighed(self, weights: Float[np.ndarray, "room most"]) -> Crossings:
+        """With the weights that the reverse pass found."""
+        counts = np.bincount(self.row, minlength=len(weights))
+        order = np.argsort(self.row, kind="stable")
+        row = self.row[order]
+        place = np.arange(len(row)) - np.concatenate([[0], np.cumsum(counts)[:-1]])[row]
+        weight = np.empty(len(row))
+        weight[order] = weights[row, place]
+        return replace(self, weight=weight)
+
+
+def onto_crossings(
+    met: Met,
+    onto_x: Float[Array, "3 atoms"],
+    onto_v: Float[Array, "3 atoms"],
+    masses: Float[Array, "atoms"],
+    timestep: Float[Array, ""],
+    types: int,
+) -> tuple[Float[Array, "3 atoms"], Float[Array, "most"], Float[Array, "types"]]:
+    """The transpose of the saltation of one step's crossings.
+
+    A crossing lies between two steps, on average in their middle, where positions are half a drift short of
+    the later step's.
+
+    Args:
+        met: the crossings between the step before and this one.
+        onto_x, onto_v: cotangents of this step's positions and of the velocities that lead there.
+        masses: shape (atoms,).
+        timestep: internal time.
+        types: number of pair types.
+
+    Returns:
+        what is added to the cotangent of the positions, derivatives of the loss by the cutoff of each
+        crossing, and by the cutoff of each pair type.
+    """
+    dtype = onto_x.dtype
+    middle = (onto_v + (0.5 * timestep).astype(dtype) * onto_x) / masses.astype(dtype)
+    there = middle.at[:, met.j].get(mode="fill", fill_value=0)
+    here = middle.at[:, met.i].get(mode="fill", fill_value=0)
+    normal = met.normal.astype(dtype)
+    pull = met.push.astype(dtype) * jnp.sum(normal * (there - here), axis=0)
+    applied = jnp.where(met.kind >= 0, pull, 0)
+    along = applied * normal
+    push = jnp.zeros_like(onto_x).at[:, met.j].add(along, mode="drop").at[:, met.i].add(-along, mode="drop")
+    kind = jnp.where(met.kind >= 0, met.kind, 0)
+    by_radius = jnp.zeros(types, jnp.float64).at[kind].add(-applied.astype(jnp.float64))
+    return push, -pull.astype(jnp.float64), by_radius
+
+
+def crossings(
+    simulation: Simulation,
+    ledger: Ledger,
+    first: int,
+    order: Int[np.ndarray, "atoms"],
+    x: Float[np.ndarray, "rows 3 atoms"],
+    x_before: Float[np.ndarray, "3 atoms"],
+    guard: float,
+) -> Crossings:
+    """The flips of a stretch as events: their normals and radial speeds between two steps.
+
+    Args:
+        simulation: the system as objects.
+        ledger: its flips.
+        first: step of the first row.
+        order: sorted atom k is atom order[k].
+        x: wrapped positions of the stretch. x_before: of the step before it.
+        guard: radial speed, length per internal time, below which a crossing is left out.
+    """
+    row = (ledger.step - first).astype(np.int64)
+    place = np.argsort(order)
+    low, high = ledger.subject[:, 0], ledger.subject[:, 1]
+    i, j = place[low], place[high]
+    cell = HostCell(simulation.cell)
+    before = np.where((row > 0)[:, None], x[np.maximum(row - 1, 0), :, i], x_before[:, i].T)
+    before_j = np.where((row > 0)[:, None], x[np.maximum(row - 1, 0), :, j], x_before[:, j].T)
+    earlier = np.stack(cell.displacement(before.astype(np.float64), before_j.astype(np.float64)), axis=1)
+    now_i, now_j = x[row, :, i].astype(np.float64), x[row, :, j].astype(np.float64)
+    now = np.stack(cell.displacement(now_i, now_j), axis=1)
+    change = np.linalg.norm(now, axis=1) - np.linalg.norm(earlier, axis=1)
+    speed = change / float(simulation.integrator.timestep)
+    middle = earlier + now
+    normal = middle / np.linalg.norm(middle, axis=1, keepdims=True)
+    # a distance that did not change has no time of crossing at all
+    grazing = ~(np.abs(speed) > guard) | (speed == 0)
+    safe = np.where(speed == 0, np.inf, speed)
+    return Crossings(
+        ledger,
+        row,
+        i,
+        j,
+        normal,
+        safe,
+        np.asarray(ledger.extra["force_jump"]),
+        np.asarray(simulation.type_of(low, high), np.int64),
+        grazing,
+        np.full(len(row), np.nan),
+    )
