@@ -76,7 +76,7 @@ def main() -> None:
     found = {}
     for role in chosen.roles:
         say(f"{system.name}: {role} in float32")
-        found[role] = fork(choice_of(role).make(system), chosen.steps, repeats=chosen.repeats)
+        found[role] = fork(choice_of(role).make(system), chosen.steps, repeats=chosen.repeats, back=False)
     tolerance = next(iter(found.values())).tolerance
     table(
         f"{system.name}, {len(system.atoms)} atoms, {chosen.steps} steps, split at {tolerance:.3g} "

@@ -125,7 +125,7 @@ def test_the_verdict_comes_first_then_dates_and_decision(compare: Recorder, caps
         "B, start perturbed its own 1,475",
         "decisions > 2,033 steps, > 24.6 nats 594 steps, 7.19 nats", "arithmetic -16 steps",
         "certified in A up to step 3,839: no decision is ambiguous",
-        "certified in B not even at the start; 431 ambiguous decisions at 390 steps after it; "
+        "certified in B not even at the start; 431 ambiguous decisions at 390 steps; "
         "of listed pairs only, a rule of rebuilds that is not safe may miss some",
         "protected up to step 302: every pair is further from its cutoff than twice the separation",
         "shadow horizon step 624: B decides as the wider program, A, up to there",

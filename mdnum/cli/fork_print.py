@@ -80,9 +80,10 @@ def _certain(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     for name, step in (summary.get("certified_horizon") or {}).items():
         doubtful, steps = summary["ambiguous"][name], summary["ambiguous_steps"][name]
         until = f"up to step {step:,}" if step >= 0 else "not even at the start"
-        text = f"{until}; {_many(doubtful, 'ambiguous decision')} at {_many(steps, 'step')} after it"
-        if not doubtful:
-            text = f"{until}: no decision is ambiguous"
+        text = f"{until}: no decision is ambiguous"
+        if doubtful:
+            after = " after it" if step >= 0 else ""
+            text = f"{until}; {_many(doubtful, 'ambiguous decision')} at {_many(steps, 'step')}{after}"
         if not summary["lists_complete"][name]:
             text += "; of listed pairs only, a rule of rebuilds that is not safe may miss some"
         yield f"certified in {name}", text

@@ -53,11 +53,13 @@ def exponent(fork: Fork) -> dict[str, Any]:
         "ulp": ulp,
         "ulp_split": None if split is None else round(split),
     }
-    reason = (
-        None
-        if found.chaotic
-        else f"not above what linear growth gives in {steps} steps: the motion itself does not part runs"
-    )
+    # log(end / first) over the steps between them, as Lyapunov.chaotic has it
+    linear = float(np.log(steps / found.transient)) / (steps - found.transient)
+    reason = None
+    if not found.chaotic and found.rate + found.error < 0.5 * linear:
+        reason = "slower than growth in proportion to time: the motion itself does not part runs"
+    elif not found.chaotic:
+        reason = f"{steps} steps do not tell it from growth in proportion to time, {linear:.2g} a step"
     return {"lyapunov": table, "lyapunov_reason": reason}
 
 

@@ -14,6 +14,7 @@ from mdnum.forks.certified import certified
 from mdnum.forks.neighborhood import Neighborhood
 from mdnum.forks.pair import FLIPS_KEPT, Fork
 from mdnum.forks.take_back import Pinned
+from mdnum.rollout.flips import Ambiguous
 from mdnum.store import RunFolder
 from mdnum.systems.build import Simulation
 
@@ -205,11 +206,19 @@ def _certified(fork: Fork) -> dict[str, Any]:
         "ambiguous": {name: one.decisions for name, one in runs},
         "ambiguous_steps": {name: one.steps for name, one in runs},
         "ambiguous_kept": {name: len(fork.doubts[name].step) for name in found.horizon},
+        "ambiguous_first": {name: _first(fork.doubts[name]) for name in found.horizon},
         "lists_complete": {name: one.complete for name, one in runs},
         "protected_until": found.protected,
         "shadow": found.shadow,
         "shadow_horizon": found.shadow_step,
     }
+
+
+def _first(doubts: Ambiguous) -> dict[str, Any] | None:
+    """The first ambiguous decision of a run."""
+    if not len(doubts.step):
+        return None
+    return {name: column[0].item() for name, column in doubts._asdict().items()}
 
 
 def _kind(simulation: Simulation, i: int, j: int) -> int:

@@ -137,6 +137,9 @@ def make_fork(
             "table": two_by_two(split) if handed else [], "shares": SHARES if split and handed else [],
             "certified_horizon": {"A": STEPS, "B": 70}, "ambiguous": {"A": 0, "B": 2 * (STEPS - 70)},
             "ambiguous_steps": {"A": 0, "B": STEPS - 70}, "ambiguous_kept": {"A": 0, "B": 2 * (STEPS - 70)},
+            "ambiguous_first": {
+                "A": None, "B": {"step": 71, "i": 5, "j": 8, "margin": 1.5e-7, "bound": 6e-6},
+            },
             "lists_complete": {"A": True, "B": True}, "protected_until": NEAR - 1 if forks else STEPS,
             "shadow": "A", "shadow_horizon": FORK - 1 if forks else STEPS, "lyapunov": LYAPUNOV,
             "lyapunov_reason": None, "minimal": MINIMAL if forks else None, "failed": {},

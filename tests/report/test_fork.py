@@ -77,7 +77,9 @@ def test_the_page_states_what_the_folder_holds(page, folder):
         f"B A’s &gt; 1,500 {split - 1:,}", "B, start perturbed its own 1,316",
         "decisions &gt; 179 steps &gt; 3.58 nats –", "arithmetic – −1 step −0.0200 nats",
         "up to step 1,500: no decision is ambiguous",
-        "up to step 70; after it 2,860 ambiguous decisions at 1,430 steps", "up to step 389; then a pair",
+        "up to step 70; after it 2,860 ambiguous decisions at 1,430 steps, first pair 5–8: "
+        "margin +1.5 × 10⁻⁷, bound 6.0 × 10⁻⁶", "all of them are in ambiguous_pairs.parquet",
+        "up to step 389; then a pair",
         "step 399: up to there B decides as A", "0.0190 ± 4 × 10⁻⁴ a step, 1.90 per τ",
         "the runs part 1.05 times as fast", "8.9 × 10⁻¹⁶ σ reaches the split tolerance about step 1,702",
         "2 pairs are enough, and none of them can be left out. 23 runs of B told, 77 pairs that differ",

@@ -13,10 +13,11 @@ import mdnum
 from mdnum.errors import FolderError, InputError
 from mdnum.forks import Twin, choices
 from mdnum.forks.choices import Screened
+from mdnum.forks.lyapunov import Lyapunov
 from mdnum.rollout.engine import Engine
 from mdnum.store import RunFolder
 from mdnum.systems import build, load
-from mdnum.workflow import ForkResult, fork
+from mdnum.workflow import ForkResult, fork, fork_answers
 
 STEPS = 680
 #: Free runs only.
@@ -97,6 +98,10 @@ def test_the_tables_hold_the_series(compared):
                          ("ambiguous_b", "ambiguous B")):  # fmt: skip
         np.testing.assert_array_equal(table[column], series[name])
     doubts = folder.read("ambiguous_pairs")
+    first = compared.summary["ambiguous_first"]
+    assert first["A"] is None and first["B"] == {
+        name: doubts[name][0] for name in ("step", "i", "j", "margin", "bound")
+    }
     assert set(doubts["run"]) == {"B"} and len(doubts["step"]) == compared.summary["ambiguous"]["B"]
     assert (np.abs(doubts["margin"]) <= doubts["bound"]).all()
     np.testing.assert_array_equal(np.bincount(doubts["step"], minlength=STEPS + 1), table["ambiguous_b"])
@@ -260,3 +265,25 @@ def test_a_run_that_stops_leaves_the_folder_free(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         fork("pair/at-cutoff", "start", steps=3, out=tmp_path / "here", progress=stop, **BARE)
     RunFolder.create(tmp_path / "here", overwrite=True).close()
+
+
+@pytest.mark.parametrize(
+    ("rate", "chaotic", "words"),
+    [(0.02, True, None), (1e-4, False, "slower than growth"), (0.006, False, "400 steps do not tell it")],
+)
+def test_an_exponent_that_is_none_says_why(compared, monkeypatch, rate, chaotic, words):
+    size = rate * np.arange(401.0)
+    made = Lyapunov(400, 0.004, rate, 1e-5, size, size, 80, chaotic)
+    monkeypatch.setattr("mdnum.forks.lyapunov.lyapunov", lambda *given: made)
+    found = fork_answers.exponent(compared.fork)
+    reason = found["lyapunov_reason"]
+    assert reason is None if words is None else reason.startswith(words)
+    assert found["lyapunov"]["ratio"] == (
+        pytest.approx(compared.fork.growth["B"].rate / rate) if chaotic else None
+    )
+    # an ulp of a coordinate between 4 and 8 has grown to the tolerance: from the size of the tangent
+    ulp = found["lyapunov"]["ulp"]
+    assert ulp == 2.0**-50 or ulp == 2.0**-51
+    expected = np.log(compared.fork.tolerance / ulp) / rate if chaotic else None
+    split = found["lyapunov"]["ulp_split"]
+    assert split is None if expected is None else split == pytest.approx(expected, abs=1)

@@ -68,6 +68,8 @@ def render(
         runs=list(sections.runs(run)),
         shares=sections.shares(run),
         certain=list(sections.certain(run)),
+        listed=sum((run.summary.get("ambiguous") or {}).values()),
+        kept=sum((run.summary.get("ambiguous_kept") or {}).values()),
         pinned=sections.pinned(run),
         minimal=sections.minimal(run),
         growth=list(sections.growth(run)),

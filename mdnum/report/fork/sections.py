@@ -103,12 +103,17 @@ def certain(run: ForkFolder) -> Iterator[tuple[str, str]]:
     summary = run.summary
     for name, step in (summary.get("certified_horizon") or {}).items():
         doubtful, steps = summary["ambiguous"][name], summary["ambiguous_steps"][name]
+        first = (summary.get("ambiguous_first") or {}).get(name)
         until = f"up to step {count(step)}" if step >= 0 else "not even at the start"
-        text = (
-            f"{until}; after it {many(doubtful, 'ambiguous decision')} at {many(steps, 'step')}"
-            if doubtful
-            else f"{until}: no decision is ambiguous"
-        )
+        text = f"{until}: no decision is ambiguous"
+        if doubtful:
+            after = "after it " if step >= 0 else ""
+            text = f"{until}; {after}{many(doubtful, 'ambiguous decision')} at {many(steps, 'step')}"
+        if first is not None:
+            near = number(first["margin"], 2, signed=True)
+            text += (
+                f", first pair {first['i']}–{first['j']}: margin {near}, bound {number(first['bound'], 2)}"
+            )
         if not summary["lists_complete"][name]:
             text += "; of listed pairs only: this rule of rebuilds may miss some"
         yield f"Certified, {name}", text
