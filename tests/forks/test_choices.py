@@ -71,6 +71,7 @@ def test_every_shipped_choice_is_parsed_from_its_name():
         "builder=jax-md",
         "relabel=4",
         "rotate=zyx",
+        "rotate=-x-yz@exact",
         "translate=0.5",
         "unwrapped=3",
         "noise=7",
@@ -105,6 +106,8 @@ def test_arguments_are_read_and_written_alike(word: str):
         ("rebuild=never", "no rule 'never'"),
         ("rebuild=every:0", "every 0 steps"),
         ("rotate=xyz", "another order of xyz"),
+        ("rotate=xxy", "with or without signs"),
+        ("rotate=-xy", "with or without signs"),
         ("builder=cuda", "no list builder"),
         ("translate=0", "other than 0"),
         ("noise=-1", "negative"),
@@ -134,7 +137,7 @@ def test_what_is_no_choice_is_refused_with_those_there_are(word: str, says: str)
         ("silicon/tersoff-512", "energy-shift", "carries its own cutoff"),
         ("argon/langevin-500", "relabel", "belongs to labels"),
         ("argon/langevin-500", "rotate", "belongs to axes"),
-        ("argon/tilted-500", "rotate", "not the same with its axes exchanged"),
+        ("argon/tilted-500", "rotate=yzx", "not the same with axes yzx in place of xyz"),
     ],
 )
 def test_a_choice_that_does_not_apply_says_why(name: str, word: str, says: str):
@@ -236,7 +239,7 @@ def test_a_shuffled_list_holds_the_same_pairs_in_another_order(crystal: System):
     assert ((mixed[0][:-1] == 108) <= (mixed[0][1:] == 108)).all()
 
 
-@pytest.mark.parametrize("word", ["relabel", "rotate", "rotate=yxz", "translate=0.25"])
+@pytest.mark.parametrize("word", ["relabel", "rotate", "rotate=yxz", "rotate=z-yx", "translate=0.25"])
 def test_a_frame_takes_the_second_start_back_to_the_first(crystal: System, word: str):
     twin = parse(word).make(crystal)
     assert twin.frame is not None and not twin.frame.is_same
@@ -254,6 +257,11 @@ def test_a_box_is_turned_only_into_itself(crystal: System):
     tall = replace(crystal, atoms=atoms)
     assert Rotate("yzx").why_not(tall) and Rotate("yxz").why_not(tall) is None
     assert "yxz" in Rotate().make(tall).difference
+    # half turns where no two edges are the same, and every lattice is its own mirror image in a point
+    atoms.set_cell([5.0, 6.0, 7.0], scale_atoms=True)
+    assert "-x-yz" in Rotate().make(replace(crystal, atoms=atoms)).difference
+    tilted = load("argon/tilted-500", world="md")
+    assert Rotate("-x-yz").why_not(tilted) and "-x-y-z" in Rotate().make(tilted).difference
 
 
 @pytest.mark.parametrize("images", [None, 1])

@@ -22,6 +22,7 @@ from mdnum.systems.build import Simulation
 from mdnum.systems.load import System, load
 
 CRYSTAL, BATH, MIXTURE = "argon/crystal-108", "argon/langevin-500", "binary/kob-andersen-1000"
+TILTED = "argon/tilted-500"
 
 #: Words for what differs, by name. Keys of the system file stand as they are.
 CHANGES: Mapping[str, set[str]] = {
@@ -84,6 +85,7 @@ MORE: tuple[tuple[str, str, dict[str, Any], set[str]], ...] = (
     ("skin=0.5@fixed-point", CRYSTAL, {}, {"neighbors.skin", "lists"}),
     ("relabel=4", CRYSTAL, {}, {"positions", "velocities", "frame"}),
     ("rotate=zyx", CRYSTAL, {}, {"positions", "velocities", "frame"}),
+    ("rotate", TILTED, {}, {"positions", "velocities", "frame"}),
     ("translate=0.5@exact", CRYSTAL, {}, {"positions", "frame"}),
     ("unwrapped=3", CRYSTAL, {}, {"positions"}),
     ("start=17:0:-2", CRYSTAL, {}, {"positions"}),

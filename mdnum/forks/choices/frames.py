@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -186,13 +187,20 @@ def exact_images(
     return wrapped, elsewhere, int((again != wrapped).any(axis=1).sum())
 
 
+#: Exchanges of axes, half turns about one, and the inversion that every box has.
+_SYMMETRIES = ("yzx", "yxz", "xzy", "zyx", "-x-yz", "x-y-z", "-xy-z", "-x-y-z")
+
+
 @dataclass(frozen=True)
 class Rotate:
-    """The axes of the box exchanged.
+    """The axes of the box exchanged or turned around.
+
+    An exchange is exact. Where a sign changes, the start is rounded once as it is wrapped.
 
     Attributes:
-        axes: axis k of the second run is axis axes[k] of the first; None: the first exchange that leaves the
-            box as it is, all three in turn where it can be.
+        axes: what stands in place of xyz: axis k of the second run is the k-th axis named, of the first, with
+            its sign ("yzx", "-x-yz"); None: the first of these that leaves the box as it is, all three in
+            turn where it can be, the inversion "-x-y-z" where nothing else does.
         both: reduction of both runs.
     """
 
@@ -200,9 +208,10 @@ class Rotate:
     both: str | None = None
 
     def __post_init__(self):
-        if self.axes is not None and (sorted(self.axes) != list("xyz") or self.axes == "xyz"):
+        if self.axes is not None and (not _AXES.fullmatch(self.axes) or self.axes == "xyz"):
             raise InputError(
-                f"axes {self.axes!r}; expected another order of xyz, such as yzx", where="rotate"
+                f"axes {self.axes!r}; expected another order of xyz, with or without signs (yzx, -x-yz)",
+                where="rotate",
             )
 
     @property
@@ -213,19 +222,23 @@ class Rotate:
     @property
     def about(self) -> str:
         """One line."""
-        return "axes of the box exchanged" + summing(self.both)
+        return "axes of the box exchanged or turned around" + summing(self.both)
 
     @property
     def must_hold(self) -> bool:
-        """Squares of components are added in another order."""
+        """Squares of components are added in another order, or the start is rounded."""
         return False
 
     def _asked(self, system: System) -> str | None:
-        asked = ("yzx", "yxz", "xzy", "zyx") if self.axes is None else (self.axes,)
-        matrix, pbc = np.asarray(system.atoms.cell), np.asarray(system.atoms.pbc)
+        asked = _SYMMETRIES if self.axes is None else (self.axes,)
+        pbc = np.asarray(system.atoms.pbc)
+        rows = {tuple(row) for row in np.asarray(system.atoms.cell)[pbc].tolist()}
+        both_ways = rows | {tuple(-c for c in row) for row in rows}
         for word in asked:
-            axes = ["xyz".index(one) for one in word]
-            if (matrix[axes][:, axes] == matrix).all() and (pbc[axes] == pbc).all():
+            axes, signs = _read(word)
+            # a lattice vector is as good as its negative
+            turned = {tuple(sign * row[k] for k, sign in zip(axes, signs, strict=True)) for row in rows}
+            if turned <= both_ways:
                 return word
         return None
 
@@ -234,7 +247,7 @@ class Rotate:
         if is_langevin(system):
             return "the thermostat's noise belongs to axes: others would get it"
         if self._asked(system) is None:
-            return "the box is not the same with its axes exchanged"
+            return f"the box is not the same with axes {self.axes} in place of xyz"
         return no_sums(system, self.both)
 
     def make(self, system: System) -> Twin:
@@ -243,7 +256,18 @@ class Rotate:
         word = self._asked(system)
         assert word is not None
         a = built(system, self.both)
-        axes = np.array(["xyz".index(one) for one in word])
-        b = replace(a, positions=a.positions[:, axes], velocities=a.velocities[:, axes])
-        frame = replace(Frame.same(a.atoms), axes=np.argsort(axes))
+        named, given = _read(word)
+        axes, signs = np.array(named), np.array(given)
+        b = replace(a, positions=a.positions[:, axes] * signs, velocities=a.velocities[:, axes] * signs)
+        back = np.argsort(axes)
+        frame = replace(Frame.same(a.atoms), axes=back, signs=signs[back])
         return Twin(a, b, f"axes {word} in place of xyz{summing(self.both)}", frame=frame)
+
+
+_AXES = re.compile(r"(?!.*([xyz]).*\1)(-?[xyz]){3}")
+
+
+def _read(word: str) -> tuple[list[int], list[float]]:
+    """Which axis stands in each place, and with which sign."""
+    parts = re.findall("-?[xyz]", word)
+    return ["xyz".index(part[-1]) for part in parts], [-1.0 if part[0] == "-" else 1.0 for part in parts]

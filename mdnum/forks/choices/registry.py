@@ -66,7 +66,7 @@ def parse(text: str) -> Choice:
     Args:
         text: a name, or a family with an argument: "reduction=permuted:3", "skin=0.5", "precision=float32",
             "precision.force=bfloat16", "format=sparse", "rebuild=every:10", "ulps=cutoff.radius:+1",
-            "start=17:0:+1" (atom, axis, ulps), "order=3", "translate=0.5", "rotate=yxz", "noise=7". A last
+            "start=17:0:+1" (atom, axis, ulps), "order=3", "translate=0.5", "rotate=-x-yz", "noise=7". A last
             "@exact" gives both runs that reduction, where the order of neighbors is what is chosen.
             "precision=bfloat16" is that of the force: no other role can have it.
 
