@@ -50,15 +50,17 @@ class Certified:
     """The three dates of a pair of runs.
 
     Attributes:
-        horizon: by run, "A" and "B".
+        horizon: by run, "A" and "B"; nothing for many-body potentials, which decide inside their energy
+            function, without a rounding bound.
         protected: the last step up to which every pair was further from its cutoff than twice the separation
-            of the runs and what their cutoffs differ by; -1 where it is not so at the first step.
+            of the runs and what their cutoffs differ by; -1 where it is not so at the first step. None for
+            many-body potentials.
         shadow: the wider of the two programs, "A" or "B"; None where neither is.
         shadow_step: the last step up to which they decided alike; None without a shadow.
     """
 
     horizon: Mapping[str, Horizon]
-    protected: int
+    protected: int | None
     shadow: str | None
     shadow_step: int | None
 
@@ -67,6 +69,8 @@ def certified(fork: Fork) -> Certified:
     """The dates of a pair that was followed."""
     twin = fork.twin
     last = fork.steps
+    if not (twin.a.pairwise and twin.b.pairwise):
+        return Certified({}, None, None, None)
     runs = (("A", twin.a), ("B", twin.b))
     horizon = {name: _horizon(run, fork.series[f"ambiguous {name}"]) for name, run in runs}
     away, needed = protection(fork)

@@ -22,6 +22,7 @@ from mdnum.systems.build import Simulation
 _SERIES = {
     "free": "B", "handed": "B|A", "back": "A|B", "cross": "cross", "overridden": "overridden",
     "furthest": "furthest", "energy_a": "energy A", "energy_b": "energy B", "energy_handed": "energy B|A",
+    "energy_back": "energy A|B",
     "handed_from_b": "B|A from B", "back_from_a": "A|B from A", "nearest_a": "nearest A",
     "nearest_b": "nearest B", "ambiguous_a": "ambiguous A", "ambiguous_b": "ambiguous B",
 }  # fmt: skip
@@ -202,7 +203,7 @@ def _certified(fork: Fork) -> dict[str, Any]:
     found = certified(fork)
     runs = found.horizon.items()
     return {
-        "certified_horizon": {name: one.step for name, one in runs},
+        "certified_horizon": {name: one.step for name, one in runs} or None,
         "ambiguous": {name: one.decisions for name, one in runs},
         "ambiguous_steps": {name: one.steps for name, one in runs},
         "ambiguous_kept": {name: len(fork.doubts[name].step) for name in found.horizon},

@@ -102,3 +102,13 @@ def test_the_wider_program_is_the_shadow(found):
     assert wider(Twin(a, replace(b, positions=b.positions + 1e-9), "another start")) is None
     later = build("argon/crystal-108", {"precision.force": "float32", "dynamics.timestep": 0.002} | WARM)
     assert wider(Twin(a, later, "another step")) is None
+
+
+def test_what_decides_inside_its_energy_function_is_not_certified(found):
+    class ManyBody(Simulation):
+        pairwise = False
+
+    a = found.twin.a
+    other = ManyBody(**{name: getattr(a, name) for name in a.__dataclass_fields__})
+    dates = certified(replace(found, twin=Twin(other, other, "nothing")))
+    assert dates.horizon == {} and dates.protected is None and dates.shadow is None
