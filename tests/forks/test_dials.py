@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mdnum.errors import InputError
-from mdnum.forks.dials import dial, names
+from mdnum.forks.dials import dial, names, unit
 from mdnum.rollout.engine import Engine
 from mdnum.rollout.epoch import run_epoch
 from mdnum.systems.build import build
@@ -92,3 +92,38 @@ def test_a_radius_that_does_not_fit_is_refused():
         dial(plain, "r_cut").turn(plain, 3.0)
     with pytest.raises(InputError, match="can be turned"):
         dial(plain, "dynamics.temperature")
+
+
+def test_the_last_word_will_do_where_only_one_number_ends_so():
+    argon, mixture = build("argon/liquid-864"), build("binary/kob-andersen-1000")
+    for word, key, what in (
+        ("sigma", "potential.sigma", "Å"),
+        ("dt", "dynamics.timestep", "ps"),
+        ("r_cut", "cutoff.radius", "Å"),
+        ("skin", "neighbors.skin", "Å"),
+        ("velocity.3.x", "velocity.3.x", "Å/ps"),
+        ("epsilon", "potential.epsilon", "eV"),
+    ):
+        assert dial(argon, word).key == key and unit(argon, key) == what
+    assert dial(mixture, "Ni-P.epsilon").key == "potential.pairs.Ni-P.epsilon"
+    with pytest.raises(InputError, match=r"could be any of potential\.pairs\.\S+epsilon, "):
+        dial(mixture, "epsilon")
+    with pytest.raises(InputError, match=r"Did you mean dynamics\.timestep\?"):
+        dial(argon, "timestpe")
+
+
+def test_a_skin_turned_is_the_skin_set():
+    plain = build("argon/crystal-108")
+    one = dial(plain, "skin")
+    turned, fresh = one.turn(plain, 0.2), build("argon/crystal-108", {"neighbors.skin": 0.2})
+    assert one.value == plain.rule.skin != 0.2 and turned.rule == fresh.rule
+    with pytest.raises(InputError, match="half the smallest"):
+        one.turn(plain, 5.0)
+
+
+def test_an_onset_stays_below_its_cutoff():
+    plain = build("argon/liquid-864", {"cutoff.kind": "switched", "cutoff.onset": 7.5})
+    with pytest.raises(InputError, match="not below the cutoff radius"):
+        dial(plain, "onset").turn(plain, 9.0)
+    with pytest.raises(InputError, match="not above its onset"):
+        dial(plain, "radius").turn(plain, 7.0)
