@@ -135,15 +135,15 @@ def print_rows(summary: Mapping[str, Any]) -> None:
         ("split", f"heights further apart than {summary['tolerance']:.3g} m"),
     ):
         rows.append((name, _date(summary, name, what)))
-    rows += list(_decision(summary.get("decision")))
+    rows += list(_decision(summary.get("decision"), summary["counted"]))
     if summary.get("growth_rate") is not None:
         fits = f"r² {summary['r_squared']:.3f}" if summary.get("r_squared") is not None else ""
         rows.append(("growth", f"{summary['growth_rate']:.3g} a step, {fits}"))
     if summary.get("predicted_split") is not None:
         rows.append(("predicted split", f"about step {summary['predicted_split']:,}"))
     stops = summary["cross_stops"]
-    also = f", {stops:,} of solvers" if stops else ""
-    rows.append(("decisions that differ", f"{summary['cross_contacts']:,} of contacts{also}"))
+    also = f", {stops:,} numbers of {summary['counted']}" if stops else ""
+    rows.append(("decisions that differ", f"{summary['cross_contacts']:,} contacts{also}"))
     output.print_table("", ("", ""), rows)
     print_two_by_two(summary)
 
@@ -155,16 +155,16 @@ def _date(summary: Mapping[str, Any], name: str, what: str) -> str:
     return f"step {step:,}, {summary[f'{name}_time']:.6g} s ({what})"
 
 
-def _decision(made: Mapping[str, Any] | None) -> Iterator[tuple[str, str]]:
+def _decision(made: Mapping[str, Any] | None, counted: str) -> Iterator[tuple[str, str]]:
     if made is None:
         return
     whose = "all balls" if made["ball"] is None else f"ball {made['ball']}"
     also = f", with {made['also']:,} more at this step" if made.get("also") else ""
-    yield "decision", f"{decided(made)}, {whose}{also}"
+    yield "decision", f"{_decided(made, counted)}, {whose}{also}"
     for name, margin in made["margins"].items():
         bound = made["bounds"][name]
         if margin is None:
-            yield f"margin in {name}", "no decision at that iteration"
+            yield f"margin in {name}", "none on record"
             continue
         word = "ambiguous" if name in made["ambiguous_in"] else "not ambiguous"
         yield f"margin in {name}", f"{margin:.3g} in {made['space']}; rounding bound {bound:.3g}: {word}"
@@ -175,12 +175,12 @@ def _decision(made: Mapping[str, Any] | None) -> Iterator[tuple[str, str]]:
         )
 
 
-def decided(made: Mapping[str, Any]) -> str:
+def _decided(made: Mapping[str, Any], counted: str) -> str:
     """What each run decided, in words."""
     a, b = (made["decided"][name] for name in "AB")
     if made["channel"] == "contact":
         return f"contact in {'A' if a else 'B'} only"
-    return f"{a} iterations in A, {b} in B"
+    return f"{a} {counted} in A, {b} in B"
 
 
 def _certify(system: str, steps: int | None, overrides: Mapping[str, str], *, as_json: bool) -> int:

@@ -136,6 +136,7 @@ def _basics(system: BallSystem) -> dict[str, Any]:
         "balls": system.balls,
         "contact_kind": system.spec.contact.kind,
         "integrator": system.spec.integrator.kind,
+        "counted": "impacts" if system.spec.integrator.kind == "event-located" else "iterations",
         "steps": steps,
         "steps_asked": steps,
         "timestep": system.spec.integrator.timestep,

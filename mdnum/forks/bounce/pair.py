@@ -94,7 +94,8 @@ class BallFork:
         table: splits of either arithmetic under either decisions.
         shares: what the decisions and what the arithmetic contributed to the split.
         verdict: on the decisions that differ.
-        failed: runs that ended in a "blow-up".
+        failed: runs that ended in a "blow-up", with which the comparison ends; where only one of them does,
+            that is the fork at the latest.
         runs: A, B and the counterfactuals by name, with every state.
     """
 
@@ -174,6 +175,9 @@ def fork(
     crossed = differing(run_a, run_b, last)
     found = first_difference(run_a, run_b)
     at = int(crossed.step[0]) if len(crossed) else None
+    if at is None and len(failed) == 1:
+        # that one run can go on and the other cannot is a fork if anything is
+        at = last
     begun = found.seed if found.seed is not None and found.seed <= last else None
     dates = Dates(begun, at, split_of(series["B"], tolerance))
     series["cross"] = crossed.by_step(last)

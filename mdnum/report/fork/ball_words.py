@@ -31,14 +31,18 @@ def headline(run: ForkFolder) -> str:
     """The verdict in one sentence."""
     summary, dates, steps = run.summary, run.dates, many(run.steps, "step")
     made = run.decision
-    if summary.get("failed"):
-        names = listed([f"{name} ended in a {word}" for name, word in summary["failed"].items()])
-        at = f"they fork at step {count(dates['fork'])}" if made else "no decision differs before"
-        return f"Run {names} after step {count(run.steps)}; {at}."
+    if failed := summary.get("failed"):
+        if len(failed) > 1:
+            return f"Both runs ended in a blow-up after step {count(run.steps)}."
+        ((name, word),) = failed.items()
+        ended = f"Run {name} ended in a {word} after step {count(run.steps)} and the other run did not"
+        return (
+            f"{ended}; they fork at step {count(dates['fork'])}." if made else f"{ended}: that is the fork."
+        )
     if run.word == "same" and made is not None:
         return (
             f"No bit of a height or a velocity differs in {steps}, though a decision does at step "
-            f"{count(made['step'])}: {decided(made)}."
+            f"{count(made['step'])}: {decided(run)}."
         )
     if run.word == "same":
         return f"The same trajectory: no bit differs in {steps}."
@@ -89,7 +93,7 @@ def _evidence(run: ForkFolder) -> Iterator[str]:
         if where
         else "in neither run could rounding alone have decided otherwise"
     )
-    yield f"At step {count(made['step'])} {decided(made)}; {doubt}."
+    yield f"At step {count(made['step'])} {decided(run)}; {doubt}."
     if made.get("protected") is not None:
         yield (
             f"The step before, the heights were {number(made['separation_before'], 2)} m apart: the margin "
@@ -97,14 +101,17 @@ def _evidence(run: ForkFolder) -> Iterator[str]:
         )
 
 
-def decided(made: Mapping[str, Any]) -> str:
+def decided(run: ForkFolder) -> str:
     """What each run decided at the fork."""
+    made = run.decision or {}
     a, b = (made["decided"][name] for name in "AB")
     if made["channel"] == "contact":
         return (
             f"ball {count(made['ball'])} is in contact in {'A' if a else 'B'} and not in {'B' if a else 'A'}"
         )
     whose = "the solver" if made["ball"] is None else f"the solver of ball {count(made['ball'])}"
+    if run.summary.get("counted") == "impacts":
+        return f"ball {count(made['ball'])} has {many(a, 'impact')} inside the step in A and {count(b)} in B"
     return f"{whose} makes {many(a, 'iteration')} in A and {count(b)} in B"
 
 
@@ -129,8 +136,7 @@ def _findings(run: ForkFolder) -> Iterator[Finding]:
             "RUN_FAILED",
             "warning",
             f"run {name} ended in a {word} after step {count(run.steps)}",
-            f"The comparison ends there, {count(summary.get('steps_asked'))} steps were asked for. Where "
-            "only one run ends so, that is the fork.",
+            f"The comparison ends there, {count(summary.get('steps_asked'))} steps were asked for.",
             "Use a smaller time step, or another precision.",
         )
     if made is not None and made["ambiguous_in"]:
@@ -191,7 +197,11 @@ def key_figures(run: ForkFolder) -> Iterator[tuple[str, str, str]]:
     handed = summary.get("handed_largest")
     yield "Under A’s decisions", number(handed, 3), "m at most" if handed is not None else "was not run"
     stops = summary.get("cross_stops")
-    yield "Decisions that differ", count(summary.get("cross_flips")), f"{count(stops)} of them of solvers"
+    yield (
+        "Decisions that differ",
+        count(summary.get("cross_flips")),
+        f"{count(stops)} of them numbers of {summary.get('counted')}",
+    )
 
 
 def decision(run: ForkFolder) -> Iterator[tuple[str, str]]:
@@ -199,7 +209,7 @@ def decision(run: ForkFolder) -> Iterator[tuple[str, str]]:
     made = run.decision
     if made is None:
         return
-    text = decided(made)
+    text = decided(run)
     yield "Decision", text[:1].upper() + text[1:]
     when = f"{count(made['step'])}, {plain(made['step'] * run.summary['timestep'], 6)} s"
     also = made.get("also")
@@ -207,7 +217,7 @@ def decision(run: ForkFolder) -> Iterator[tuple[str, str]]:
     for name, margin in made["margins"].items():
         bound = made["bounds"][name]
         if margin is None:
-            yield f"Margin in {name}", "the solver of this run made no decision at that iteration"
+            yield f"Margin in {name}", "none on record: this run made no decision there"
             continue
         word = (
             "ambiguous: rounding alone could have decided otherwise"

@@ -251,6 +251,8 @@ def test_a_run_that_blows_up_ends_the_comparison():
     found = fork(between(tame, wild, tame.start(0.5), steps=400), repeats=0)
     assert found.failed == {"B": "blow-up"}
     assert 0 < found.steps < 400 and found.asked == 400
+    # whether or not a decision differs before
+    assert found.dates.fork is not None and found.dates.fork <= found.steps
     assert all(len(values) == found.steps + 1 for values in found.series.values())
     assert np.isfinite(found.series["B"]).all()
 
