@@ -110,7 +110,7 @@ class Crossing:
 
     def __init__(self, a: Int[np.ndarray, "inside"], b: Int[np.ndarray, "others"], atoms: int):
         self.atoms = atoms
-        self.differing: Int[np.ndarray, "pairs"] = np.setxor1d(a, b)
+        self.differing: Int[np.ndarray, "pairs"] = np.setxor1d(a, b, assume_unique=True)
 
     def opening(self) -> list[CrossFlip]:
         """The pairs on which they differ from the start, as flips at step 0."""
