@@ -70,8 +70,8 @@ def _print(summary: Mapping[str, Any]) -> None:
             f"{row['below']!r}\n{row['above']!r}",
             f"{row['step']:,}",
             f"{row['who']}\n{row['way']}",
-            f"{row['margin_below']:+.2e}\n{row['margin_above']:+.2e}",
-            f"{row['jump']:+.3e}",
+            "\n".join(_signed(row[f"margin_{side}"], 2) for side in ("below", "above")),
+            _signed(row["jump"], 3),
             *(() if row["apart"] is None else (f"{row['apart']:.2e}",)),
             row["confirmed"],
         )
@@ -101,3 +101,7 @@ def _print(summary: Mapping[str, Any]) -> None:
     if summary["complete"]:
         counts[-1] = ("may be missed", "nothing: every float was run")
     output.print_table("", ("", ""), counts)
+
+
+def _signed(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:+.{digits}e}"

@@ -12,7 +12,10 @@ from mdnum.systems.build import Simulation
 
 @dataclass(frozen=True)
 class Point:
-    """What is remembered of a run: a digest of its decisions, loss and energy at its last step, a failure."""
+    """What is remembered of a run: a digest of its decisions, loss and energy at its last step, a failure.
+
+    Loss and energy of a run that failed are NaN.
+    """
 
     digest: str
     loss: float
@@ -39,8 +42,10 @@ class Line:
         """The run at a float; what it decided is remembered."""
         simulation = self.at(place)
         made = history(simulation, self.steps)
-        loss = float(self.loss(simulation, made.x, made.v))
-        self.known[place] = Point(made.digest, loss, made.energy, made.failed)
+        # a run that failed has no last step for a loss to be of
+        loss = float("nan") if made.failed else float(self.loss(simulation, made.x, made.v))
+        energy = float("nan") if made.failed else made.energy
+        self.known[place] = Point(made.digest, loss, energy, made.failed)
         return made
 
     def digest(self, place: int) -> str:

@@ -15,8 +15,8 @@ from mdnum.store import COLUMNS, RunFolder
 from mdnum.workflow.fork_question import Log, Progress, basics, finish, is_ball, loaded, opened, steps_of
 
 if TYPE_CHECKING:
-    from mdnum.forks.boundaries import Boundary, BoundaryMap
     from mdnum.forks.histories import Loss
+    from mdnum.forks.piecewise import Boundary, BoundaryMap
     from mdnum.systems.ball_system import BallSystem
     from mdnum.systems.load import System
 
@@ -234,7 +234,7 @@ def _summary(found: BoundaryMap, rows: list[dict[str, Any]], confirm: bool) -> d
         "failed_runs": found.failed,
         "confirm": confirm,
         "confirmed": sum(edge.confirmed is True for edge in edges) if confirm else None,
-        "jump_largest": max((abs(edge.jump) for edge in edges), default=None),
+        "jump_largest": max((abs(edge.jump) for edge in edges if np.isfinite(edge.jump)), default=None),
         "apart_largest": max((edge.apart for edge in edges), default=None),
         "boundaries": rows,
         "intervals": [

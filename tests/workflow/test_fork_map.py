@@ -126,14 +126,16 @@ def test_what_a_person_must_know_is_a_finding(mapped, tmp_path):
 def test_from_the_command_line(mapped, tmp_path, monkeypatch, capsys):
     path = meeting().write(tmp_path / "system")
     monkeypatch.chdir(tmp_path)
-    first, *others = mapped.map.boundaries
-    edges = (replace(first, confirmed=False), *(replace(one, confirmed=True) for one in others))
+    first, second, third = mapped.map.boundaries
+    # a run that fails has no loss, and what has none no jump
+    failing = replace(second, below=replace(second.below, loss=np.nan), confirmed=True)
+    edges = (replace(first, confirmed=False), failing, replace(third, confirmed=True))
     asked = []
 
     def search(system, key, low, high, steps, **options):
         asked.append((key, low, high, steps, options["most"], options["confirm"]))
         options["progress"](1, 7, {"phase": "running a grid", "unit": "runs"})
-        return replace(mapped.map, boundaries=edges, unresolved=((0.08, 0.09),))
+        return replace(mapped.map, boundaries=edges, unresolved=((0.08, 0.09),), failed=2)
 
     monkeypatch.setattr("mdnum.forks.boundaries.boundaries", search)
     arguments = ["fork", str(path), "--along", "timestep=0.06:0.105", "--no-report"]
@@ -142,7 +144,9 @@ def test_from_the_command_line(mapped, tmp_path, monkeypatch, capsys):
     answer = json.loads(capsys.readouterr().out)
     # the default number of steps, and a boundary that a fresh process does not find is a finding
     assert asked == [("dynamics.timestep", 0.06, 0.105, STEPS, 3, True)] and stopped.value.code == 1
-    assert [one["code"] for one in answer["findings"]] == ["NOT_REPRODUCED", "MORE_BOUNDARIES"]
+    assert [one["code"] for one in answer["findings"]] == ["NOT_REPRODUCED", "RUNS_FAILED", "MORE_BOUNDARIES"]
+    assert answer["boundaries"][1]["jump"] is None
+    assert answer["jump_largest"] == max(abs(edge.jump) for edge in (first, third))
     assert answer["folder"] == "here" and answer["boundaries"][0]["confirmed"] == "no"
     assert "running a grid: 1 of 7 runs" in (tmp_path / "here/log.txt").read_text()
     assert not (tmp_path / "here/report.html").exists()

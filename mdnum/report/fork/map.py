@@ -79,26 +79,28 @@ def _headline(run: Question) -> str:
 
 def _evidence(run: Question) -> Iterator[str]:
     summary, edges = run.summary, run.summary["boundaries"]
-    if edges:
-        largest = max(edges, key=lambda edge: abs(edge["jump"]))
+    jumping = [edge for edge in edges if edge["jump"] is not None]
+    if jumping:
+        largest = max(jumping, key=lambda edge: abs(edge["jump"]))
         yield (
             f"The largest jump of the {summary['loss']} is "
             f"{number(largest['jump'], 3, signed=True)} {summary['loss_unit']}".rstrip()
             + f", where {largest['says']} at step {count(largest['step'])}."
         )
-        total = sum(edge["jump"] for edge in edges)
-        ends = summary["intervals"][-1]["loss_high"] - summary["intervals"][0]["loss_low"]
         known = "the jumps that were found" if summary["unresolved"] else "the jumps"
-        yield (
-            f"From end to end the {summary['loss']} changes by {number(ends, 3, signed=True)}; "
-            f"{known} add up to {number(total, 3, signed=True)}. "
-            "A derivative of the program knows nothing of them."
-        )
-        if summary["confirm"] and summary["confirmed"] == len(edges):
+        total = number(sum(edge["jump"] for edge in jumping), 3, signed=True)
+        ends = (summary["intervals"][-1]["loss_high"], summary["intervals"][0]["loss_low"])
+        if None not in ends:
+            change = number(ends[0] - ends[1], 3, signed=True)
             yield (
-                "Each boundary lies between two adjacent floats, and a fresh process finds the same "
-                "history on either side."
+                f"From end to end the {summary['loss']} changes by {change}; {known} add up to {total}. "
+                "A derivative of the program knows nothing of them."
             )
+    if edges and summary["confirm"] and summary["confirmed"] == len(edges):
+        yield (
+            "Each boundary lies between two adjacent floats, and a fresh process finds the same history on "
+            "either side."
+        )
     if summary["complete"]:
         yield "Every float of the interval was run: nothing can hide."
     else:
@@ -142,7 +144,7 @@ def _findings(run: Question) -> Iterator[Finding]:
             "RUNS_FAILED",
             "warning",
             f"{many(summary['failed_runs'], 'run')} of {count(summary['evaluations'])} ended in a blow-up",
-            "Part of the interval cannot be run to the last step; its losses mean nothing.",
+            "Part of the interval cannot be run to the last step, and has no loss there.",
             "Search an interval of values that can be run, or fewer steps.",
         )
 

@@ -116,7 +116,7 @@ def jumps(run: Question) -> Plot | None:
     if len(edges) < 2:
         return None
     at = np.array([edge["above"] for edge in edges])
-    size = np.abs([edge["jump"] for edge in edges])
+    size = np.abs([np.nan if edge["jump"] is None else edge["jump"] for edge in edges])
     apart = np.array([np.nan if edge["apart"] is None else edge["apart"] for edge in edges])
     summary, length = run.summary, run.units.length
     loss = with_unit(f"jump of the {summary['loss']}", summary["loss_unit"])
