@@ -75,7 +75,8 @@ def evaluated(sim: Simulation):
 @pytest.mark.parametrize(
     ("dtype", "kind", "decision"),
     [
-        ("bfloat16", "hard", "float64"),
+        # widened to float32, where XLA would leave out roundings
+        ("bfloat16", "hard", "float32"),
         pytest.param("bfloat16", "switched", "float32", marks=pytest.mark.slow),
         pytest.param("bfloat16", "force-shifted", "float64", marks=pytest.mark.slow),
         pytest.param("float16", "switched", "float64", marks=pytest.mark.slow),

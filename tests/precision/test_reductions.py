@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
+
 import jax
 import jax.numpy as jnp
 import ml_dtypes
@@ -11,6 +13,7 @@ from jax import lax
 
 from mdnum.errors import InputError
 from mdnum.precision.exact import zero_bits
+from mdnum.precision.orders import Halves, Twice
 from mdnum.precision.reductions import (
     BY_NAME,
     Blocked,
@@ -251,3 +254,18 @@ def test_reductions_have_names_and_options():
         parse("blocked:1")
     with pytest.raises(InputError, match="unknown dtype 'half'"):
         Widened(Sequential(), "half")
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 24])
+def test_sums_of_two_ends_are_two_loops(count):
+    """The orders of neighbor formats, against loops that round every result to float32."""
+    terms = np.random.default_rng(count).normal(size=(count, 5)).astype(np.float32)
+
+    half, halves = count // 2, np.float32(0.5) * terms
+    ends = [loop(part) if len(part) else np.zeros(5, np.float32) for part in (terms[:half], terms[half:])]
+    expected = {Halves(): ends[0] + ends[1], Twice(): loop([loop(halves), *halves])}
+    for reduction, sums in expected.items():
+        found = np.asarray(reduction(jnp.asarray(terms)))
+        assert np.array_equal(found, sums)
+        exact = [float(sum(Fraction(float(t)) for t in column)) for column in terms.T]
+        assert (np.abs(found - np.array(exact)) <= reduction.bound(terms)).all()
