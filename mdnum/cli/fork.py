@@ -7,8 +7,8 @@ from pathlib import Path
 import typer
 
 from mdnum.cli import fork_ahead, fork_ball, fork_map, fork_processes, fork_questions, output
-from mdnum.cli.fork_print import print_fork
-from mdnum.cli.progress import ProgressBar
+from mdnum.cli.fork_print import print_rows
+from mdnum.cli.progress import watched
 from mdnum.errors import InputError
 
 
@@ -139,32 +139,24 @@ def fork(
         return _choices(as_json)
     from mdnum.workflow import fork as compare
 
-    try:
-        with ProgressBar() as progress:
-            result = compare(
-                system,
-                vary,
-                steps=steps,
-                split=split,
-                repeats=repeats,
-                counterfactual=not no_counterfactual,
-                back=not no_back,
-                lyapunov=not no_lyapunov,
-                minimal=minimal,
-                pin=pin,
-                out=out,
-                overrides=overrides,
-                report=not no_report,
-                progress=progress,
-            )
-    except KeyboardInterrupt:
-        raise output.Stopped("stopped") from None
-    summary = dict(result.summary)
-    if as_json:
-        output.print_json({"folder": result.folder, **summary})
-    else:
-        print_fork(summary, result.folder)
-    return output.exit_code(summary.get("findings", ()), ok=summary.get("status") == "complete")
+    with watched() as progress:
+        result = compare(
+            system,
+            vary,
+            steps=steps,
+            split=split,
+            repeats=repeats,
+            counterfactual=not no_counterfactual,
+            back=not no_back,
+            lyapunov=not no_lyapunov,
+            minimal=minimal,
+            pin=pin,
+            out=out,
+            overrides=overrides,
+            report=not no_report,
+            progress=progress,
+        )
+    return output.answer(result.folder, result.summary, print_rows, as_json=as_json)
 
 
 def _choices(as_json: bool) -> int:

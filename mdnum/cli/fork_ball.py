@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from mdnum.cli import output
+from mdnum.cli.fork_print import print_ranking, print_two_by_two
 from mdnum.cli.progress import watched
 from mdnum.errors import InputError
 
@@ -112,9 +113,6 @@ def folders(a: str, b: Path, *, as_json: bool) -> int | None:
 
 def print_rows(summary: Mapping[str, Any]) -> None:
     """Dates, the decision at the fork and splits by run; or a ranking of choices."""
-    from mdnum.cli.fork_print import _print_ranking as print_ranking
-    from mdnum.cli.fork_print import _print_two_by_two as print_two_by_two
-
     if "ranking" in summary:
         print_ranking(summary)
         return

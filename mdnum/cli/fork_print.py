@@ -3,24 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Any
 
 from mdnum.cli import output
 
 
-def print_fork(summary: Mapping[str, Any], folder: Path) -> None:
-    """Print what a fork folder says: one pair of runs, or the ranking of a screening."""
-    out = output.console()
-    if headline := summary.get("headline"):
-        out.print(headline, style="bold", markup=False)
+def print_rows(summary: Mapping[str, Any]) -> None:
+    """What a fork folder says below its headline: one pair of runs, or the ranking of a screening."""
     if "ranking" in summary:
-        _print_ranking(summary)
+        print_ranking(summary)
     else:
         _print_pair(summary)
-    output.print_findings(summary.get("findings", ()))
-    report = folder / "report.html"
-    out.print(f"wrote {report if report.exists() else folder}", markup=False)
 
 
 def _print_pair(summary: Mapping[str, Any]) -> None:
@@ -51,7 +44,7 @@ def _print_pair(summary: Mapping[str, Any]) -> None:
     rows += list(_pinned(summary.get("pinned")))
     rows += list(_certain(summary))
     output.print_table("", ("", ""), rows)
-    _print_two_by_two(summary)
+    print_two_by_two(summary)
     _print_minimal(summary.get("minimal"))
 
 
@@ -98,7 +91,7 @@ def _certain(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         yield "shadow horizon", f"step {step:,}: {other} decides as the wider program, {wide}, up to there"
 
 
-def _print_two_by_two(summary: Mapping[str, Any]) -> None:
+def print_two_by_two(summary: Mapping[str, Any]) -> None:
     """Splits by arithmetic and decisions, from either run, and what each of the two contributed."""
     cells = summary.get("table") or ()
     runs = {(cell["arithmetic"], cell["decisions"]) for cell in cells}
@@ -230,7 +223,7 @@ def _decision(made: Mapping[str, Any] | None) -> list[tuple[str, str]]:
     return rows
 
 
-def _print_ranking(summary: Mapping[str, Any]) -> None:
+def print_ranking(summary: Mapping[str, Any]) -> None:
     rows = [
         (
             one["choice"],

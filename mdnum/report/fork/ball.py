@@ -72,8 +72,8 @@ def render(run: ForkFolder, verdict: Verdict, pictures: dict, notes: dict) -> st
         return page.render(
             "fork/screen.html.j2",
             **shared,
-            figures=list(html._ranked_figures(run)),
-            ranking=list(html._ranking(run)),
+            figures=list(html.ranked_figures(run)),
+            ranking=list(html.ranking(run)),
             scripted=False,
         )
     decisions = _decisions(run)

@@ -34,7 +34,7 @@ def drawn(
         plot = replace(
             plot, title="Separation of the two rollouts", y_label="largest difference of heights (m)"
         )
-        yield "separation", plot.title, partial(figures._separation, run, plot), []
+        yield "separation", plot.title, partial(figures.draw_separation, run, plot), []
     for name, made in (
         ("around", near(run, around)),
         ("cross", cross(run)),

@@ -38,7 +38,7 @@ def figures(run: ForkFolder) -> Iterator[tuple[str, str, Drawer, list[str]]]:
         return
     plot = separation(run)
     if plot is not None:
-        yield "separation", plot.title, partial(_separation, run, plot), []
+        yield "separation", plot.title, partial(draw_separation, run, plot), []
     if len(run.around.get("atom", ())) > 1:
         yield "atoms", "The atoms around the deciding pair at the fork", partial(atoms.draw, run), []
     for name, plot in (("protection", protection(run)), ("cross", cross(run)),
@@ -104,7 +104,8 @@ def _fit(run: ForkFolder) -> tuple[np.ndarray, np.ndarray] | None:
     return at, np.exp(fit["intercept"] + fit["rate"] * at)
 
 
-def _separation(run: ForkFolder, plot: Plot, width: float) -> Figure:
+def draw_separation(run: ForkFolder, plot: Plot, width: float) -> Figure:
+    """The separation with its lines by weight, its tolerance named, and a tick for each cross-run flip."""
     figure = plots.draw(plot, width)
     figure.set_figheight(figure.get_figheight() + (1.5 if width >= PAGE_WIDTH else 0.9))
     axes = figure.axes[0]

@@ -14,7 +14,6 @@ from mdnum.report.fork import figures, findings, sections
 from mdnum.report.fork.run import ROWS_LOADED, ForkFolder, load
 from mdnum.report.words import count, many, number, plain
 from mdnum.store import RunFolder
-from mdnum.store.atomic import write_text
 
 #: Rows of the table of flips that the page carries.
 TABLE_ROWS = 5_000
@@ -33,12 +32,11 @@ def write_report(folder: RunFolder | str | Path) -> Path:
     run = load(folder)
     verdict = findings.judge(run)
     verdict.store(folder, run.summary)
-    pictures, notes = {}, {}
-    for name, title, draw, said in figures.figures(run):
-        pictures[name], notes[name] = page.picture(folder.path, name, title, draw), said
-    path = folder.path / "report.html"
-    write_text(path, render(run, verdict, pictures, notes))
-    return path
+    return page.publish(
+        folder.path,
+        figures.figures(run),
+        lambda pictures, notes: render(run, verdict, pictures, notes),
+    )
 
 
 def render(
@@ -62,7 +60,7 @@ def render(
         notes=notes,
         captions=figures.captions(run),
         summary=run.summary,
-        figures=list(_ranked_figures(run) if run.screened else _key_figures(run)),
+        figures=list(ranked_figures(run) if run.screened else _key_figures(run)),
         what=list(_what(run)),
         decision=list(sections.decision(run)),
         runs=list(sections.runs(run)),
@@ -74,7 +72,7 @@ def render(
         minimal=sections.minimal(run),
         growth=list(sections.growth(run)),
         changes=_changes(run.summary.get("changes") or {}),
-        ranking=list(_ranking(run)),
+        ranking=list(ranking(run)),
         flips=flips,
         flips_total=int(run.summary.get("cross_flips") or 0),
         scripted=bool(flips and flips.rows),
@@ -204,7 +202,7 @@ def _flips(run: ForkFolder) -> Browse:
 # --- all choices --------------------------------------------------------------------------------------
 
 
-def _ranked_figures(run: ForkFolder) -> Iterator[tuple[str, str, str]]:
+def ranked_figures(run: ForkFolder) -> Iterator[tuple[str, str, str]]:
     rows = run.ranking
     forked = [one for one in rows if one.get("fork") is not None]
     yield (
@@ -221,7 +219,7 @@ def _ranked_figures(run: ForkFolder) -> Iterator[tuple[str, str, str]]:
     yield "Took", f"{number(run.summary.get('seconds'), 2)} s", "compilation and all"
 
 
-def _ranking(run: ForkFolder) -> Iterator[dict[str, Any]]:
+def ranking(run: ForkFolder) -> Iterator[dict[str, Any]]:
     """A row per choice, as text."""
     for one in run.ranking:
         yield {
