@@ -35,6 +35,10 @@ MINIMAL = {
     "proven": True, "fork_alone": False, "candidates": 77, "tests": 23, "horizon": 1652,
     "reason": "2 pairs are enough, and none of them can be left out",
 }  # fmt: skip
+PINNED = {
+    "pin": "fork", "pairs": [[3, 4]], "first": FORK, "last": FORK + 6, "split": None, "free": 1321,
+    "until": STEPS, "largest": 2e-9, "reason": None,
+}  # fmt: skip
 
 
 def two_by_two(split: int | None) -> list[dict[str, Any]]:
@@ -142,7 +146,8 @@ def make_fork(
             },
             "lists_complete": {"A": True, "B": True}, "protected_until": NEAR - 1 if forks else STEPS,
             "shadow": "A", "shadow_horizon": FORK - 1 if forks else STEPS, "lyapunov": LYAPUNOV,
-            "lyapunov_reason": None, "minimal": MINIMAL if forks else None, "failed": {},
+            "lyapunov_reason": None, "minimal": MINIMAL if forks else None,
+            "pinned": PINNED if forks else None, "failed": {},
             "findings": [], "status": "complete", "seconds": 3.5,
         }
         | (summary or {})

@@ -12,6 +12,7 @@ from report.synthetic_fork import (
     DECISION,
     FORK,
     NEAR,
+    PINNED,
     RATE,
     SIZE,
     STEPS,
@@ -25,7 +26,7 @@ from report.test_html import Tags
 
 from mdnum import report
 from mdnum.errors import FolderError
-from mdnum.report.fork import atoms, figures, findings
+from mdnum.report.fork import atoms, figures, findings, sections
 from mdnum.report.fork.run import load
 from mdnum.store import RunFolder
 
@@ -84,6 +85,8 @@ def test_the_page_states_what_the_folder_holds(page, folder):
         "the runs part 1.05 times as fast", "8.9 × 10⁻¹⁶ σ reaches the split tolerance about step 1,702",
         "2 pairs are enough, and none of them can be left out. 23 runs of B told, 77 pairs that differ",
         "3–4 400 to 406, 420, 430 to 459, and 1 time more", "3–9 from 410 on",
+        "Told what A decided about 3–4 at steps 400 to 406 and nothing else, B does not split from A by step "
+        "1,500: they are 2.0 × 10⁻⁹ σ apart at most; without, at 1,321.",
         f"split {split:,}", "fork 400", "seed 5", "split: beyond 0.100 σ", "A and B under A’s decisions",
     ):  # fmt: skip
         assert words in text, words
@@ -117,27 +120,20 @@ def test_without_an_exponent_or_a_minimal_cause_the_page_says_why(tmp_path):
         "lyapunov": None, "lyapunov_reason": "a many-body potential",
         "minimal": {"pairs": None, "tests": 0, "reason": "the runs did not split"},
     }  # fmt: skip
-    page = report.write(make_fork(tmp_path / "run", summary=entries)).read_text(encoding="utf-8")
-    assert "none: a many-body potential" in page and "<p>The runs did not split.</p>" in page
+    run = load(make_fork(tmp_path / "run", summary=entries))
+    assert dict(sections.growth(run))["Lyapunov exponent"] == "none: a many-body potential"
+    assert sections.minimal(run) == {"none": True, "text": "The runs did not split.", "rows": []}
 
 
 def test_a_decision_that_was_taken_back_is_told(tmp_path):
-    made = {
-        "pin": "fork", "pairs": [[3, 4]], "first": FORK, "last": FORK + 6, "split": None, "free": 1321,
-        "until": STEPS, "largest": 2e-9, "reason": None,
-    }  # fmt: skip
-
     def told(name, **entries):
-        page = report.write(make_fork(tmp_path / name, summary={"pinned": made | entries}))
-        return re.sub(r"\s+", " ", page.read_text(encoding="utf-8"))
+        return str(sections.pinned(load(make_fork(tmp_path / name, summary={"pinned": PINNED | entries}))))
 
-    assert (
-        "<p>Told what A decided about 3–4 at steps 400 to 406 and nothing else, B does not split from A by "
-        "step 1,500: they are 2.0 × 10⁻⁹ σ apart at most; without, at 1,321.</p>"
-    ) in told("held").replace("\N{NO-BREAK SPACE}", " ")
     assert "at step 400 and nothing else, B splits from A at step 1,333" in told("one", last=400, split=1333)
-    assert "No decision could be taken back: the runs do not fork." in told(
-        "none", pairs=None, reason="the runs do not fork"
+    assert "at steps 400 to 406" in told("free", free=None)
+    assert told("free-too", free=None).endswith("; without, they do not split.")
+    assert told("none", pairs=None, reason="the runs do not fork") == (
+        "No decision could be taken back: the runs do not fork."
     )
 
 
