@@ -202,6 +202,7 @@ def test_one_decision_is_planted_and_nothing_else(systems):
         assert twin.a is twin.b and twin.order is None and not twin.changes
 
 
+@pytest.mark.slow
 def test_the_order_of_a_batch_is_heard_by_its_sum_alone():
     """Nine penetrations that sum to the tolerance: whichever is summed last is heard."""
     low = {f"precision.{role}": "bfloat16" for role in ("state", "arithmetic", "decision", "accumulate")}
