@@ -207,14 +207,23 @@ Dynamics = Annotated[NVE | Langevin, Discriminator("kind")]
 class Precision(Table):
     """Which float plays which role."""
 
-    state: FloatName = Field(default="float64", description="positions and velocities")
+    state: FloatName = Field(
+        default="float64",
+        description="positions and velocities (with sixteen bits a step would move no atom)",
+    )
     force: ForceFloatName = Field(
         default="float64",
         description="pair distances, energies and forces; in bfloat16 and float16 distances are those of the "
         "decision, rounded",
     )
-    decision: FloatName = Field(default="float64", description="the quantity compared with a threshold")
-    accumulate: FloatName = Field(default="float64", description="sums over pairs")
+    decision: FloatName = Field(
+        default="float64",
+        description="the quantity compared with a threshold (with sixteen bits the grid of coordinates would "
+        "decide)",
+    )
+    accumulate: FloatName = Field(
+        default="float64", description="sums over pairs (with sixteen bits the small terms would be lost)"
+    )
     reduction: ReductionName = Field(
         default="sequential",
         description="order of the sums; exact and fixed-point give the same bits in every order of neighbors",
