@@ -84,11 +84,10 @@ def test_the_nearest_pair_protects_until_the_runs_could_have_moved_it(found):
     assert found.dates.fork is not None and sure < found.dates.fork
 
 
-def test_two_runs_of_one_program_are_protected_by_their_bounds_alone():
-    a = build("argon/crystal-108", {"cutoff.radius": 1.35})
-    same = fork(Twin(a, a, "nothing"), 20, counterfactual=False)
-    dates = certified(same)
-    assert dates.protected == 20 and dates.shadow is None and dates.shadow_step is None
+def test_two_runs_of_one_program_are_protected_by_their_bounds_alone(found):
+    a = found.twin.a
+    dates = certified(fork(Twin(a, a, "nothing"), STEPS, counterfactual=False))
+    assert dates.protected == STEPS and dates.shadow is None and dates.shadow_step is None
 
 
 def test_the_wider_program_is_the_shadow(found):
