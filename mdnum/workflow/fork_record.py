@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
-from mdnum.events.forks import Growth
-from mdnum.events.shares import Cell
 from mdnum.forks.certified import certified
 from mdnum.forks.neighborhood import Neighborhood
 from mdnum.forks.pair import FLIPS_KEPT, Fork
@@ -17,6 +14,7 @@ from mdnum.forks.take_back import Pinned
 from mdnum.rollout.flips import Ambiguous
 from mdnum.store import RunFolder
 from mdnum.systems.build import Simulation
+from mdnum.workflow import fork_numbers as numbers
 
 #: Columns of separation.parquet by the series that they hold.
 _SERIES = {
@@ -26,8 +24,6 @@ _SERIES = {
     "handed_from_b": "B|A from B", "back_from_a": "A|B from A", "nearest_a": "nearest A",
     "nearest_b": "nearest B", "ambiguous_a": "ambiguous A", "ambiguous_b": "ambiguous B",
 }  # fmt: skip
-#: r² of a fit that counts as growth.
-_FITS = 0.5
 
 
 def write(folder: RunFolder, fork: Fork, around: Neighborhood | None, pinned: Pinned | None = None) -> None:
@@ -61,9 +57,7 @@ def summarize(
     """The content of summary.json, without headline and findings."""
     a = fork.twin.a
     step = timestep(a)
-    dates, verdict, rate = fork.dates, fork.verdict, fork.growth["B"]
-    when = {name: getattr(dates, name) for name in ("seed", "fork", "split")}
-    free = fork.series["B"]
+    rate, free = fork.growth["B"], fork.series["B"]
     return {
         "world": "fork",
         "system": a.system.name,
@@ -79,31 +73,25 @@ def summarize(
         "timestep": step,
         "units": a.units.name,
         "r_cut": a.r_cut,
-        **when,
-        **{f"{name}_time": None if at is None else at * step for name, at in when.items()},
+        **numbers.dates(fork.dates, step),
         "tolerance": fork.tolerance,
         "decision": _decision(fork, around),
-        "verdict": verdict.word,
-        "reasons": list(verdict.reasons),
-        "growth_rate": _plain(rate.rate),
-        "growth_rate_time": _plain(rate.rate / step),
-        "r_squared": _plain(rate.r_squared),
-        "growth": {name: _growth(fork, name) for name in fork.growth},
-        "predicted_split": predicted(fork),
+        **numbers.verdict(fork.verdict),
+        **numbers.rate(rate, step),
+        "growth": {name: numbers.fitted(fit, fork.series[name]) for name, fit in fork.growth.items()},
+        "predicted_split": numbers.predicted(fork.dates, rate, free, fork.tolerance, fork.steps),
         "splits": {name: fork.splits.get(name) for name in ("B", "B|A", "A|B") if name in fork.splits},
-        "nats": verdict.nats,
-        "noise": verdict.noise,
         "repeats": fork.repeats,
         "repeats_run": sum(name.startswith("B ") for name in fork.splits),
-        "handed_until": _until(fork, "B|A"),
-        "handed_largest": _largest(fork, "B|A"),
-        "separation_end": _plain(free[np.isfinite(free)][-1]) if np.isfinite(free).any() else None,
-        "separation_largest": _largest(fork, "B"),
-        "overridden": _total(fork, "overridden"),
+        "handed_until": numbers.until(fork.series, "B|A"),
+        "handed_largest": numbers.largest(fork.series, "B|A"),
+        "separation_end": numbers.plain(free[np.isfinite(free)][-1]) if np.isfinite(free).any() else None,
+        "separation_largest": numbers.largest(fork.series, "B"),
+        "overridden": numbers.total(fork.series, "overridden"),
         "cross_flips": fork.flips_total,
         "cross_flips_kept": min(fork.flips_total, FLIPS_KEPT),
-        "table": [_cell(cell) for cell in fork.table],
-        "shares": [asdict(share) for share in fork.shares],
+        "table": [numbers.cell(cell) for cell in fork.table],
+        "shares": [numbers.share(share) for share in fork.shares],
         **_certified(fork),
         "failed": {name: word for name, word in fork.failed.items() if name in ("A", "B")},
         "failed_told": {name: word for name, word in fork.failed.items() if name not in ("A", "B")},
@@ -116,18 +104,6 @@ def summarize(
 def timestep(simulation: Simulation) -> float:
     """The time step, the user's unit of time."""
     return float(simulation.system.spec.dynamics.timestep)
-
-
-def predicted(fork: Fork) -> int | None:
-    """The step at which runs that have not split are expected to; None where nothing grows plainly."""
-    free = fork.series["B"]
-    seen = free[np.isfinite(free)]
-    fit = fork.growth["B"]
-    # a line through noise predicts nothing
-    if fork.dates.split is not None or not len(seen) or not fit.r_squared > _FITS:
-        return None
-    more = fit.steps_to(float(seen[-1]), fork.tolerance)
-    return None if more is None else round(fork.steps + more)
 
 
 def changes(a: Simulation, b: Simulation) -> dict[str, list[Any]]:
@@ -186,18 +162,6 @@ def _decision(fork: Fork, around: Neighborhood | None) -> dict[str, Any] | None:
     }
 
 
-def _cell(cell: Cell) -> dict[str, Any]:
-    """A run of the table of two by two: whose arithmetic and decisions, and when it splits from which run."""
-    return {
-        "arithmetic": cell.arithmetic,
-        "decisions": cell.decisions,
-        "from": cell.reference,
-        "same": cell.same,
-        "split": cell.split,
-        "until": cell.until,
-    }
-
-
 def _certified(fork: Fork) -> dict[str, Any]:
     """How far the decisions of either run are certain, by themselves and against the other's."""
     found = certified(fork)
@@ -231,43 +195,3 @@ def _cutoff(simulation: Simulation, i: int, j: int) -> float:
     decider = simulation.decider
     value = decider.thresholds[_kind(simulation, i, j)].value
     return float(np.sqrt(value)) if decider.space == "r2" else value
-
-
-def _growth(fork: Fork, name: str) -> dict[str, Any]:
-    """The fit as a line: separation = exp(intercept + rate * step) between first and last."""
-    fit: Growth = fork.growth[name]
-    if not np.isfinite(fit.rate):
-        return {"rate": None, "r_squared": None, "first": None, "last": None, "intercept": None}
-    step = np.arange(fit.first, fit.last + 1)
-    values = fork.series[name][fit.first : fit.last + 1]
-    usable = np.isfinite(values) & (values > 0)
-    intercept = float(np.mean(np.log(values[usable]) - fit.rate * step[usable]))
-    return {
-        "rate": fit.rate,
-        "r_squared": fit.r_squared,
-        "first": fit.first,
-        "last": fit.last,
-        "intercept": intercept,
-    }
-
-
-def _until(fork: Fork, name: str) -> int | None:
-    """The last step of a counterfactual; None where there is none."""
-    if name not in fork.series:
-        return None
-    seen = np.flatnonzero(np.isfinite(fork.series[name]))
-    return int(fork.series["step"][seen[-1]]) if len(seen) else None
-
-
-def _largest(fork: Fork, name: str) -> float | None:
-    values = fork.series.get(name)
-    return float(np.nanmax(values)) if values is not None and np.isfinite(values).any() else None
-
-
-def _total(fork: Fork, name: str) -> int | None:
-    values = fork.series.get(name)
-    return int(np.nansum(values)) if values is not None else None
-
-
-def _plain(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
