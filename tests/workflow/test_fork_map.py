@@ -23,6 +23,7 @@ from mdnum.rollout.engine import Engine
 from mdnum.store import RunFolder
 from mdnum.systems import build
 
+# slow: a search makes hundreds of runs
 APART, RADIUS, SPEED, STEPS = 3.0, 2.5, 1.25, 9
 
 
@@ -48,6 +49,7 @@ def displacement(timestep: float) -> float:
     return float(np.mean(np.sum((x - simulation.positions) ** 2, axis=1)))
 
 
+@pytest.mark.slow
 def test_the_folder_holds_the_piecewise_map(mapped):
     folder = RunFolder.open(mapped.folder)
     assert folder.world == "along" and folder.summary == mapped.summary
@@ -75,6 +77,7 @@ def test_the_folder_holds_the_piecewise_map(mapped):
         assert set(points["history"][inside]) == {piece}
 
 
+@pytest.mark.slow
 def test_the_page_says_what_the_folder_holds(mapped):
     text = (mapped.folder / "report.html").read_text(encoding="utf-8")
     tags = Tags()
@@ -102,6 +105,7 @@ def judged(mapped, tmp_path, **changes):
     return page.judge(load(folder, "along")[1])
 
 
+@pytest.mark.slow
 def test_what_a_person_must_know_is_a_finding(mapped, tmp_path):
     assert [one.code for one in judged(mapped, tmp_path / "a").findings] == ["NOT_CONFIRMED"]
     edges = [{**edge, "confirmed": "yes"} for edge in mapped.summary["boundaries"]]
@@ -123,6 +127,7 @@ def test_what_a_person_must_know_is_a_finding(mapped, tmp_path):
     assert quiet.tone == "good" and quiet.headline.startswith("One history")
 
 
+@pytest.mark.slow
 def test_from_the_command_line(mapped, tmp_path, monkeypatch, capsys):
     path = meeting().write(tmp_path / "system")
     monkeypatch.chdir(tmp_path)
@@ -161,6 +166,7 @@ def test_from_the_command_line(mapped, tmp_path, monkeypatch, capsys):
     assert "wrote runs/fork-" in said and asked[1][4] == MOST
 
 
+@pytest.mark.slow
 def test_a_ball_has_a_map_too(tmp_path, capsys):
     """Solver iterations along the tolerance: each cuts what is left to 1 - alpha k of it."""
     asked = [
