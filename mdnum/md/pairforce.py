@@ -14,11 +14,12 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int, UInt8
+from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from mdnum.md.cell import Cell
 from mdnum.md.cutoffs import AtCutoff
 from mdnum.md.decide import (
+    GROUP,
     Decisions,
     PairDecider,
     SlotJudge,
@@ -135,9 +136,7 @@ class PairForce(eqx.Module):
             if decisions:
                 bits, nearest = judge.tally(nearest, quantity, inside, threshold)
             if told is not None:
-                # a mask that depends on its own as well: one that is only unpacked lets the compiler work out
-                # distances twice and not vectorize, and the step takes twice the time
-                asked = inside ^ unpacked(told)
+                asked = _other(inside, told)
                 inside = inside ^ (asked if pinned is None else asked & unpacked(pinned))
             d = d if same else displacements(components, cell, j)
             if same and self.decider.space == "r2":
@@ -192,6 +191,16 @@ class PairForce(eqx.Module):
         totals, _ = lax.scan(block, (jnp.zeros(judge.atoms, geometry),) * 6, tables.groups())
         xx, yy, zz, yz, xz, xy = (-jnp.sum(total, dtype=jnp.float64) for total in totals)
         return jnp.stack([jnp.stack([xx, xy, xz]), jnp.stack([xy, yy, yz]), jnp.stack([xz, yz, zz])])
+
+
+def _other(inside: Bool[Array, "4 atoms"], told: UInt8[Array, "atoms"]) -> Bool[Array, "4 atoms"]:
+    """Where a group is told otherwise than it decides.
+
+    A mask made of what is told alone lets the compiler work out distances twice, and one made slot by slot
+    (`unpacked`) does not mend all of it: a step of 864 atoms takes 2.2 and 1.3 times a plain one, and 1.2 so.
+    """
+    shift = jnp.arange(GROUP, dtype=jnp.uint8)[:, None]
+    return inside ^ ((told[None, :] >> shift) & jnp.uint8(1) == 1)
 
 
 class _Rounded(eqx.Module):
