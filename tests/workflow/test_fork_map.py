@@ -23,7 +23,6 @@ from mdnum.rollout.engine import Engine
 from mdnum.store import RunFolder
 from mdnum.systems import build
 
-# slow: a search makes hundreds of runs
 APART, RADIUS, SPEED, STEPS = 3.0, 2.5, 1.25, 9
 
 
@@ -49,6 +48,7 @@ def displacement(timestep: float) -> float:
     return float(np.mean(np.sum((x - simulation.positions) ** 2, axis=1)))
 
 
+# searches make hundreds of runs
 @pytest.mark.slow
 def test_the_folder_holds_the_piecewise_map(mapped):
     folder = RunFolder.open(mapped.folder)
