@@ -144,6 +144,7 @@ def test_skin_masked_entries_images_and_folding_do_not_matter(case):
         np.testing.assert_allclose(np.asarray(other_forces), forces, rtol=0, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_triclinic_and_slab_agree_with_extended_precision():
     tilted = crystal("Si", 2, 0.1)
     tilted.set_cell(

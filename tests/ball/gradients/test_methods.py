@@ -83,6 +83,7 @@ def test_a_gain_that_no_iteration_used_is_said_not_to_matter() -> None:
     assert flying.why["restitution"].startswith("no ball touched the floor")
 
 
+@pytest.mark.slow
 def test_frozen_is_the_derivative_of_the_pinned_program() -> None:
     control = 3.0 * np.sin(np.arange(60.0))[:, None] * np.array([1.0, 0.5])
     contact = Projection(0.5, 0.5, GlobalSum(1e-3, 60))
@@ -131,6 +132,7 @@ def test_located_impacts_have_the_derivative_of_the_exact_motion() -> None:
         np.testing.assert_allclose(got[name], exact[name], rtol=1e-8, err_msg=name)
 
 
+@pytest.mark.slow
 def test_steps_alone_never_learn_of_the_start_and_saltation_does_to_order_h() -> None:
     # the mean over heights averages out where in its step each impact falls
     starts = np.linspace(0.98, 1.02, 41)
