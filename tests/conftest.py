@@ -1,19 +1,40 @@
-"""What every test runs under: strict dtypes, checked shapes, no cached programs, no deadlines."""
+"""What every test runs under: strict dtypes, checked shapes, no programs of another run, no deadlines."""
 
 from __future__ import annotations
 
+import atexit
 import os
+import shutil
+import tempfile
 from collections.abc import Iterator
-
-# a program compiled by another run must not answer for this one
-os.environ.pop("JAX_COMPILATION_CACHE_DIR", None)
-os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "false"
 
 import hypothesis
 import jax
 import jaxtyping
 import pytest
 import typing_rules
+
+
+def _share_programs() -> None:
+    """Let workers and child processes of one run share what they compile, in a new folder.
+
+    A program compiled by another run must not answer for this one. CI names one folder for its two calls.
+    """
+    name = "MDNUM_TEST_PROGRAMS"
+    if name not in os.environ:
+        os.environ[name] = tempfile.mkdtemp(prefix="mdnum-programs-")
+        atexit.register(shutil.rmtree, os.environ[name], ignore_errors=True)
+    for option, value in (
+        ("jax_compilation_cache_dir", os.environ[name]),
+        ("jax_persistent_cache_min_compile_time_secs", 0),
+        ("jax_persistent_cache_min_entry_size_bytes", -1),
+    ):
+        jax.config.update(option, value)
+        # child processes read the environment
+        os.environ[option.upper()] = str(value)
+
+
+_share_programs()
 
 # Annotations are checked when a function is called. Not those of the command line and the report: they
 # import slow packages lazily, so their annotations name what is not imported yet.
