@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import typer
 
-from mdnum.cli import fork_ahead, fork_ball, fork_map, fork_processes, fork_questions, output
+from mdnum.cli import fork_ahead, fork_ball, fork_map, fork_options, fork_processes, fork_questions, output
 from mdnum.cli.fork_print import print_rows
 from mdnum.cli.progress import watched
 from mdnum.errors import InputError
+
+#: Repeats where nothing was said.
+_REPEATS = 2
 
 
 def fork(
@@ -29,8 +33,8 @@ def fork(
     split: float | None = typer.Option(
         None, metavar="LENGTH", help="The separation that counts as split; 0.04 of the cutoff by default."
     ),
-    repeats: int = typer.Option(
-        2, min=0, metavar="K", help="Runs with perturbed starts, to tell a delay from chance."
+    repeats: int | None = typer.Option(
+        None, min=0, metavar="K", help="Perturbed starts, to tell a delay from chance; 2 by default."
     ),
     settings: list[str] | None = output.SET_OPTION,
     no_counterfactual: bool = typer.Option(
@@ -90,8 +94,14 @@ def fork(
         "--vary": vary is not None,
     }
     if sum(asked.values()) > 1:
-        given = " and ".join(name for name, is_asked in asked.items() if is_asked)
-        raise InputError(f"{given} are different questions", remedy="Ask one at a time")
+        names = " and ".join(name for name, is_asked in asked.items() if is_asked)
+        raise InputError(f"{names} are different questions", remedy="Ask one at a time")
+    given = {
+        "--steps": steps is not None, "--split": split is not None, "--repeats": repeats is not None,
+        "--set": bool(overrides), "--no-counterfactual": no_counterfactual, "--no-back": no_back,
+        "--no-lyapunov": no_lyapunov, "--minimal": minimal, "--pin": pin is not None,
+        "--most": most is not None, "--benign": benign, "-o": out is not None, "--no-report": no_report,
+    }  # fmt: skip
     # along a number is the one question that is the same in both worlds
     if system is not None and other is None and along is None and fork_ball.is_ball(system):
         foreign = {
@@ -100,19 +110,23 @@ def fork(
             "--pin": pin is not None, "--no-back": no_back, "--no-lyapunov": no_lyapunov,
         }  # fmt: skip
         return fork_ball.fork(
-            system, vary, foreign=foreign, certify=certify, steps=steps, split=split, repeats=repeats,
+            system, vary, foreign=foreign, given=given, certify=certify, steps=steps, split=split,
+            repeats=_REPEATS if repeats is None else repeats,
             counterfactual=not no_counterfactual, out=out, overrides=overrides, report=not no_report,
             as_json=as_json,
         )  # fmt: skip
     if benign and vary is None:
         raise InputError("--benign needs a choice", remedy="Add --vary CHOICE")
+    if benign and vary == "all":
+        raise InputError("--benign is asked of one choice, not of all", remedy="Give one to --vary")
     for name, is_asked in (("--minimal", minimal), ("--pin", pin is not None)):
         if is_asked and vary is None and any(asked.values()):
             raise InputError(f"{name} is asked of two runs", remedy="Add it to --vary CHOICE")
     if most is not None and along is None:
         raise InputError("--most needs a number to go along", remedy="Add --along KEY=LOW:HIGH")
-    if any(asked.values()) and system is None:
+    if (any(asked.values()) or any(given.values())) and system is None:
         raise InputError("no system given", remedy="`mdnum systems list` names those that come with mdnum")
+    fork_options.check(_question(asked, vary, benign), given)
     if system is not None:
         if other is not None:
             code = fork_ball.folders(system, other, as_json=as_json)
@@ -145,7 +159,7 @@ def fork(
             vary,
             steps=steps,
             split=split,
-            repeats=repeats,
+            repeats=_REPEATS if repeats is None else repeats,
             counterfactual=not no_counterfactual,
             back=not no_back,
             lyapunov=not no_lyapunov,
@@ -157,6 +171,17 @@ def fork(
             progress=progress,
         )
     return output.answer(result.folder, result.summary, print_rows, as_json=as_json)
+
+
+def _question(asked: Mapping[str, bool], vary: str | None, benign: bool) -> str:
+    """The key of `fork_options.TAKES` for what was asked."""
+    if asked["RUN"]:
+        return "RUN_A RUN_B"
+    if vary is not None and benign:
+        return "--vary CHOICE --benign"
+    if vary == "all":
+        return "--vary all"
+    return next((name for name, is_asked in asked.items() if is_asked), "--vary")
 
 
 def _choices(as_json: bool) -> int:

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from mdnum.cli import output
+from mdnum.cli import fork_options, output
 from mdnum.cli.fork_print import print_ranking, print_two_by_two
 from mdnum.cli.progress import watched
 from mdnum.errors import InputError
@@ -36,6 +36,7 @@ def fork(
     vary: str | None,
     *,
     foreign: Mapping[str, bool],
+    given: Mapping[str, bool],
     certify: bool,
     steps: int | None,
     split: float | None,
@@ -50,14 +51,17 @@ def fork(
 
     Args:
         foreign: options of molecular dynamics, and whether they were given.
+        given: all options, and whether they were given.
         certify: ask when runs leave the exact history instead.
     """
-    for option, given in foreign.items():
-        if given:
+    for option, is_given in foreign.items():
+        if is_given:
             raise InputError(
                 f"{option} is a question for molecular dynamics, and {system} is a ball",
                 remedy=_INSTEAD.get(option, "Leave it out"),
             )
+    question = "--certify" if certify else "--vary all" if vary == "all" else "--vary"
+    fork_options.check(f"{question} of a ball", given)
     if certify:
         return _certify(system, steps, overrides, as_json=as_json)
     from mdnum.workflow import fork as compare
