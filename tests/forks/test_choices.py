@@ -87,7 +87,7 @@ def test_arguments_are_read_and_written_alike(word: str):
     ("word", "says"),
     [
         ("reductoin", "Did you mean"),
-        ("nonsense", "There are precision, precision.state"),
+        ("nonsense", "lists all"),
         ("precision.mass", "no role 'mass'; there are state, force, decision, accumulate"),
         ("precision=half", "known are float64, float32, float16, bfloat16"),
         ("precision.state=bfloat16", "bfloat16 cannot be the state of molecular dynamics: a step moves"),

@@ -63,7 +63,7 @@ def check(choice: Choice, system: System) -> None:
         raise InputError(
             f"does not apply to {system.name}: {reason}",
             where=choice.name,
-            remedy="Choose another: `mdnum.forks.choices.names()` lists them",
+            remedy="Choose another: `mdnum fork` lists them",
         )
 
 

@@ -51,6 +51,9 @@ _SHIPPED: tuple[Choice, ...] = (
     Noise(),
 )
 
+#: What `--processes` varies, and people may look for here.
+_PROGRAMS = ("jit", "eager", "vmap", "grad", "xla")
+
 #: The choices that are screened when all are asked for.
 BY_NAME: Mapping[str, Choice] = {choice.name: choice for choice in _SHIPPED}
 
@@ -88,12 +91,17 @@ def parse(text: str) -> Choice:
             reductions.parse(both)
         if argument or not equals:
             return _SUMMED[family](argument, both or None)
-    raise InputError(f"no choice {text!r}", remedy=f"{_near(text)}There are {', '.join(BY_NAME)}")
+    if family in _PROGRAMS:
+        raise InputError(
+            f"{text} is another program of one run, and no choice of two",
+            remedy="Ask `mdnum fork SYSTEM --processes`",
+        )
+    raise InputError(f"no choice {text!r}", remedy=f"{_near(text)}`mdnum fork` lists all")
 
 
 def _near(text: str) -> str:
-    close = difflib.get_close_matches(text, BY_NAME, n=1)
-    return f"Did you mean {close[0]}? " if close else ""
+    close = difflib.get_close_matches(text, BY_NAME, n=3)
+    return f"Did you mean {' or '.join(close)}? " if close else ""
 
 
 def _without(family: str, text: str) -> Choice:

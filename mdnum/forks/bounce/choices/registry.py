@@ -67,12 +67,12 @@ def parse(text: str) -> Choice:
         return BatchOrder(whole(argument, "order") if argument else 1, both or None)
     if family in _FAMILIES and not at and argument:
         return _FAMILIES[family](argument)
-    raise InputError(f"no choice {text!r} of a ball", remedy=f"{_near(text)}There are {', '.join(BY_NAME)}")
+    raise InputError(f"no choice {text!r} of a ball", remedy=f"{_near(text)}`mdnum fork` lists all")
 
 
 def _near(text: str) -> str:
-    close = difflib.get_close_matches(text, BY_NAME, n=1)
-    return f"Did you mean {close[0]}? " if close else ""
+    close = difflib.get_close_matches(text, BY_NAME, n=3)
+    return f"Did you mean {' or '.join(close)}? " if close else ""
 
 
 def _ulps(argument: str) -> Choice:
