@@ -109,6 +109,8 @@ def print_two_by_two(summary: Mapping[str, Any]) -> None:
         for (arithmetic, decisions), texts in by_run.items()
     ]
     lines += [("B, start perturbed", "its own", f"{split:,}", "") for split in summary.get("repeats") or ()]
+    more = (("B, start perturbed", "its own", f"> {summary['steps']:,}", ""),)
+    lines += more * (summary.get("repeats_censored") or 0)
     output.print_table(
         "splits, either arithmetic under either decisions",
         ("arithmetic", "decisions", "from A", "from B"),

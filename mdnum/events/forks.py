@@ -25,9 +25,12 @@ _PATIENCE = 1.2
 #: A counterfactual that grows and would split within so many times the free run's steps is late, not saved.
 _SAVED = 5.0
 #: A delay of less than one power of e is no delay: the separation was never as much as e times smaller.
-_NATS = 1.0
-#: Of a fit that counts as growth.
-_FITS = 0.5
+NATS = 1.0
+#: r² of a fit that counts as growth.
+FITS = 0.5
+#: Powers of e that the later half of a fit must grow by before it predicts anything. What the first steps do
+#: is a power law: its later half grows by 0.7 powers of e for every power of the time.
+_HALF = 3.0
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,11 @@ class Growth:
     r_squared: float
     first: int
     last: int
+
+    @property
+    def plain(self) -> bool:
+        """Whether something grows at all, rather than a line through noise."""
+        return bool(np.isfinite(self.rate) and self.rate > 0 and self.r_squared > FITS)
 
     def steps_to(self, start: float, end: float) -> float | None:
         """Steps in which a separation grows from one size to another; None where it does not grow."""
@@ -92,12 +100,47 @@ def growth(separation: Float[np.ndarray, "steps"], tolerance: float) -> Growth:
     at = np.flatnonzero(fit)
     if len(at) < _FIT_ROWS:
         return Growth(float("nan"), float("nan"), -1, -1)
-    y = np.log(rows[at])
-    slope, base = np.polyfit(at, y, 1)
-    residual = y - (slope * at + base)
+    rate, r_squared = _line(at, np.log(rows[at]))
+    return Growth(rate, r_squared, int(at[0]), int(at[-1]))
+
+
+def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
+    """Slope of a straight line and its r²."""
+    slope, base = np.polyfit(x, y, 1)
     spread = float(np.sum((y - y.mean()) ** 2))
-    r_squared = 1.0 - float(np.sum(residual**2)) / spread if spread > 0 else 0.0
-    return Growth(float(slope), r_squared, int(at[0]), int(at[-1]))
+    return float(slope), 1.0 - float(np.sum((y - slope * x - base) ** 2)) / spread if spread > 0 else 0.0
+
+
+def expected(
+    separation: Float[np.ndarray, "steps"], tolerance: float, exponent: float | None = None
+) -> float | None:
+    """Steps after the last one at which runs that have not split are expected to; None where nothing tells.
+
+    Their own growth predicts only where it outlasts the first steps: its later half must be several powers
+    of e, at a rate within a factor of 2 of the whole.
+
+    Args:
+        separation: of each step, length; NaN where a run had ended.
+        tolerance: of the split, length.
+        exponent: the Lyapunov exponent per step, where it is known: it needs no fit.
+    """
+    seen = np.flatnonzero(np.isfinite(separation))
+    if not len(seen) or not separation[seen[-1]] > 0:
+        return None
+    rate = exponent
+    if rate is None:
+        fit = growth(separation, tolerance)
+        if not fit.plain:
+            return None
+        at = np.arange((fit.first + fit.last) // 2, fit.last + 1)
+        at = at[np.isfinite(separation[at]) & (separation[at] > 0)]
+        late, _ = _line(at, np.log(separation[at]))
+        if late * (at[-1] - at[0]) < _HALF or not 0.5 < late / fit.rate < 2.0:
+            return None
+        rate = fit.rate
+    if not rate > 0:
+        return None
+    return max(0.0, float(np.log(tolerance / separation[seen[-1]])) / rate)
 
 
 @dataclass(frozen=True)
@@ -105,12 +148,14 @@ class Verdict:
     """Whether the flips caused a split, hurried it, or only came along.
 
     Attributes:
-        word: "same" (no bit differs), "no fork" (no decision differs), "open" (no split within the horizon),
-            "cause" (without the flips no split), "hurried" (without them later, beyond chance), "bystander"
-            (without them as early, no later than by chance, or by less than one power of e).
+        word: "same" (no bit differs), "no fork" (no decision differs), "open" (no split within the horizon,
+            or nothing tells a delay from chance), "cause" (without the flips no split), "hurried" (without
+            them later, beyond chance), "bystander" (the split came before any flip; or without them as
+            early, no later than by chance, or by less than one power of e).
         free: split of the free run, step.
         handed: split of the run under the other's decisions, step; None where there is none.
-        noise: by how many steps two splits differ by chance: twice the standard deviation of a difference.
+        noise: by how many steps two splits differ by chance: twice the standard deviation of a difference; a
+            lower bound where a repeat did not split. 0 where nothing is known of it.
         nats: growth rate times the steps gained: how many powers of e the flips were worth; infinite for a
             cause.
         reasons: the criteria, in words with their numbers.
@@ -124,12 +169,57 @@ class Verdict:
     reasons: tuple[str, ...]
 
 
+@dataclass(frozen=True)
+class _Chance:
+    """How far splits scatter by chance.
+
+    Attributes:
+        noise: twice the standard deviation of a difference of two splits, steps.
+        known: whether it is an estimate; False where no repeat split.
+        least: whether it is a lower bound, as a repeat did not split.
+        text: in words.
+    """
+
+    noise: float
+    known: bool
+    least: bool
+    text: str
+
+
+def _scatter(free: int, repeats: Sequence[int | None], last: int) -> _Chance:
+    if not repeats:
+        return _Chance(0.0, False, False, "no repeats were run")
+    many = f"{len(repeats)} repeat{'s' if len(repeats) > 1 else ''}"
+    how = (
+        "all positions of B's start displaced at random by as much as the choice separates the runs in their "
+        "first 100 steps, an ulp at least"
+    )
+    late = sum(at is None for at in repeats)
+    if late == len(repeats):
+        return _Chance(0.0, False, True, f"of {many} ({how}) none split within {last} steps")
+    # repeats may all be earlier than the pair, when they are perturbed by more: their own scatter counts
+    sample = [last if at is None else at for at in repeats]
+    if len(sample) == 1:
+        sample = [free, *sample]
+    # both dates scatter, the free one and the handed one
+    noise = 2.0 * float(np.sqrt(2) * np.std(sample, ddof=1))
+    if not late:
+        return _Chance(noise, True, False, f"{many} ({how}) scatter by {noise:.0f} steps (2 σ)")
+    text = (
+        f"{many} ({how}) scatter by {noise:.0f} steps (2 σ) at least: {late} did not split within {last} "
+        "steps and counts as if then"
+    )
+    return _Chance(noise, True, True, text)
+
+
 def judge(
     dates: Dates,
     free: Float[np.ndarray, "steps"],
     handed: Float[np.ndarray, "steps"] | None,
     tolerance: float,
-    chance: Sequence[int] = (),
+    chance: Sequence[int | None] = (),
+    *,
+    ended: str | None = None,
 ) -> Verdict:
     """The verdict on a pair of runs.
 
@@ -139,74 +229,131 @@ def judge(
         handed: separation of the counterfactual from the first run, length; NaN after it was ended. None
             where there is no counterfactual.
         tolerance: of the split, length.
-        chance: splits of repeats of the pair, the start perturbed by as much as the choice does, steps.
+        chance: splits of repeats of the pair, the start perturbed by as much as the choice does, steps; None
+            for one that did not split.
+        ended: where the fork is that one run ended and the other did not: which and how, in words.
     """
     last = len(free) - 1
+    if ended is not None:
+        before = f"no decision differs in the {last} steps before"
+        return Verdict("open", dates.split, None, 0.0, None, (f"{ended}: that is the fork; {before}",))
     if dates.seed is None:
         return Verdict("same", None, None, 0.0, None, (f"no bit differs in {last} steps",))
     if dates.fork is None:
-        reach = float(np.nanmax(free))
-        text = f"no decision differs in {last} steps; the separation reaches {reach:.2g}"
-        return Verdict("no fork", dates.split, None, 0.0, None, (text,))
-    rate = growth(free, tolerance)
+        text = f"no decision differs in {last} steps; the separation reaches {np.nanmax(free):.2g}"
+        reasons = (text,) if dates.split is not None else (text, *_outlook(free, tolerance))
+        return Verdict("no fork", dates.split, None, 0.0, None, reasons)
     if dates.split is None:
-        now = float(free[np.isfinite(free)][-1])
-        more = rate.steps_to(now, tolerance)
-        text = f"after {last} steps the separation is {now:.2g}, the tolerance {tolerance:.2g}"
-        guess = (
-            f"growing at {rate.rate:.2g} a step it would split about {more:.0f} steps later" if more else ""
+        reasons = _outlook(free, tolerance)
+        other = None if handed is None else split_of(handed, tolerance)
+        if other is not None:
+            reasons += (
+                f"under the first run's decisions the runs do split, at step {other}: the decisions that "
+                "differ keep them together",
+            )
+        return Verdict("open", None, other, 0.0, None, reasons)
+    if dates.split < dates.fork:
+        text = (
+            f"the runs had split at step {dates.split}, before any decision differed (step {dates.fork}): no "
+            "flip had a part in it"
         )
-        return Verdict("open", None, None, 0.0, None, tuple(part for part in (text, guess) if part))
+        return Verdict("bystander", dates.split, None, 0.0, None, (text,))
     if handed is None:
         text = f"split at step {dates.split}; without a counterfactual nothing is said about the cause"
         return Verdict("open", dates.split, None, 0.0, None, (text,))
-    # repeats may all be earlier than the pair, when they are perturbed by more: their own scatter counts
-    sample = chance if len(chance) > 1 else [dates.split, *chance]
-    # both dates scatter, the free one and the handed one
-    noise = 2.0 * float(np.sqrt(2) * np.std(sample, ddof=1)) if chance else 0.0
+    scatter = _scatter(dates.split, chance, last)
+    fit = growth(free, tolerance)
+    rate = fit.rate if fit.plain else None
     other = split_of(handed, tolerance)
-    seen = int(np.flatnonzero(np.isfinite(handed))[-1]) if np.isfinite(handed).any() else 0
     if other is None:
-        reach = float(np.nanmax(handed))
-        text = (
-            f"free, the runs split at step {dates.split}; under the first run's decisions the separation is "
-            f"{reach:.2g} at most up to step {seen}"
-        )
-        if seen < _PATIENCE * dates.split:
-            more = (
-                f"only {seen - dates.split} steps follow the split; run longer to tell a cause from a delay"
-                if seen > dates.split
-                else "where it was ended"
-            )
-            return Verdict("open", dates.split, None, noise, None, (text, more))
-        late = _expected(handed, tolerance, seen)
-        if late is not None and late < _SAVED * dates.split:
-            nats = rate.rate * (late - dates.split) if np.isfinite(rate.rate) else None
-            more = f"it grows and is expected to split about step {late:.0f}: later, but not saved"
-            return Verdict("hurried", dates.split, None, noise, nats, (text, more))
-        return Verdict(
-            "cause", dates.split, None, noise, float("inf"), (text, "and it is not on its way there")
-        )
+        return _kept(dates.split, handed, tolerance, scatter, rate)
     gained = other - dates.split
-    nats = rate.rate * gained if np.isfinite(rate.rate) else None
+    nats = None if rate is None else rate * gained
     text = (
         f"free, the runs split at step {dates.split}; under the first run's decisions at step {other}, "
         f"{abs(gained)} steps {'later' if gained >= 0 else 'earlier'}"
     )
-    scatter = (
-        f"repeats that differ by an ulp scatter by {noise:.0f} steps" if chance else "no repeats were run"
-    )
-    later = bool(chance) and gained > noise and (nats is None or nats >= _NATS)
     worth = f"the flips were worth {nats:.2g} powers of e of separation" if nats is not None else ""
-    word: Word = "hurried" if later else "bystander"
-    reasons = tuple(part for part in (text, scatter, worth) if part)
-    return Verdict(word, dates.split, other, noise, nats, reasons)
+    word, why = _delayed(gained, nats, scatter)
+    reasons = tuple(part for part in (text, scatter.text, worth, why) if part)
+    return Verdict(word, dates.split, other, scatter.noise, nats, reasons)
+
+
+def _delayed(gained: float, nats: float | None, scatter: _Chance) -> tuple[Word, str]:
+    """The word for a split that comes so much later without the flips, and why."""
+    if gained <= 0:
+        return "bystander", "without the flips it comes no later"
+    if scatter.known and gained <= scatter.noise:
+        return "bystander", "no later than by chance"
+    if nats is not None and nats < NATS:
+        beyond = "beyond the scatter, but by" if scatter.known else "by"
+        return "bystander", (
+            f"later {beyond} less than one power of e of separation ({nats:.2g}), which counts as no "
+            "difference"
+        )
+    if not scatter.known:
+        return "open", f"no repeat tells whether {gained:.0f} steps later is chance"
+    if scatter.least:
+        return "open", f"{gained:.0f} steps later is more than that lower bound; it may still be chance"
+    return "hurried", "later, beyond chance"
+
+
+def _kept(
+    free: int, handed: Float[np.ndarray, "steps"], tolerance: float, scatter: _Chance, rate: float | None
+) -> Verdict:
+    """The verdict where the runs do not split under the first run's decisions."""
+    some = np.isfinite(handed)
+    seen = int(np.flatnonzero(some)[-1]) if some.any() else 0
+    reach = float(np.nanmax(handed)) if some.any() else 0.0
+    below = float(np.log(tolerance / reach)) if reach > 0 else float("inf")
+    how = f"{below:.2g} powers of e below the tolerance" if reach > 0 else "the same bits"
+    text = (
+        f"free, the runs split at step {free}; under the first run's decisions they do not up to step "
+        f"{seen}: the separation is {reach:.2g} at most, {how}"
+    )
+    noise = scatter.noise
+    if seen < _PATIENCE * free:
+        more = (
+            f"only {seen - free} steps follow the split; run longer to tell a cause from a delay"
+            if seen > free
+            else "where it was ended"
+        )
+        return Verdict("open", free, None, noise, None, (text, scatter.text, more))
+    late = _expected(handed, tolerance, seen)
+    if late is not None and late < _SAVED * free:
+        gained = late - free
+        nats = None if rate is None else rate * gained
+        more = f"it grows and is expected to split about step {late:.0f}: later, but not saved"
+        word, why = _delayed(gained, nats, scatter)
+        if word == "bystander":
+            # it has not split yet: the expectation may be off
+            word = "open"
+        return Verdict(word, free, None, noise, nats, (text, scatter.text, more, why))
+    if below < NATS:
+        more = "which is within one power of e of it: no cause without a longer run"
+        return Verdict("open", free, None, noise, None, (text, scatter.text, more))
+    basis = f"a cause for that: followed to {seen / free:.2g} times the split, and not on its way there"
+    return Verdict("cause", free, None, noise, float("inf"), (text, scatter.text, basis))
+
+
+def _outlook(free: Float[np.ndarray, "steps"], tolerance: float) -> tuple[str, ...]:
+    """How the separation stands at the end of a horizon without a split, and what is to be expected."""
+    seen = free[np.isfinite(free)]
+    text = f"after {len(free) - 1} steps the separation is {seen[-1]:.2g}, the tolerance {tolerance:.2g}"
+    more = expected(free, tolerance)
+    if more is None:
+        return text, "it does not grow plainly enough in so few steps to predict a split"
+    rate = growth(free, tolerance).rate
+    return text, f"growing at {rate:.2g} a step it would split about {more:.0f} steps later"
 
 
 def _expected(separation: Float[np.ndarray, "steps"], tolerance: float, seen: int) -> float | None:
-    """The step at which a separation that has not split yet is expected to; None where it does not grow."""
+    """The step at which a counterfactual may split, if it grows at all; None where it does not.
+
+    Looser than `expected` on purpose: what may be growing is no cause.
+    """
     fit = growth(separation[: seen + 1], tolerance)
     now = float(separation[seen])
-    if not (np.isfinite(fit.rate) and fit.rate > 0 and fit.r_squared > _FITS and now > 0):
+    if not (fit.plain and now > 0):
         return None
     return seen + float(np.log(tolerance / now)) / fit.rate

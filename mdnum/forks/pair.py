@@ -130,8 +130,8 @@ def fork(
         counterfactual: whether to run B under A's decisions.
         back: whether to run A under B's decisions too, for the full table of two by two; it costs as much
             as the run of B under A's.
-        repeats: runs of B whose start is perturbed as much as the choice perturbs A, to tell a delay from
-            chance.
+        repeats: runs of B of which all atoms are displaced at random by as much as the choice separates the
+            runs in their first 100 steps (an ulp at least), to tell a delay from chance.
         seed: of the perturbations.
         progress: called with the step reached, the last step, and figures.
 
@@ -253,11 +253,18 @@ def _judged(
         # that one run can go on and the other cannot is a fork if anything is
         first = len(free) - 1
     failed = {name: word for stretch in gathered[-1:] for name, word in stretch.failed.items() if word}
-    dates = Dates(int(bits.argmax()) if bits.any() else None, first, splits["B"])
+    seed = int(bits.argmax()) if bits.any() else None
+    told = None
+    if not flips and len(ended) == 1:
+        # one of them has no state after it: no bit can be the same
+        seed = first if seed is None else seed
+        word, other = failed[ended[0]], "B" if ended[0] == "A" else "A"
+        told = f"run {ended[0]} ended in a {word} at step {first} and run {other} did not"
+    dates = Dates(seed, first, splits["B"])
     handed = series.get("B|A")
     rates = {name: growth(series[name], tolerance) for name in ("B", "B|A") if name in series}
-    chance = [split for name, split in splits.items() if name.startswith("B ") and split is not None]
-    verdict = judge(dates, free, handed, tolerance, chance)
+    chance = [split for name, split in splits.items() if name.startswith("B ")]
+    verdict = judge(dates, free, handed, tolerance, chance, ended=told)
     cells = table(series, tolerance)
     return Fork(
         twin,

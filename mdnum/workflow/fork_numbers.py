@@ -8,11 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mdnum.events.forks import Dates, Growth, Verdict
+from mdnum.events.forks import Dates, Growth, Verdict, expected
 from mdnum.events.shares import Cell, Share
-
-#: r² of a fit that counts as growth.
-FITS = 0.5
 
 
 def dates(found: Dates, timestep: float) -> dict[str, Any]:
@@ -53,23 +50,33 @@ def fitted(fit: Growth, separation: Float[np.ndarray, "rows"]) -> dict[str, Any]
 
 
 def predicted(
-    found: Dates, fit: Growth, free: Float[np.ndarray, "rows"], tolerance: float, steps: int
+    found: Dates,
+    free: Float[np.ndarray, "rows"],
+    tolerance: float,
+    steps: int,
+    exponent: float | None = None,
 ) -> int | None:
-    """The step at which runs that have not split are expected to; None where nothing grows plainly.
+    """The step at which runs that have not split are expected to; None where nothing tells.
 
     Args:
         found: their dates.
-        fit: of their separation.
         free: the separation by step.
         tolerance: of the split.
         steps: that were followed.
+        exponent: the Lyapunov exponent per step, where it is known.
     """
-    seen = free[np.isfinite(free)]
-    # a line through noise predicts nothing
-    if found.split is not None or not len(seen) or not fit.r_squared > FITS:
-        return None
-    more = fit.steps_to(float(seen[-1]), tolerance)
+    more = expected(free, tolerance, exponent) if found.split is None else None
     return None if more is None else round(steps + more)
+
+
+def repeats(splits: Mapping[str, int | None]) -> dict[str, Any]:
+    """Splits of the repeats, and how many did not split within the horizon."""
+    found = [split for name, split in splits.items() if name.startswith("B ")]
+    return {
+        "repeats": [split for split in found if split is not None],
+        "repeats_run": len(found),
+        "repeats_censored": sum(split is None for split in found),
+    }
 
 
 def cell(found: Cell) -> dict[str, Any]:

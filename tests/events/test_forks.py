@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mdnum.events.forks import Dates, growth, judge, split_of
+from mdnum.events.forks import Dates, expected, growth, judge, split_of
 
 
 def grown(rate: float, steps: int, start: float = 1e-15, top: float = 3.0) -> np.ndarray:
@@ -76,3 +76,62 @@ def test_a_bystander_splits_as_early_or_earlier(free):
     assert judge(dates(free), free, free, 0.1, chance=[split + 5]).word == "bystander"
     earlier = np.append(free[40:], np.full(40, 3.0))
     assert judge(dates(free), free, earlier, 0.1, chance=[split + 5]).word == "bystander"
+
+
+def test_without_repeats_that_split_a_delay_is_open(free):
+    handed = np.concatenate([np.full(300, 1e-15), free])[:3000]
+    for chance in ((), (None, None)):
+        verdict = judge(dates(free), free, handed, 0.1, chance=chance)
+        assert verdict.word == "open"
+        assert "no repeat tells whether 300 steps later is chance" in verdict.reasons
+
+
+def test_a_repeat_that_does_not_split_bounds_the_scatter_from_below(free):
+    handed = np.concatenate([np.full(300, 1e-15), free])[:3000]
+    split = split_of(free, 0.1)
+    verdict = judge(dates(free), free, handed, 0.1, chance=[split, None])
+    assert verdict.word == "bystander" and verdict.noise == pytest.approx(2 * (2999 - split))
+    # eight of nine agree: later than the bound on their scatter proves nothing
+    late = np.concatenate([np.full(299, 1e-15), free])[: split + 301]
+    verdict = judge(dates(free), free[: split + 301], late, 0.1, chance=[*8 * [split], None])
+    assert verdict.word == "open" and verdict.noise == pytest.approx(2 * np.sqrt(2) * 300 / 3)
+    assert any(f"1 did not split within {split + 300} steps" in reason for reason in verdict.reasons)
+
+
+def test_less_than_a_power_of_e_counts_as_no_difference_and_says_so(free):
+    split = split_of(free, 0.1)
+    handed = np.concatenate([np.full(40, 1e-15), free])[:3000]
+    verdict = judge(dates(free), free, handed, 0.1, chance=[split + 2, split - 2])
+    assert verdict.word == "bystander" and verdict.noise < 40
+    assert any("less than one power of e of separation (0.8)" in reason for reason in verdict.reasons)
+
+
+def test_close_to_the_tolerance_is_no_cause(free):
+    verdict = judge(dates(free), free, np.full(3000, 0.05), 0.1, chance=[1600, 1620])
+    assert verdict.word == "open"
+    assert any("within one power of e" in reason for reason in verdict.reasons)
+
+
+def test_a_split_before_the_fork_is_no_flips_doing(free):
+    verdict = judge(dates(free, fork=2500), free, free, 0.1)
+    assert verdict.word == "bystander"
+    assert "before any decision differed" in verdict.reasons[0]
+
+
+def test_first_steps_predict_nothing():
+    step = np.arange(61.0)
+    assert expected(1e-9 * step**2, 0.1) is None
+    assert expected(1e-9 * step**2, 0.1, exponent=0.0036) == pytest.approx(np.log(0.1 / 3.6e-6) / 0.0036)
+    verdict = judge(Dates(0, 5, None), 1e-9 * step**2, None, 0.1)
+    assert any("so few steps" in reason for reason in verdict.reasons)
+
+
+def test_an_end_of_one_run_is_a_fork_by_itself():
+    verdict = judge(Dates(0, 0, None), np.zeros(1), None, 0.1, ended="run B ended in a runaway at step 0")
+    assert verdict.word == "open" and "that is the fork" in verdict.reasons[0]
+
+
+def test_a_split_under_the_others_decisions_alone_is_told(free):
+    verdict = judge(Dates(0, 400, None), free[:900], free[-900:], 0.1)
+    assert verdict.word == "open" and verdict.handed == 0
+    assert any("keep them together" in reason for reason in verdict.reasons)

@@ -179,6 +179,14 @@ def fork(
         # that one run can go on and the other cannot is a fork if anything is
         at = last
     begun = found.seed if found.seed is not None and found.seed <= last else None
+    ended = None
+    if not len(crossed) and len(failed) == 1:
+        # one of them has no state after it: no bit can be the same
+        begun = last if begun is None else begun
+        ((name, word),) = failed.items()
+        ended = (
+            f"run {name} ended in a {word} after step {last} and run {'B' if name == 'A' else 'A'} did not"
+        )
     dates = Dates(begun, at, split_of(series["B"], tolerance))
     series["cross"] = crossed.by_step(last)
     runs = {"A": run_a, "B": run_b}
@@ -203,7 +211,7 @@ def fork(
             series[f"B {number}"] = _apart(run_a, again, last)
     names = [name for name in series if name in ("B", "B|A", "A|B") or name.startswith("B ")]
     splits = {name: split_of(series[name], tolerance) for name in names}
-    chance = [at for name, at in splits.items() if name.startswith("B ") and at is not None]
+    chance = [at for name, at in splits.items() if name.startswith("B ")]
     rates = {name: growth(series[name], tolerance) for name in ("B", "B|A") if name in series}
     apart = {name: values for name, values in series.items() if name[0] in "AB"}
     cells = table(apart, tolerance)
@@ -220,7 +228,7 @@ def fork(
         splits=splits,
         table=cells,
         shares=shares(cells, rates["B"].rate),
-        verdict=judge(dates, series["B"], handed, tolerance, chance),
+        verdict=judge(dates, series["B"], handed, tolerance, chance, ended=ended),
         failed=failed,
         runs=runs,
     )

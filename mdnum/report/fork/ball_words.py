@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from mdnum.report.fork import findings
 from mdnum.report.fork.findings import Verdict
 from mdnum.report.fork.run import ForkFolder
 from mdnum.report.verdict import Finding, restore
@@ -54,7 +55,7 @@ def headline(run: ForkFolder) -> str:
     if run.word == "cause":
         return (
             f"The {what} at step {at} is the cause: free, the runs split at step {split}; "
-            "under A’s decisions they stay together."
+            f"under A’s decisions they stay together{findings.followed(run)}."
         )
     if run.word == "hurried":
         other = (summary.get("splits") or {}).get("B|A")
@@ -63,13 +64,9 @@ def headline(run: ForkFolder) -> str:
         )
         return f"The decisions hurried the split: free, it is at step {split}; under A’s decisions {later}."
     if run.word == "bystander":
-        other = (summary.get("splits") or {}).get("B|A")
-        return (
-            f"The {what} at step {at} is a bystander: free, the runs split at step {split}, and under A’s "
-            f"decisions at step {count(other)}."
-        )
+        return f"The {what} at step {at} is a bystander: {findings.bystander(run)}."
     if "split" in dates:
-        return f"The runs fork at step {at} and split at step {split}; what the decisions did to it is open."
+        return f"The runs fork at step {at} and split at step {split}{findings.undecided(run, 'decisions')}."
     return f"The runs fork at step {at} and have not split after {steps}."
 
 
@@ -169,7 +166,7 @@ def _findings(run: ForkFolder) -> Iterator[Finding]:
             "A contact that it was told was no longer near the floor in its own heights: nothing that "
             "rounding could have changed.",
         )
-    if run.word in ("hurried", "bystander") and not summary.get("repeats_run"):
+    if findings.uncalibrated(run):
         yield Finding(
             "NO_REPEATS",
             "info",
@@ -262,7 +259,12 @@ def what(run: ForkFolder) -> Iterator[tuple[str, str]]:
         yield "Counterfactual", "none was run: nothing is said about the cause"
     if ran := summary.get("repeats_run"):
         noise = number(summary.get("noise"), 3)
-        yield "Chance", f"{many(ran, 'repeat')}; two splits differ by {noise} steps by chance (2 σ)"
+        late = summary.get("repeats_censored")
+        text = f"; {count(late)} did not split and bound that from below" if late else ""
+        if late == ran:
+            yield "Chance", f"{many(ran, 'repeat')}; none split: nothing is known of chance"
+        else:
+            yield "Chance", f"{many(ran, 'repeat')}; two splits differ by {noise} steps by chance (2 σ){text}"
     yield "Took", f"{number(summary.get('seconds'), 2)} s"
 
 

@@ -86,7 +86,7 @@ def _headline(run: ForkFolder) -> str:
     if run.word == "cause":
         return (
             f"The flip at step {fork} is the cause: free, the runs split at step {split}; "
-            "under A’s decisions they stay together."
+            f"under A’s decisions they stay together{followed(run)}."
         )
     if run.word == "hurried":
         other = (summary.get("splits") or {}).get("B|A")
@@ -99,15 +99,52 @@ def _headline(run: ForkFolder) -> str:
             f"The flips hurried the split: free, the runs split at step {split}; under A’s decisions {later}."
         )
     if run.word == "bystander":
-        return (
-            f"The flip at step {fork} is a bystander: under A’s decisions the runs split as early, "
-            f"about step {split}."
-        )
+        return f"The flip at step {fork} is a bystander: {bystander(run)}."
     if "split" in dates:
-        return f"The runs fork at step {fork} and split at step {split}; what the flips did to it is open."
+        return f"The runs fork at step {fork} and split at step {split}{undecided(run)}."
     guess = summary.get("predicted_split")
     tail = f"; the growth so far puts it at about step {count(guess)}" if guess is not None else ""
     return f"The runs fork at step {fork} and have not split in {steps}{tail}."
+
+
+def followed(run: ForkFolder) -> str:
+    """Up to which step the runs stay together under A's decisions."""
+    until = run.summary.get("handed_until")
+    return "" if until is None else f" up to step {count(until)}"
+
+
+def undecided(run: ForkFolder, what: str = "flips") -> str:
+    """Why it is open what flips did to a split."""
+    other = (run.summary.get("splits") or {}).get("B|A")
+    later = None if other is None else other - run.dates["split"]
+    if later is None or later <= 0:
+        return f"; what the {what} did to it is open"
+    return f", under A’s decisions {many(later, 'step')} later; whether that is chance is open, as " + (
+        "a repeat did not split" if run.summary.get("repeats_run") else "no repeats were run"
+    )
+
+
+def bystander(run: ForkFolder) -> str:
+    """By which criterion flips had no part in a split."""
+    summary, dates = run.summary, run.dates
+    split = dates["split"]
+    other = (summary.get("splits") or {}).get("B|A")
+    if split < dates.get("fork", 0):
+        return f"the runs had split at step {count(split)}, before any decision differed"
+    if other is None:
+        return f"free, the runs split at step {count(split)}"
+    gained, noise = other - split, summary.get("noise") or 0.0
+    if gained <= 0:
+        when = "at the same step" if gained == 0 else f"{many(-gained, 'step')} earlier"
+        return f"free, the runs split at step {count(split)}, and under A’s decisions {when}"
+    later = (
+        f"free, the runs split at step {count(split)}, and under A’s decisions {many(gained, 'step')} later"
+    )
+    if gained <= noise:
+        return f"{later}, no later than by chance (repeats scatter by {noise:,.0f})"
+    beyond = f"beyond the scatter of repeats ({noise:,.0f}), but by" if noise else "by"
+    nats = number(summary.get("nats"), 2)
+    return f"{later}: {beyond} less than one power of e ({nats}), which counts as no difference"
 
 
 def _ended(run: ForkFolder) -> str:
@@ -217,7 +254,7 @@ def _findings(run: ForkFolder) -> Iterator[Finding]:
             else "A decision that it was told was no longer near its threshold in its own positions: "
             "nothing that rounding could have changed.",
         )
-    if run.word in ("hurried", "bystander") and not summary.get("repeats_run"):
+    if uncalibrated(run):
         yield Finding(
             "NO_REPEATS",
             "info",
@@ -225,6 +262,13 @@ def _findings(run: ForkFolder) -> Iterator[Finding]:
             "Without them a delay cannot be told from chance.",
             "Add --repeats 4.",
         )
+
+
+def uncalibrated(run: ForkFolder) -> bool:
+    """Whether a split under A's decisions was compared with no repeats."""
+    told = (run.summary.get("splits") or {}).get("B|A") is not None
+    judged = run.word in ("hurried", "bystander") or (run.word == "open" and told)
+    return judged and "fork" in run.dates and not run.summary.get("repeats_run")
 
 
 def _broken(one: Mapping[str, Any], remedy: str) -> Finding:

@@ -78,6 +78,13 @@ def runs(run: ForkFolder) -> Iterator[dict[str, str]]:
         yield {"arithmetic": arithmetic, "decisions": whose, **{name: texts.get(name, "") for name in "AB"}}
     for at in run.summary.get("repeats") or ():
         yield {"arithmetic": "B, start perturbed", "decisions": "its own", "A": count(at), "B": ""}
+    for _ in range(run.summary.get("repeats_censored") or 0):
+        yield {
+            "arithmetic": "B, start perturbed",
+            "decisions": "its own",
+            "A": f"> {count(run.steps)}",
+            "B": "",
+        }
 
 
 def _cell(cell: Mapping[str, Any]) -> str:
