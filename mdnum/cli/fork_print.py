@@ -38,7 +38,9 @@ def _print_pair(summary: Mapping[str, Any]) -> None:
             ("growth", f"{rate:.3g} a step, {summary['growth_rate_time']:.3g} a unit of time, {fits}")
         )
     if summary.get("predicted_split") is not None:
-        rows.append(("predicted split", f"about step {summary['predicted_split']:,}"))
+        by = {"exponent": ", at the Lyapunov exponent", "growth": ", as they part so far"}
+        how = by.get(str(summary.get("predicted_by")), "")
+        rows.append(("predicted split", f"about step {summary['predicted_split']:,}{how}"))
     rows += list(_exponent(summary))
     rows.append(("flips in one run only", f"{summary['cross_flips']:,}"))
     rows += list(_pinned(summary.get("pinned")))
@@ -162,7 +164,7 @@ def _pinned(found: Mapping[str, Any] | None) -> Iterator[tuple[str, str]]:
 
 
 def _print_minimal(found: Mapping[str, Any] | None) -> None:
-    """The fewest decisions whose taking back keeps the runs together."""
+    """The fewest pairs whose decisions, taken back up to a horizon, keep the runs together."""
     if found is None:
         return
     runs = (

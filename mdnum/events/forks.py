@@ -332,7 +332,13 @@ def _kept(
     if below < NATS:
         more = "which is within one power of e of it: no cause without a longer run"
         return Verdict("open", free, None, noise, None, (text, scatter.text, more))
-    basis = f"a cause for that: followed to {seen / free:.2g} times the split, and not on its way there"
+    basis = (
+        f"the word cause rests on that: no split within {seen / free:.2g} times the steps to the free one, and "
+        "none on its way"
+    )
+    if scatter.noise > seen - free:
+        # the free split may come that late by chance: then it is not the delay that tells
+        basis += "; the scatter is wider than the steps followed since, so it is the size that tells"
     return Verdict("cause", free, None, noise, float("inf"), (text, scatter.text, basis))
 
 

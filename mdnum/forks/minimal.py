@@ -1,8 +1,8 @@
-"""The fewest decisions that have to be taken back for two runs to stay together.
+"""The fewest pairs whose decisions have to be taken back for two runs to stay together.
 
-Of the pairs that the two runs decide differently before they split, pin some in B to what A decided, let B
-decide everything else, and see whether it still leaves A. Verrou does the same for the instructions of a
-program, by delta debugging.
+Of the pairs that the two runs decide differently before they split, pin some in B to what A decided, at every
+step up to the horizon, let B decide everything else, and see whether it still leaves A. Verrou does the same
+for the instructions of a program, by delta debugging.
 """
 
 from __future__ import annotations
@@ -26,10 +26,11 @@ _SAMPLES = 400
 
 @dataclass(frozen=True)
 class Minimal:
-    """A smallest set of decisions that restores agreement.
+    """A smallest set of pairs that restores agreement.
 
     Attributes:
-        pairs: pairs (i, j) whose pinning to A's decisions keeps B with A; None where no set does.
+        pairs: pairs (i, j) whose pinning to A's decisions, from the start to the horizon, keeps B with A;
+            None where no set does.
         proven: whether none of them can be left out; False where the runs allowed did not suffice.
         fork_alone: whether pinning the pair at the fork alone is enough.
         candidates: pairs that the runs decided differently before the split.
@@ -66,23 +67,26 @@ def minimal_cause(
         raise InputError("the runs did not split", remedy="Run longer, or with a smaller split tolerance")
     check_pins(found)
     horizon = int(_BEYOND * found.dates.split) + 1
+    told = f"from the start to step {horizon:,} are A's"
     keys = _candidates(found)
     search = _Search(found, keys, horizon, tests, progress)
     first = found.decision.i * found.twin.a.atoms + found.decision.j
     alone = search.holds([first])
     if alone:
-        return search.answer([first], True, "the decision at the fork alone does it")
+        text = f"the pair at the fork alone does it (its decisions {told}: {horizon + 1:,} decisions)"
+        return search.answer([first], True, text)
     if not search.holds(keys):
         return search.answer(
-            None, False, "with all of them pinned the runs part as well: no set of decisions is the cause"
+            None, False, "with all of them pinned the runs part as well: no set of pairs is the cause"
         )
     # bisection is quick where the decisions do not depend on one another; what it leaves is thinned further
     best = _required(keys, search, search.made + (tests - search.made) // 2)
     best = _ddmin(best if search.known(best) else keys, search)
     if search.spent:
         text = f"{len(best)} pairs are enough; {search.made} runs did not show whether fewer are"
-        return search.answer(best, False, text, proven=False)
-    return search.answer(best, False, f"{len(best)} pairs are enough, and none of them can be left out")
+        return search.answer(best, False, f"{text} (their decisions {told})", proven=False)
+    text = f"{len(best)} pairs are enough, and none of them can be left out (their decisions {told})"
+    return search.answer(best, False, text)
 
 
 def _candidates(found: Fork) -> list[int]:

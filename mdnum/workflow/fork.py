@@ -163,7 +163,7 @@ def _one(
         fork_record.write(folder, made, around, taken)
         folder.finalize()
         seconds = time.perf_counter() - began
-        folder.write_summary(fork_record.summarize(made, around, vary, choice, seconds) | answers)
+        folder.write_summary(fork_record.summarize(made, around, vary, choice, seconds, answers))
     except BaseException:
         folder.close()
         raise

@@ -215,7 +215,7 @@ def summarize(system: BallSystem, fork: BallFork) -> dict[str, Any]:
         **numbers.verdict(fork.verdict),
         **numbers.rate(rate, step),
         "growth": {name: numbers.fitted(fit, fork.series[name]) for name, fit in fork.growth.items()},
-        "predicted_split": numbers.predicted(fork.dates, free, fork.tolerance, fork.steps),
+        **numbers.predicted(fork.dates, free, fork.tolerance, fork.steps),
         "splits": {name: fork.splits[name] for name in ("B", "B|A", "A|B") if name in fork.splits},
         "table": [numbers.cell(cell) for cell in fork.table],
         "shares": [numbers.share(share) for share in fork.shares],

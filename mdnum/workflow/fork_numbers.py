@@ -55,8 +55,10 @@ def predicted(
     tolerance: float,
     steps: int,
     exponent: float | None = None,
-) -> int | None:
-    """The step at which runs that have not split are expected to; None where nothing tells.
+) -> dict[str, Any]:
+    """The step at which runs that have not split are expected to, and what tells; None where nothing does.
+
+    Their own growth does where it is plain, or else the exponent.
 
     Args:
         found: their dates.
@@ -65,8 +67,12 @@ def predicted(
         steps: that were followed.
         exponent: the Lyapunov exponent per step, where it is known.
     """
-    more = expected(free, tolerance, exponent) if found.split is None else None
-    return None if more is None else round(steps + more)
+    ways = {"growth": None} if exponent is None else {"growth": None, "exponent": exponent}
+    for name, rate in ways.items() if found.split is None else ():
+        more = expected(free, tolerance, rate)
+        if more is not None:
+            return {"predicted_split": round(steps + more), "predicted_by": name}
+    return {"predicted_split": None, "predicted_by": None}
 
 
 def repeats(splits: Mapping[str, int | None]) -> dict[str, Any]:

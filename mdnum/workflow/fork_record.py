@@ -52,9 +52,16 @@ def write(folder: RunFolder, fork: Fork, around: Neighborhood | None, pinned: Pi
 
 
 def summarize(
-    fork: Fork, around: Neighborhood | None, vary: str, choice: Any, seconds: float
+    fork: Fork,
+    around: Neighborhood | None,
+    vary: str,
+    choice: Any,
+    seconds: float,
+    answers: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """The content of summary.json, without headline and findings."""
+    """The content of summary.json, without headline and findings; with further answers, where there are."""
+    found = (answers or {}).get("lyapunov")
+    exponent = found["rate"] if found and found["chaotic"] else None
     a = fork.twin.a
     step = timestep(a)
     rate, free = fork.growth["B"], fork.series["B"]
@@ -79,7 +86,7 @@ def summarize(
         **numbers.verdict(fork.verdict),
         **numbers.rate(rate, step),
         "growth": {name: numbers.fitted(fit, fork.series[name]) for name, fit in fork.growth.items()},
-        "predicted_split": numbers.predicted(fork.dates, free, fork.tolerance, fork.steps),
+        **numbers.predicted(fork.dates, free, fork.tolerance, fork.steps, exponent),
         "splits": {name: fork.splits.get(name) for name in ("B", "B|A", "A|B") if name in fork.splits},
         **numbers.repeats(fork.splits),
         "handed_until": numbers.until(fork.series, "B|A"),
@@ -97,6 +104,7 @@ def summarize(
         "findings": [],
         "status": "failed" if fork.failed.keys() & {"A", "B"} else "complete",
         "seconds": seconds,
+        **(answers or {}),
     }
 
 

@@ -103,7 +103,8 @@ def _headline(run: ForkFolder) -> str:
     if "split" in dates:
         return f"The runs fork at step {fork} and split at step {split}{undecided(run)}."
     guess = summary.get("predicted_split")
-    tail = f"; the growth so far puts it at about step {count(guess)}" if guess is not None else ""
+    what = "the Lyapunov exponent" if summary.get("predicted_by") == "exponent" else "the growth so far"
+    tail = f"; {what} puts it at about step {count(guess)}" if guess is not None else ""
     return f"The runs fork at step {fork} and have not split in {steps}{tail}."
 
 
