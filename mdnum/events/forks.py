@@ -333,8 +333,8 @@ def _kept(
         more = "which is within one power of e of it: no cause without a longer run"
         return Verdict("open", free, None, noise, None, (text, scatter.text, more))
     basis = (
-        f"the word cause rests on that: no split within {seen / free:.2g} times the steps to the free one, and "
-        "none on its way"
+        f"the word cause rests on that: no split within {seen / free:.2g} times the steps to the free one, "
+        "and none on its way"
     )
     if scatter.noise > seen - free:
         # the free split may come that late by chance: then it is not the delay that tells
