@@ -13,6 +13,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
+from mdnum.events.chance import Chance, scatter_of
+
 Word = Literal["same", "no fork", "open", "cause", "hurried", "bystander"]
 
 #: A slope is fitted to separations between these, as shares of the split tolerance: above rounding's plateau
@@ -169,49 +171,6 @@ class Verdict:
     reasons: tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class _Chance:
-    """How far splits scatter by chance.
-
-    Attributes:
-        noise: twice the standard deviation of a difference of two splits, steps.
-        known: whether it is an estimate; False where no repeat split.
-        least: whether it is a lower bound, as a repeat did not split.
-        text: in words.
-    """
-
-    noise: float
-    known: bool
-    least: bool
-    text: str
-
-
-def _scatter(free: int, repeats: Sequence[int | None], last: int) -> _Chance:
-    if not repeats:
-        return _Chance(0.0, False, False, "no repeats were run")
-    many = f"{len(repeats)} repeat{'s' if len(repeats) > 1 else ''}"
-    how = (
-        "all positions of B's start displaced at random by as much as the choice separates the runs in their "
-        "first 100 steps, an ulp at least"
-    )
-    late = sum(at is None for at in repeats)
-    if late == len(repeats):
-        return _Chance(0.0, False, True, f"of {many} ({how}) none split within {last} steps")
-    # repeats may all be earlier than the pair, when they are perturbed by more: their own scatter counts
-    sample = [last if at is None else at for at in repeats]
-    if len(sample) == 1:
-        sample = [free, *sample]
-    # both dates scatter, the free one and the handed one
-    noise = 2.0 * float(np.sqrt(2) * np.std(sample, ddof=1))
-    if not late:
-        return _Chance(noise, True, False, f"{many} ({how}) scatter by {noise:.0f} steps (2 σ)")
-    text = (
-        f"{many} ({how}) scatter by {noise:.0f} steps (2 σ) at least: {late} did not split within {last} "
-        "steps and counts as if then"
-    )
-    return _Chance(noise, True, True, text)
-
-
 def judge(
     dates: Dates,
     free: Float[np.ndarray, "steps"],
@@ -261,7 +220,7 @@ def judge(
     if handed is None:
         text = f"split at step {dates.split}; without a counterfactual nothing is said about the cause"
         return Verdict("open", dates.split, None, 0.0, None, (text,))
-    scatter = _scatter(dates.split, chance, last)
+    scatter = scatter_of(dates.split, chance, last)
     fit = growth(free, tolerance)
     rate = fit.rate if fit.plain else None
     other = split_of(handed, tolerance)
@@ -279,7 +238,7 @@ def judge(
     return Verdict(word, dates.split, other, scatter.noise, nats, reasons)
 
 
-def _delayed(gained: float, nats: float | None, scatter: _Chance) -> tuple[Word, str]:
+def _delayed(gained: float, nats: float | None, scatter: Chance) -> tuple[Word, str]:
     """The word for a split that comes so much later without the flips, and why."""
     if gained <= 0:
         return "bystander", "without the flips it comes no later"
@@ -299,7 +258,7 @@ def _delayed(gained: float, nats: float | None, scatter: _Chance) -> tuple[Word,
 
 
 def _kept(
-    free: int, handed: Float[np.ndarray, "steps"], tolerance: float, scatter: _Chance, rate: float | None
+    free: int, handed: Float[np.ndarray, "steps"], tolerance: float, scatter: Chance, rate: float | None
 ) -> Verdict:
     """The verdict where the runs do not split under the first run's decisions."""
     some = np.isfinite(handed)

@@ -117,7 +117,7 @@ def captions(run: ForkFolder) -> dict[str, str]:
     )
     handed = (
         " Under A’s decisions B keeps its own arithmetic, and is told when each ball touches and how often "
-        "each solve iterates: what the second line does not do, the decisions did."
+        "each solve iterates: what the dashed line does not do, the decisions did."
         if run.has("handed")
         else ""
     )

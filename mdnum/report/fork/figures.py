@@ -26,6 +26,8 @@ Role = Literal["first", "second", "third", "bad", "muted", "ink"]
 _TICKS = 1_500
 #: Points of the lines by color: free runs, counterfactuals, a decision taken back, repeats.
 _WIDTHS = {FIRST: 2.6, SECOND: 1.2, THIRD: 1.0, BAD: 1.0, MUTED: 0.7}
+#: How the counterfactual is dashed, shorter than a fit.
+_HANDED = (0, (3.0, 1.5))
 #: A fit is drawn on where it predicts a split, for at most so many times the steps that were followed.
 _BEYOND = 2.0
 
@@ -114,15 +116,22 @@ def draw_separation(run: ForkFolder, plot: Plot, width: float) -> Figure:
         if line.get_linestyle() == "-" and line.get_color() in _WIDTHS:
             # before the fork the lines lie upon one another: the wider one shows at both sides of the others
             line.set(linewidth=_WIDTHS[str(line.get_color())], alpha=1.0)
+            if line.get_color() == SECOND:
+                # above all of them, with gaps that show those below
+                line.set(linestyle=_HANDED, zorder=2.5)
     _name_tolerance(axes, run)
     _ticks(axes, run)
     return figure
 
 
 def _name_tolerance(axes: Axes, run: ForkFolder) -> None:
-    """Writes what the horizontal line is into the widest gap between the dates, whose names stand upright."""
+    """Writes what the horizontal line is into the widest gap between the dates, whose names stand upright.
+
+    Up to the split only: beyond it the separation runs where the words would stand.
+    """
     low, high = axes.get_xlim()
-    edges = np.sort([low, *run.dates.values(), high])
+    end = run.dates.get("split", high)
+    edges = np.sort([low, *(at for at in run.dates.values() if at < end), end])
     widest = int(np.argmax(np.diff(edges)))
     tolerance = float(run.summary["tolerance"])
     label = axes.annotate(
@@ -252,7 +261,7 @@ def captions(run: ForkFolder) -> dict[str, str]:
     ) else ""  # fmt: skip
     handed = (
         " Under A’s decisions B keeps its own arithmetic, and is told which pairs are inside: "
-        "what the second line does not do, the flips did."
+        "what the dashed line does not do, the flips did."
         if run.has("handed")
         else ""
     )
