@@ -84,9 +84,11 @@ def fork(
 
 def folders(a: str, b: Path, *, as_json: bool) -> int | None:
     """Where two finished runs of a ball part; None where they are no runs of a ball."""
+    from mdnum.forks.stored import check_runs
     from mdnum.store import RunFolder
 
     runs = [RunFolder.open(folder) for folder in (a, b)]
+    check_runs(*runs)
     if not any(run.world == "ball" for run in runs):
         return None
     from mdnum.forks.bounce.folders import compare_folders
@@ -96,10 +98,10 @@ def folders(a: str, b: Path, *, as_json: bool) -> int | None:
         output.print_json({"question": "folders", **output.plain(found)})
         return output.EXIT_FINE
     out = output.console()
-    for number, reason in enumerate(found.reasons):
-        out.print(reason, style="bold" if number == 0 else None, markup=False)
     if found.differences:
         output.print_table("differences", ("key", "A", "B"), found.differences)
+    for number, reason in enumerate(found.reasons):
+        out.print(reason, style="bold" if number == 0 else None, markup=False)
     dates = {"seed": found.seed, "fork": found.fork}
     none = f"none in {found.steps:,}"
     lines = [(name, none if step is None else f"{step:,}") for name, step in dates.items()]

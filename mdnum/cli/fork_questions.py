@@ -47,13 +47,14 @@ def folders(a: Path, b: Path, *, as_json: bool) -> int:
         output.print_json({"question": "folders", **output.plain(found)})
         return output.EXIT_FINE
     out = output.console()
+    # what was different comes first: no date means anything without it
+    if found.differences:
+        output.print_table("differences", ("key", "A", "B"), found.differences)
     for number, reason in enumerate(found.reasons):
         out.print(reason, style="bold" if number == 0 else None, markup=False)
     output.print_table(
         "", ("", "step"), [("seed", _step(found.seed, found.steps)), ("fork", _step(found.fork, found.steps))]
     )
-    if found.differences:
-        output.print_table("differences", ("key", "A", "B"), found.differences)
     table = [
         (flip.run, f"{flip.i}–{flip.j}", "entered" if flip.entered else "left", flip.margin, flip.bound)
         for flip in found.decisions[:10]

@@ -6,15 +6,16 @@ runs are in the folders too (`twin`), and `mdnum.forks.fork` follows them again.
 
 from __future__ import annotations
 
-import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from mdnum.errors import InputError
+from mdnum.forks import folder_differences
+from mdnum.forks.folder_differences import Difference
+from mdnum.forks.stored import check_runs
 from mdnum.forks.twin import Twin
 from mdnum.store import RunFolder
 from mdnum.systems.build import build
@@ -22,10 +23,6 @@ from mdnum.systems.load import load
 
 #: Stored at every step; that one of them differs in a bit means that the state does.
 _NUMBERS = ("potential", "kinetic", "displacement", "min_margin")
-#: Of a system file, what does not decide what is computed.
-_WORDS = ("about", "name", "record.save_every")
-#: Of the provenance, what bits depend on.
-_ARITHMETIC = ("versions", "cpu", "devices", "jax_settings", "environment", "fingerprint")
 
 
 @dataclass(frozen=True)
@@ -54,8 +51,8 @@ class FolderFork:
 
     Attributes:
         a, b: the folders.
-        differences: what was different about the runs, as (key, in A, in B): system first, then what bits
-            depend on.
+        differences: what was different about the runs, as (key, in A, in B): system first, then the starts,
+            then what bits depend on.
         steps: steps that both have.
         seed: first step at which a stored number differs; None where none does.
         fork: first step at which a stored decision differs; None where none does.
@@ -66,7 +63,7 @@ class FolderFork:
 
     a: Path
     b: Path
-    differences: tuple[tuple[str, Any, Any], ...]
+    differences: tuple[Difference, ...]
     steps: int
     seed: int | None
     fork: int | None
@@ -82,33 +79,36 @@ def compare_folders(a: RunFolder | str | Path, b: RunFolder | str | Path) -> Fol
         a, b: run folders of molecular dynamics, finished or not.
 
     Raises:
-        InputError: the runs are not of one structure and potential, so that no step of theirs corresponds;
-            names the first field that differs.
+        InputError: the runs are of different systems, so that no step of theirs corresponds; names what is
+            different. Or a folder is that of a fork.
         FolderError: a folder holds no run.
     """
     first, second = (folder if isinstance(folder, RunFolder) else RunFolder.open(folder) for folder in (a, b))
-    systems = [_flat(tomllib.loads(folder.system_toml)) for folder in (first, second)]
-    hashes = [folder.provenance.get("hashes", {}).get("structure") for folder in (first, second)]
-    different = _different(*systems)
-    _refuse(first, second, different)
+    check_runs(first, second)
+    programs = folder_differences.of_programs(first, second)
+    folder_differences.refuse_other_systems(first, second, programs)
+    starts = folder_differences.of_starts(first, second, programs)
+    arithmetic = folder_differences.of_arithmetic(first, second)
     series = [folder.read("series", ["step", "pairs", *_NUMBERS]) for folder in (first, second)]
     steps = min(len(table["step"]) for table in series) - 1
     if steps < 0:
         raise InputError("a run has no step to compare", remedy="Resume it, or run again")
-    seed = _first_difference(series, steps)
+    # other starts need not show in a stored number at once
+    seed = 0 if starts else _first_difference(series, steps)
     fork, decisions = _fork(first, second, series, steps)
-    arithmetic = _different(*(_flat(_arithmetic(folder.provenance)) for folder in (first, second)))
-    same = hashes[0] is not None and hashes[0] == hashes[1]
     return FolderFork(
         first.path,
         second.path,
-        tuple(different + arithmetic),
+        (*programs, *starts, *arithmetic),
         steps,
         seed,
         fork,
         decisions,
-        same,
-        tuple(_reasons(different, arithmetic, same, steps, seed, fork, decisions)),
+        not starts,
+        (
+            *_attributed(folder_differences.choices(programs), starts, arithmetic),
+            *_dated(steps, seed, fork, decisions),
+        ),
     )
 
 
@@ -120,43 +120,6 @@ def twin(a: str | Path, b: str | Path) -> Twin:
     found = compare_folders(a, b)
     words = "; ".join(f"{key}: {one} and {other}" for key, one, other in found.differences[:3])
     return Twin(build(load(found.a, world="md")), build(load(found.b, world="md")), words or "nothing known")
-
-
-def _flat(tables: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    out: dict[str, Any] = {}
-    for key, value in tables.items():
-        name = f"{prefix}{key}"
-        if isinstance(value, Mapping):
-            out |= _flat(value, f"{name}.")
-        else:
-            out[name] = value
-    return out
-
-
-def _arithmetic(provenance: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: provenance[key] for key in _ARITHMETIC if key in provenance}
-
-
-def _different(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
-    keys = [key for key in dict.fromkeys([*one, *other]) if key not in _WORDS]
-    return [(key, one.get(key), other.get(key)) for key in keys if one.get(key) != other.get(key)]
-
-
-def _refuse(first: RunFolder, second: RunFolder, different: list[tuple[str, Any, Any]]) -> None:
-    atoms = [folder.summary.get("atoms") for folder in (first, second)]
-    if atoms[0] != atoms[1]:
-        raise InputError(
-            f"the runs have {atoms[0]} and {atoms[1]} atoms",
-            where=f"{first.path} and {second.path}",
-            remedy="Compare runs of one structure",
-        )
-    for key, one, other in different:
-        if key == "units" or key.startswith("potential.") or key == "cutoff.kind":
-            raise InputError(
-                f"the runs are of different systems: {key} is {one} in the first and {other} in the second",
-                where=f"{first.path} and {second.path}",
-                remedy="A fork is between two programs of one model; compare runs that differ in numerics",
-            )
 
 
 def _first_difference(series: list[dict[str, np.ndarray]], steps: int) -> int | None:
@@ -203,34 +166,49 @@ def _fork(
     return step, tuple(sorted(flips, key=lambda flip: abs(flip.margin)))
 
 
-def _reasons(different, arithmetic, same, steps, seed, fork, decisions) -> list[str]:
-    out = []
-    choices = [key for key, _, _ in different if not key.startswith("structure.")]
-    if len(choices) > 1:
-        listed = ", ".join(choices[:6])
-        out.append(f"the runs differ in {len(choices)} choices ({listed}): which of them did it is not told")
+def _attributed(choices: list[str], starts: list[Difference], arithmetic: list[Difference]) -> Iterator[str]:
+    """What parting may be put down to."""
+    things = [*choices]
+    if starts:
+        things.append("the start")
+    if arithmetic:
+        things.append("versions, flags or machine")
+    if len(things) > 1:
+        listed = ", ".join(things[:6]) + (", ..." if len(things) > 6 else "")
+        yield f"the runs differ in {len(things)} things ({listed}): a fork cannot be put down to one choice"
     elif choices:
-        out.append(f"the runs differ in one choice, {choices[0]}")
+        yield f"the runs differ in one choice, {choices[0]}"
+    elif starts:
+        yield "the programs are the same and the starts are not"
     elif arithmetic:
-        out.append(f"the system is the same; what bits depend on differs in {len(arithmetic)} points")
+        yield f"the system is the same; what bits depend on differs in {len(arithmetic)} points"
     else:
-        out.append("nothing on record differs: runs like these should agree bit for bit")
-    if not same:
-        out.append("they did not begin from the same atoms, bit for bit")
+        yield "nothing on record differs: runs like these should agree bit for bit"
+    if starts:
+        what = " and ".join(key.removeprefix("start: ") for key, _, _ in starts)
+        yield f"they begin otherwise ({what}), so the seed is step 0"
+
+
+def _dated(
+    steps: int, seed: int | None, fork: int | None, decisions: tuple[StoredFlip, ...]
+) -> Iterator[str]:
+    """Where they part."""
     if seed is None:
-        out.append(f"no stored number differs in {steps} steps")
+        yield f"no stored number differs in {steps} steps"
     else:
-        out.append(f"the first stored number that differs is that of step {seed}")
+        yield f"the first stored number that differs is that of step {seed}"
     if fork is None:
-        out.append(f"no decision differs in {steps} steps")
+        yield f"no decision differs in {steps} steps"
     elif not decisions:
-        out.append("the pairs inside differ at the start already")
+        yield "the pairs inside differ at the start already"
     else:
         flip = decisions[0]
         verb = "entered" if flip.entered else "left"
-        out.append(
+        yield (
             f"at step {fork} pair {flip.i}-{flip.j} {verb} in {flip.run} only, "
             f"{abs(flip.margin):.2g} from the threshold (rounding bound {flip.bound:.1g})"
         )
-        out.append("whether this caused what followed takes a counterfactual: follow the two runs again")
-    return out
+        yield (
+            "when they split, and whether this was the cause, is told by following both again: "
+            "mdnum.forks.fork(mdnum.forks.folders.twin(A, B)) from Python"
+        )

@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
+import json
+import shutil
+from pathlib import Path
+
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from mdnum.errors import InputError
@@ -26,8 +32,19 @@ def folders(tmp_path_factory):
         )
         return root / name
 
+    plain = made("plain")
+
+    def edited(name, *words):
+        copy = Path(shutil.copytree(plain, root / name))
+        text = (copy / "system.toml").read_text()
+        for old, new in words:
+            assert old in text
+            text = text.replace(old, new)
+        (copy / "system.toml").write_text(text)
+        return copy
+
     return {
-        "plain": made("plain"),
+        "plain": plain,
         "again": made("again"),
         "short": made("short", steps=100),
         "float32": made(
@@ -35,6 +52,13 @@ def folders(tmp_path_factory):
         ),
         "two choices": made("two", precision__force="float32", neighbors__skin=0.5),
         "shifted": made("shifted", cutoff__kind="shifted"),
+        # the tables are not read for what these are asked
+        "ulp": edited("ulp", ("epsilon = 1.0", "epsilon = 1.0000000000000002")),
+        "warm": edited(
+            "warm",
+            ('velocities = "file"', 'velocities = "drawn"'),
+            ("temperature = 0.02", "temperature = 0.3"),
+        ),
     }
 
 
@@ -62,24 +86,64 @@ def test_dates_are_those_of_the_runs_followed_again(folders):
 def test_more_than_one_difference_is_said(folders):
     found = compare_folders(folders["plain"], folders["two choices"])
     assert {"precision.force", "neighbors.skin"} <= {key for key, _, _ in found.differences}
-    assert "2 choices" in found.reasons[0]
+    assert "differ in 2 things (neighbors.skin, precision)" in found.reasons[0]
 
 
-def test_other_models_are_refused_by_the_field_that_differs(folders):
-    with pytest.raises(InputError, match=r"cutoff\.kind is hard in the first and shifted"):
-        compare_folders(folders["plain"], folders["shifted"])
+def test_choices_and_numbers_are_differences_and_no_other_systems(folders):
+    shifted = compare_folders(folders["plain"], folders["shifted"])
+    assert shifted.reasons[0] == "the runs differ in one choice, cutoff.kind" and shifted.same_structure
+    ulp = compare_folders(folders["plain"], folders["ulp"])
+    assert [key for key, _, _ in ulp.differences] == ["potential.epsilon"]
+    assert ulp.reasons[0] == "the runs differ in one choice, potential.epsilon"
+    # three roles of one dtype are one choice
+    assert "one choice, precision" in compare_folders(folders["plain"], folders["float32"]).reasons[0]
+
+
+def test_other_starts_are_said_and_are_a_difference(folders):
+    found = compare_folders(folders["plain"], folders["warm"])
+    assert not found.same_structure and found.seed == 0
+    assert "dynamics.temperature" in found.reasons[0] and "the start" in found.reasons[0]
+    assert "cannot be put down to one choice" in found.reasons[0]
+    assert found.reasons[1] == "they begin otherwise (velocities), so the seed is step 0"
+
+
+def test_other_systems_are_refused_by_what_differs(folders, tmp_path):
+    other = tmp_path / "other"
+    shutil.copytree(folders["plain"], other)
+    system = (other / "system.toml").read_text()
+    (other / "system.toml").write_text(system.replace('"lennard-jones"', '"soft-sphere"'))
+    with pytest.raises(InputError, match=r"potential\.kind is lennard-jones in the first and soft-sphere"):
+        compare_folders(folders["plain"], other)
+    (other / "system.toml").write_text(system)
+    structure = (other / "structure.extxyz").read_text()
+    for wrong, message in (
+        (structure.replace("Ar ", "Ne ", 1), "species"),
+        (structure.replace("4.762203155904598", "4.862203155904598"), "boxes differ"),
+        (structure.replace("T T T", "T T F"), "periodic directions"),
+    ):
+        (other / "structure.extxyz").write_text(wrong)
+        with pytest.raises(InputError, match=message):
+            compare_folders(folders["plain"], other)
+    (other / "structure.extxyz").write_text(structure.replace("0.01800456587341473", "0.01800456587341474"))
+    assert compare_folders(folders["plain"], other).differences[0][0] == "start: positions"
+
+
+def test_fork_folders_are_told_from_runs(folders, tmp_path):
+    answered = tmp_path / "answered"
+    answered.mkdir()
+    (answered / "summary.json").write_text(json.dumps({"world": "fork", "question": "along"}))
+    for pair in ((folders["plain"], answered), (answered, folders["plain"])):
+        with pytest.raises(
+            InputError, match=r"answered: this is a fork folder.* Give two folders of `mdnum run`"
+        ):
+            compare_folders(*pair)
 
 
 def test_a_planted_flip_is_found(folders, tmp_path):
     """One row taken out of a copy of a run's flips."""
-    import shutil
-
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
     copy = tmp_path / "planted"
     shutil.copytree(folders["plain"], copy)
-    table = pq.read_table(copy / "flips.parquet", partitioning=None)
+    table = pq.ParquetFile(copy / "flips.parquet").read()
     keep = np.ones(len(table), bool)
     keep[len(table) // 2] = False
     row = {name: table[name][len(table) // 2].as_py() for name in ("step", "i", "j")}

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from mdnum.errors import InputError
+from mdnum.forks.stored import check_runs
 from mdnum.store import RunFolder
 
 #: Of a system file: what says nothing about a step.
@@ -75,6 +76,7 @@ def compare_folders(a: RunFolder | str | Path, b: RunFolder | str | Path) -> Bal
     """
     first, second = (folder if isinstance(folder, RunFolder) else RunFolder.open(folder) for folder in (a, b))
     where = f"{first.path} and {second.path}"
+    check_runs(first, second)
     if not first.world == second.world == "ball":
         raise InputError("one of these is no run of a ball", where=where, remedy="Compare runs of one world")
     different = _different(*(dict(_flat(tomllib.loads(folder.system_toml))) for folder in (first, second)))
@@ -83,7 +85,8 @@ def compare_folders(a: RunFolder | str | Path, b: RunFolder | str | Path) -> Bal
         raise InputError(f"the runs have {balls[0]} and {balls[1]} balls", where=where,
                          remedy="Compare runs of as many balls")  # fmt: skip
     for key, one, other in different:
-        if key in ("contact.kind", "integrator.kind", "integrator.timestep"):
+        # every number and every choice of a program is a difference and may be varied
+        if key in ("contact.kind", "integrator.kind"):
             raise InputError(
                 f"the runs are of different systems: {key} is {one} in the first and {other} in the second",
                 where=where,
@@ -162,7 +165,9 @@ def _reasons(
         what = "a contact differs" if channel == "contact" else "the iterations of a solver differ"
         yield f"The runs fork at step {fork:,}: {what}."
     if len(different) > 1:
-        yield f"They differ in {len(different)} keys of their system files, listed first."
+        yield (
+            f"They differ in {len(different)} keys of their system files: a fork cannot be put down to one."
+        )
     elif not different:
         yield "Their system files say the same: versions, flags or the machine are another."
     yield "Whether the decision was the cause is asked of the system: mdnum fork SYSTEM --vary CHOICE."
