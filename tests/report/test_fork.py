@@ -199,6 +199,44 @@ def test_every_verdict_has_its_words(tmp_path, entries, tone, words):
     assert not verdict.headline.endswith("..")
 
 
+@pytest.mark.parametrize(
+    ("handed", "noise", "nats", "words"),
+    [
+        (1290, 0.0, -0.2, "under A’s decisions 31 steps earlier."),
+        (1350, 80.0, 0.5, "29 steps later, no later than by chance (repeats scatter by 80)."),
+        (1350, 12.0, 0.5, "beyond the scatter of repeats (12), but by less than one power of e (0.50)"),
+        (
+            1350,
+            0.0,
+            0.5,
+            "29 steps later: by less than one power of e (0.50), which counts as no difference.",
+        ),
+        (None, 0.0, None, "the runs had split at step 300, before any decision differed."),
+    ],
+)
+def test_a_bystander_is_told_by_its_criterion(tmp_path, handed, noise, nats, words):
+    split = 1321 if handed is not None else 300
+    splits = {"B": split, "B|A": handed}
+    found = judged(tmp_path, verdict="bystander", split=split, splits=splits, noise=noise, nats=nats)
+    assert words in found.headline
+
+
+def test_repeats_that_did_not_split_are_in_the_page(tmp_path):
+    ran = {"repeats": [1300], "repeats_run": 2, "repeats_censored": 1, "noise": 60.0}
+    run = load(make_fork(tmp_path / "one", summary=ran))
+    assert [row["A"] for row in sections.runs(run)][-2:] == ["1,300", "> 1,500"]
+    assert str(findings.chance(run)).endswith("at least: 1 did not split")
+    none = load(make_fork(tmp_path / "none", summary=ran | {"repeats": [], "repeats_censored": 2}))
+    assert "none of which split in 1,500 steps" in str(findings.chance(none))
+
+
+def test_a_delay_without_repeats_is_open(tmp_path):
+    entries = {"splits": {"B": 1321, "B|A": 1700}, "repeats_run": 0, "verdict": "open"}
+    found = judged(tmp_path, **entries)
+    assert found.headline.endswith("378 steps later; whether that is chance is open, as no repeats were run.")
+    assert [finding.code for finding in found.findings] == ["NO_REPEATS"]
+
+
 def test_findings_are_those_that_apply(tmp_path):
     def codes(name, **entries):
         verdict = findings.judge(load(make_fork(tmp_path / name, summary=entries)))

@@ -257,14 +257,8 @@ def what(run: ForkFolder) -> Iterator[tuple[str, str]]:
     yield "Split", f"when heights are further apart than {number(summary.get('tolerance'), 3)} m"
     if summary.get("handed_until") is None:
         yield "Counterfactual", "none was run: nothing is said about the cause"
-    if ran := summary.get("repeats_run"):
-        noise = number(summary.get("noise"), 3)
-        late = summary.get("repeats_censored")
-        text = f"; {count(late)} did not split and bound that from below" if late else ""
-        if late == ran:
-            yield "Chance", f"{many(ran, 'repeat')}; none split: nothing is known of chance"
-        else:
-            yield "Chance", f"{many(ran, 'repeat')}; two splits differ by {noise} steps by chance (2 σ){text}"
+    if (chance := findings.chance(run)) is not None:
+        yield "Chance", chance
     yield "Took", f"{number(summary.get('seconds'), 2)} s"
 
 

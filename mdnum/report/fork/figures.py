@@ -25,7 +25,7 @@ Role = Literal["first", "second", "third", "bad", "muted", "ink"]
 #: Flips that are drawn as ticks.
 _TICKS = 1_500
 #: Points of the lines by color: free runs, counterfactuals, a decision taken back, repeats.
-_WIDTHS = {FIRST: 2.6, SECOND: 1.2, THIRD: 1.0, BAD: 1.0, MUTED: 0.7}
+_WIDTHS = {FIRST: 2.6, SECOND: 1.8, THIRD: 1.0, BAD: 1.0, MUTED: 0.7}
 #: How the counterfactual is dashed, shorter than a fit.
 _HANDED = (0, (3.0, 1.5))
 #: A fit is drawn on where it predicts a split, for at most so many times the steps that were followed.

@@ -265,6 +265,20 @@ def _findings(run: ForkFolder) -> Iterator[Finding]:
         )
 
 
+def chance(run: ForkFolder) -> str | None:
+    """How far splits scatter by chance; None where no repeats were run."""
+    ran, late = run.summary.get("repeats_run"), run.summary.get("repeats_censored")
+    if not ran:
+        return None
+    if late == ran:
+        return f"{many(ran, 'repeat')}, none of which split in {many(run.steps, 'step')}: it is not known"
+    text = (
+        f"{many(ran, 'repeat')}; two splits differ by {number(run.summary.get('noise'), 3)} steps by chance "
+        "(2 σ)"
+    )
+    return text + (f" at least: {count(late)} did not split" if late else "")
+
+
 def uncalibrated(run: ForkFolder) -> bool:
     """Whether a split under A's decisions was compared with no repeats."""
     told = (run.summary.get("splits") or {}).get("B|A") is not None

@@ -154,13 +154,8 @@ def _what(run: ForkFolder) -> Iterator[tuple[str, str]]:
     )
     if summary.get("handed_until") is None:
         yield "Counterfactual", "none was run: nothing is said about the cause"
-    noise = summary.get("noise")
-    ran = summary.get("repeats_run")
-    if ran:
-        yield (
-            "Chance",
-            f"{many(ran, 'repeat')}; two splits differ by {number(noise, 3)} steps by chance (2 σ)",
-        )
+    if (chance := findings.chance(run)) is not None:
+        yield "Chance", chance
     yield "Took", f"{number(summary.get('seconds'), 2)} s"
 
 
