@@ -18,7 +18,7 @@ from mdnum.cli import main
 from mdnum.errors import FolderError, InputError
 from mdnum.forks.boundaries import MOST
 from mdnum.report.fork import map as page
-from mdnum.report.fork.question import load
+from mdnum.report.fork.question import Question, load
 from mdnum.rollout.engine import Engine
 from mdnum.store import RunFolder
 from mdnum.systems import build
@@ -219,3 +219,16 @@ def test_what_cannot_be_is_refused_before_there_is_a_folder(tmp_path):
     (tmp_path / "taken/notes").write_text("mine")
     with pytest.raises(FolderError, match="not empty"):
         mdnum.fork_map(meeting(), "sigma", 1.0, 1.1, out=tmp_path / "taken")
+
+
+def test_runs_that_all_blow_up_are_no_single_history(tmp_path):
+    summary = {
+        "key": "potential.sigma", "low": 3.4, "high": 3.41, "value": 1.0, "steps": 500, "evaluations": 65,
+        "failed_runs": 65, "boundaries": [], "unresolved": [], "confirm": True, "confirmed": 0,
+    }  # fmt: skip
+    verdict = page.judge(Question(tmp_path, summary, "", {}, {}))
+    assert verdict.headline.startswith("All 65 runs between potential.sigma = 3.4 and 3.41 blew up")
+    assert verdict.evidence == ("The interval is far above the system's own value, 1.0.",)
+    assert verdict.tone == "warning" and "far above" in verdict.findings[0].remedy
+    inside = {**summary, "low": 0.9, "high": 1.1}
+    assert page.judge(Question(tmp_path, inside, "", {}, {})).evidence == ()

@@ -360,15 +360,29 @@ def _lost(row: PolicyHorizon, base: int) -> str:
 
 
 def _gained(row: PolicyHorizon, base: int, last: int, at_most: str) -> str:
-    bits = f"its positions are {row.closer:+.1f} bits closer to the exact ones"
+    bits = _bits_closer(row.closer)
     if row.horizon is None:
         return f"the promotion gains {last - base} steps or more, and {bits}"
+    if row.horizon <= base:
+        nothing = "no step" if row.closer >= _NO_BITS else "nothing"
+        earlier = f"{base - row.horizon} steps earlier than" if row.horizon < base else "at the same step as"
+        return f"the promotion gains {nothing}: it leaves {earlier} single precision, and {bits}"
     share = f"{row.horizon - base:+d} steps"
     if np.isfinite(row.gain):
         share += f", {at_most}{row.gain:.0%} of what double precision throughout gains"
     # a horizon hangs on one pair; what is not closer to the exact run was lucky, not better
     if row.closer < _NO_BITS:
-        if row.horizon - base <= 0 or row.gain < _NOTHING:
+        if row.gain < _NOTHING:
             return f"the promotion gains nothing ({share}; {bits})"
         return f"one decision came out right, and that is all the promotion gains ({share}; {bits})"
     return f"the promotion gains {share}; {bits}"
+
+
+def _bits_closer(closer: float) -> str:
+    """By how much positions are closer to the exact ones, or further off, in words."""
+    if np.isnan(closer):
+        return "how close its positions are to the exact ones is not known"
+    if abs(closer) < 0.05:
+        return "its positions are as far from the exact ones"
+    where = "closer to" if closer > 0 else "further from"
+    return f"its positions are {abs(closer):.1f} bits {where} the exact ones"

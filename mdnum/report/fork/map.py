@@ -66,6 +66,10 @@ def judge(run: Question) -> Verdict:
 def _headline(run: Question) -> str:
     summary, edges = run.summary, run.summary["boundaries"]
     where = f"between {summary['key']} = {summary['low']!r} and {summary['high']!r}"
+    if _all_failed(summary):
+        # runs that end alike at once say nothing of decisions
+        said = "what changes is how they fail" if edges else "nothing was mapped"
+        return f"All {many(summary['evaluations'], 'run')} {where} blew up: {said}."
     if not edges:
         if summary["unresolved"]:
             return f"No decision was found to change {where}, and yet the runs at its ends fail differently."
@@ -77,8 +81,25 @@ def _headline(run: Question) -> str:
     return f"The decisions of {many(run.steps, 'step')} change at {places} {where}."
 
 
+def _all_failed(summary: Mapping[str, Any]) -> bool:
+    return bool(summary["failed_runs"]) and summary["failed_runs"] == summary["evaluations"]
+
+
+def _far(summary: Mapping[str, Any]) -> str:
+    """That an interval is nowhere near the system's own value; "" where it is."""
+    own, low, high = summary.get("value"), summary["low"], summary["high"]
+    if own is None or low <= own <= high:
+        return ""
+    far = " far" if min(abs(low - own), abs(high - own)) > max(high - low, 0.1 * abs(own)) else ""
+    return f"The interval is{far} {'above' if own < low else 'below'} the system's own value, {own!r}."
+
+
 def _evidence(run: Question) -> Iterator[str]:
     summary, edges = run.summary, run.summary["boundaries"]
+    if _all_failed(summary):
+        if far := _far(summary):
+            yield far
+        return
     jumping = [edge for edge in edges if edge["jump"] is not None]
     if jumping:
         largest = max(jumping, key=lambda edge: abs(edge["jump"]))
@@ -144,8 +165,10 @@ def _findings(run: Question) -> Iterator[Finding]:
             "RUNS_FAILED",
             "warning",
             f"{many(summary['failed_runs'], 'run')} of {count(summary['evaluations'])} ended in a blow-up",
-            "Part of the interval cannot be run to the last step, and has no loss there.",
-            "Search an interval of values that can be run, or fewer steps.",
+            "No value of the interval can be run to the last step."
+            if _all_failed(summary)
+            else "Part of the interval cannot be run to the last step, and has no loss there.",
+            f"{_far(summary)} Search an interval of values that can be run, or fewer steps.".lstrip(),
         )
 
 

@@ -10,7 +10,16 @@ import pytest
 import small_systems
 
 from mdnum.errors import InputError
-from mdnum.forks.exact.horizon import POLICIES, certify, compare, rounded_start, taped
+from mdnum.events.forks import Growth
+from mdnum.forks.exact.horizon import (
+    POLICIES,
+    PolicyHorizon,
+    _gained,
+    certify,
+    compare,
+    rounded_start,
+    taped,
+)
 from mdnum.forks.exact.program import ExactProgram, with_policy
 from mdnum.forks.exact.tape import first_difference
 from mdnum.precision import PrecisionPolicy
@@ -144,3 +153,16 @@ def test_two_precisions_prove_the_same_long_history():
     )
     assert narrow.horizon is not None and wide.horizon is not None
     assert wide.horizon > 3 * narrow.horizon
+
+
+def test_gains_are_said_in_words():
+    growth = Growth(0.1, 0.9, 0, 2)
+    row = PolicyHorizon("one", PrecisionPolicy(), 90, None, 0.0, np.zeros(3), growth, "", 0.0, -0.01)
+    assert _gained(row, 90, 200, "") == (
+        "the promotion gains nothing: it leaves at the same step as single precision, and its positions are "
+        "as far from the exact ones"
+    )
+    assert "leaves 10 steps earlier" in _gained(row, 100, 200, "")
+    further = _gained(replace(row, closer=-0.5), 80, 200, "")
+    assert "0.5 bits further from the exact ones" in further and "gains nothing (+10 steps" in further
+    assert "gains no step" in _gained(replace(row, closer=3.0), 90, 200, "")
