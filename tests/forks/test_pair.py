@@ -78,3 +78,12 @@ def test_what_cannot_be_compared_is_refused():
         fork(Twin(a, a, "nothing"), 0)
     with pytest.raises(InputError, match="split = -1"):
         fork(Twin(a, a, "nothing"), 10, split=-1.0)
+
+
+@pytest.mark.slow
+def test_a_run_that_ends_before_any_decision_differs_is_a_fork_by_itself():
+    b = build("argon/crystal-108", overrides={"dynamics.timestep": 2.0})
+    found = fork(Twin(build("argon/crystal-108"), b, "time step"), 4, repeats=0, counterfactual=False)
+    assert found.failed.keys() == {"B"} and not found.flips
+    assert found.dates.seed == found.dates.fork == found.steps
+    assert found.verdict.word == "open" and "that is the fork" in found.verdict.reasons[0]
