@@ -11,6 +11,7 @@ from command_line import call
 
 from mdnum.cli.fork_map import interval
 from mdnum.errors import InputError
+from mdnum.forks.exact import program
 from mdnum.rollout.run import run
 from mdnum.store import RunFolder
 
@@ -55,6 +56,13 @@ def test_what_cannot_be_asked_is_refused_in_one_line(arguments, message, capsys,
     assert message in error and error.count("\n") == 1
     # and leaves no folder behind
     assert not list(tmp_path.iterdir())
+
+
+def test_what_is_missing_is_named_with_its_extra(monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(program, "installed", lambda: False)
+    assert call("fork", "argon/crystal-108", "--certify", "--steps", "2", "--set", "cutoff.radius=1.5") == 2
+    assert "mdnum[exact]" in capsys.readouterr().err
 
 
 def test_a_forecast_names_the_flip_that_comes(tmp_path: Path, capsys):

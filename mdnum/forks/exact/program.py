@@ -114,7 +114,8 @@ def why_not(simulation: Simulation) -> InputError | None:
         )
     if not installed():
         return InputError(
-            "exact runs need python-flint, which is not installed", remedy="pip install python-flint"
+            "exact runs need python-flint, which is not installed",
+            remedy="Install the extra `exact`: pip install 'mdnum[exact]', or python-flint alone",
         )
     return None
 
