@@ -33,7 +33,7 @@ def test_an_interval_is_a_key_and_two_numbers():
         (("argon/crystal-108", "--vary", "vmap"), "--processes"),
         (("argon/crystal-108", "--vary", "xla=fast"), "--processes"),
         (("argon/crystal-108", "--vary", "presicion"), "Did you mean precision"),
-        (("argon/crystal-108", "--vary", "zzz"), "no choice 'zzz'. `mdnum fork` lists all."),
+        (("argon/crystal-108", "--vary", "zzz"), "no choice 'zzz'. There are precision, reduction,"),
         (("silicon/tersoff-512", "--vary", "precision"), "`mdnum fork` lists them"),
         (("--certify",), "no system given"),
         (("argon/crystal-108", "--forecast", "-1"), "expected a length above 0"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -14,6 +15,7 @@ import pytest
 SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
 STUDIES = (
     "ase_comparison",
+    "ball_benchmark",
     "ball_sensitivity",
     "benchmark",
     "cutoff_sensitivity",
@@ -59,8 +61,14 @@ def is_png(path: Path) -> bool:
 
 
 @pytest.mark.parametrize("name", STUDIES)
-def test_help_says_the_question_and_how_to_read_the_answer(name: str, tmp_path: Path) -> None:
-    text = study(name, "--help", cwd=tmp_path)
+def test_help_says_the_question_and_how_to_read_the_answer(name: str, monkeypatch, capsys) -> None:
+    # in this process: what the scripts import would be imported anew for each of them
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    monkeypatch.setattr(sys, "argv", [f"{name}.py", "--help"])
+    with pytest.raises(SystemExit) as done:
+        runpy.run_path(str(SCRIPTS / f"{name}.py"), run_name="__main__")
+    assert not done.value.code
+    text = capsys.readouterr().out
     assert "?" in text.split("\n\n")[1]
     assert "How to read it." in text
 
@@ -160,6 +168,13 @@ def test_a_ball_answers_to_its_knobs(tmp_path: Path) -> None:
     )
     assert soft < 5 < 50 < hard
     assert is_png(tmp_path / "k.png")
+
+
+def test_balls_are_timed_against_their_own_recorded_run(tmp_path: Path) -> None:
+    words = ["--balls", "50", "--steps", "40", "--turns", "1"]
+    printed = study("ball_benchmark", *words, cwd=tmp_path)
+    for world in ("spring", "located impacts", "projection"):
+        assert float(row(printed, world)[4]) > 0
 
 
 def test_a_projection_that_cannot_converge_is_refused(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from mdnum.forks.choices.formats import FORMATS, Format
 from mdnum.forks.choices.frames import Images, Relabel, Rotate, Translate
 from mdnum.forks.choices.inputs import Noise, StartUlp, Ulps
 from mdnum.forks.choices.lists import Builder, Order, Rebuild, Skin
+from mdnum.forks.words import families
 from mdnum.precision import reductions
 
 _SHIPPED: tuple[Choice, ...] = (
@@ -96,7 +97,9 @@ def parse(text: str) -> Choice:
             f"{text} is another program of one run, and no choice of two",
             remedy="Ask `mdnum fork SYSTEM --processes`",
         )
-    raise InputError(f"no choice {text!r}", remedy=f"{_near(text)}`mdnum fork` lists all")
+    raise InputError(
+        f"no choice {text!r}", remedy=f"{_near(text)}There are {families(BY_NAME)}; `mdnum fork` lists all"
+    )
 
 
 def _near(text: str) -> str:

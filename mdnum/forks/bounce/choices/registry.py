@@ -12,6 +12,7 @@ from mdnum.forks.bounce.choices.base import Choice, whole
 from mdnum.forks.bounce.choices.decisions import ContactStep, Inverted, Iterations
 from mdnum.forks.bounce.choices.inputs import OFTEN, Cap, StartUlp, Ulps
 from mdnum.forks.bounce.choices.order import BOTH, BatchOrder
+from mdnum.forks.words import families
 from mdnum.precision import reductions
 
 #: From the widest to the narrowest; "precision" alone means the second.
@@ -67,7 +68,10 @@ def parse(text: str) -> Choice:
         return BatchOrder(whole(argument, "order") if argument else 1, both or None)
     if family in _FAMILIES and not at and argument:
         return _FAMILIES[family](argument)
-    raise InputError(f"no choice {text!r} of a ball", remedy=f"{_near(text)}`mdnum fork` lists all")
+    raise InputError(
+        f"no choice {text!r} of a ball",
+        remedy=f"{_near(text)}There are {families(BY_NAME)}; `mdnum fork` lists all",
+    )
 
 
 def _near(text: str) -> str:
