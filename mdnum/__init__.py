@@ -24,6 +24,7 @@ _HOMES = {
     "diagnose": "mdnum.doctor:diagnose",
     "fork": "mdnum.workflow:fork",
     "fork_certify": "mdnum.workflow:fork_certify",
+    "fork_folders": "mdnum.workflow:fork_folders",
     "fork_forecast": "mdnum.workflow:fork_forecast",
     "fork_map": "mdnum.workflow:fork_map",
     "fork_processes": "mdnum.workflow:fork_processes",
@@ -46,6 +47,7 @@ if TYPE_CHECKING:
     from mdnum.workflow import bounce as bounce
     from mdnum.workflow import fork as fork
     from mdnum.workflow import fork_certify as fork_certify
+    from mdnum.workflow import fork_folders as fork_folders
     from mdnum.workflow import fork_forecast as fork_forecast
     from mdnum.workflow import fork_map as fork_map
     from mdnum.workflow import fork_processes as fork_processes
@@ -64,6 +66,7 @@ __all__ = [
     "diagnose",
     "fork",
     "fork_certify",
+    "fork_folders",
     "fork_forecast",
     "fork_map",
     "fork_processes",

@@ -12,11 +12,12 @@ _ALL = {
     "--set": ("--set", "dynamics.seed=3"), "--no-counterfactual": ("--no-counterfactual",),
     "--no-back": ("--no-back",), "--no-lyapunov": ("--no-lyapunov",), "--minimal": ("--minimal",),
     "--pin": ("--pin", "fork"), "--most": ("--most", "3"), "--benign": ("--benign",), "-o": ("-o", "x"),
-    "--no-report": ("--no-report",),
+    "--no-report": ("--no-report",), "--replay": ("--replay",),
 }  # fmt: skip
 _MD = "argon/crystal-108"
 _ASKED = {
     "RUN_A RUN_B": ("a", "b"),
+    "RUN_A RUN_B --replay": ("a", "b", "--replay"),
     "--vary": (_MD, "--vary", "skin"),
     "--vary all": (_MD, "--vary", "all"),
     "--vary CHOICE --benign": (_MD, "--vary", "skin", "--benign"),
@@ -39,8 +40,9 @@ def test_every_question_is_here():
 def test_an_option_that_a_question_does_not_use_is_refused(question, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for option, words in _ALL.items():
-        # --benign makes another question of it
-        if option in TAKES[question] or (option == "--benign" and question == "--vary"):
+        # these make another question of it
+        another = (question, option) in (("--vary", "--benign"), ("RUN_A RUN_B", "--replay"))
+        if option in TAKES[question] or another:
             continue
         assert call("fork", *_ASKED[question], *words) == 2, option
         error = capsys.readouterr().err

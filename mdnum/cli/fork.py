@@ -74,6 +74,9 @@ def fork(
     benign: bool = typer.Option(
         False, "--benign", help="With --vary: whether anything that would be measured differs."
     ),
+    replay: bool = typer.Option(
+        False, "--replay", help="With two run folders: follow both again, for split, verdict and report."
+    ),
     out: Path | None = typer.Option(
         None, "-o", "--out", metavar="DIR", help="The fork folder; runs/fork-NAME-N by default."
     ),
@@ -101,6 +104,7 @@ def fork(
         "--set": bool(overrides), "--no-counterfactual": no_counterfactual, "--no-back": no_back,
         "--no-lyapunov": no_lyapunov, "--minimal": minimal, "--pin": pin is not None,
         "--most": most is not None, "--benign": benign, "-o": out is not None, "--no-report": no_report,
+        "--replay": replay,
     }  # fmt: skip
     # along a number is the one question that is the same in both worlds
     if system is not None and other is None and along is None and fork_ball.is_ball(system):
@@ -120,15 +124,22 @@ def fork(
     if benign and vary == "all":
         raise InputError("--benign is asked of one choice, not of all", remedy="Give one to --vary")
     for name, is_asked in (("--minimal", minimal), ("--pin", pin is not None)):
-        if is_asked and vary is None and any(asked.values()):
+        if is_asked and vary is None and any(asked.values()) and not replay:
             raise InputError(f"{name} is asked of two runs", remedy="Add it to --vary CHOICE")
     if most is not None and along is None:
         raise InputError("--most needs a number to go along", remedy="Add --along KEY=LOW:HIGH")
     if (any(asked.values()) or any(given.values())) and system is None:
         raise InputError("no system given", remedy="`mdnum systems list` names those that come with mdnum")
-    fork_options.check(_question(asked, vary, benign), given)
+    fork_options.check(_question(asked, vary, benign, replay), given)
+    pair = {
+        "steps": steps, "split": split, "repeats": _REPEATS if repeats is None else repeats,
+        "counterfactual": not no_counterfactual, "back": not no_back, "lyapunov": not no_lyapunov,
+        "minimal": minimal, "pin": pin, "out": out, "report": not no_report,
+    }  # fmt: skip
     if system is not None:
         if other is not None:
+            if replay:
+                return fork_questions.replay(Path(system), other, pair, as_json=as_json)
             code = fork_ball.folders(system, other, as_json=as_json)
             return fork_questions.folders(Path(system), other, as_json=as_json) if code is None else code
         if along is not None:
@@ -154,29 +165,14 @@ def fork(
     from mdnum.workflow import fork as compare
 
     with watched() as progress:
-        result = compare(
-            system,
-            vary,
-            steps=steps,
-            split=split,
-            repeats=_REPEATS if repeats is None else repeats,
-            counterfactual=not no_counterfactual,
-            back=not no_back,
-            lyapunov=not no_lyapunov,
-            minimal=minimal,
-            pin=pin,
-            out=out,
-            overrides=overrides,
-            report=not no_report,
-            progress=progress,
-        )
+        result = compare(system, vary, overrides=overrides, progress=progress, **pair)
     return output.answer(result.folder, result.summary, print_rows, as_json=as_json)
 
 
-def _question(asked: Mapping[str, bool], vary: str | None, benign: bool) -> str:
+def _question(asked: Mapping[str, bool], vary: str | None, benign: bool, replay: bool) -> str:
     """The key of `fork_options.TAKES` for what was asked."""
     if asked["RUN"]:
-        return "RUN_A RUN_B"
+        return "RUN_A RUN_B --replay" if replay else "RUN_A RUN_B"
     if vary is not None and benign:
         return "--vary CHOICE --benign"
     if vary == "all":

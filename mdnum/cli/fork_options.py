@@ -8,14 +8,15 @@ from mdnum.errors import InputError
 
 _FOLDER = ("--set", "-o", "--no-report")
 _RUNS = ("--steps", *_FOLDER)
+_PAIR = (
+    "--split", "--repeats", "--no-counterfactual", "--no-back", "--no-lyapunov", "--minimal", "--pin",
+)  # fmt: skip
 
 #: Question to the options that it uses; --json is taken by all.
 TAKES: Mapping[str, tuple[str, ...]] = {
     "RUN_A RUN_B": (),
-    "--vary": (
-        *_RUNS, "--split", "--repeats", "--no-counterfactual", "--no-back", "--no-lyapunov", "--minimal",
-        "--pin",
-    ),
+    "RUN_A RUN_B --replay": ("--replay", "--steps", *_PAIR, "-o", "--no-report"),
+    "--vary": (*_RUNS, *_PAIR),
     "--vary all": _RUNS,
     "--vary CHOICE --benign": ("--benign", "--steps", "--set"),
     "--along": (*_RUNS, "--most"),

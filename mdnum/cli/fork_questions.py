@@ -1,12 +1,14 @@
-"""The questions of `mdnum fork` that leave no folder: of an ensemble, and of two finished runs."""
+"""Questions of `mdnum fork` of an ensemble, and of two finished runs."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from mdnum.cli import output
-from mdnum.cli.progress import ProgressBar
+from mdnum.cli.fork_print import print_rows
+from mdnum.cli.progress import ProgressBar, watched
 
 
 def consistent(
@@ -62,6 +64,18 @@ def folders(a: Path, b: Path, *, as_json: bool) -> int:
     if table:
         output.print_table("decisions at the fork", ("only in", "pair", "", "margin", "bound"), table)
     return output.EXIT_FINE
+
+
+def replay(a: Path, b: Path, pair: dict[str, Any], *, as_json: bool) -> int:
+    """Two finished runs followed again, into a fork folder."""
+    from mdnum.workflow import fork_folders
+
+    with watched() as progress:
+        result = fork_folders(a, b, progress=progress, **pair)
+    if not as_json:
+        output.print_table("differences", ("key", "A", "B"), result.summary["differences"])
+        output.console().print(f"replay: {result.summary['replayed']}", markup=False)
+    return output.answer(result.folder, result.summary, print_rows, as_json=as_json)
 
 
 def _step(step: int | None, steps: int) -> str:

@@ -210,5 +210,5 @@ def _dated(
         )
         yield (
             "when they split, and whether this was the cause, is told by following both again: "
-            "mdnum.forks.fork(mdnum.forks.folders.twin(A, B)) from Python"
+            "`mdnum fork RUN_A RUN_B --replay`"
         )

@@ -8,6 +8,7 @@ from mdnum.workflow.fork_certify import CertifyResult, fork_certify
 from mdnum.workflow.fork_forecast import ForecastResult, fork_forecast
 from mdnum.workflow.fork_map import MapResult, fork_map
 from mdnum.workflow.fork_processes import ProcessesResult, fork_processes
+from mdnum.workflow.fork_replay import fork_folders
 from mdnum.workflow.md import run
 
 __all__ = [
@@ -20,6 +21,7 @@ __all__ = [
     "bounce",
     "fork",
     "fork_certify",
+    "fork_folders",
     "fork_forecast",
     "fork_map",
     "fork_processes",

@@ -14,6 +14,7 @@ from mdnum.store.naming import default_folder
 
 if TYPE_CHECKING:
     from mdnum.forks import BallFork, Fork
+    from mdnum.forks.twin import Twin
     from mdnum.systems import BallSystem
     from mdnum.systems.load import System
 
@@ -136,16 +137,40 @@ def _one(
     report: bool,
     progress: Progress | None,
 ) -> ForkResult:
-    from mdnum.forks import fork as follow
     from mdnum.forks.choices import parse
+
+    choice = parse(vary)
+    say(progress, 0, "compile")
+    return follow_into_folder(choice.make(system), vary, choice, options, asked, None, out, report, progress)
+
+
+def follow_into_folder(
+    twin: Twin,
+    vary: str,
+    choice: Any,
+    options: dict[str, Any],
+    asked: Asked,
+    further: Callable[[Fork], dict[str, Any]] | None,
+    out: str | Path | None,
+    report: bool,
+    progress: Progress | None,
+) -> ForkResult:
+    """Follow a twin and leave a fork folder.
+
+    Args:
+        twin: the two programs.
+        vary, choice: what was asked, as a word and as an object with a line about it.
+        options: of `mdnum.forks.fork`.
+        asked: further questions about the pair.
+        further: entries of the summary beside those of any pair of runs.
+        out, report, progress: as for `fork`.
+    """
+    from mdnum.forks import fork as follow
     from mdnum.forks.neighborhood import neighborhood
     from mdnum.workflow import fork_answers, fork_record
 
-    choice = parse(vary)
     began = time.perf_counter()
-    say(progress, 0, "compile")
-    twin = choice.make(system)
-    folder = new_folder(system, out)
+    folder = new_folder(twin.a.system, out)
     try:
         made = follow(twin, progress=_logged(folder, progress), **options)
         say(progress, made.steps, "the atoms at the fork")
@@ -163,7 +188,8 @@ def _one(
         fork_record.write(folder, made, around, taken)
         folder.finalize()
         seconds = time.perf_counter() - began
-        folder.write_summary(fork_record.summarize(made, around, vary, choice, seconds, answers))
+        summary = fork_record.summarize(made, around, vary, choice, seconds, answers)
+        folder.write_summary(summary | (further(made) if further is not None else {}))
     except BaseException:
         folder.close()
         raise
