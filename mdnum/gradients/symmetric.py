@@ -163,7 +163,12 @@ def _wanted(names: Sequence[str]) -> frozenset[str]:
 
 
 def _pairs_only(simulation: Simulation) -> str | None:
-    return None if isinstance(simulation.force, PairForce) else "its reverse pass is one of pair potentials"
+    if not isinstance(simulation.force, PairForce):
+        return "its reverse pass is one of pair potentials"
+    if simulation.policy.dtype("force").itemsize < 4:
+        rounded = f"forces in {simulation.policy.force} are rounded after every operation"
+        return f"{rounded}, which has no derivative"
+    return None
 
 
 def _in(progress: Progress | None, phase: str):

@@ -139,6 +139,12 @@ def test_bad_input_says_what_there_is(switched):
         Problem(switched.simulation, everything(switched.simulation.atoms), 3)
 
 
+def test_forces_in_sixteen_bits_are_refused():
+    simulation = build("argon/crystal-108", {"precision.force": "bfloat16"})
+    with pytest.raises(InputError, match="bfloat16 are rounded"):
+        Symmetric()(Problem(simulation, FinalProjection(), 10), ("sigma",))
+
+
 def test_a_parameter_that_nothing_depends_on_is_said_to_be_one(switched):
     loss = FinalProjection(direction=jnp.zeros(3))
     found = Symmetric()(replace(switched, loss=loss), ("sigma",))
