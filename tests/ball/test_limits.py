@@ -103,4 +103,5 @@ def test_a_share_is_no_height():
     """A relative tolerance may be smaller than any height of the arithmetic."""
     low = RolePrecision("float16", "float16", "float64", "float64", "float64")
     rule = ball.Relative(1e-9, 5)
-    ball.World.create(ball.Projection(0.5, 0.5, rule), ball.SemiImplicitEuler(0.01), policy=low)
+    world = ball.World.create(ball.Projection(0.5, 0.5, rule), ball.SemiImplicitEuler(0.01), policy=low)
+    assert isinstance(world.contact, ball.Projection) and float(world.contact.stop.tol) < 2e-9

@@ -198,6 +198,7 @@ def _flips(run: ForkFolder) -> Browse:
 
 
 def ranked_figures(run: ForkFolder) -> Iterator[tuple[str, str, str]]:
+    """Figures of a screening: what each is, its value, and a note."""
     rows = run.ranking
     forked = [one for one in rows if one.get("fork") is not None]
     yield (

@@ -135,10 +135,12 @@ def jumps(run: Question) -> Plot | None:
 
 
 def with_unit(text: str, unit: str) -> str:
+    """The label of an axis, with its unit where it has one."""
     return f"{text} ({unit})" if unit else text
 
 
 def captions(run: Question) -> dict[str, str]:
+    """What stands below each figure of a map, by the figure's name."""
     which = (
         "the boundary of this number in the table"
         if numbered(run)
