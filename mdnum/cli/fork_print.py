@@ -228,6 +228,7 @@ def _decision(made: Mapping[str, Any] | None) -> list[tuple[str, str]]:
 
 
 def print_ranking(summary: Mapping[str, Any]) -> None:
+    """Print the choices of a screening, the earliest fork first."""
     rows = [
         (
             one["choice"],

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
+from mdnum.errors import InputError
 from mdnum.events.forks import Dates
 
 
@@ -67,3 +69,40 @@ def rank(row: Screened) -> tuple[bool, float, float, float]:
     late = float("inf")
     fork, seed, split = (late if date is None else date for date in (row.fork, row.seed, row.split))
     return row.why_not is not None, fork, seed, split
+
+
+def screened(
+    choices: Sequence[Any],
+    system: Any,
+    steps: int | None,
+    follow: Callable[..., Any],
+    progress: Callable[[int, int, str], None] | None,
+) -> list[Screened]:
+    """Every choice against a system, without counterfactuals: the earliest fork first.
+
+    Args:
+        choices: of the system's world.
+        system: as loaded.
+        steps: horizon; default the system's own.
+        follow: the world's `fork`.
+        progress: called with how many are done, how many there are, and the name of the next.
+
+    Raises:
+        InputError: no choice, or steps below 1.
+    """
+    if not choices:
+        raise InputError("no choice to screen", remedy="Give at least one")
+    rows = []
+    for done, choice in enumerate(choices):
+        if progress is not None:
+            progress(done, len(choices), choice.name)
+        reason = choice.why_not(system)
+        if reason is not None:
+            rows.append(not_run(choice.name, choice.must_hold, reason))
+            continue
+        twin = choice.make(system)
+        found = follow(twin, steps, counterfactual=False, repeats=0)
+        rows.append(
+            followed(choice.name, choice.must_hold, twin.difference, found.dates, found.steps, found.failed)
+        )
+    return sorted(rows, key=rank)
