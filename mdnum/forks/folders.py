@@ -117,7 +117,11 @@ def twin(a: str | Path, b: str | Path) -> Twin:
 
     A replay has the bits of the stored run where versions and processor are the same.
     """
-    found = compare_folders(a, b)
+    return twin_of(compare_folders(a, b))
+
+
+def twin_of(found: FolderFork) -> Twin:
+    """The runs of two folders that have been compared, to be followed again."""
     words = "; ".join(f"{key}: {one} and {other}" for key, one, other in found.differences[:3])
     return Twin(build(load(found.a, world="md")), build(load(found.b, world="md")), words or "nothing known")
 

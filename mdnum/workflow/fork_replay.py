@@ -52,7 +52,7 @@ def fork_folders(
         InputError: the folders hold runs of other systems, or no runs.
         FolderError: a folder holds no run, or the new one cannot be used.
     """
-    from mdnum.forks.folders import compare_folders, twin
+    from mdnum.forks.folders import compare_folders, twin_of
 
     say(progress, 0, "compare")
     found = compare_folders(a, b)
@@ -75,7 +75,9 @@ def fork_folders(
 
     say(progress, 0, "compile")
     asked = Asked(lyapunov, minimal, pin)
-    return follow_into_folder(twin(a, b), "replay", _Replay(), options, asked, further, out, report, progress)
+    return follow_into_folder(
+        twin_of(found), "replay", _Replay(), options, asked, further, out, report, progress
+    )
 
 
 def _met(found: FolderFork, made: Fork) -> str:
