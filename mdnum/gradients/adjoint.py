@@ -59,7 +59,6 @@ def reverse(
     wanted: frozenset[str] = ALL,
     saltation: bool = False,
     guard: float = 0.0,
-    watch: Callable[[int, np.ndarray, np.ndarray], None] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[Cotangents, list[Crossings]]:
     """Derivatives of a tape's loss by everything that the run is made of.
@@ -69,8 +68,6 @@ def reverse(
         wanted: what is wanted beyond the start: of MODEL, SCALE and FORCE (the integrator's numbers).
         saltation: whether to add what every flip does through the time at which it happens.
         guard: radial speed, length per internal time, below which a flip counts as grazing and adds nothing.
-        watch: called after every stretch with its first step and the cotangents of positions and velocities
-            there, user's order.
         progress: called with the steps done and the last step.
 
     Returns:
@@ -130,8 +127,6 @@ def reverse(
         carry = carry._replace(x=_unsorted(carry.x, order), v=_unsorted(carry.v, order))
         if met is not None:
             found.append(met.weighed(np.asarray(weights)))
-        if watch is not None:
-            watch(stretch.first, np.asarray(carry.x), np.asarray(carry.v))
         if progress is not None:
             progress(tape.steps - stretch.first, tape.steps)
     x = np.asarray(carry.x + carry.origin[0], np.float64)

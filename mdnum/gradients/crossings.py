@@ -70,14 +70,18 @@ class Crossings:
     def __len__(self) -> int:
         return len(self.row)
 
-    def on_device(self, room: int, atoms: int) -> Met:
-        """Padded to the rows of the stretch."""
+    def _places(self, room: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The crossings sorted by row, their rows, and where each stands among those of its row."""
         counts = np.bincount(self.row, minlength=room)
-        # a power of two, so that not every stretch is compiled for
-        most = 1 << max(3, int(counts.max(initial=0) - 1).bit_length())
         order = np.argsort(self.row, kind="stable")
         row = self.row[order]
-        place = np.arange(len(row)) - np.concatenate([[0], np.cumsum(counts)[:-1]])[row]
+        return order, row, np.arange(len(row)) - np.concatenate([[0], np.cumsum(counts)[:-1]])[row]
+
+    def on_device(self, room: int, atoms: int) -> Met:
+        """Padded to the rows of the stretch."""
+        order, row, place = self._places(room)
+        # a power of two, so that not every stretch is compiled for
+        most = 1 << max(3, int(place.max(initial=0)).bit_length())
         i, j = np.full((room, most), atoms), np.full((room, most), atoms)
         normal, push = np.zeros((room, 3, most)), np.zeros((room, most))
         kind = np.zeros((room, most), np.int64)
@@ -90,10 +94,7 @@ class Crossings:
 
     def weighed(self, weights: Float[np.ndarray, "room most"]) -> Crossings:
         """With the weights that the reverse pass found."""
-        counts = np.bincount(self.row, minlength=len(weights))
-        order = np.argsort(self.row, kind="stable")
-        row = self.row[order]
-        place = np.arange(len(row)) - np.concatenate([[0], np.cumsum(counts)[:-1]])[row]
+        order, row, place = self._places(len(weights))
         weight = np.empty(len(row))
         weight[order] = weights[row, place]
         return replace(self, weight=weight)

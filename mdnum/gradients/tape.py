@@ -164,11 +164,6 @@ class Tape:
         for k in reversed(range(len(self._starts))):
             yield self._kept[k] if k in self._kept else self._again(k)
 
-    def forward(self) -> Iterator[Stretch]:
-        """The stretches, first first."""
-        for k in range(len(self._starts)):
-            yield self._kept[k] if k in self._kept else self._again(k)
-
     def _again(self, k: int) -> Stretch:
         start = self._starts[k]
         return stretch_of(self._engine.again(start), start, self._ledgers[k])
