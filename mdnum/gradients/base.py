@@ -6,13 +6,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
 from mdnum.errors import InputError
 from mdnum.gradients import parameters
-from mdnum.gradients.losses import Loss
-from mdnum.gradients.tape import Tape
+from mdnum.gradients.losses import Frame, Loss
+from mdnum.gradients.tape import Tape, surroundings
 from mdnum.systems.build import Simulation
 
 #: Called with the steps done, all steps, and a phase in words.
@@ -40,6 +41,27 @@ class Problem:
             raise InputError(
                 f"the loss {self.loss.name} looks at no step up to {self.steps}",
                 remedy="Run longer, or look earlier or more often",
+            )
+        self._check_scalar()
+
+    def _check_scalar(self) -> None:
+        """Refuse a loss that is no real number, before anything is run."""
+        simulation = self.simulation
+        atoms, dtype = (3, simulation.atoms), simulation.policy.dtype("state")
+        vector, number = jax.ShapeDtypeStruct(atoms, dtype), jax.ShapeDtypeStruct((), np.float64)
+        frame = Frame(jax.ShapeDtypeStruct((), np.int64), vector, vector, number, number)
+
+        def loss(frame: Frame):
+            return self.loss.value(self.loss.observe(frame, frame, surroundings(simulation)), 1)
+
+        found = jax.eval_shape(loss, frame)
+        if jax.tree.structure(found) != jax.tree.structure(0.0) or found.shape != ():
+            seen = getattr(found, "shape", None) or jax.tree.structure(found)
+            raise InputError(f"the loss has shape {seen}; expected a scalar", remedy="Reduce it to a number")
+        if not np.issubdtype(found.dtype, np.floating):
+            raise InputError(
+                f"the loss is of dtype {found.dtype}; expected a real number",
+                remedy="A count or a complex number has no gradient: make a float of it that varies smoothly",
             )
 
     def at(self, values: Mapping[str, Any]) -> Problem:

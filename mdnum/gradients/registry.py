@@ -1,0 +1,31 @@
+"""Methods by their words: one row for each way of differentiating a rollout."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable
+
+from mdnum.errors import InputError
+from mdnum.gradients.base import Method
+from mdnum.gradients.differences import FiniteDifferences
+from mdnum.gradients.symmetric import EventAware, Symmetric
+
+#: A method with its defaults, by word; the order is the one that tables show.
+METHODS: dict[str, Callable[[], Method]] = {
+    "symmetric": Symmetric,
+    "event-aware": EventAware,
+    "finite-differences": FiniteDifferences,
+}
+
+
+def by_word(word: str) -> Method:
+    """The method of that name, with its defaults.
+
+    Raises:
+        InputError: there is none.
+    """
+    if word not in METHODS:
+        close = difflib.get_close_matches(word, METHODS, n=1)
+        hint = f"Did you mean {close[0]}? " if close else ""
+        raise InputError(f"no method {word!r}", remedy=f"{hint}There are {', '.join(METHODS)}")
+    return METHODS[word]()

@@ -1,0 +1,82 @@
+"""Gradients in JAX's shape: through a user's own parameters, with the keys that were asked for."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small_systems import LENNARD_JONES, crystal, make
+
+from mdnum.errors import InputError
+from mdnum.gradients import differentiable, value_and_grad
+from mdnum.gradients.base import Problem
+from mdnum.gradients.losses import Custom, MeanPotential, MeanSquaredDisplacement
+from mdnum.systems import build
+
+STEPS = 20
+
+
+@pytest.fixture(scope="module")
+def problem():
+    simulation = build(make(crystal(), LENNARD_JONES, {"kind": "quintic", "radius": 2.2, "onset": 1.8}))
+    return Problem(simulation, MeanSquaredDisplacement(), STEPS)
+
+
+def test_the_keys_are_those_asked_for_and_values_move_the_loss(problem):
+    function = value_and_grad(problem, ("sigma", "potential.epsilon"), "symmetric")
+    value, gradient = function({"sigma": 1.0, "potential.epsilon": 1.0})
+    assert value == problem.value()
+    assert list(gradient) == ["sigma", "potential.epsilon"]
+    step = 1e-5
+    up, down = (function({"sigma": 1.0 + s})[0] for s in (step, -step))
+    assert float(gradient["sigma"]) == pytest.approx((up - down) / (2 * step), rel=1e-5)
+    (again, whole), _ = value_and_grad(problem, ("sigma",), "symmetric", has_aux=True)({})
+    assert again == value
+    assert whole.method == "symmetric"
+
+
+def test_jax_differentiates_through_a_users_own_tree(problem):
+    told = []
+    loss = differentiable(problem, ("sigma", "epsilon"), "symmetric", told=told.append)
+
+    def mine(tree):
+        root, (shift, width) = tree["root"], tree["rest"]
+        return jnp.sin(1e2 * loss({"sigma": jnp.exp(root) * width, "epsilon": 1.0 + shift * width}))
+
+    tree = {"root": jnp.asarray(0.01), "rest": (jnp.asarray(0.02), jnp.asarray(0.99))}
+    value, gradient = jax.value_and_grad(mine)(tree)
+    assert len(told) == 1
+    assert float(value) == float(mine(tree))
+    leaves, structure = jax.tree.flatten(tree)
+    for k, ours in enumerate(jax.tree.leaves(gradient)):
+
+        def shifted(step, k=k):
+            moved = [leaf + step if n == k else leaf for n, leaf in enumerate(leaves)]
+            return float(mine(jax.tree.unflatten(structure, moved)))
+
+        assert float(ours) == pytest.approx((shifted(1e-5) - shifted(-1e-5)) / 2e-5, rel=1e-5)
+
+
+def test_what_cannot_be_traced_or_named_is_refused(problem):
+    loss = differentiable(problem, ("sigma",), "symmetric")
+    with pytest.raises(InputError, match="outside of jit"):
+        jax.jit(loss)({"sigma": jnp.asarray(1.0)})
+    with pytest.raises(InputError, match="not asked for"):
+        loss({"epsilon": 1.0})
+    with pytest.raises(InputError, match="Did you mean symmetric"):
+        value_and_grad(problem, ("sigma",), "symetric")
+    with pytest.raises(InputError, match="seed"):
+        value_and_grad(problem, ("seed",))
+    with pytest.raises(InputError, match="expected finite numbers"):
+        loss({"sigma": jnp.asarray(np.nan)})
+
+
+def test_a_loss_that_is_no_number_is_refused_before_the_run(problem):
+    vector = Custom(see=lambda frame, origin, around: jnp.sum(frame.x, axis=1))
+    with pytest.raises(InputError, match="shape \\(3,\\)"):
+        Problem(problem.simulation, vector, STEPS)
+    count = Custom(see=lambda frame, origin, around: frame.step, conclude=lambda total, frames: total)
+    with pytest.raises(InputError, match="int"):
+        Problem(problem.simulation, count, STEPS)
+    assert Problem(problem.simulation, MeanPotential(), STEPS).loss.name == "potential"
