@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from mdnum.errors import InputError
 from mdnum.gradients import parameters
@@ -86,7 +87,7 @@ def differentiable(
 
     def at(values: Values) -> Problem:
         for leaf in jax.tree.leaves(values):
-            if isinstance(leaf, jax.core.Tracer):
+            if isinstance(leaf, Tracer):
                 raise InputError(
                     "a rollout was called inside jit or vmap; its lists are made on the host",
                     remedy="Call it, and jax.grad of it, outside of jit and vmap",

@@ -49,7 +49,8 @@ class Problem:
         simulation = self.simulation
         atoms, dtype = (3, simulation.atoms), simulation.policy.dtype("state")
         vector, number = jax.ShapeDtypeStruct(atoms, dtype), jax.ShapeDtypeStruct((), np.float64)
-        frame = Frame(jax.ShapeDtypeStruct((), np.int64), vector, vector, number, number)
+        shapes: tuple[Any, ...] = (jax.ShapeDtypeStruct((), np.int64), vector, vector, number, number)
+        frame = Frame(*shapes)
 
         def loss(frame: Frame):
             return self.loss.value(self.loss.observe(frame, frame, surroundings(simulation)), 1)
