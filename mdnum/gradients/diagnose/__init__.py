@@ -1,0 +1,33 @@
+"""Whether a gradient through a rollout can be trusted, how far, and what it is made of."""
+
+from mdnum.gradients.diagnose.results import (
+    Agreement,
+    Comparison,
+    Diagnosis,
+    Edge,
+    Edges,
+    Flips,
+    Growth,
+    Limit,
+    NotFinite,
+    Opinion,
+    Scaling,
+    Spectrum,
+    Trust,
+)
+
+__all__ = [
+    "Agreement",
+    "Comparison",
+    "Diagnosis",
+    "Edge",
+    "Edges",
+    "Flips",
+    "Growth",
+    "Limit",
+    "NotFinite",
+    "Opinion",
+    "Scaling",
+    "Spectrum",
+    "Trust",
+]
