@@ -23,7 +23,7 @@ from mdnum.gradients.crossings import Crossings, crossings, onto_crossings
 from mdnum.gradients.losses import Frame
 from mdnum.gradients.pairs import FORCE, MODEL, SCALE, pull_back
 from mdnum.gradients.parameters import Cotangents
-from mdnum.gradients.tape import Tape, frame_of, rows_of
+from mdnum.gradients.tape import Stretch, Tape, frame_of, rows_of
 from mdnum.md.integrators import Integrator
 from mdnum.md.pairforce import PairForce
 from mdnum.md.potentials import CutPotential
@@ -53,6 +53,27 @@ class Carry(NamedTuple):
     r_cut: Float[Array, "types"]
 
 
+class Trace(NamedTuple):
+    """What the reverse pass carried at every step of a stretch.
+
+    Row k belongs to the state (x, half-kicked v) that step first + k begins with, before the crossings that
+    lead there; rows beyond the used ones are void.
+
+    Attributes:
+        x, v: cotangents of positions and velocities, in the order of the stretch's list, shape
+            (room, 3, atoms).
+        model, integrator, scale, r_cut: as in `Carry`, with a leading axis of rows: what the steps from here
+            to the end have added.
+    """
+
+    x: Float[Array, "room 3 atoms"]
+    v: Float[Array, "room 3 atoms"]
+    model: CutPotential
+    integrator: Any
+    scale: Float[Array, "room"]
+    r_cut: Float[Array, "room types"]
+
+
 def reverse(
     tape: Tape,
     *,
@@ -60,6 +81,7 @@ def reverse(
     saltation: bool = False,
     guard: float = 0.0,
     progress: Callable[[int, int], None] | None = None,
+    watch: Callable[[Stretch, Trace], None] | None = None,
 ) -> tuple[Cotangents, list[Crossings]]:
     """Derivatives of a tape's loss by everything that the run is made of.
 
@@ -69,6 +91,7 @@ def reverse(
         saltation: whether to add what every flip does through the time at which it happens.
         guard: radial speed, length per internal time, below which a flip counts as grazing and adds nothing.
         progress: called with the steps done and the last step.
+        watch: called with every stretch, last first, and what was carried at its steps.
 
     Returns:
         The derivatives, and the crossings of every stretch with their weights, last stretch first.
@@ -110,7 +133,7 @@ def reverse(
             met = crossings(
                 simulation, stretch.ledger, stretch.first, order, stretch.x, stretch.x_before, guard
             )
-        carry, weights = _stretch(
+        carry, (weights, trace) = _stretch(
             force,
             simulation.integrator,
             jnp.asarray(simulation.masses[order]),
@@ -123,7 +146,10 @@ def reverse(
             None if met is None else met.on_device(len(stretch.x), atoms),
             carry._replace(x=carry.x[:, order], v=carry.v[:, order]),
             wanted,
+            watch is not None,
         )
+        if watch is not None:
+            watch(stretch, trace)
         carry = carry._replace(x=_unsorted(carry.x, order), v=_unsorted(carry.v, order))
         if met is not None:
             found.append(met.weighed(np.asarray(weights)))
@@ -145,7 +171,7 @@ def _unsorted(a, order):
     return jnp.zeros_like(a).at[:, order].set(a)
 
 
-@partial(jax.jit, static_argnames=("wanted",))
+@partial(jax.jit, static_argnames=("wanted", "traced"))
 def _stretch(
     force: PairForce,
     integrator: Integrator,
@@ -159,6 +185,7 @@ def _stretch(
     crossed,
     carry: Carry,
     wanted: frozenset[str],
+    traced: bool,
 ):
     loss, origin, around, onto_total = looking
     order = tables.order
@@ -175,9 +202,11 @@ def _stretch(
     def look(row):
         """Cotangents of one frame and of the origin, from those of the sums."""
 
-        def seen_at(x, v, potential, virial, origin, length):
+        def seen_at(x, v, potential, virial, origin, length, timestep):
             at = (row[0], x, v, row[3], potential, virial)
-            here = around._replace(matrix=around.matrix * length, volume=around.volume * length**3)
+            here = around._replace(
+                matrix=around.matrix * length, volume=around.volume * length**3, timestep=timestep
+            )
             frame = frame_of(at, order, around.matrix)
             scaled = frame._replace(x=frame.x * length.astype(dtype), v=frame.v * length.astype(dtype))
             start = Frame(
@@ -187,7 +216,7 @@ def _stretch(
 
         nan, origin_step = origin.potential, origin.step
         one = jnp.ones((), jnp.float64)
-        _, back = jax.vjp(seen_at, row[1], row[2], row[4], row[5], (origin.x, origin.v), one)
+        _, back = jax.vjp(seen_at, row[1], row[2], row[4], row[5], (origin.x, origin.v), one, around.timestep)
         return back(onto_total)
 
     def blind(row):
@@ -197,6 +226,7 @@ def _stretch(
             jnp.zeros_like(row[4]),
             jnp.zeros_like(row[5]),
             (jnp.zeros_like(origin.x), jnp.zeros_like(origin.v)),
+            jnp.zeros((), jnp.float64),
             jnp.zeros((), jnp.float64),
         )
 
@@ -209,7 +239,7 @@ def _stretch(
         # drift is linear in x and v, so where it is transposed does not matter to them
         _, back = jax.vjp(lambda x, v: drift(x, v, numbers, one, number), x, v)
         onto_x, onto_kicked = back((carry.x, carry.v))
-        loss_x, loss_v, onto_potential, onto_virial, onto_origin, onto_length = lax.cond(
+        loss_x, loss_v, onto_potential, onto_virial, onto_origin, onto_length, onto_time = lax.cond(
             see, look, blind, row
         )
         onto_v = onto_kicked + loss_v
@@ -230,7 +260,7 @@ def _stretch(
             by_numbers = eqx.tree_at(
                 lambda one: one.timestep,
                 by_numbers,
-                by_numbers.timestep + (0.5 * kick).astype(by_numbers.timestep.dtype),
+                by_numbers.timestep + (0.5 * kick + onto_time).astype(by_numbers.timestep.dtype),
             )
             numbers_bar = jax.tree.map(jnp.add, numbers_bar, by_numbers)
             scale = scale + by_scale.astype(scale.dtype)
@@ -245,6 +275,7 @@ def _stretch(
             jax.tree.map(jnp.add, carry.origin, onto_origin),
             carry.r_cut,
         )
+        trace = Trace(after.x, after.v, model, numbers_bar, scale, carry.r_cut) if traced else None
         weights = jnp.zeros(0)
         if met is not None:
             push, weights, by_radius = onto_crossings(
@@ -256,6 +287,6 @@ def _stretch(
                 r_cut=after.r_cut + by_radius,
             )
         kept = jax.tree.map(lambda new, old: jnp.where(use, new, old), after, carry)
-        return kept, weights
+        return kept, (weights, trace)
 
     return lax.scan(step, carry, (rows, bits, used, seen, crossed), reverse=True)

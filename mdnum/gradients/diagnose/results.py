@@ -270,7 +270,8 @@ class Flips(Plain):
         margin, bound: of the decision at that step, in the quantity's space. ambiguous: |margin| <= bound.
         radial_speed: length per internal time, negative where the pair enters.
         weight: derivative of the loss by the cutoff of this one crossing.
-        grazing: slower than the guard and left out: it contributes 0, and its weight is what it would have had.
+        grazing: slower than the guard and left out: it contributes 0, and its weight is what it would have
+            been.
         contribution: by parameter, each of shape (flips,). For a parameter of several entries, along the
             direction of the whole gradient, so that they sum to the length of what the flips add along it.
         smooth: the gradient between the flips (their decisions held fixed), by parameter, along the same
