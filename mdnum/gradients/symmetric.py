@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -46,15 +46,19 @@ class Symmetric:
 
     def why_not(self, problem: Problem, names: Sequence[str]) -> str | None:
         """Pair potentials only."""
-        return _pairs_only(problem.simulation)
+        return pairs_only(problem.simulation)
 
     def __call__(self, problem: Problem, names: Sequence[str], progress: Progress | None = None) -> Gradient:
         """The derivative by the named parameters."""
         names = check(self, problem, names)
         tape = Tape(
-            problem.simulation, problem.loss, problem.steps, budget=self.budget, progress=_in(progress, "run")
+            problem.simulation,
+            problem.loss,
+            problem.steps,
+            budget=self.budget,
+            progress=in_phase(progress, "run"),
         )
-        parts, _ = reverse(tape, wanted=_wanted(names), progress=_in(progress, "reverse pass"))
+        parts, _ = reverse(tape, wanted=wanted(names), progress=in_phase(progress, "reverse pass"))
         gradient = {name: parameters.gradient(problem.simulation, parts, name) for name in names}
         notes = independent(problem, gradient, saltation=False)
         details = {"stretches": len(tape), "made again": tape.replayed, "bytes kept": tape.held}
@@ -86,7 +90,7 @@ class EventAware:
 
     def why_not(self, problem: Problem, names: Sequence[str]) -> str | None:
         """Pair potentials only."""
-        return _pairs_only(problem.simulation)
+        return pairs_only(problem.simulation)
 
     def __call__(self, problem: Problem, names: Sequence[str], progress: Progress | None = None) -> Gradient:
         """The derivative by the named parameters."""
@@ -98,15 +102,15 @@ class EventAware:
             problem.steps,
             flips=True,
             budget=self.budget,
-            progress=_in(progress, "run"),
+            progress=in_phase(progress, "run"),
         )
         guard = self.guard * radial_speed(simulation)
         parts, found = reverse(
             tape,
-            wanted=_wanted(names),
+            wanted=wanted(names),
             saltation=True,
             guard=guard,
-            progress=_in(progress, "reverse pass"),
+            progress=in_phase(progress, "reverse pass"),
         )
         gradient = {name: parameters.gradient(simulation, parts, name) for name in names}
         notes = independent(problem, gradient, saltation=True)
@@ -149,20 +153,21 @@ def radial_speed(simulation: Simulation) -> float:
     return float(np.sqrt(2 * speed2 / 3))
 
 
-def _wanted(names: Sequence[str]) -> frozenset[str]:
+def wanted(names: Sequence[str]) -> frozenset[str]:
     """What the reverse pass has to work out for these parameters."""
-    wanted: set[str] = set()
+    found: set[str] = set()
     for name in names:
         if name.startswith(("potential.", "cutoff.")):
-            wanted.add(MODEL)
+            found.add(MODEL)
         elif name.startswith("dynamics."):
-            wanted.add(FORCE)
+            found.add(FORCE)
         elif name == "box.scale":
-            wanted |= {SCALE, FORCE}
-    return frozenset(wanted)
+            found |= {SCALE, FORCE}
+    return frozenset(found)
 
 
-def _pairs_only(simulation: Simulation) -> str | None:
+def pairs_only(simulation: Simulation) -> str | None:
+    """Why the reverse pass does not apply; None where it does."""
     if not isinstance(simulation.force, PairForce):
         return "its reverse pass is one of pair potentials"
     if simulation.policy.dtype("force").itemsize < 4:
@@ -171,7 +176,7 @@ def _pairs_only(simulation: Simulation) -> str | None:
     return None
 
 
-def _in(progress: Progress | None, phase: str):
+def in_phase(progress: Progress | None, phase: str) -> Callable[[int, int], None] | None:
     """A callback of steps alone, that tells the phase too."""
     if progress is None:
         return None
