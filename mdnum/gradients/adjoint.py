@@ -278,13 +278,14 @@ def _stretch(
         trace = Trace(after.x, after.v, model, numbers_bar, scale, carry.r_cut) if traced else None
         weights = jnp.zeros(0)
         if met is not None:
-            push, weights, by_radius = onto_crossings(
+            push, weights, by_radius, by_scale = onto_crossings(
                 met, after.x, after.v, masses, integrator.timestep, carry.r_cut.shape[0]
             )
             after = after._replace(
                 x=after.x + push,
                 v=after.v - half * push,
                 r_cut=after.r_cut + by_radius,
+                scale=after.scale + by_scale.astype(after.scale.dtype),
             )
         kept = jax.tree.map(lambda new, old: jnp.where(use, new, old), after, carry)
         return kept, (weights, trace)

@@ -42,6 +42,9 @@ class Problem:
                 f"the loss {self.loss.name} looks at no step up to {self.steps}",
                 remedy="Run longer, or look earlier or more often",
             )
+        why = self.loss.why_not(surroundings(self.simulation))
+        if why is not None:
+            raise InputError(f"the loss {self.loss.name} has no meaning here: {why}")
         self._check_scalar()
 
     def _check_scalar(self) -> None:

@@ -164,6 +164,11 @@ class Tape:
         for k in reversed(range(len(self._starts))):
             yield self._kept[k] if k in self._kept else self._again(k)
 
+    def forward(self) -> Iterator[Stretch]:
+        """The stretches, first one first."""
+        for k in range(len(self._starts)):
+            yield self._kept[k] if k in self._kept else self._again(k)
+
     def _again(self, k: int) -> Stretch:
         start = self._starts[k]
         return stretch_of(self._engine.again(start), start, self._ledgers[k])
@@ -224,6 +229,8 @@ def surroundings(simulation: Simulation) -> Surroundings:
         jnp.asarray(np.asarray(cell.matrix), jnp.float64),
         jnp.asarray(volume, jnp.float64),
         jnp.asarray(simulation.units.k_B, jnp.float64),
+        jnp.asarray(simulation.integrator.timestep, jnp.float64),
+        jnp.asarray(simulation.units.time_factor, jnp.float64),
     )
 
 

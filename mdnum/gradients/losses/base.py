@@ -46,12 +46,16 @@ class Surroundings(NamedTuple):
         matrix: lattice vectors as rows, length, shape (3, 3).
         volume: of the box, length³; 0 without one.
         kB: Boltzmann's constant in the units of the run.
+        timestep: internal time.
+        time_factor: internal time of one unit of time as a person writes it.
     """
 
     masses: Float[Array, "atoms"]
     matrix: Float[Array, "3 3"]
     volume: Float[Array, ""]
     kB: Float[Array, ""]
+    timestep: Float[Array, ""]
+    time_factor: Float[Array, ""]
 
 
 class Loss(eqx.Module):
@@ -91,100 +95,14 @@ class Loss(eqx.Module):
     def value(self, total: Any, frames: Int[Array, ""] | int) -> Float[Array, ""]:
         """The number, from the sum of what was observed and how many frames there were."""
 
+    def why_not(self, around: Surroundings) -> str | None:
+        """Why it has no meaning in these surroundings; None where it has."""
+        return None
 
-class FinalProjection(Loss):
-    """Projection of the last positions on fixed directions, divided by the number of atoms.
-
-    Attributes:
-        direction: shape (3, atoms), or (3,) for all atoms alike.
-    """
-
-    name = "final-projection"
-    direction: Float[Array, "3 *atoms"] = eqx.field(default_factory=lambda: jnp.array([1.0, 0.0, 0.0]))
-
-    def looks_at(self, steps, last):
-        """The last step alone."""
-        return steps == last
-
-    def observe(self, frame, origin, around):
-        way = self.direction if self.direction.ndim == 2 else self.direction[:, None]
-        return jnp.sum(frame.x * way.astype(frame.x.dtype)) / frame.x.shape[1]
-
-    def value(self, total, frames):
-        return total
-
-
-class MeanSquaredDisplacement(Loss):
-    """Mean squared displacement since step 0 at the last step, length²."""
-
-    name = "msd"
-
-    def looks_at(self, steps, last):
-        """The last step alone."""
-        return steps == last
-
-    def observe(self, frame, origin, around):
-        return jnp.mean(jnp.sum(jnp.square(frame.x - origin.x), axis=0))
-
-    def value(self, total, frames):
-        return total
-
-
-class VelocityAutocorrelation(Loss):
-    """Mean of v(0) · v(t) over atoms at the last step, (length / internal time)²."""
-
-    name = "vacf"
-
-    def looks_at(self, steps, last):
-        """The last step alone."""
-        return steps == last
-
-    def observe(self, frame, origin, around):
-        return jnp.mean(jnp.sum(frame.v * origin.v, axis=0))
-
-    def value(self, total, frames):
-        return total
-
-
-class MeanPotential(Loss):
-    """Potential energy of an atom, averaged over frames."""
-
-    name = "potential"
-
-    def observe(self, frame, origin, around):
-        return frame.potential / frame.x.shape[1]
-
-    def value(self, total, frames):
-        return total / frames
-
-
-def _kinetic(frame: Frame, around: Surroundings) -> Float[Array, ""]:
-    speed2 = jnp.sum(jnp.square(frame.v.astype(jnp.float64)), axis=0)
-    return 0.5 * jnp.sum(around.masses * speed2)
-
-
-class MeanTemperature(Loss):
-    """Kinetic temperature 2 K / (3 N kB), averaged over frames, K (or the units' temperature)."""
-
-    name = "temperature"
-
-    def observe(self, frame, origin, around):
-        return 2 * _kinetic(frame, around) / (3 * frame.x.shape[1] * around.kB)
-
-    def value(self, total, frames):
-        return total / frames
-
-
-class MeanPressure(Loss):
-    """Pressure (2 K + virial) / (3 V), averaged over frames, energy/length³."""
-
-    name = "pressure"
-
-    def observe(self, frame, origin, around):
-        return (2 * _kinetic(frame, around) + frame.virial) / (3 * around.volume)
-
-    def value(self, total, frames):
-        return total / frames
+    @property
+    def of_single_frames(self) -> bool:
+        """Whether it is made of what each frame shows by itself, so that an ensemble has it too."""
+        return False
 
 
 class Custom(Loss):
@@ -193,6 +111,7 @@ class Custom(Loss):
     Attributes:
         see: (frame, origin, surroundings) to a pytree of arrays that is summed over frames.
         conclude: (sum, number of frames) to a scalar.
+        single: `see` does not look at the origin, so that the loss is one of an ensemble, too.
     """
 
     name = "custom"
@@ -200,6 +119,7 @@ class Custom(Loss):
     conclude: Callable[[Any, Any], Any] = eqx.field(
         static=True, kw_only=True, default=lambda total, frames: total / frames
     )
+    single: bool = eqx.field(static=True, kw_only=True, default=False)
 
     def observe(self, frame, origin, around):
         return self.see(frame, origin, around)
@@ -212,3 +132,8 @@ class Custom(Loss):
                 f"the loss has shape {shape}; expected a scalar", remedy="Reduce it, with a sum or a mean"
             )
         return jnp.asarray(value)
+
+    @property
+    def of_single_frames(self) -> bool:
+        """As it was told."""
+        return self.single

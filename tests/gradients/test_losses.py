@@ -1,0 +1,133 @@
+"""Losses against numpy and scipy on the stored trajectory, and their derivatives against differences."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from ase.neighborlist import neighbor_list
+from scipy.integrate import trapezoid
+from scipy.interpolate import BSpline
+from small_systems import LENNARD_JONES, crystal, make
+
+from mdnum.errors import InputError
+from mdnum.gradients.base import Problem
+from mdnum.gradients.differences import FiniteDifferences
+from mdnum.gradients.losses import (
+    Custom,
+    EinsteinDiffusion,
+    GreenKuboDiffusion,
+    MeanPressure,
+    RadialDistribution,
+    VelocityAutocorrelation,
+)
+from mdnum.gradients.symmetric import Symmetric
+from mdnum.rollout.engine import Engine, unwrapped
+from mdnum.systems import build
+
+STEPS, BINS, R_MAX = 40, 24, 2.4
+RDF = RadialDistribution(r_max=R_MAX, bins=BINS, every=10)
+EINSTEIN = EinsteinDiffusion(every=5, first=10)
+GREEN_KUBO = GreenKuboDiffusion(every=2, until=STEPS)
+
+
+@pytest.fixture(scope="module")
+def run():
+    """A short run of 108 atoms with every position and velocity kept."""
+    simulation = build(make(crystal(), LENNARD_JONES, {"kind": "quintic", "radius": 2.2, "onset": 1.8}))
+    x, v = [], []
+    for segment in Engine(simulation, STEPS).segments():
+        for row in range(segment.rows):
+            wrapped, images = segment.unsorted("x", row), segment.unsorted("images", row)
+            x.append(unwrapped(np.asarray(simulation.cell.matrix), wrapped, images))
+            v.append(segment.unsorted("v", row))
+    return SimpleNamespace(simulation=simulation, x=np.stack(x), v=np.stack(v))
+
+
+def g_of_r(run) -> np.ndarray:
+    """g(r) of the frames that RDF looks at, from ASE's distances and scipy's B-splines."""
+    atoms = run.simulation.system.atoms.copy()
+    width = R_MAX / BINS
+    centers = width * (np.arange(BINS) + 0.5)
+    fine = np.linspace(-2 * width, 2 * width, 2001)
+    hat = BSpline.basis_element(width * np.arange(-2.0, 3.0), extrapolate=False)
+    shells = np.array(
+        [trapezoid(np.nan_to_num(hat(fine)) * 4 * np.pi * (c + fine) ** 2, fine) for c in centers]
+    )
+    found = np.zeros(BINS)
+    for x in run.x[::10]:
+        atoms.positions = x
+        distance = neighbor_list("d", atoms, R_MAX + 2 * width)
+        counts = np.array([np.nansum(hat(distance - center)) for center in centers])
+        found += counts * atoms.get_volume() / shells
+    return found / len(run.x[::10]) / (len(atoms) * (len(atoms) - 1))
+
+
+def test_g_of_r_is_that_of_all_distances(run):
+    expected = g_of_r(run)
+    assert expected.max() > 2 and expected[3] == 0
+    target = Problem(run.simulation, replace(RDF, target=jnp.asarray(expected)), STEPS)
+    assert target.value() < 1e-12
+    weights = np.random.default_rng(0).standard_normal(BINS)
+    projected = Problem(run.simulation, replace(RDF, weights=jnp.asarray(weights)), STEPS)
+    assert projected.value() == pytest.approx(weights @ expected, rel=1e-6)
+
+
+def test_diffusion_is_slope_and_integral(run):
+    dt = run.simulation.system.spec.dynamics.timestep
+    time = dt * np.arange(STEPS + 1)
+    msd = np.mean(np.sum((run.x - run.x[0]) ** 2, axis=2), axis=1)
+    slope = np.polyfit(time[10::5], msd[10::5], 1)[0]
+    assert Problem(run.simulation, EINSTEIN, STEPS).value() == pytest.approx(slope / 6, rel=1e-9)
+    vacf = np.mean(np.sum(run.v * run.v[0], axis=2), axis=1)
+    integral = trapezoid(vacf[::2], time[::2]) / 3
+    assert Problem(run.simulation, GREEN_KUBO, STEPS).value() == pytest.approx(integral, rel=1e-12)
+    last = Problem(run.simulation, VelocityAutocorrelation(), STEPS).value()
+    assert last == pytest.approx(vacf[-1], rel=1e-12)
+
+
+def test_diffusion_is_told_per_unit_of_time():
+    """In metal units the internal time is not a picosecond."""
+    weak = LENNARD_JONES | {"epsilon": 1e-9}
+    simulation = build(make(crystal(), weak, {"kind": "hard", "radius": 2.2}, units="metal"))
+    moving = replace(simulation, velocities=np.tile([0.01, 0.0, 0.0], (simulation.atoms, 1)))
+    problem = Problem(moving, GreenKuboDiffusion(until=1), 1)
+    speed = 0.01 * simulation.units.time_factor
+    dt = simulation.system.spec.dynamics.timestep
+    assert problem.value() == pytest.approx(speed**2 * dt / 3, rel=1e-3)
+    assert Problem(moving, EinsteinDiffusion(), 1).value() == pytest.approx(speed**2 * dt / 6, rel=1e-3)
+
+
+def test_derivatives_are_those_of_differences(run):
+    """All three at once, with weights that no symmetry cancels: one reverse pass to compile."""
+    weights = jnp.asarray(np.random.default_rng(1).standard_normal(BINS))
+    rdf = replace(RDF, weights=weights)
+
+    def see(frame, origin, around):
+        return tuple(loss.observe(frame, origin, around) for loss in (rdf, EINSTEIN, GREEN_KUBO))
+
+    def conclude(total, frames):
+        return rdf.value(total[0], frames) + EINSTEIN.value(total[1], frames) + GREEN_KUBO.value(total[2], 1)
+
+    problem = Problem(run.simulation, Custom(see=see, conclude=conclude, every=2), STEPS)
+    names = ("sigma", "timestep", "scale")
+    ours = Symmetric()(problem, names)
+    theirs = FiniteDifferences(relative=1e-4, levels=3)(problem, names)
+    for name, value in theirs.gradient.items():
+        assert float(ours.gradient[name]) == pytest.approx(float(value), rel=1e-6), name
+
+
+def test_what_has_no_meaning_is_refused(run):
+    with pytest.raises(InputError, match="half the smallest box width"):
+        Problem(run.simulation, RadialDistribution(r_max=2.7), STEPS)
+    with pytest.raises(InputError, match="goes up to step 50"):
+        Problem(run.simulation, GreenKuboDiffusion(until=50), STEPS)
+    with pytest.raises(InputError, match="two frames"):
+        Problem(run.simulation, EinsteinDiffusion(first=40), STEPS)
+    with pytest.raises(InputError, match="no volume"):
+        Problem(build("pair/leaving-well"), MeanPressure(), 10)
+    with pytest.raises(InputError, match=r"expected \(24,\)"):
+        replace(RDF, target=jnp.ones(3))
