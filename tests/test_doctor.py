@@ -31,12 +31,14 @@ def diagnosis(examined: tuple[Diagnosis, float]) -> Diagnosis:
     return examined[0]
 
 
+@pytest.mark.slow
 def test_this_installation_is_safe(diagnosis: Diagnosis):
     assert diagnosis.ok, [row for row in diagnosis.rows if row.status == "unsafe"]
     names = {row.name for row in diagnosis.rows}
     assert {"float64", "tilted crystal", "jit = eager = numpy", "second process", "devices"} <= names
 
 
+@pytest.mark.slow
 def test_it_answers_in_time(examined: tuple[Diagnosis, float]):
     """20 s on two cores; processor time, because other programs may be using them."""
     assert examined[1] < 40

@@ -73,6 +73,7 @@ def test_the_unrolled_derivative_is_an_artifact_of_the_tolerance():
         assert slopes["k"] == pytest.approx(slope, rel=0.02)
 
 
+@pytest.mark.slow
 def test_forward_and_reverse_mode_agree():
     for contact, integrator, names in CASES.values():
         world = ball.World.create(contact, integrator)
@@ -86,6 +87,7 @@ def test_forward_and_reverse_mode_agree():
             assert float(forward) == pytest.approx(float(reverse[name]), rel=1e-10, abs=1e-14)
 
 
+@pytest.mark.slow
 def test_the_loss_inside_value_and_grad_is_the_loss_of_the_run():
     """Fenced arithmetic: differentiating does not compile another forward pass."""
     for contact, integrator, names in CASES.values():

@@ -81,7 +81,9 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "case", [pytest.param(c, marks=pytest.mark.slow) if "hot" in c else c for c in CASES]
+)
 def test_energy_forces_and_stress_agree_with_extended_precision_and_with_ase(case):
     make, oracle, kind, repeat, rattle = CASES[case]
     atoms, potential = crystal(kind, repeat, rattle), make()
@@ -296,7 +298,9 @@ def test_the_1989_constants_differ_from_those_of_1988():
 
 
 @pytest.mark.jax_md
-@pytest.mark.parametrize("format", ["dense", "sparse", "ordered-sparse"])
+@pytest.mark.parametrize(
+    "format", [*(pytest.param(one, marks=pytest.mark.slow) for one in ("dense", "sparse")), "ordered-sparse"]
+)
 def test_any_jax_md_energy_function_runs_in_every_format(format):
     from ase.calculators.lj import LennardJones
     from jax_md import energy as jax_md_energy

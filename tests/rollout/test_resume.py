@@ -76,6 +76,7 @@ def stopped_at(system, out, stop, monkeypatch, steps=STEPS):
         run(system, out=out, steps=steps, save_every=10, progress=progress)
 
 
+@pytest.mark.slow
 def test_a_killed_run_resumes(path, whole, tmp_path):
     out = tmp_path / "run"
     code = CHILD.format(stop=60, path=str(path), out=str(out), steps=STEPS)
