@@ -1,5 +1,7 @@
 """Whether a gradient through a rollout can be trusted, how far, and what it is made of."""
 
+from mdnum.gradients.diagnose.agreement import agreement
+from mdnum.gradients.diagnose.growth import growth
 from mdnum.gradients.diagnose.results import (
     Agreement,
     Comparison,
@@ -30,4 +32,6 @@ __all__ = [
     "Scaling",
     "Spectrum",
     "Trust",
+    "agreement",
+    "growth",
 ]
