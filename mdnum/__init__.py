@@ -28,6 +28,7 @@ _HOMES = {
     "fork_forecast": "mdnum.workflow:fork_forecast",
     "fork_map": "mdnum.workflow:fork_map",
     "fork_processes": "mdnum.workflow:fork_processes",
+    "grad": "mdnum.workflow:grad",
     "load": "mdnum.systems:load",
     "run": "mdnum.workflow:run",
     "systems": "mdnum.systems",
@@ -51,6 +52,7 @@ if TYPE_CHECKING:
     from mdnum.workflow import fork_forecast as fork_forecast
     from mdnum.workflow import fork_map as fork_map
     from mdnum.workflow import fork_processes as fork_processes
+    from mdnum.workflow import grad as grad
     from mdnum.workflow import run as run
 
 __all__ = [
@@ -70,6 +72,7 @@ __all__ = [
     "fork_forecast",
     "fork_map",
     "fork_processes",
+    "grad",
     "load",
     "run",
     "systems",

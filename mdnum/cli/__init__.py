@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 
 import typer
 
-from mdnum.cli import ball, check, doctor, fork, report, run, systems
+from mdnum.cli import ball, check, doctor, fork, grad, report, run, systems
 from mdnum.cli.output import EXIT_STOPPED, EXIT_USAGE, print_error
 from mdnum.errors import InputError, MdnumError
 
@@ -29,6 +29,7 @@ _check = typer.Typer(help="Compare a system with ASE and other codes.", **_PLAIN
 app.command("run")(run.run)
 app.command("ball")(ball.ball)
 app.command("fork")(fork.fork)
+app.command("grad")(grad.grad)
 app.add_typer(_systems, name="systems")
 app.add_typer(_check, name="check")
 app.command("report")(report.report)

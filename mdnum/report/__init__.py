@@ -11,8 +11,8 @@ if TYPE_CHECKING:
 
 __all__ = ["judge", "write"]
 
-# which module judges a folder (`record`) and which writes its page (`write_report`); fork folders that answer
-# another question than where two runs part go by that question
+# which module judges a folder (`record`) and which writes its page (`write_report`); folders that answer
+# another question than what a run does or where two part go by that question
 _MODULES = {
     "md": ("mdnum.report.findings", "mdnum.report.html"),
     "ball": ("mdnum.report.ball.findings", "mdnum.report.ball.html"),
@@ -22,6 +22,7 @@ _MODULES = {
     "processes": ("mdnum.report.fork.processes", "mdnum.report.fork.processes"),
     "certify": ("mdnum.report.fork.certify", "mdnum.report.fork.certify"),
     "forecast": ("mdnum.report.fork.forecast", "mdnum.report.fork.forecast"),
+    "grad": ("mdnum.report.grad.html", "mdnum.report.grad.html"),
 }
 
 

@@ -99,11 +99,19 @@ COLUMNS: Mapping[str, Mapping[str, pa.DataType]] = MappingProxyType(
         "foretold": _columns(
             asked=_TEXT, step=_INT, i=_SHORT, j=_SHORT, amplitude=_FLOAT, margin=_FLOAT, ulps=_FLOAT,
         ),
+        "growth": _columns(
+            horizon=_INT, step=_INT, onto_positions=_FLOAT, onto_velocities=_FLOAT, size=_FLOAT, speed=_FLOAT,
+        ),
+        "flip_contributions": _columns(
+            step=_INT, i=_SHORT, j=_SHORT, entered=_BOOL, margin=_FLOAT, bound=_FLOAT, ambiguous=_BOOL,
+            radial_speed=_FLOAT, weight=_FLOAT, grazing=_BOOL,
+        ),
+        "trust": _columns(horizon=_INT),
     }
 )  # fmt: skip
 
-#: The tables that a folder has, whether they hold a row or not, by the world that was run; fork folders that
-#: answer another question than where two runs part go by that question.
+#: The tables that a folder has, whether they hold a row or not, by the world that was run; folders that
+#: answer another question than what a run does or where two part go by that question.
 TABLES: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         "md": ("series", "flips", "epochs"),
@@ -114,6 +122,7 @@ TABLES: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "processes": ("variants", "variant_separations"),
         "certify": ("policies", "ambiguous", "policy_separations"),
         "forecast": ("foretold", "reach"),
+        "grad": ("growth", "flip_contributions", "trust"),
     }
 )
 

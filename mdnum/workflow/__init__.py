@@ -1,4 +1,4 @@
-"""The verbs as functions: `mdnum run`, `mdnum ball` and `mdnum fork`."""
+"""The verbs as functions: `mdnum run`, `mdnum ball`, `mdnum fork` and `mdnum grad`."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from mdnum.workflow.fork_forecast import ForecastResult, fork_forecast
 from mdnum.workflow.fork_map import MapResult, fork_map
 from mdnum.workflow.fork_processes import ProcessesResult, fork_processes
 from mdnum.workflow.fork_replay import fork_folders
+from mdnum.workflow.grad import GradResult, grad
 from mdnum.workflow.md import run
 
 __all__ = [
@@ -16,6 +17,7 @@ __all__ = [
     "CertifyResult",
     "ForecastResult",
     "ForkResult",
+    "GradResult",
     "MapResult",
     "ProcessesResult",
     "bounce",
@@ -25,5 +27,6 @@ __all__ = [
     "fork_forecast",
     "fork_map",
     "fork_processes",
+    "grad",
     "run",
 ]

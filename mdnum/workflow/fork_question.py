@@ -1,4 +1,4 @@
-"""What the questions about forks share: a system, a folder of its own kind, and its page."""
+"""What questions that leave a folder of their own kind share: a system, the folder, and its page."""
 
 from __future__ import annotations
 
@@ -59,15 +59,18 @@ def steps_of(system: System, steps: int | None) -> int:
     return last
 
 
-def opened(system: System, question: str, out: str | Path | None) -> RunFolder:
-    """An empty fork folder that is to answer a question, with the system and its provenance.
+def opened(
+    system: System | BallSystem, question: str, out: str | Path | None, verb: str = "fork"
+) -> RunFolder:
+    """An empty folder that is to answer a question, with the system and its provenance.
 
     Args:
         question: a key of `store.TABLES`.
+        verb: of the command line, which the folder is named after.
     """
     from mdnum.provenance import collect
 
-    path = default_folder(f"fork-{system.name}") if out is None else out
+    path = default_folder(f"{verb}-{system.name}") if out is None else out
     folder = RunFolder.create(path, world=question)
     try:
         system.write(folder.path)

@@ -59,8 +59,12 @@ class Question:
         return units.get(str(self.summary.get("units") or "lj"))
 
 
-def load(folder: RunFolder | str | Path, question: str) -> tuple[RunFolder, Question]:
-    """A fork folder that answers a question.
+def load(folder: RunFolder | str | Path, question: str, verb: str = "fork") -> tuple[RunFolder, Question]:
+    """A folder that answers a question.
+
+    Args:
+        question: a key of `store.TABLES`.
+        verb: of the command line, which asks it.
 
     Raises:
         FolderError: it does not.
@@ -68,7 +72,9 @@ def load(folder: RunFolder | str | Path, question: str) -> tuple[RunFolder, Ques
     folder = folder if isinstance(folder, RunFolder) else RunFolder.open(folder)
     summary = folder.summary
     if summary.get("question") != question:
-        raise FolderError("holds no finished answer", remedy="Run `mdnum fork` again", where=str(folder.path))
+        raise FolderError(
+            "holds no finished answer", remedy=f"Run `mdnum {verb}` again", where=str(folder.path)
+        )
     tables = {name: folder.read(name) for name in TABLES[question]}
     return folder, Question(folder.path, summary, folder.system_toml, folder.provenance, tables)
 

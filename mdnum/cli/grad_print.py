@@ -1,0 +1,69 @@
+"""A gradient folder in the terminal: derivatives by method, and what was left out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from mdnum.cli import output
+
+
+def print_rows(summary: Mapping[str, Any]) -> None:
+    """What a gradient folder says below its headline."""
+    out = output.console()
+    loss = summary["loss"]
+    size = f"{summary['atoms']:,} atoms" if "atoms" in summary else f"{summary['balls']:,} balls"
+    out.print(
+        f"  {summary['system']}, {size}, {summary['steps']:,} steps; "
+        f"{loss['word']} = {summary['value']:.10g} {loss['unit']}",
+        markup=False,
+    )
+    _print_methods(summary)
+    for one in summary["refused"]:
+        out.print(f"  {one['method']} gave none: {one['why']}", markup=False)
+    if left := summary["left_out"]:
+        output.print_table(
+            "left out", ("", "why", "ask with"), [(one["what"], one["why"], one["how"]) for one in left]
+        )
+
+
+def _print_methods(summary: Mapping[str, Any]) -> None:
+    """Derivatives by method, each with how far it is from the reference."""
+    names = [one["name"] for one in summary["parameters"]]
+    apart = {(row["method"], row["name"]): row for row in summary["comparisons"]}
+    reference = summary["reference"]
+    table = []
+    if exact := summary.get("exact"):
+        table.append(
+            ("closed form", *(part for name in names for part in (output.show(exact.get(name)), "")))
+        )
+    for one in sorted(summary["methods"], key=lambda one: one["method"] != reference):
+        cells = []
+        for name in names:
+            cells += [_slope(one, name), _apart(apart.get((one["method"], name)))]
+        table.append((one["method"], *cells))
+    columns = [part for name in names for part in (f"d/d {name}", f"from {reference}")]
+    output.print_table("", ("method", *columns), table)
+    notes = dict.fromkeys(
+        (one["method"], name, note) for one in summary["methods"] for name, note in one["notes"].items()
+    )
+    for method, name, note in notes:
+        output.console().print(f"  {method}, {name}: {note}", markup=False)
+
+
+def _slope(found: Mapping[str, Any], name: str) -> str:
+    value = found["gradient"].get(name)
+    if isinstance(value, Mapping):
+        return f"norm {value['norm']:.8g}"
+    if isinstance(value, list):
+        return ", ".join(f"{entry:.8g}" for entry in value)
+    error = found["error"].get(name)
+    text = "-" if value is None else f"{value:.8g}"
+    return text if error is None else f"{text} ± {error:.2g}"
+
+
+def _apart(row: Mapping[str, Any] | None) -> str:
+    if row is None:
+        return ""
+    means = f", {row['means']}" if row["means"] else ""
+    return f"{row['relative']:.2g}{means}" if row["relative"] is not None else "-"

@@ -1,0 +1,1 @@
+"""What a gradient folder says, to people."""

@@ -1,0 +1,91 @@
+"""report.html of a gradient: how large it is by each method, how it grows, what the flips add."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from mdnum.report.fork.findings import Verdict
+from mdnum.report.fork.question import Question, load, size_of, took, write_page
+from mdnum.report.grad import findings
+from mdnum.report.grad.words import EXACT, by, difference, slope, slope_unit, value_text
+from mdnum.report.words import count, number
+from mdnum.store import RunFolder
+
+
+def write_report(folder: RunFolder | str | Path) -> Path:
+    """Writes report.html and figures/*.svg, and puts headline and findings into summary.json.
+
+    Returns:
+        the path of report.html.
+
+    Raises:
+        FolderError: no gradient in the folder, or it cannot be written.
+    """
+    folder, run = load(folder, "grad", "grad")
+    return write_page(
+        folder,
+        run,
+        findings.judge(run),
+        "grad/run.html.j2",
+        {},
+        captions={},
+        figures=list(_key_figures(run)),
+        parameters=[_parameter(run, one) for one in run.summary["parameters"]],
+        methods=list(_methods(run)),
+        what=list(_what(run)),
+    )
+
+
+def record(folder: RunFolder | str | Path) -> Verdict:
+    """Judges a gradient and writes headline and findings into its summary.json."""
+    folder, run = load(folder, "grad", "grad")
+    judged = findings.judge(run)
+    judged.store(folder, run.summary)
+    return judged
+
+
+def _key_figures(run: Question) -> Iterator[tuple[str, str, str]]:
+    """(label, value, small print) of the strip below the verdict."""
+    summary = run.summary
+    loss = summary["loss"]
+    yield (
+        loss["word"].upper() if len(loss["word"]) <= 4 else loss["word"],
+        number(summary["value"], 4),
+        loss["unit"],
+    )
+    reference = by(run, summary["reference"])
+    for one in summary["parameters"][:4]:
+        yield f"by {one['name']}", slope(reference, one["name"]), slope_unit(summary, one)
+    details = {} if reference is None else reference["details"]
+    if "crossings" in details:
+        yield "Flips on the way", count(details["crossings"]), f"{count(details['grazing'])} of them grazing"
+
+
+def _parameter(run: Question, one: Mapping[str, Any]) -> dict[str, str]:
+    """A column of the table of methods."""
+    return {"name": one["name"], "unit": slope_unit(run.summary, one), "value": value_text(one)}
+
+
+def _methods(run: Question) -> Iterator[dict[str, Any]]:
+    """A row for each method, the reference first."""
+    summary = run.summary
+    rows = sorted(summary["methods"], key=lambda one: one["method"] != summary["reference"])
+    if summary.get("exact"):
+        cells = [(number(summary["exact"].get(one["name"]), 6), "") for one in summary["parameters"]]
+        yield {"method": "closed form", "says": EXACT, "cells": cells}
+    for one in rows:
+        cells = [
+            (slope(one, each["name"]), difference(run, one["method"], each["name"]))
+            for each in summary["parameters"]
+        ]
+        yield {"method": one["method"], "says": one["says"], "cells": cells}
+
+
+def _what(run: Question) -> Iterator[tuple[str, str]]:
+    summary = run.summary
+    yield from size_of(run)
+    loss = summary["loss"]
+    yield "Loss", f"{loss['about']} ({loss['unit']})"
+    yield took(run)

@@ -1,0 +1,153 @@
+"""`mdnum grad` as a function: differentiate a loss through a rollout in several ways, compare, report."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mdnum.errors import InputError
+from mdnum.workflow.fork_question import Log, Progress, finish, is_ball, loaded, opened, steps_of
+
+if TYPE_CHECKING:
+    from mdnum.gradients.base import Problem
+    from mdnum.systems.ball_system import BallSystem
+    from mdnum.systems.load import System
+
+
+@dataclass(frozen=True)
+class GradResult:
+    """A finished comparison of gradients.
+
+    Attributes:
+        folder: the gradient folder.
+        gradients: by method, in the order in which they were made; of a ball, those of
+            `mdnum.ball.gradients`.
+        summary: what summary.json says, findings included.
+    """
+
+    folder: Path
+    gradients: dict[str, Any]
+    summary: dict[str, Any]
+
+
+def grad(
+    system: System | BallSystem | str | Path,
+    of: str | None = None,
+    wrt: str | Sequence[str] = (),
+    *,
+    steps: int | None = None,
+    methods: str | Sequence[str] | None = None,
+    out: str | Path | None = None,
+    overrides: Mapping[str, Any] | None = None,
+    report: bool = True,
+    progress: Progress | None = None,
+) -> GradResult:
+    """Differentiate a loss of a rollout by parameters of its system, in several ways, and compare them.
+
+    Args:
+        system: a loaded system, a shipped name or the path of a system file; of molecular dynamics or a
+            ball.
+        of: the loss, a word of `workflow.grad_words.LOSSES` with options behind a colon
+            ("potential:every=10"); of a ball a kind of its [loss] table, default what its file says.
+        wrt: parameters, full or short names, one by one or with commas; of a ball default what the
+            [gradient] table of its file says.
+        steps: last step; default the system's own, but no more than 500 of molecular dynamics.
+        methods: words of `mdnum.gradients.registry.METHODS`, or "all"; default those that answer within
+            about a minute. What they leave out is said in the summary.
+        out: the new gradient folder; default runs/grad-<name>-<n>.
+        overrides: dotted keys to values, such as {"cutoff.kind": "switched"}.
+        report: write report.html.
+        progress: called now and then with what is done, of how much, and a dictionary of figures.
+
+    Raises:
+        InputError: no such loss, parameter or method, or none of the methods applies.
+        NumericalError: the run blew up.
+        FolderError: the folder cannot be used.
+    """
+    from mdnum.workflow.grad_words import words
+
+    wanted = words(wrt)
+    chosen = None if methods is None else words(methods)
+    if is_ball(system):
+        from mdnum.workflow.grad_ball import grad_ball
+
+        return grad_ball(
+            system, of, wanted, steps=steps, methods=chosen, out=out, overrides=overrides, report=report,
+            progress=progress,
+        )  # fmt: skip
+    return _molecules(loaded(system, overrides), of, wanted, chosen, steps, out, report, progress)
+
+
+def _molecules(
+    system: System,
+    of: str | None,
+    wrt: Sequence[str],
+    methods: Sequence[str] | None,
+    steps: int | None,
+    out: str | Path | None,
+    report: bool,
+    progress: Progress | None,
+) -> GradResult:
+    from mdnum.workflow import grad_methods, grad_record
+
+    began = time.perf_counter()
+    word, problem, names = _problem(system, of, wrt, steps)
+    plan = grad_methods.plan(problem, names, methods)
+    folder = opened(system, "grad", out, "grad")
+    try:
+        told = Log(folder, progress)
+        opinions = grad_methods.run(plan, problem, names, told)
+        agreement = grad_methods.compare(problem, opinions)
+        grad_record.write(folder, agreement)
+        folder.finalize()
+        summary = grad_record.summarize(problem, word, names, agreement)
+        summary["refused"] = [*plan.refused, *summary["refused"]]
+        summary |= {"left_out": list(plan.left_out), "seconds": time.perf_counter() - began}
+        folder.write_summary(summary)
+    except BaseException:
+        folder.close()
+        raise
+    made = {one.method: one.found for one in opinions if one.found is not None}
+    return GradResult(folder.path, made, finish(folder, report, progress))
+
+
+def _problem(
+    system: System, of: str | None, wrt: Sequence[str], steps: int | None
+) -> tuple[str, Problem, tuple[str, ...]]:
+    """The loss's word, the problem, and full names of the parameters: what cannot be is refused here."""
+    from mdnum.gradients import parameters
+    from mdnum.gradients.base import Problem
+    from mdnum.systems import build
+    from mdnum.workflow.grad_words import LOSSES, loss
+
+    if of is None:
+        raise InputError(
+            "no loss to differentiate",
+            where=system.name,
+            remedy=f"Add --of LOSS. There are {', '.join(LOSSES)}",
+        )
+    word, made = loss(of)
+    last = steps_of(system, steps)
+    simulation = build(system)
+    if not simulation.pairwise:
+        raise InputError(
+            "the parameters of a many-body potential have no names here",
+            where=system.name,
+            remedy="Differentiate it in Python, with mdnum.gradients",
+        )
+    if LOSSES[word].needs_box and not all(simulation.pbc):
+        raise InputError(
+            f"the loss {word} is one of a periodic box, and this system has an open side",
+            where=system.name,
+            remedy="Take another loss, or close the box with structure.pbc",
+        )
+    if not wrt:
+        raise InputError(
+            "no parameter to differentiate by",
+            where=system.name,
+            remedy=f"Add --wrt NAME,NAME. There are {', '.join(parameters.names(simulation))}",
+        )
+    return word, Problem(simulation, made, last), parameters.resolve(simulation, wrt)

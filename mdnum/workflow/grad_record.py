@@ -1,0 +1,107 @@
+"""What a gradient folder holds: its tables, large derivatives, and summary.json."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mdnum.gradients import parameters
+from mdnum.gradients.diagnose.results import plain
+from mdnum.store import RunFolder
+from mdnum.store.atomic import write_bytes
+from mdnum.workflow.grad_words import LOSSES, unit_of_loss, unit_of_parameter
+
+if TYPE_CHECKING:
+    from mdnum.gradients.base import Gradient, Problem
+    from mdnum.gradients.diagnose import Agreement, Opinion
+
+#: Entries of a derivative that summary.json tells one by one.
+_FEW = 6
+#: File with the derivatives that have more, by "method/parameter".
+ARRAYS = "gradients.npz"
+
+
+def write(folder: RunFolder, agreement: Agreement) -> None:
+    """Puts large derivatives into a folder."""
+    large = {
+        f"{one.method}/{name}": np.asarray(value)
+        for one in agreement.opinions
+        if one.found is not None
+        for name, value in one.found.gradient.items()
+        if np.size(value) > _FEW
+    }
+    if large:
+        sink = io.BytesIO()
+        np.savez_compressed(sink, **large)  # type: ignore[arg-type]
+        write_bytes(folder.path / ARRAYS, sink.getbuffer())
+
+
+def summarize(problem: Problem, word: str, names: Sequence[str], agreement: Agreement) -> dict[str, Any]:
+    """The content of summary.json, without headline and findings."""
+    simulation = problem.simulation
+    units = simulation.units
+    reference = agreement.gradient(agreement.reference)
+    assert reference is not None
+    return {
+        "world": "grad",
+        "question": "grad",
+        "system": simulation.system.name,
+        "about": simulation.system.spec.about,
+        "atoms": simulation.atoms,
+        "steps": problem.steps,
+        "timestep": float(simulation.system.spec.dynamics.timestep),
+        "units": units.name,
+        "loss": {"word": word, "about": LOSSES[word].about, "unit": unit_of_loss(word, units)},
+        "value": reference.value,
+        "parameters": [
+            {
+                "name": name,
+                "unit": unit_of_parameter(name, units),
+                "value": told(parameters.value(simulation, name)),
+            }
+            for name in names
+        ],
+        "force_jump": float(np.max(np.abs(simulation.jumps()[1]))),
+        "reference": agreement.reference,
+        "methods": [_method(one, one.found) for one in agreement.opinions if one.found is not None],
+        "comparisons": [one.plain() for one in agreement.comparisons],
+        "refused": [
+            {"method": one.method, "why": one.missing} for one in agreement.opinions if one.found is None
+        ],
+        "findings": [],
+        "status": "complete",
+    }
+
+
+def _method(opinion: Opinion, found: Gradient) -> dict[str, Any]:
+    """What one method found, in plain values."""
+    details = plain(found.details)
+    return {
+        "method": opinion.method,
+        "says": found.says,
+        "value": found.value,
+        "gradient": {name: told(value) for name, value in found.gradient.items()},
+        "error": details.pop("error", {}),
+        "notes": dict(found.notes),
+        "details": details,
+        "seconds": opinion.seconds,
+    }
+
+
+def told(value: Any) -> Any:
+    """A number, a few, or the size of many."""
+    array = np.asarray(value, np.float64)
+    if array.ndim == 0:
+        return float(array)
+    if array.size <= _FEW:
+        return array.tolist()
+    at = np.unravel_index(int(np.argmax(np.abs(array))), array.shape)
+    return {
+        "shape": list(array.shape),
+        "norm": float(np.linalg.norm(array)),
+        "largest": float(array[at]),
+        "at": [int(place) for place in at],
+    }
