@@ -278,8 +278,16 @@ def _stretch(
         trace = Trace(after.x, after.v, model, numbers_bar, scale, carry.r_cut) if traced else None
         weights = jnp.zeros(0)
         if met is not None:
+            # the forces are there wherever the derivative by scale is wanted
+            arriving = v - half * made.force / mass_row
             push, weights, by_radius, by_scale = onto_crossings(
-                met, after.x, after.v, masses, integrator.timestep, carry.r_cut.shape[0]
+                met,
+                after.x,
+                after.v,
+                (x, arriving, jnp.asarray(force.cell.matrix)),
+                masses,
+                integrator.timestep,
+                carry.r_cut.shape[0],
             )
             after = after._replace(
                 x=after.x + push,

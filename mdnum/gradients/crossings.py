@@ -30,7 +30,8 @@ class Met(NamedTuple):
         i, j: sorted atoms; beyond the last one where there is no crossing, shape (rows, most).
         normal: from i to j, shape (rows, 3, most).
         push: signed force jump over radial speed, energy/length per (length/time); 0 where it is left out.
-        kind: pair type.
+        kind: pair type; -1 - kind where it is left out.
+        images: lattice vectors from the nearest image of atom j to its wrapped position, (rows, 3, most).
     """
 
     i: Int[Array, "*rows most"]
@@ -38,6 +39,7 @@ class Met(NamedTuple):
     normal: Float[Array, "*rows 3 most"]
     push: Float[Array, "*rows most"]
     kind: Int[Array, "*rows most"]
+    images: Int[Array, "*rows 3 most"]
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,7 @@ class Crossings:
         speed: radial speed there, length per internal time: negative where the pair enters.
         force: radial force that the flip adds, energy/length.
         kind: pair type.
+        images: lattice vectors from the nearest image of atom j to its wrapped position, (crossings, 3).
         grazing: slower than the guard: left out.
         weight: derivative of the loss by the cutoff of this one crossing; NaN until the reverse pass has
             been there. For one left out, what it would have been.
@@ -64,6 +67,7 @@ class Crossings:
     speed: Float[np.ndarray, "crossings"]
     force: Float[np.ndarray, "crossings"]
     kind: Int[np.ndarray, "crossings"]
+    images: Int[np.ndarray, "crossings 3"]
     grazing: Bool[np.ndarray, "crossings"]
     weight: Float[np.ndarray, "crossings"]
 
@@ -84,30 +88,37 @@ class Crossings:
         most = 1 << max(3, int(place.max(initial=0)).bit_length())
         i, j = np.full((room, most), atoms), np.full((room, most), atoms)
         normal, push = np.zeros((room, 3, most)), np.zeros((room, most))
+        images = np.zeros((room, 3, most), np.int64)
         kind = np.zeros((room, most), np.int64)
         i[row, place], j[row, place] = self.i[order], self.j[order]
         normal[row, :, place] = self.normal[order]
         # what is left out still has its weight worked out: the sign tells the reverse pass not to apply it
         push[row, place] = (self.force / self.speed)[order]
         kind[row, place] = np.where(self.grazing, -1 - self.kind, self.kind)[order]
-        return Met(jnp.asarray(i), jnp.asarray(j), jnp.asarray(normal), jnp.asarray(push), jnp.asarray(kind))
+        images[row, :, place] = self.images[order]
+        return Met(*(jnp.asarray(part) for part in (i, j, normal, push, kind, images)))
+
+    def gathered(self, values: Float[np.ndarray, "room most *rest"]) -> Float[np.ndarray, "crossings *rest"]:
+        """Values of padded rows, in the order of the crossings."""
+        order, row, place = self._places(len(values))
+        out = np.empty((len(row), *values.shape[2:]))
+        out[order] = values[row, place]
+        return out
 
     def weighed(self, weights: Float[np.ndarray, "room most"]) -> Crossings:
         """With the weights that the reverse pass found."""
-        order, row, place = self._places(len(weights))
-        weight = np.empty(len(row))
-        weight[order] = weights[row, place]
-        return replace(self, weight=weight)
+        return replace(self, weight=self.gathered(weights))
 
 
 def onto_crossings(
     met: Met,
     onto_x: Float[Array, "3 atoms"],
     onto_v: Float[Array, "3 atoms"],
+    here: tuple[Float[Array, "3 atoms"], Float[Array, "3 atoms"], Float[Array, "3 3"]],
     masses: Float[Array, "atoms"],
     timestep: Float[Array, ""],
     types: int,
-) -> tuple[Float[Array, "3 atoms"], Float[Array, "most"], Float[Array, "types"]]:
+) -> tuple[Float[Array, "3 atoms"], Float[Array, "most"], Float[Array, "types"], Float[Array, ""]]:
     """The transpose of the saltation of one step's crossings.
 
     A crossing lies between two steps, on average in their middle, where positions are half a drift short of
@@ -116,26 +127,72 @@ def onto_crossings(
     Args:
         met: the crossings between the step before and this one.
         onto_x, onto_v: cotangents of this step's positions and of the velocities that lead there.
+        here: these wrapped positions and velocities themselves, and the lattice vectors.
         masses: shape (atoms,).
         timestep: internal time.
         types: number of pair types.
 
     Returns:
         what is added to the cotangent of the positions, derivatives of the loss by the cutoff of each
-        crossing, and by the cutoff of each pair type.
+        crossing, by the cutoff of each pair type, and by a common factor of all distances.
     """
     dtype = onto_x.dtype
-    middle = (onto_v + (0.5 * timestep).astype(dtype) * onto_x) / masses.astype(dtype)
-    there = middle.at[:, met.j].get(mode="fill", fill_value=0)
-    here = middle.at[:, met.i].get(mode="fill", fill_value=0)
-    normal = met.normal.astype(dtype)
-    pull = met.push.astype(dtype) * jnp.sum(normal * (there - here), axis=0)
+    half = (0.5 * timestep).astype(dtype)
+    x, v, matrix = here
+    pull = met.push.astype(dtype) * _along(met, (onto_v + half * onto_x) / masses.astype(dtype))
     applied = jnp.where(met.kind >= 0, pull, 0)
-    along = applied * normal
+    along = applied * met.normal.astype(dtype)
     push = jnp.zeros_like(onto_x).at[:, met.j].add(along, mode="drop").at[:, met.i].add(-along, mode="drop")
     kind = jnp.where(met.kind >= 0, met.kind, 0)
     by_radius = jnp.zeros(types, jnp.float64).at[kind].add(-applied.astype(jnp.float64))
-    return push, -pull.astype(jnp.float64), by_radius
+    by_scale = jnp.sum(applied * _along(met, x - half * v, matrix)).astype(jnp.float64)
+    return push, -pull.astype(jnp.float64), by_radius, by_scale
+
+
+def _along(
+    met: Met, vectors: Float[Array, "3 atoms"], matrix: Float[Array, "3 3"] | None = None
+) -> Float[Array, "most"]:
+    """Component along each pair of the difference of a vector between its atoms; of nearest images where
+    lattice vectors are given."""
+    dtype = vectors.dtype
+    there = vectors.at[:, met.j].get(mode="fill", fill_value=0)
+    here = vectors.at[:, met.i].get(mode="fill", fill_value=0)
+    apart = there - here
+    if matrix is not None:
+        apart = apart - (matrix.T @ met.images.astype(matrix.dtype)).astype(dtype)
+    return jnp.sum(met.normal.astype(dtype) * apart, axis=0)
+
+
+def push_through(
+    met: Met,
+    x: Float[Array, "3 atoms"],
+    v: Float[Array, "3 atoms"],
+    masses: Float[Array, "atoms"],
+    timestep: Float[Array, ""],
+    r_cut: Float[Array, "types"],
+    matrix: Float[Array, "3 3"],
+) -> tuple[Float[Array, "most"], tuple[Float[Array, "3 atoms"], Float[Array, "3 atoms"]]]:
+    """The saltation of one step's crossings, on one tangent.
+
+    Args:
+        met: the crossings between the step before and this one.
+        x, v: tangents of this step's wrapped positions and of the velocities that lead there.
+        masses: shape (atoms,).
+        timestep: internal time.
+        r_cut, matrix: tangents of the cutoffs and of the lattice vectors.
+
+    Returns:
+        tangents of the distances at the crossings, and what is added to x and v.
+    """
+    dtype = x.dtype
+    half = (0.5 * timestep).astype(dtype)
+    dr = _along(met, x - half * v, matrix)
+    kind = jnp.where(met.kind >= 0, met.kind, 0)
+    late = jnp.where(met.kind >= 0, met.push.astype(dtype) * (dr - r_cut[kind].astype(dtype)), 0)
+    along = late * met.normal.astype(dtype)
+    kick = jnp.zeros_like(x).at[:, met.j].add(along, mode="drop").at[:, met.i].add(-along, mode="drop")
+    kick = kick / masses.astype(dtype)
+    return dr.astype(jnp.float64), (half * kick, kick)
 
 
 def crossings(
@@ -167,6 +224,8 @@ def crossings(
     earlier = np.stack(cell.displacement(before.astype(np.float64), before_j.astype(np.float64)), axis=1)
     now_i, now_j = x[row, :, i].astype(np.float64), x[row, :, j].astype(np.float64)
     now = np.stack(cell.displacement(now_i, now_j), axis=1)
+    inverse = np.asarray(simulation.cell.inverse, np.float64)
+    images = np.rint((now_j - now_i - now) @ inverse).astype(np.int64)
     change = np.linalg.norm(now, axis=1) - np.linalg.norm(earlier, axis=1)
     speed = change / float(simulation.integrator.timestep)
     middle = earlier + now
@@ -183,6 +242,7 @@ def crossings(
         safe,
         np.asarray(ledger.extra["force_jump"]),
         np.asarray(simulation.type_of(low, high), np.int64),
+        images,
         grazing,
         np.full(len(row), np.nan),
     )

@@ -1,0 +1,257 @@
+"""The forward pass of derivatives: tangents of a few parameters along the run that was recorded.
+
+A tangent is pushed through each step at the recorded state and decisions, so the program that is linearized
+is the one that ran. It needs no memory beyond the run's, and costs a force evaluation for each parameter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from mdnum.errors import InputError
+from mdnum.gradients.crossings import Crossings, Met, crossings, push_through
+from mdnum.gradients.directions import Column, Direction, columns_of, directions
+from mdnum.gradients.losses import Frame
+from mdnum.gradients.tape import Stretch, Tape, frame_of, rows_of
+from mdnum.md.decide import Tables
+from mdnum.md.integrators import Integrator
+from mdnum.md.pairforce import PairForce
+
+
+class Carry(NamedTuple):
+    """Tangents between two steps, user's order, one for each column.
+
+    Attributes:
+        x: of the positions as if the box had no faces, at the step that comes next, (columns, 3, atoms).
+        v: of the half-kicked velocities that lead there, same shape.
+        total: of the sums of the loss.
+    """
+
+    x: Float[Array, "columns 3 atoms"]
+    v: Float[Array, "columns 3 atoms"]
+    total: Any
+
+
+@dataclass(frozen=True)
+class Tangents:
+    """Tangents along one stretch of a run.
+
+    Attributes:
+        stretch: the steps.
+        columns: the numbers by which it is differentiated.
+        x, v: tangents of the positions (as if the box had no faces) and of the full-step velocities in the
+            order of the stretch's list, shape (rows, columns, 3, atoms); None where they were not asked for.
+        crossings: its flips as events; None for a tape without flips.
+        dr: tangent of the distance of each crossing's pair at the crossing, (crossings, columns).
+        dr_cut: of its cutoff, same shape.
+        total: of the sums of the loss up to here.
+    """
+
+    stretch: Stretch
+    columns: tuple[Column, ...]
+    x: Float[np.ndarray, "rows columns 3 atoms"] | None
+    v: Float[np.ndarray, "rows columns 3 atoms"] | None
+    crossings: Crossings | None
+    dr: Float[np.ndarray, "crossings columns"] | None
+    dr_cut: Float[np.ndarray, "crossings columns"] | None
+    total: Any
+
+
+def tangents(
+    tape: Tape,
+    names: Sequence[str],
+    *,
+    saltation: bool = False,
+    guard: float = 0.0,
+    states: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> Iterator[Tangents]:
+    """Tangents by named parameters along a recorded run, stretch by stretch, first one first.
+
+    With the weights of a reverse pass (derivatives of the loss by the cutoff of each crossing) the sum of
+    weight times (dr_cut - dr) over crossings is what the flips add to the derivative by each column: with
+    tangents that do not jump, event-aware weights give event-aware minus symmetric.
+
+    Args:
+        tape: the run; made with flips where crossings are wanted.
+        names: full names of parameters.
+        saltation: whether the tangents jump at every crossing that does not graze.
+        guard: radial speed, length per internal time, below which a crossing grazes.
+        states: whether to hand out the tangents of every step.
+        progress: called with the steps done and the last step.
+
+    Raises:
+        InputError: a many-body potential, or saltation with a tape without flips.
+
+    Error: a rounding error times the growth of the tangent; none of truncation, for the program as it ran.
+    """
+    simulation = tape.simulation
+    force = simulation.force
+    if not isinstance(force, PairForce):
+        raise InputError("tangents are of pair potentials", where=simulation.system.name)
+    columns = columns_of(simulation, names)
+    along = directions(simulation, columns)
+    carry = Carry(along.x, along.v, _empty(tape.total, len(columns)))
+    for stretch in tape.forward():
+        order = stretch.table.order
+        met = None
+        if stretch.ledger is not None:
+            met = crossings(
+                simulation, stretch.ledger, stretch.first, order, stretch.x, stretch.x_before, guard
+            )
+        elif saltation:
+            raise InputError("this run was recorded without its flips", remedy="Make the tape with flips")
+        carry, (by_row, dr) = _stretch(
+            force,
+            simulation.integrator,
+            jnp.asarray(simulation.masses[order]),
+            simulation.tables(stretch.table),
+            rows_of(stretch),
+            stretch.bits,
+            np.arange(len(stretch.x)) < stretch.rows,
+            tape.seen(stretch),
+            (tape.loss, tape.origin, tape.around),
+            None if met is None else met.on_device(len(stretch.x), simulation.atoms),
+            carry._replace(x=carry.x[..., order], v=carry.v[..., order]),
+            along,
+            jnp.asarray(float(saltation)),
+            states,
+        )
+        carry = carry._replace(x=_unsorted(carry.x, order), v=_unsorted(carry.v, order))
+        x, v = (np.asarray(part)[: stretch.rows] for part in by_row) if states else (None, None)
+        moved = None if met is None else met.gathered(np.moveaxis(np.asarray(dr), 1, 2))
+        cuts = None if met is None else np.asarray(along.r_cut).T[met.kind]
+        yield Tangents(stretch, columns, x, v, met, moved, cuts, carry.total)
+        if progress is not None:
+            progress(stretch.first + stretch.rows - 1, tape.steps)
+
+
+def by_column(tape: Tape, total: Any) -> Float[np.ndarray, "columns"]:
+    """The derivatives of the loss, from the tangents of its sums at the end."""
+
+    def one(tangent):
+        return jax.jvp(lambda total: tape.loss.value(total, tape.frames), (tape.total,), (tangent,))[1]
+
+    return np.asarray(jax.vmap(one)(total), np.float64)
+
+
+def _empty(total: Any, columns: int) -> Any:
+    return jax.tree.map(lambda one: jnp.zeros((columns, *one.shape), one.dtype), total)
+
+
+def _unsorted(a, order):
+    return jnp.zeros_like(a).at[..., order].set(a)
+
+
+def _with(force: PairForce, model, matrix) -> PairForce:
+    """The force with other parameters in another box; which image is nearest does not move with the box."""
+    return replace(force, model=model, cell=replace(force.cell, matrix=matrix))
+
+
+@partial(jax.jit, static_argnames=("states",))
+def _stretch(
+    force: PairForce,
+    integrator: Integrator,
+    masses: Float[Array, "atoms"],
+    tables: Tables,
+    rows,
+    bits,
+    used,
+    seen,
+    looking,
+    crossed: Met | None,
+    carry: Carry,
+    along: Direction,
+    jumps: Float[Array, ""],
+    states: bool,
+):
+    loss, origin, around = looking
+    order = tables.order
+    dtype = rows[1].dtype
+    mass_row = masses.astype(dtype)
+    numbers = eqx.filter(integrator, eqx.is_inexact_array)
+    rest = eqx.filter(integrator, eqx.is_inexact_array, inverse=True)
+    matrix = jnp.asarray(force.cell.matrix)
+    volume = around.volume
+
+    def evaluate(told):
+        def forces(x, model, matrix):
+            made = _with(force, model, matrix)(x, tables, decisions=False, given=told)
+            return (
+                made.force.astype(dtype) / mass_row,
+                jnp.sum(made.energy, dtype=jnp.float64),
+                made.virial,
+            )
+
+        return forces
+
+    def drift(x, v, numbers, number):
+        x, v, _ = eqx.combine(numbers, rest).drift(x, v, masses, number, order)
+        return x, v
+
+    def look(row, total, x, v, potential, virial, along):
+        frame = frame_of(row, order, around.matrix)
+        whole = frame._replace(x=_unsorted(x, order), v=_unsorted(v, order))
+        moving = whole._replace(step=_still(frame.step), potential=potential, virial=virial)
+        start = Frame(_still(origin.step), along.x, along.v, jnp.zeros(()), jnp.zeros(()))
+        # of a cube with the box: the volume goes with the trace of what moves the lattice vectors
+        stretch = jnp.trace(jnp.linalg.solve(_whole(matrix), along.matrix))
+        here = jax.tree.map(jnp.zeros_like, around)._replace(matrix=along.matrix, volume=volume * stretch)
+        _, seen = jax.jvp(loss.observe, (frame, origin, around), (moving, start, here))
+        return jax.tree.map(jnp.add, total, seen)
+
+    def push(row, told, see, met, carry: Carry, along: Direction):
+        """One column through one step."""
+        number, x, v = row[0], row[1], row[2]
+        dx, dv = carry.x, carry.v
+        half, first = (0.5 * integrator.timestep).astype(dtype), number == 0
+        dr = jnp.zeros(0)
+        shift = (along.matrix.T @ row[3].astype(matrix.dtype)).astype(dtype)
+        if met is not None:
+            dr, (by_x, by_v) = push_through(
+                met, dx - shift, dv, masses, integrator.timestep, along.r_cut, along.matrix
+            )
+            dx, dv = dx + jumps.astype(dtype) * by_x, dv + jumps.astype(dtype) * by_v
+        (acceleration, *_), (onto, potential, virial) = jax.jvp(
+            evaluate(told), (x, force.model, matrix), (dx - shift, along.model, along.matrix)
+        )
+        kick = half * onto + 0.5 * along.integrator.timestep.astype(dtype) * acceleration
+        dv = dv + jnp.where(first, 0, kick)
+        total = lax.cond(
+            see, look, lambda row, total, *_: total, row, carry.total, dx, dv, potential, virial, along
+        )
+        _, (after_x, after_v) = jax.jvp(
+            lambda x, v, numbers: drift(x, v, numbers, number),
+            (x, v + half * acceleration, numbers),
+            (dx, dv + kick, along.integrator),
+        )
+        return Carry(after_x, after_v, total), (dx, dv), dr
+
+    def step(carry, given):
+        row, told, use, see, met = given
+        after, here, dr = jax.vmap(lambda carry, along: push(row, told, see, met, carry, along))(carry, along)
+        kept = jax.tree.map(lambda new, old: jnp.where(use, new, old), after, carry)
+        return kept, (here if states else (), dr)
+
+    return lax.scan(step, carry, (rows, bits, used, seen, crossed))
+
+
+def _whole(matrix: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+    """Lattice vectors with one of length 1 for an axis that has none."""
+    missing = jnp.all(matrix == 0, axis=1)
+    return jnp.where(missing[:, None], jnp.eye(3, dtype=matrix.dtype), matrix)
+
+
+def _still(integer: Array) -> Any:
+    """The tangent of what cannot move."""
+    return np.zeros(jnp.shape(integer), jax.dtypes.float0)
