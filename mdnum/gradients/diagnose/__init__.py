@@ -1,6 +1,7 @@
 """Whether a gradient through a rollout can be trusted, how far, and what it is made of."""
 
 from mdnum.gradients.diagnose.agreement import agreement
+from mdnum.gradients.diagnose.flips import flips
 from mdnum.gradients.diagnose.growth import growth
 from mdnum.gradients.diagnose.results import (
     Agreement,
@@ -33,5 +34,6 @@ __all__ = [
     "Spectrum",
     "Trust",
     "agreement",
+    "flips",
     "growth",
 ]

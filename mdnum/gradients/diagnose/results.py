@@ -272,11 +272,10 @@ class Flips(Plain):
         weight: derivative of the loss by the cutoff of this one crossing.
         grazing: slower than the guard and left out: it contributes 0, and its weight is what it would have
             been.
-        contribution: by parameter, each of shape (flips,). For a parameter of several entries, along the
-            direction of the whole gradient, so that they sum to the length of what the flips add along it.
-        smooth: the gradient between the flips (their decisions held fixed), by parameter, along the same
-            direction. total: with the flips.
-        share: share of the total that each channel adds, by parameter, then channel: "smooth", "pair enters",
+        contribution: by number, each of shape (flips,). A number is a scalar parameter, or an entry of one
+            that has several: "potential.sigma[1]".
+        smooth: the gradient between the flips (their decisions held fixed), by number. total: with the flips.
+        share: share of the total that each channel adds, by number, then channel: "smooth", "pair enters",
             "pair leaves".
         skipped: parameters that have no contributions, with the reason.
         says: what stands out, in a sentence.

@@ -1,0 +1,65 @@
+"""Contributions of single flips, against the two gradients between which they stand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from small_systems import LENNARD_JONES, crystal, make
+
+from mdnum.errors import InputError
+from mdnum.gradients import Problem
+from mdnum.gradients.diagnose.flips import flips
+from mdnum.gradients.losses import MeanSquaredDisplacement
+from mdnum.gradients.symmetric import EventAware, Symmetric
+from mdnum.systems import build
+
+NAMES = ("potential.sigma", "cutoff.radius", "dynamics.temperature")
+
+
+@pytest.fixture(scope="module")
+def problem():
+    simulation = build(make(crystal(), LENNARD_JONES, {"kind": "hard", "radius": 2.2}))
+    return Problem(simulation, MeanSquaredDisplacement(), 100)
+
+
+@pytest.fixture(scope="module")
+def found(problem):
+    return flips(problem, (*NAMES, "v0"))
+
+
+def test_contributions_sum_to_what_event_aware_adds(problem, found):
+    """The two gradients come from reverse passes, the contributions from tangents too."""
+    aware, plain = (method(problem, NAMES).gradient for method in (EventAware(), Symmetric()))
+    assert len(found) > 100
+    for name in NAMES:
+        added = float(aware[name] - plain[name])
+        assert found.contribution[name].sum() == pytest.approx(added, rel=1e-9), name
+        assert found.smooth[name] == pytest.approx(float(plain[name]), rel=1e-9, abs=1e-12), name
+        assert sum(found.share[name].values()) == pytest.approx(1.0, rel=1e-9), name
+    assert found.smooth["cutoff.radius"] == 0.0 and "100 %" in found.says
+
+
+def test_the_heaviest_come_first_and_the_start_is_skipped(found):
+    sizes = [np.abs(parts) / np.abs(parts).sum() for parts in found.contribution.values()]
+    heaviest = np.max(sizes, axis=0)
+    assert np.all(np.diff(heaviest) <= 0)
+    assert set(found.skipped) == {"initial.velocities"} and "324" in found.skipped["initial.velocities"]
+    table = found.table()
+    assert {len(column) for column in table.values()} == {len(found)}
+    assert found.plain()["flips"] == len(found)
+
+
+def test_by_the_start_alone_there_are_no_contributions(problem):
+    with pytest.raises(InputError, match="324 entries"):
+        flips(problem, ("v0",))
+
+
+def test_what_grazes_contributes_nothing(problem, found):
+    """With a guard above most speeds."""
+    guarded = flips(problem, NAMES, guard=1.0)
+    assert 0 < guarded.grazing.sum() < len(guarded)
+    assert not guarded.contribution["cutoff.radius"][guarded.grazing].any()
+    assert np.all(
+        np.abs(guarded.radial_speed[guarded.grazing]) < np.abs(guarded.radial_speed[~guarded.grazing]).min()
+    )
+    assert "grazed" in guarded.says and "grazed" not in found.says
