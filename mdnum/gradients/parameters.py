@@ -15,6 +15,8 @@ from jaxtyping import Float
 from mdnum.errors import InputError
 from mdnum.md.cell import Cell
 from mdnum.md.integrators import Integrator, Langevin
+from mdnum.md.manyforce import ManyBodyForce
+from mdnum.md.pairforce import PairForce
 from mdnum.md.potentials import CutPotential
 from mdnum.systems.build import Simulation
 
@@ -50,6 +52,21 @@ class Cotangents:
     v: Float[np.ndarray, "3 atoms"]
     scale: float
     r_cut: Float[np.ndarray, "types"]
+
+
+def quantities(force: PairForce | ManyBodyForce) -> Any:
+    """The parameters of a force that are quantities: a pytree of arrays."""
+    if isinstance(force, PairForce):
+        return force.model
+    return eqx.filter(force.potential, eqx.is_inexact_array)
+
+
+def with_quantities(force: PairForce | ManyBodyForce, values: Any) -> PairForce | ManyBodyForce:
+    """The force with other quantities; inside jit too."""
+    if isinstance(force, PairForce):
+        return replace(force, model=values)
+    rest = eqx.filter(force.potential, eqx.is_inexact_array, inverse=True)
+    return replace(force, potential=eqx.combine(values, rest))
 
 
 def names(simulation: Simulation) -> tuple[str, ...]:

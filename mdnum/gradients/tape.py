@@ -102,6 +102,7 @@ class Tape:
         steps: last step.
         flips: whether to write the ledger too.
         budget: bytes of recorded stretches that are kept; the rest is made again when it is asked for.
+        each: called with every stretch when it has been made.
         progress: called with the step reached and the last step.
 
     Raises:
@@ -116,6 +117,7 @@ class Tape:
         *,
         flips: bool = False,
         budget: int = 2**29,
+        each: Callable[[Stretch], None] | None = None,
         progress: Callable[[int, int], None] | None = None,
     ):
         self.simulation, self.loss, self.steps = simulation, loss, steps
@@ -142,6 +144,8 @@ class Tape:
             self._ledgers.append(None if recorder is None else recorder.flips(segment))
             stretch = stretch_of(segment, start, self._ledgers[-1])
             self._observe(stretch)
+            if each is not None:
+                each(stretch)
             if held + stretch.nbytes <= budget:
                 self._kept[len(self._starts) - 1] = stretch
                 held += stretch.nbytes
