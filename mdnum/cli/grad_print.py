@@ -12,13 +12,17 @@ def print_rows(summary: Mapping[str, Any]) -> None:
     """What a gradient folder says below its headline."""
     out = output.console()
     loss = summary["loss"]
-    size = f"{summary['atoms']:,} atoms" if "atoms" in summary else f"{summary['balls']:,} balls"
+    many, noun = (summary["atoms"], "atom") if "atoms" in summary else (summary["balls"], "ball")
+    size = f"{many:,} {noun}{'' if many == 1 else 's'}"
     out.print(
         f"  {summary['system']}, {size}, {summary['steps']:,} steps; "
         f"{loss['word']} = {summary['value']:.10g} {loss['unit']}",
         markup=False,
     )
     _print_methods(summary)
+    for part in ("growth", "flips", "trust"):
+        if found := summary.get(part):
+            out.print(f"  {part}: {found['says']}", markup=False)
     for one in summary["refused"]:
         out.print(f"  {one['method']} gave none: {one['why']}", markup=False)
     if left := summary["left_out"]:
@@ -44,11 +48,13 @@ def _print_methods(summary: Mapping[str, Any]) -> None:
         table.append((one["method"], *cells))
     columns = [part for name in names for part in (f"d/d {name}", f"from {reference}")]
     output.print_table("", ("method", *columns), table)
-    notes = dict.fromkeys(
-        (one["method"], name, note) for one in summary["methods"] for name, note in one["notes"].items()
-    )
-    for method, name, note in notes:
-        output.console().print(f"  {method}, {name}: {note}", markup=False)
+    # one line for each note, whatever it is about
+    notes: dict[tuple[str, str], list[str]] = {}
+    for one in summary["methods"]:
+        for name, note in one["notes"].items():
+            notes.setdefault((one["method"], note), []).append(name)
+    for (method, note), about in notes.items():
+        output.console().print(f"  {method} by {', '.join(about)}: {note}", markup=False)
 
 
 def _slope(found: Mapping[str, Any], name: str) -> str:

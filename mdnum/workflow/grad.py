@@ -99,18 +99,20 @@ def _molecules(
     folder = opened(system, "grad", out, "grad")
     try:
         told = Log(folder, progress)
-        opinions = grad_methods.run(plan, problem, names, told)
-        agreement = grad_methods.compare(problem, opinions)
-        grad_record.write(folder, agreement)
+        found = grad_methods.run(plan, problem, names, told)
+        grad_record.write(folder, found)
         folder.finalize()
-        summary = grad_record.summarize(problem, word, names, agreement)
-        summary["refused"] = [*plan.refused, *summary["refused"]]
-        summary |= {"left_out": list(plan.left_out), "seconds": time.perf_counter() - began}
-        folder.write_summary(summary)
+        folder.write_summary(
+            grad_record.summarize(problem, word, names, found)
+            | {
+                "left_out": [*_shorter(system, steps, problem.steps), *plan.left_out, *found.failed],
+                "seconds": time.perf_counter() - began,
+            }
+        )
     except BaseException:
         folder.close()
         raise
-    made = {one.method: one.found for one in opinions if one.found is not None}
+    made = {one.method: one.found for one in found.agreement.opinions if one.found is not None}
     return GradResult(folder.path, made, finish(folder, report, progress))
 
 
@@ -129,7 +131,6 @@ def _problem(
             where=system.name,
             remedy=f"Add --of LOSS. There are {', '.join(LOSSES)}",
         )
-    word, made = loss(of)
     last = steps_of(system, steps)
     simulation = build(system)
     if not simulation.pairwise:
@@ -138,12 +139,7 @@ def _problem(
             where=system.name,
             remedy="Differentiate it in Python, with mdnum.gradients",
         )
-    if LOSSES[word].needs_box and not all(simulation.pbc):
-        raise InputError(
-            f"the loss {word} is one of a periodic box, and this system has an open side",
-            where=system.name,
-            remedy="Take another loss, or close the box with structure.pbc",
-        )
+    word, made = loss(of, simulation, last)
     if not wrt:
         raise InputError(
             "no parameter to differentiate by",
@@ -151,3 +147,11 @@ def _problem(
             remedy=f"Add --wrt NAME,NAME. There are {', '.join(parameters.names(simulation))}",
         )
     return word, Problem(simulation, made, last), parameters.resolve(simulation, wrt)
+
+
+def _shorter(system: System, asked: int | None, steps: int) -> list[dict[str, str]]:
+    """That fewer steps were made than the system has, where nobody asked for that."""
+    own = system.spec.dynamics.steps
+    if asked is not None or steps >= own:
+        return []
+    return [{"what": f"{own - steps:,} steps", "why": f"the system has {own:,}", "how": f"--steps {own}"}]

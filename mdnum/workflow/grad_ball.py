@@ -149,6 +149,9 @@ def _summary(
         ],
         "reference": reference,
         "exact": dict(right),
+        "growth": None,
+        "flips": None,
+        "trust": None,
         "methods": [
             {
                 "method": one["method"],

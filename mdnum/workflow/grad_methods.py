@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mdnum.errors import InputError, NumericalError
-from mdnum.gradients.diagnose import Agreement, Comparison, Opinion
+from mdnum.errors import InputError
+from mdnum.gradients.base import Gradient, independent
+from mdnum.gradients.diagnose.agreement import agreement
+from mdnum.gradients.diagnose.flips import flips
+from mdnum.gradients.diagnose.growth import GrowthWatch
+from mdnum.gradients.diagnose.passes import Passed, passed
 from mdnum.gradients.differences import FiniteDifferences
 from mdnum.gradients.registry import METHODS, by_word
+from mdnum.gradients.symmetric import EventAware, Symmetric, weights
 from mdnum.workflow.fork_question import Progress
 
 if TYPE_CHECKING:
     from mdnum.gradients.base import Method, Problem
+    from mdnum.gradients.diagnose import Agreement, Flips, Growth
 
 #: Runs every method that applies.
 ALL = "all"
@@ -25,7 +30,7 @@ AFFORDABLE = 20_000_000
 #: Shifts of finite differences where nothing was said about methods.
 _LEVELS = 2
 #: What is tried where nothing was said about methods.
-_QUICK = ("event-aware", "symmetric", "unrolled", "finite-differences")
+_QUICK = ("event-aware", "symmetric", "finite-differences")
 
 
 @dataclass(frozen=True)
@@ -34,13 +39,28 @@ class Plan:
 
     Attributes:
         methods: in this order.
-        refused: those asked for that do not apply: method and why.
         left_out: what was not asked for and not run: what, why, and how to ask.
     """
 
     methods: tuple[Method, ...]
-    refused: tuple[dict[str, str], ...] = ()
     left_out: tuple[dict[str, str], ...] = ()
+
+
+@dataclass(frozen=True)
+class Found:
+    """What the methods gave.
+
+    Attributes:
+        agreement: every method and what their differences mean.
+        growth: of the gradient with the horizon; None where there was no reverse pass to watch.
+        flips: what each of them adds; None where there was no such pass, or no number to add to.
+        failed: further parts that could not be had: what, why, and how to ask otherwise.
+    """
+
+    agreement: Agreement
+    growth: Growth | None
+    flips: Flips | None
+    failed: tuple[dict[str, str], ...] = ()
 
 
 def plan(problem: Problem, names: Sequence[str], asked: Sequence[str] | None) -> Plan:
@@ -52,105 +72,120 @@ def plan(problem: Problem, names: Sequence[str], asked: Sequence[str] | None) ->
         asked: words; None for those that answer soon.
 
     Raises:
-        InputError: no such method, or none applies.
+        InputError: no such method.
     """
-    if asked is None:
-        return _quick(problem, names)
-    chosen = [by_word(word) for word in (METHODS if ALL in asked else asked) if word != ALL]
-    apply, refused = [], []
-    for method in chosen:
-        why = method.why_not(problem, names)
+    if asked is not None:
+        return Plan(tuple(by_word(word) for word in (METHODS if ALL in asked else asked)))
+    apply: list[Method] = []
+    left: list[dict[str, str]] = []
+    for word, make in METHODS.items():
+        method = FiniteDifferences(levels=_LEVELS) if word == "finite-differences" else make()
+        why = _why_left_out(word, method, problem, names)
         if why is None:
             apply.append(method)
         else:
-            refused.append({"method": method.name, "why": why})
-    if not apply:
-        reasons = "; ".join(f"{one['method']}: {one['why']}" for one in refused)
+            left.append({"what": word, "why": why, "how": f"--methods {word}, or --methods all"})
+    return Plan(tuple(apply), tuple(left))
+
+
+def _why_left_out(word: str, method: Method, problem: Problem, names: Sequence[str]) -> str | None:
+    """Why a method is not run where nothing was said about methods."""
+    if word not in _QUICK:
+        return "another opinion, which takes its time"
+    # whether it has a derivative by some of them
+    alone = [method.why_not(problem, [name]) for name in names]
+    if None not in alone:
+        return alone[0]
+    if word == "finite-differences":
+        runs = 2 * _LEVELS * alone.count(None) + 1
+        if runs * problem.simulation.atoms * problem.steps > AFFORDABLE:
+            return f"{runs} more runs of {problem.steps:,} steps"
+    return None
+
+
+def run(plan: Plan, problem: Problem, names: Sequence[str], progress: Progress) -> Found:
+    """Every method of a plan, and how the gradient grows, from the reverse pass that is made anyhow.
+
+    Raises:
+        InputError: no method applies, with the reason of each. NumericalError: the run blew up.
+    """
+    if not plan.methods:
+        reasons = "; ".join(f"{one['what']}: {one['why']}" for one in plan.left_out)
         raise InputError(
             f"no method applies: {reasons}",
             where=problem.simulation.system.name,
-            remedy=f"There are {', '.join(METHODS)}",
+            remedy="Ask for one with --methods",
         )
-    return Plan(tuple(apply), tuple(refused))
-
-
-def _quick(problem: Problem, names: Sequence[str]) -> Plan:
-    """Reverse passes, and differences where they are soon made."""
-    apply, left, refused = [], [], []
-    for word, make in METHODS.items():
-        method = FiniteDifferences(levels=_LEVELS) if word == "finite-differences" else make()
-        why = method.why_not(problem, names)
-        if why is not None:
-            refused.append(f"{word}: {why}")
-            continue
-        if word not in _QUICK:
-            left.append({"what": word, "why": "another opinion, not made by default", "how": _ask(word)})
-            continue
-        if word == "finite-differences":
-            runs = 2 * _LEVELS * len(names) + 1
-            cost = runs * problem.simulation.atoms * problem.steps
-            if cost > AFFORDABLE:
-                why = f"{runs} more runs of {problem.steps:,} steps"
-                left.append({"what": word, "why": why, "how": _ask(word)})
-                continue
-        apply.append(method)
-    if not apply:
-        raise InputError(f"no method applies: {'; '.join(refused)}", where=problem.simulation.system.name)
-    return Plan(tuple(apply), left_out=tuple(left))
-
-
-def _ask(word: str) -> str:
-    return f"--methods {word}, or --methods all"
-
-
-def run(plan: Plan, problem: Problem, names: Sequence[str], progress: Progress) -> tuple[Opinion, ...]:
-    """Every method of a plan; one that fails says why.
-
-    Raises:
-        InputError, NumericalError: the last method's own, where none gave a gradient.
-    """
-    opinions: list[Opinion] = []
-    last: InputError | NumericalError | None = None
-    for method in plan.methods:
-        progress(0, 0, {"phase": method.name})
-        began = time.perf_counter()
-        found, missing = None, ""
+    known: dict[str, Gradient] = {}
+    growth, added = None, None
+    failed: list[dict[str, str]] = []
+    asked = {one.name: one for one in plan.methods}
+    aware = asked.get("event-aware")
+    if isinstance(aware, EventAware) and aware.why_not(problem, names) is None:
+        watch = GrowthWatch(problem.simulation, names, problem.steps)
+        watched = passed(
+            problem,
+            names,
+            guard=aware.guard,
+            watches=[watch],
+            progress=_phases(progress, "event-aware: "),
+        )
+        growth = watch.result(watched.gradient)
+        known["event-aware"] = _event_aware(aware, problem, watched)
+        if isinstance(asked.get("symmetric"), Symmetric):
+            # the same run, so that it need not be made twice
+            plainly = passed(
+                problem, names, saltation=False, tape=watched.tape, progress=_phases(progress, "symmetric: ")
+            )
+            known["symmetric"] = Gradient(
+                asked["symmetric"].name,
+                asked["symmetric"].says,
+                plainly.tape.value,
+                plainly.gradient,
+                independent(problem, plainly.gradient, saltation=False),
+                {"stretches": len(plainly.tape), "made again": plainly.tape.replayed},
+            )
         try:
-            found = method(problem, names, progress=_phases(progress, method.name))
-        except (InputError, NumericalError) as error:
-            # another way may exist where this one fails
-            missing, last = str(error), error
-        opinions.append(Opinion(method.name, method.says, found, missing, time.perf_counter() - began))
-    if last is not None and not any(one.found for one in opinions):
-        raise last
-    return tuple(opinions)
+            added = flips(
+                problem, names, made=watched, progress=_phases(progress, "contributions of flips: ")
+            )
+        except InputError as error:
+            failed.append({"what": "contributions of flips", "why": error.message, "how": error.remedy or ""})
+    found = agreement(
+        problem,
+        names,
+        plan.methods,
+        known=known,
+        growth=1.0 if growth is None else _gain(growth),
+        progress=_phases(progress),
+    )
+    return Found(found, growth, added, tuple(failed))
 
 
-def _phases(progress: Progress, method: str) -> Callable[[int, int, str], None]:
+def _event_aware(method: EventAware, problem: Problem, made: Passed) -> Gradient:
+    """What the method itself would say of this pass."""
+    return Gradient(
+        method.name,
+        method.says,
+        made.tape.value,
+        made.gradient,
+        independent(problem, made.gradient, saltation=True),
+        {"guard": made.guard, **weights(made.crossings)},
+    )
+
+
+def _gain(growth: Growth) -> float:
+    """How much the gradient by the state grew over the run."""
+    seen = growth.size[np.isfinite(growth.size) & (growth.size > 0)]
+    return float(seen[-1] / seen[0]) if len(seen) else 1.0
+
+
+def _phases(progress: Progress, method: str = "") -> Callable[[int, int, str], None]:
     """What a method reports, as a rollout would."""
 
     def tell(done: int, of: int, phase: str) -> None:
-        unit = "runs" if phase == "differences" else "steps"
-        info: dict[str, Any] = {"phase": f"{method}: {phase}", "unit": unit}
+        unit = "runs" if phase.endswith("differences") else "steps"
+        info: dict[str, Any] = {"phase": f"{method}{phase}", "unit": unit}
         progress(done, of, info)
 
     return tell
-
-
-def compare(problem: Problem, opinions: Sequence[Opinion]) -> Agreement:
-    """What the methods found against one of them: the derivative of the flow, where there is one."""
-    found = {one.method: one.found for one in opinions if one.found is not None}
-    reference = "event-aware" if "event-aware" in found else next(iter(found))
-    base = found[reference].gradient
-    rows = []
-    for method, one in found.items():
-        if method == reference:
-            continue
-        for name, value in one.gradient.items():
-            apart = np.ravel(value - base[name])
-            size, other = (float(np.linalg.norm(np.ravel(each))) for each in (base[name], value))
-            difference = float(apart[0]) if len(apart) == 1 else float(np.linalg.norm(apart))
-            largest = max(size, other)
-            relative = abs(difference) / largest if largest else 0.0
-            rows.append(Comparison(name, method, reference, size, difference, relative, "", ""))
-    return Agreement(problem.steps, reference, tuple(opinions), tuple(rows))

@@ -16,7 +16,8 @@ from mdnum.workflow.grad_words import LOSSES, unit_of_loss, unit_of_parameter
 
 if TYPE_CHECKING:
     from mdnum.gradients.base import Gradient, Problem
-    from mdnum.gradients.diagnose import Agreement, Opinion
+    from mdnum.gradients.diagnose import Opinion
+    from mdnum.workflow.grad_methods import Found
 
 #: Entries of a derivative that summary.json tells one by one.
 _FEW = 6
@@ -24,11 +25,11 @@ _FEW = 6
 ARRAYS = "gradients.npz"
 
 
-def write(folder: RunFolder, agreement: Agreement) -> None:
-    """Puts large derivatives into a folder."""
+def write(folder: RunFolder, found: Found) -> None:
+    """Puts large derivatives, how the gradient grows and what each flip adds into a folder."""
     large = {
         f"{one.method}/{name}": np.asarray(value)
-        for one in agreement.opinions
+        for one in found.agreement.opinions
         if one.found is not None
         for name, value in one.found.gradient.items()
         if np.size(value) > _FEW
@@ -37,10 +38,15 @@ def write(folder: RunFolder, agreement: Agreement) -> None:
         sink = io.BytesIO()
         np.savez_compressed(sink, **large)  # type: ignore[arg-type]
         write_bytes(folder.path / ARRAYS, sink.getbuffer())
+    if found.growth is not None:
+        folder.append("growth", found.growth.table())
+    if found.flips is not None and len(found.flips):
+        folder.append("flip_contributions", found.flips.table())
 
 
-def summarize(problem: Problem, word: str, names: Sequence[str], agreement: Agreement) -> dict[str, Any]:
+def summarize(problem: Problem, word: str, names: Sequence[str], found: Found) -> dict[str, Any]:
     """The content of summary.json, without headline and findings."""
+    agreement = found.agreement
     simulation = problem.simulation
     units = simulation.units
     reference = agreement.gradient(agreement.reference)
@@ -68,6 +74,9 @@ def summarize(problem: Problem, word: str, names: Sequence[str], agreement: Agre
         "reference": agreement.reference,
         "methods": [_method(one, one.found) for one in agreement.opinions if one.found is not None],
         "comparisons": [one.plain() for one in agreement.comparisons],
+        "growth": None if found.growth is None else found.growth.plain(),
+        "flips": None if found.flips is None else found.flips.plain(),
+        "trust": None,
         "refused": [
             {"method": one.method, "why": one.missing} for one in agreement.opinions if one.found is None
         ],

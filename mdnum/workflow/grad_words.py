@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import dataclass, fields
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +12,7 @@ from mdnum.errors import InputError
 
 if TYPE_CHECKING:
     from mdnum.gradients.losses import Loss
+    from mdnum.systems.build import Simulation
     from mdnum.units import Units
 
 #: Velocities and what is made of them: inside, time is length * sqrt(mass / energy).
@@ -26,13 +27,11 @@ class LossWord:
         kind: name of its class in `mdnum.gradients.losses`.
         about: what it is, a few words.
         unit: its unit, with the names of `Units` in braces.
-        needs_box: whether it means nothing without a periodic box.
     """
 
     kind: str
     about: str
     unit: str
-    needs_box: bool = False
 
 
 #: Losses by word.
@@ -40,18 +39,21 @@ LOSSES: Mapping[str, LossWord] = MappingProxyType(
     {
         "msd": LossWord("MeanSquaredDisplacement", "mean squared displacement at the last step", "{length}²"),
         "vacf": LossWord("VelocityAutocorrelation", "mean of v(0) · v(t) at the last step", _SPEED2),
+        "diffusion-einstein": LossWord(
+            "EinsteinDiffusion", "diffusion constant from the slope of displacements", "{length}²/{time}"
+        ),
+        "diffusion-green-kubo": LossWord(
+            "GreenKuboDiffusion", "diffusion constant from the velocity autocorrelation", "{length}²/{time}"
+        ),
+        "rdf": LossWord("RadialDistribution", "mean squared difference of g(r) from 1", ""),
         "potential": LossWord(
             "MeanPotential", "potential energy of an atom, averaged over steps", "{energy}"
         ),
         "temperature": LossWord(
             "MeanTemperature", "kinetic temperature, averaged over steps", "{temperature}"
         ),
-        "pressure": LossWord(
-            "MeanPressure", "pressure, averaged over steps", "{energy}/{length}³", needs_box=True
-        ),
-        "final-projection": LossWord(
-            "FinalProjection", "mean of the last positions along a direction", "{length}"
-        ),
+        "pressure": LossWord("MeanPressure", "pressure, averaged over steps", "{energy}/{length}³"),
+        "final-projection": LossWord("FinalProjection", "mean of the last positions along x", "{length}"),
     }
 )
 
@@ -65,12 +67,13 @@ _UNITS: Mapping[str, str] = MappingProxyType(
 )  # fmt: skip
 
 
-def loss(text: str) -> tuple[str, Loss]:
+def loss(text: str, simulation: Simulation, steps: int) -> tuple[str, Loss]:
     """The loss that a word names, and the word without its options.
 
     Args:
         text: a word of `LOSSES`, with numbers of the loss behind a colon where others than the defaults are
             meant: "potential:every=10,first=500".
+        simulation, steps: what it is a loss of.
 
     Raises:
         InputError: no such loss, or it has no such number.
@@ -84,29 +87,36 @@ def loss(text: str) -> tuple[str, Loss]:
     from mdnum.gradients import losses
 
     make: Callable[..., Loss] = getattr(losses, LOSSES[word].kind)
-    return word, make(**_options(word, make, rest))
+    options = _options(word, make, rest)
+    if word == "rdf":
+        # every pair is looked at, and neighboring steps look alike
+        options = {"every": 10, "bins": 60} | options
+        # bins reach two widths further, and no further than nearest images do
+        half = 0.5 * float(min(simulation.cell.widths))
+        options.setdefault("r_max", 0.999 * half / (1 + 2 / options["bins"]))
+    elif word == "diffusion-green-kubo":
+        every = options.get("every", 1)
+        options.setdefault("until", steps // every * every)
+    return word, make(**options)
 
 
 def _options(word: str, make: Any, rest: str) -> dict[str, Any]:
     """The numbers behind the colon."""
-    known = {one.name: one for one in fields(make) if isinstance(one.default, int | float)}
+    known = {one.name: str(one.type) for one in fields(make) if one.type in ("int", "float")}
     found: dict[str, Any] = {}
     for part in filter(None, (part.strip() for part in rest.split(","))):
         key, equals, value = (piece.strip() for piece in part.partition("="))
         if not equals or key not in known:
             raise InputError(
-                f"{part!r} is not a number of the loss {word}",
+                f"{part!r} is no number of the loss {word}",
                 remedy=f"It has {', '.join(known)}; write for example {word}:every=10",
             )
-        kind = type(known[key].default) if known[key].default is not MISSING else float
         try:
-            found[key] = kind(value)
+            found[key] = int(value) if known[key] == "int" else float(value)
         except ValueError:
-            raise InputError(f"{key} = {value!r} of the loss {word} is not {_A[kind]}") from None
+            a = "a whole number" if known[key] == "int" else "a number"
+            raise InputError(f"{key} = {value!r} of the loss {word} is not {a}") from None
     return found
-
-
-_A = {int: "a whole number", float: "a number"}
 
 
 def unit_of_loss(word: str, units: Units) -> str:

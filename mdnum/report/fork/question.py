@@ -99,12 +99,14 @@ def write_page(
     judged: Verdict,
     template: str,
     drawn: Mapping[str, Drawn],
+    scripted: bool = False,
     **content: Any,
 ) -> Path:
     """Writes report.html and figures/*.svg, and puts headline and findings into summary.json.
 
     Args:
         drawn: figures by name.
+        scripted: whether a table of the page can be searched.
     """
     judged.store(folder, run.summary)
     pictures = {
@@ -118,7 +120,7 @@ def write_page(
         pictures=pictures,
         notes={name: notes for name, (_, _, notes) in drawn.items()},
         summary=run.summary,
-        scripted=False,
+        scripted=scripted,
         provenance=list(page.flat(run.provenance)),
         **content,
     )

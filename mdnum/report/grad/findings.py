@@ -6,14 +6,20 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+import numpy as np
+
 from mdnum.report.fork.findings import Verdict
 from mdnum.report.fork.question import Question, verdict
-from mdnum.report.grad.words import by, size, slope, slope_unit
+from mdnum.report.grad.words import apart, by, size, slope, slope_unit
 from mdnum.report.verdict import Finding
-from mdnum.report.words import listed, many
+from mdnum.report.words import count, listed, many, number, percent
 
-#: Error estimates of a difference within which a method agrees with the reference.
-_ERRORS = 3
+#: Share of a derivative above which single flips decide it, and how many of them count as single.
+_HEAVY, _SINGLE = 0.2, 3
+#: Share of the weight of all flips above which what the guard leaves out matters.
+_LEFT_OUT = 0.01
+#: Relative difference from a closed form within which a derivative is that of the exact motion.
+_CLOSE = 0.01
 
 
 def judge(run: Question) -> Verdict:
@@ -38,13 +44,118 @@ def _evidence(run: Question) -> Iterator[str]:
     summary = run.summary
     reference = by(run, summary["reference"])
     if reference is not None:
-        yield f"By {reference['method']}: {reference['says']}."
+        yield f"By {reference['method']}: {reference['says'].rstrip('.')}."
+    if trust := summary.get("trust"):
+        yield trust["says"]
+    elif growth := summary.get("growth"):
+        yield growth["says"]
+    added = (summary.get("flips") or {}).get("share", {})
+    told = [
+        f"{percent(abs(parts['pair enters'] + parts['pair leaves']))} of that by {name}"
+        for name, parts in added.items()
+        if None not in parts.values()
+    ]
+    if told:
+        yield f"Flips on the way make {listed(told)}."
 
 
 def _findings(run: Question) -> Iterator[Finding]:
     yield from _not_finite(run)
     yield from _no_dependence(run)
+    yield from _unexplained(run)
+    yield from _plain_at_a_jump(run)
+    yield from _short(run)
+    yield from _few_flips(run)
+    yield from _grazing(run)
+    yield from _off_the_motion(run)
     yield from _refused(run)
+
+
+def _unexplained(run: Question) -> Iterator[Finding]:
+    """Methods that should agree and do not."""
+    for row in run.summary["comparisons"]:
+        if row["means"] == "unexplained":
+            yield Finding(
+                "UNEXPLAINED",
+                "warning",
+                f"{row['method']} and {row['reference']} differ by {row['name']}",
+                f"They are {apart(row)}. {row['says']}",
+                "Compare them at a shorter horizon, where less has grown.",
+            )
+
+
+def _plain_at_a_jump(run: Question) -> Iterator[Finding]:
+    """Only methods that hold decisions fixed, where flips count."""
+    summary = run.summary
+    aware = {"event-aware", "smoothed-differences", "ensemble", "closed form"}
+    methods = [one["method"] for one in summary["methods"]]
+    if summary.get("force_jump") and not aware & {*methods, summary["reference"]}:
+        jump = f"{number(summary['force_jump'])} {run.units.energy}/{run.units.length}"
+        held = f"{listed(methods)} hold{'s' * (len(methods) == 1)} decisions fixed"
+        yield Finding(
+            "MISSING_SALTATION",
+            "warning",
+            "what the flips add is missing",
+            f"The force jumps by {jump} at the cutoff, and {held}: the error does not shrink with the time "
+            "step, and the derivative by the cutoff comes out as 0.",
+            "Add event-aware to --methods, or take a cutoff without a jump: --set cutoff.kind=switched.",
+        )
+
+
+def _short(run: Question) -> Iterator[Finding]:
+    """A gradient that is not trusted as far as it was asked for."""
+    trust = run.summary.get("trust")
+    if trust and trust["limited_by"] and trust["horizon"] < run.steps:
+        yield Finding(
+            "BEYOND_TRUST",
+            "warning",
+            f"trusted up to {many(trust['horizon'], 'step')} of {count(run.steps)}",
+            trust["says"],
+            "Ask for a shorter horizon, or for an average over starts with --replicas.",
+        )
+
+
+def _few_flips(run: Question) -> Iterator[Finding]:
+    """Derivatives that hang on a flip or two."""
+    table = run.tables["flip_contributions"]
+    for name, total in (run.summary.get("flips") or {}).get("total", {}).items():
+        added = table.get(f"contribution.{name}")
+        if added is None or not len(added) or not total:
+            continue
+        heavy = np.argsort(-np.abs(added))[:_SINGLE]
+        heavy = heavy[np.abs(added[heavy]) > _HEAVY * abs(total)]
+        if not len(heavy):
+            continue
+        first = heavy[0]
+        pair = f"{table['i'][first]}–{table['j'][first]} at step {count(int(table['step'][first]))}"
+        speed = number(abs(float(table["radial_speed"][first])), 2)
+        how = (
+            f"{many(len(heavy), 'flip')} add{'s' * (len(heavy) == 1)} more than {percent(_HEAVY)} of it each"
+        )
+        yield Finding(
+            "FEW_FLIPS",
+            "info",
+            f"few flips decide the derivative by {name}",
+            f"{how}: first the pair {pair}, which crosses with a radial speed of {speed} and adds "
+            f"{percent(abs(float(added[first]) / total))}. One run then says little of another.",
+            "Average over starts with --replicas.",
+        )
+
+
+def _grazing(run: Question) -> Iterator[Finding]:
+    """What the guard left out."""
+    found = by(run, "event-aware")
+    details = {} if found is None else found["details"]
+    left, applied = details.get("weight left out"), details.get("weight applied")
+    if left and applied is not None and left > _LEFT_OUT * (left + applied):
+        yield Finding(
+            "GRAZING",
+            "warning",
+            f"{many(details['grazing'], 'flip')} that graze{'s' * (details['grazing'] == 1)} left out",
+            f"They would have had {percent(left / (left + applied))} of the weight of all flips: slower than "
+            f"the guard, {number(details['guard'], 2)}, a crossing has no time that a derivative could move.",
+            "Look at them in flip_contributions.parquet; average over starts with --replicas.",
+        )
 
 
 def _not_finite(run: Question) -> Iterator[Finding]:
@@ -79,6 +190,33 @@ def _no_dependence(run: Question) -> Iterator[Finding]:
             f"Every method gives exactly 0: {next(filter(None, notes), 'nothing that ran used it')}.",
             "Look at another loss, or run longer.",
         )
+
+
+def _off_the_motion(run: Question) -> Iterator[Finding]:
+    """Methods that do not give the derivative of the exact motion, where that is known."""
+    if not run.summary.get("exact"):
+        return
+    off = [row for row in run.summary["comparisons"] if not row["relative"] <= _CLOSE]
+    if not off:
+        return
+    aware = [row for row in off if row["method"] == "event-aware"]
+    methods = list(dict.fromkeys(row["method"] for row in off))
+    each = {
+        method: ", ".join(f"{row['name']} {apart(row)}" for row in off if row["method"] == method)
+        for method in methods
+    }
+    told = listed([f"{method} ({rows})" for method, rows in each.items()])
+    impact = run.summary["contact_kind"] == "impact" and run.summary["integrator"] != "event-located"
+    located = ", or locate the impacts: --set integrator.kind=event-located" if impact else ""
+    yield Finding(
+        "NOT_THE_MOTION",
+        "warning" if aware else "info",
+        f"{many(len(methods), 'method')} not within {100 * _CLOSE:g} % of the exact motion",
+        f"{told[:1].upper()}{told[1:]}. "
+        + ("Event-aware among them: the steps themselves do not follow the motion." if aware else
+           "They are derivatives of something else, and say of what."),
+        f"Use a smaller time step{located}." if aware else "",
+    )  # fmt: skip
 
 
 def _refused(run: Question) -> Iterator[Finding]:

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from mdnum.report.fork.findings import Verdict
-from mdnum.report.fork.question import Question, load, size_of, took, write_page
-from mdnum.report.grad import findings
+from mdnum.report.fork.question import Question, declared, load, size_of, took, write_page
+from mdnum.report.grad import figures as drawn
+from mdnum.report.grad import findings, sections
 from mdnum.report.grad.words import EXACT, by, difference, slope, slope_unit, value_text
 from mdnum.report.words import count, number
 from mdnum.store import RunFolder
@@ -24,16 +25,22 @@ def write_report(folder: RunFolder | str | Path) -> Path:
         FolderError: no gradient in the folder, or it cannot be written.
     """
     folder, run = load(folder, "grad", "grad")
+    browsed = sections.flips(run)
     return write_page(
         folder,
         run,
         findings.judge(run),
         "grad/run.html.j2",
-        {},
-        captions={},
+        {name: declared(plot) for name, plot in drawn.plots(run).items()},
+        captions=drawn.captions(run),
         figures=list(_key_figures(run)),
         parameters=[_parameter(run, one) for one in run.summary["parameters"]],
         methods=list(_methods(run)),
+        differences=list(sections.differences(run)),
+        shares=sections.shares(run),
+        browsed=browsed,
+        rows_shown=sections.TABLE_ROWS,
+        scripted=browsed is not None,
         what=list(_what(run)),
     )
 
@@ -57,7 +64,7 @@ def _key_figures(run: Question) -> Iterator[tuple[str, str, str]]:
     )
     reference = by(run, summary["reference"])
     for one in summary["parameters"][:4]:
-        yield f"by {one['name']}", slope(reference, one["name"]), slope_unit(summary, one)
+        yield f"by {one['name']}", slope(reference, one["name"], 4), slope_unit(summary, one)
     details = {} if reference is None else reference["details"]
     if "crossings" in details:
         yield "Flips on the way", count(details["crossings"]), f"{count(details['grazing'])} of them grazing"
@@ -73,11 +80,11 @@ def _methods(run: Question) -> Iterator[dict[str, Any]]:
     summary = run.summary
     rows = sorted(summary["methods"], key=lambda one: one["method"] != summary["reference"])
     if summary.get("exact"):
-        cells = [(number(summary["exact"].get(one["name"]), 6), "") for one in summary["parameters"]]
+        cells = [(number(summary["exact"].get(one["name"]), 6), ("", "")) for one in summary["parameters"]]
         yield {"method": "closed form", "says": EXACT, "cells": cells}
     for one in rows:
         cells = [
-            (slope(one, each["name"]), difference(run, one["method"], each["name"]))
+            (slope(one, each["name"]), difference(run, one["method"], each["name"])[:2])
             for each in summary["parameters"]
         ]
         yield {"method": one["method"], "says": one["says"], "cells": cells}

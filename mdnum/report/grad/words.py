@@ -48,7 +48,9 @@ def slope_unit(summary: Mapping[str, Any], parameter: Mapping[str, Any]) -> str:
         return ""
     if not below:
         return above
-    return f"{above}/({below})" if "/" in below else f"{above}/{below}"
+    above = above or "1"
+    joined = "/" in below and not below.startswith("√")
+    return f"{above}/({below})" if joined else f"{above}/{below}"
 
 
 def value_text(parameter: Mapping[str, Any]) -> str:
@@ -62,13 +64,10 @@ def value_text(parameter: Mapping[str, Any]) -> str:
     return f"{text} {parameter['unit']}".rstrip()
 
 
-def difference(run: Question, method: str, name: str) -> str:
-    """How far a method is from the reference; "" where it is the reference."""
+def difference(run: Question, method: str, name: str) -> tuple[str, str, str]:
+    """How far a method is from the reference, what that means, and the same in a sentence."""
     row = comparison(run, method, name)
-    if row is None:
-        return ""
-    means = f", {row['means']}" if row["means"] else ""
-    return f"{apart(row)}{means}"
+    return ("", "", "") if row is None else (apart(row), row["means"], row["says"])
 
 
 def comparison(run: Question, method: str, name: str) -> Mapping[str, Any] | None:
