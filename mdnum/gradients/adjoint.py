@@ -20,6 +20,7 @@ from jaxtyping import Array, Float
 
 from mdnum.errors import InputError
 from mdnum.gradients.crossings import Crossings, crossings, onto_crossings
+from mdnum.gradients.loops import over_rows
 from mdnum.gradients.losses import Frame
 from mdnum.gradients.pairs import FORCE, MODEL, SCALE, pull_back
 from mdnum.gradients.parameters import Cotangents
@@ -140,7 +141,7 @@ def reverse(
             simulation.tables(stretch.table),
             rows_of(stretch),
             stretch.bits,
-            np.arange(len(stretch.x)) < stretch.rows,
+            stretch.rows,
             tape.seen(stretch),
             (tape.loss, tape.origin, tape.around, onto_total),
             None if met is None else met.on_device(len(stretch.x), atoms),
@@ -231,7 +232,7 @@ def _stretch(
         )
 
     def step(carry: Carry, given):
-        row, told, use, see, met = given
+        row, told, see, met = given
         number, x, v = row[0], row[1], row[2]
         half = (0.5 * integrator.timestep).astype(dtype)
         second = jnp.where(number == 0, jnp.zeros((), dtype), half)
@@ -295,7 +296,6 @@ def _stretch(
                 r_cut=after.r_cut + by_radius,
                 scale=after.scale + by_scale.astype(after.scale.dtype),
             )
-        kept = jax.tree.map(lambda new, old: jnp.where(use, new, old), after, carry)
-        return kept, (weights, trace)
+        return after, (weights, trace)
 
-    return lax.scan(step, carry, (rows, bits, used, seen, crossed), reverse=True)
+    return over_rows(step, carry, (rows, bits, seen, crossed), used, backward=True)

@@ -21,6 +21,7 @@ from jaxtyping import Array, Float
 from mdnum.errors import InputError
 from mdnum.gradients.crossings import Crossings, Met, crossings, push_through
 from mdnum.gradients.directions import Column, Direction, columns_of, directions
+from mdnum.gradients.loops import over_rows
 from mdnum.gradients.losses import Frame
 from mdnum.gradients.tape import Stretch, Tape, frame_of, rows_of
 from mdnum.md.decide import Tables
@@ -118,7 +119,7 @@ def tangents(
             simulation.tables(stretch.table),
             rows_of(stretch),
             stretch.bits,
-            np.arange(len(stretch.x)) < stretch.rows,
+            stretch.rows,
             tape.seen(stretch),
             (tape.loss, tape.origin, tape.around),
             None if met is None else met.on_device(len(stretch.x), simulation.atoms),
@@ -238,12 +239,11 @@ def _stretch(
         return Carry(after_x, after_v, total), (dx, dv), dr
 
     def step(carry, given):
-        row, told, use, see, met = given
+        row, told, see, met = given
         after, here, dr = jax.vmap(lambda carry, along: push(row, told, see, met, carry, along))(carry, along)
-        kept = jax.tree.map(lambda new, old: jnp.where(use, new, old), after, carry)
-        return kept, (here if states else (), dr)
+        return after, (here if states else (), dr)
 
-    return lax.scan(step, carry, (rows, bits, used, seen, crossed))
+    return over_rows(step, carry, (rows, bits, seen, crossed), used)
 
 
 def _whole(matrix: Float[Array, "3 3"]) -> Float[Array, "3 3"]:

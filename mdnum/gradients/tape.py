@@ -19,11 +19,15 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mdnum.errors import NumericalError
 from mdnum.events import Ledger
+from mdnum.gradients.loops import over_rows
 from mdnum.gradients.losses import Frame, Loss, Surroundings
 from mdnum.md.verlet import PairTable
 from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, first_state, resume_point
 from mdnum.rollout.flips import PairRecorder
 from mdnum.systems.build import Simulation
+
+#: Fewest rows that a stretch is kept with.
+_LEAST_ROOM = 16
 
 
 @dataclass(frozen=True)
@@ -77,17 +81,19 @@ def stretch_of(segment: Segment, start: Start, ledger: Ledger | None = None) -> 
     """
     record, order = segment.record, segment.table.order
     assert segment.before is not None
+    # the record has room for the longest stretch; powers of two, so that not every length is compiled for
+    room = min(len(record.x), max(_LEAST_ROOM, 1 << (segment.rows - 1).bit_length()))
     return Stretch(
         segment.first,
         segment.rows,
-        np.array(record.x),
-        np.array(record.v),
-        np.array(record.images),
-        np.array(record.bits),
+        np.array(record.x[:room]),
+        np.array(record.v[:room]),
+        np.array(record.images[:room]),
+        np.array(record.bits[:room]),
         np.array(segment.before),
         np.asarray(start.state.x_before)[:, order],
-        np.array(record.potential),
-        np.array(record.virial),
+        np.array(record.potential[:room]),
+        np.array(record.virial[:room]),
         segment.table,
         ledger,
     )
@@ -190,7 +196,14 @@ class Tape:
             self.total = jax.tree.map(lambda one: jnp.zeros(one.shape, one.dtype), shapes)
         if seen.any():
             self.total = _summed(
-                self.loss, self.total, rows_of(stretch), seen, self.origin, self.around, stretch.table.order
+                self.loss,
+                self.total,
+                rows_of(stretch),
+                stretch.rows,
+                seen,
+                self.origin,
+                self.around,
+                stretch.table.order,
             )
 
 
@@ -211,7 +224,7 @@ def frame_of(row, order: Int[Array, "atoms"], matrix: Float[Array, "3 3"]) -> Fr
 
 
 @jax.jit
-def _summed(loss, total, rows, seen, origin, around, order):
+def _summed(loss, total, rows, used, seen, origin, around, order):
     def step(total, row):
         row, see = row
 
@@ -221,7 +234,7 @@ def _summed(loss, total, rows, seen, origin, around, order):
 
         return lax.cond(see, add, lambda total: total, total), None
 
-    return lax.scan(step, total, (rows, seen))[0]
+    return over_rows(step, total, (rows, seen), used)[0]
 
 
 def surroundings(simulation: Simulation) -> Surroundings:
