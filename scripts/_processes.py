@@ -68,14 +68,15 @@ def _memory_of(atoms: int, steps: int) -> None:
 
     def look(step: int, _: int, info: dict[str, Any]) -> None:
         if info["phase"] == "run" and 4 * step >= (len(seen) + 1) * steps:
-            seen.append({"step": step, "flips": info["flips"], "peak_mb": _peak_mb()})
+            seen.append({"step": step, "flips": info["flips"], "peak_mb": peak_mb()})
 
     with tempfile.TemporaryDirectory() as scratch:
         run(liquid(atoms), out=f"{scratch}/run", steps=steps, progress=look)
     print(json.dumps(seen))
 
 
-def _peak_mb() -> float:
+def peak_mb() -> float:
+    """Peak memory of this process, MB."""
     status = Path("/proc/self/status")
     if status.is_file():
         # getrusage would answer with the peak of the parent process where that is larger
