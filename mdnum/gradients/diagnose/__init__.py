@@ -3,6 +3,7 @@
 from mdnum.gradients.diagnose.agreement import agreement
 from mdnum.gradients.diagnose.flips import flips
 from mdnum.gradients.diagnose.growth import growth
+from mdnum.gradients.diagnose.horizons import Horizons, horizons
 from mdnum.gradients.diagnose.results import (
     Agreement,
     Comparison,
@@ -18,6 +19,7 @@ from mdnum.gradients.diagnose.results import (
     Spectrum,
     Trust,
 )
+from mdnum.gradients.diagnose.trust import trust
 
 __all__ = [
     "Agreement",
@@ -27,6 +29,7 @@ __all__ = [
     "Edges",
     "Flips",
     "Growth",
+    "Horizons",
     "Limit",
     "NotFinite",
     "Opinion",
@@ -36,4 +39,6 @@ __all__ = [
     "agreement",
     "flips",
     "growth",
+    "horizons",
+    "trust",
 ]

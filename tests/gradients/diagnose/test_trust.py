@@ -1,0 +1,109 @@
+"""How far a gradient is trusted: each limit against what it is made of."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+from small_systems import LENNARD_JONES, crystal, make
+
+from mdnum.errors import InputError
+from mdnum.gradients import Problem
+from mdnum.gradients.diagnose.horizons import Horizons, first_difference, horizons, spread
+from mdnum.gradients.diagnose.trust import ambiguity, last_below, shadow_of, standard_error, trust
+from mdnum.gradients.differences import richardson
+from mdnum.gradients.directions import Column
+from mdnum.gradients.losses import MeanPotential, MeanSquaredDisplacement
+from mdnum.systems import build
+
+QUINTIC = {"kind": "quintic", "radius": 2.2, "onset": 1.8}
+NARROW: dict[str, Any] = {"precision": dict.fromkeys(("state", "force", "decision", "accumulate"), "float32")}
+
+
+@pytest.fixture(scope="module")
+def problem():
+    simulation = build(make(crystal(), LENNARD_JONES, QUINTIC))
+    return Problem(simulation, MeanPotential(every=7, first=5), 60)
+
+
+@pytest.mark.slow
+def test_every_horizon_has_the_gradient_of_its_own_run(problem):
+    """A mean over frames, of which shorter runs have fewer."""
+    at = spread(problem, 4)
+    assert at.tolist() == [15, 30, 45, 60]
+    found = horizons(problem, ("potential.sigma",), at)
+    for k, steps in enumerate(at):
+        shorter = replace(problem, steps=int(steps))
+        slope = richardson(lambda q, one=shorter: one.value({"potential.sigma": q}), 1.0, 1e-4, 3)
+        assert found.value[k] == pytest.approx(shorter.value(), rel=1e-12)
+        assert found.gradient[k, 0] == pytest.approx(slope.value, rel=1e-7)
+
+
+def test_horizons_that_look_at_nothing_are_left_out(problem):
+    assert spread(problem, 20)[0] == 6
+
+
+def made(gradient, ledgers=()) -> Horizons:
+    gradient = np.asarray(gradient, float)[:, None]
+    return Horizons(np.arange(len(gradient)), (Column("q"),), gradient[:, 0], gradient, tuple(ledgers))
+
+
+def test_a_single_point_beyond_a_limit_does_not_end_trust():
+    at = np.array([10, 20, 30, 40, 50])
+    assert last_below(at, [np.array([0, 5, 0, 0, 0.0])], 1.0) == (50, False)
+    assert last_below(at, [np.array([0, 0, 5, 5, 5.0])], 1.0) == (20, True)
+    assert last_below(at, [np.zeros(5), np.array([0, 0, 0, 0, np.nan])], 1.0) == (40, True)
+    assert last_below(at, [np.full(5, 2.0)], 1.0) == (0, True)
+
+
+def test_the_standard_error_is_that_of_the_mean():
+    runs = [made([1.0, 1.0]), made([1.0, -1.0]), made([1.0, 3.0])]
+    found = standard_error(runs)["q"]
+    assert found.tolist() == pytest.approx([0.0, 2 / np.sqrt(3)])
+
+
+def test_runs_without_flips_differ_nowhere():
+    assert first_difference(made([1.0]), made([2.0])) is None
+
+
+def test_a_shadow_is_wider_where_there_is_a_wider_format(problem):
+    ours = shadow_of(problem.simulation)
+    moved = np.abs(ours.simulation.positions - problem.simulation.positions)
+    assert not ours.wider and 0 < moved.max() < 1e-14
+    narrow = shadow_of(build(make(crystal(), LENNARD_JONES, QUINTIC, **NARROW)))
+    assert narrow.wider and narrow.words == "float32 against float64"
+    force = eqx.filter(narrow.simulation.force, eqx.is_inexact_array)
+    assert {str(leaf.dtype) for leaf in jax.tree.leaves(force)} == {"float64"}
+    assert narrow.simulation.decider.dtype == "float64"
+
+
+def test_a_shell_at_the_cutoff_is_an_ambiguous_decision(problem):
+    shell = build(make(crystal(rattle=0), LENNARD_JONES, {"kind": "quintic", "radius": 1.8, "onset": 1.5}))
+    found = ambiguity(replace(problem, simulation=shell))
+    assert found.reached and found.horizon == 0 and "At step 0" in found.says
+    assert not ambiguity(problem).reached
+
+
+def test_bad_input_is_refused(problem):
+    with pytest.raises(InputError, match="each entry"):
+        trust(problem, ("v0",))
+    with pytest.raises(InputError, match="tolerance"):
+        trust(problem, ("sigma",), tolerance=2.0)
+
+
+@pytest.mark.slow
+def test_rounding_limits_a_narrow_run_where_it_has_grown_to_the_tolerance():
+    simulation = build(make(crystal(), LENNARD_JONES, QUINTIC, **NARROW))
+    problem = Problem(simulation, MeanSquaredDisplacement(), 400)
+    found = trust(problem, ("sigma",), tolerance=1e-4, points=20)
+    rounding, ambiguous, scatter = found.limits
+    assert rounding.horizon is not None and ambiguous.horizon is not None
+    assert rounding.reached and 100 < rounding.horizon < 400 and scatter.horizon is None
+    apart = found.relative["potential.sigma"]
+    assert np.all(apart[found.at <= rounding.horizon] <= 1e-4) and apart[0] < 1e-5
+    assert found.horizon == min(rounding.horizon, ambiguous.horizon) and found.limited_by in found.says
+    assert len(found.table()["relative.potential.sigma"]) == 20
