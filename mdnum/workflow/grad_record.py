@@ -32,7 +32,7 @@ def write(folder: RunFolder, found: Found) -> None:
         for one in found.agreement.opinions
         if one.found is not None
         for name, value in one.found.gradient.items()
-        if np.size(value) > _FEW
+        if np.ndim(value) > 1 or np.size(value) > _FEW
     }
     if large:
         sink = io.BytesIO()
@@ -105,7 +105,7 @@ def told(value: Any) -> Any:
     array = np.asarray(value, np.float64)
     if array.ndim == 0:
         return float(array)
-    if array.size <= _FEW:
+    if array.ndim == 1 and array.size <= _FEW:
         return array.tolist()
     at = np.unravel_index(int(np.argmax(np.abs(array))), array.shape)
     return {

@@ -1,0 +1,110 @@
+"""The page of a gradient: whole, self-contained, and true to the folder."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from report.synthetic_grad import NAMES, RATE, STEPS, WEIGHTS, summary, write
+from report.test_html import Tags
+
+from mdnum import report
+from mdnum.report.fork.question import load
+from mdnum.report.grad import figures, findings
+from mdnum.store import RunFolder
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = write(tmp_path_factory.mktemp("gradients") / "run")
+    report.write(folder.path)
+    return RunFolder.open(folder.path)
+
+
+def judged(tmp_path, **changes):
+    """Findings by code, of a folder with these entries."""
+    _, run = load(write(tmp_path / "one", **changes), "grad", "grad")
+    return {one.code: one for one in findings.judge(run).findings}
+
+
+def test_one_whole_file_that_loads_nothing(folder):
+    page = (folder.path / "report.html").read_text(encoding="utf-8")
+    tags = Tags()
+    tags.feed(page)
+    assert tags.open == [] and tags.sources == []
+    assert len(tags.ids) == len(set(tags.ids))
+    names = sorted(path.stem for path in (folder.path / "figures").iterdir())
+    assert names == ["growth", "ranked", "running", "state"]
+    assert tags.seen.count("svg") == 2 * len(names)
+
+
+def test_the_page_states_what_the_folder_holds(folder):
+    page = (folder.path / "report.html").read_text(encoding="utf-8")
+    text = re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", page))
+    for words in (
+        "argon/synthetic: gradient of msd", "After 500 steps, d msd / d epsilon = 4.000 σ²/ε",
+        "10 % of that by potential.epsilon and 100 % of that by cutoff.radius",
+        "3.90000 ± 0.20 2.5 % off truncation and noise", "norm 3.00000", "It grew 1.5 × 10²-fold.",
+        "cutoff.radius 0 % +40.0 % +60.0 %",
+        "--methods unrolled", "100 atoms, 500 steps of 0.01 τ",
+    ):  # fmt: skip
+        assert words in text, words
+
+
+def test_a_flip_that_outweighs_the_others_is_named(folder):
+    (found,) = folder.summary["findings"]
+    assert found["code"] == "FEW_FLIPS" and found["severity"] == "info"
+    assert "the pair 0–1 at step 1" in found["text"] and "adds 25 %" in found["text"]
+    assert folder.summary["headline"].startswith("After 500 steps")
+
+
+def test_growth_is_told_by_what_a_relative_change_does(folder):
+    _, run = load(folder, "grad", "grad")
+    plot = figures.growth(run)
+    by = {series.label: series for series in plot.series}
+    # the parameter's value times the derivative, from one step on
+    np.testing.assert_allclose(by[NAMES[1]].y[-1], 2.5 * 2.0)
+    np.testing.assert_allclose(by[NAMES[2]].y, 17.0 * np.exp(RATE * np.arange(1, STEPS + 1)))
+    line = figures.state(run).series[1]
+    np.testing.assert_allclose(line.y, np.exp(RATE * np.arange(STEPS + 1)), rtol=1e-9)
+    ends = {series.label: series.y[-1] for series in figures.running(run).series}
+    assert ends[NAMES[1]] == pytest.approx(WEIGHTS.sum() / 2.0)
+
+
+def test_findings_follow_the_numbers(tmp_path):
+    methods = summary()["methods"]
+    plain = judged(tmp_path / "a", methods=methods[:1], reference="symmetric", comparisons=[], flips=None)
+    assert (
+        plain["MISSING_SALTATION"].severity == "warning"
+        and "event-aware" in plain["MISSING_SALTATION"].remedy
+    )
+    # the only method finds nothing by the cutoff
+    assert plain["NO_DEPENDENCE"].title.endswith("cutoff.radius")
+    smooth = judged(tmp_path / "b", methods=methods[:1], reference="symmetric", force_jump=0.0, flips=None)
+    assert "MISSING_SALTATION" not in smooth
+
+    broken = {**methods[1], "gradient": {**methods[1]["gradient"], NAMES[0]: float("nan")}}
+    assert judged(tmp_path / "c", methods=[broken])["NOT_FINITE"].severity == "error"
+
+    row = {**summary()["comparisons"][0], "means": "unexplained"}
+    assert "10 % off" in judged(tmp_path / "d", comparisons=[row])["UNEXPLAINED"].text
+
+    details = {**methods[1]["details"], "grazing": 2, "weight left out": 0.5}
+    left = judged(tmp_path / "e", methods=[{**methods[1], "details": details}])
+    assert "16 % of the weight" in left["GRAZING"].text
+
+    trust = {"horizon": 300, "limited_by": "rounding", "tolerance": 0.01, "says": "Rounding limits it."}
+    assert judged(tmp_path / "f", trust=trust)["BEYOND_TRUST"].title == "trusted up to 300 steps of 500"
+    assert "BEYOND_TRUST" not in judged(tmp_path / "g", trust={**trust, "limited_by": ""})
+
+
+def test_a_ball_far_from_its_closed_form_is_told(tmp_path):
+    told = {"exact": {"y0": 2.0}, "reference": "closed form", "contact_kind": "impact", "flips": None}
+    told |= {"integrator": "semi-implicit-euler", "growth": None, "force_jump": None}
+    row = {**summary()["comparisons"][0], "name": "y0", "method": "event-aware"}
+    off = judged(tmp_path / "a", comparisons=[row], **told)["NOT_THE_MOTION"]
+    assert off.severity == "warning" and "event-aware (y0 10 % off)" in off.text.lower()
+    assert "event-located" in off.remedy
+    near = judged(tmp_path / "b", comparisons=[{**row, "relative": 0.009}], **told)
+    assert "NOT_THE_MOTION" not in near
