@@ -103,65 +103,101 @@ def reverse(
     Error: of the order of a rounding error times the growth of the adjoint; none of truncation, for the
     program as it ran.
     """
-    simulation = tape.simulation
-    force = simulation.force
-    if not isinstance(force, PairForce):
-        raise InputError(
-            "this reverse pass is one of pair potentials",
-            remedy="Use the method unrolled for a many-body potential",
-            where=simulation.system.name,
-        )
-    dtype = simulation.policy.dtype("state")
-    atoms = simulation.atoms
-    onto_total = jax.grad(lambda total: tape.loss.value(total, tape.frames))(tape.total)
-    nothing = jnp.zeros((3, atoms), dtype)
-    numbers, _ = eqx.partition(simulation.integrator, _is_number)
-    carry = Carry(
-        nothing,
-        nothing,
-        jax.tree.map(jnp.zeros_like, force.model),
-        jax.tree.map(jnp.zeros_like, numbers),
-        jnp.zeros((), force.policy.dtype("force")),
-        (nothing, nothing),
-        jnp.zeros(simulation.pair_types, jnp.float64),
-    )
+    back = Backward(tape, wanted, guard if saltation else None)
     found: list[Crossings] = []
     for stretch in tape.backward():
-        order = stretch.table.order
-        met = None
-        if saltation:
-            assert stretch.ledger is not None, "made without flips"
-            met = crossings(
-                simulation, stretch.ledger, stretch.first, order, stretch.x, stretch.x_before, guard
+        weights, trace = back.through(stretch, traced=watch is not None)
+        if watch is not None and trace is not None:
+            watch(stretch, trace)
+        if back.met is not None:
+            found.append(back.met.weighed(weights))
+        if progress is not None:
+            progress(tape.steps - stretch.first, tape.steps)
+    return back.cotangents(), found
+
+
+class Backward:
+    """A reverse pass on its way, from the end of a tape to its start.
+
+    Args:
+        tape: the run.
+        wanted: of MODEL, SCALE and FORCE.
+        guard: radial speed below which a flip adds nothing; None where flips do not count.
+
+    Attributes:
+        carry: what is carried, atoms in the user's order.
+        met: the crossings of the stretch that was gone through last; None where flips do not count.
+
+    Raises:
+        InputError: a many-body potential.
+    """
+
+    def __init__(self, tape: Tape, wanted: frozenset[str], guard: float | None):
+        simulation = tape.simulation
+        force = simulation.force
+        if not isinstance(force, PairForce):
+            raise InputError(
+                "this reverse pass is one of pair potentials",
+                remedy="Use the method unrolled for a many-body potential",
+                where=simulation.system.name,
             )
-        carry, (weights, trace) = _stretch(
-            force,
+        self.tape, self.wanted, self.guard, self.force = tape, wanted, guard, force
+        self.onto_total = jax.grad(lambda total: tape.loss.value(total, tape.frames))(tape.total)
+        nothing = jnp.zeros((3, simulation.atoms), simulation.policy.dtype("state"))
+        numbers, _ = eqx.partition(simulation.integrator, _is_number)
+        self.met: Crossings | None = None
+        self.carry = Carry(
+            nothing,
+            nothing,
+            jax.tree.map(jnp.zeros_like, force.model),
+            jax.tree.map(jnp.zeros_like, numbers),
+            jnp.zeros((), force.policy.dtype("force")),
+            (nothing, nothing),
+            jnp.zeros(simulation.pair_types, jnp.float64),
+        )
+
+    def arguments(self, stretch: Stretch, traced: bool) -> tuple[Any, ...]:
+        """What `transposed` is called with for a stretch, from where the pass stands."""
+        simulation, order = self.tape.simulation, stretch.table.order
+        self.met = None
+        if self.guard is not None:
+            assert stretch.ledger is not None, "made without flips"
+            self.met = crossings(
+                simulation, stretch.ledger, stretch.first, order, stretch.x, stretch.x_before, self.guard
+            )
+        return (
+            self.force,
             simulation.integrator,
             jnp.asarray(simulation.masses[order]),
             simulation.tables(stretch.table),
             rows_of(stretch),
             stretch.bits,
             stretch.rows,
-            tape.seen(stretch),
-            (tape.loss, tape.origin, tape.around, onto_total),
-            None if met is None else met.on_device(len(stretch.x), atoms),
-            carry._replace(x=carry.x[:, order], v=carry.v[:, order]),
-            wanted,
-            watch is not None,
+            self.tape.seen(stretch),
+            (self.tape.loss, self.tape.origin, self.tape.around, self.onto_total),
+            None if self.met is None else self.met.on_device(len(stretch.x), simulation.atoms),
+            self.carry._replace(x=self.carry.x[:, order], v=self.carry.v[:, order]),
+            self.wanted,
+            traced,
         )
-        if watch is not None:
-            watch(stretch, trace)
-        carry = carry._replace(x=_unsorted(carry.x, order), v=_unsorted(carry.v, order))
-        if met is not None:
-            found.append(met.weighed(np.asarray(weights)))
-        if progress is not None:
-            progress(tape.steps - stretch.first, tape.steps)
-    x = np.asarray(carry.x + carry.origin[0], np.float64)
-    v = np.asarray(carry.v + carry.origin[1], np.float64)
-    # distances stretch with the box; the velocities of the start do not
-    scale = float(carry.scale) - float(np.sum(v * np.asarray(simulation.velocities).T))
-    parts = Cotangents(carry.model, carry.integrator, x, v, scale, np.asarray(carry.r_cut))
-    return parts, found
+
+    def through(
+        self, stretch: Stretch, *, traced: bool = False
+    ) -> tuple[Float[np.ndarray, "room most"], Trace | None]:
+        """Carry everything through a stretch: the weights of its crossings, and what each step carried."""
+        carry, (weights, trace) = transposed(*self.arguments(stretch, traced))
+        order = stretch.table.order
+        self.carry = carry._replace(x=_unsorted(carry.x, order), v=_unsorted(carry.v, order))
+        return np.asarray(weights), trace
+
+    def cotangents(self) -> Cotangents:
+        """The derivatives, once the start has been reached."""
+        simulation, carry = self.tape.simulation, self.carry
+        x = np.asarray(carry.x + carry.origin[0], np.float64)
+        v = np.asarray(carry.v + carry.origin[1], np.float64)
+        # distances stretch with the box; the velocities of the start do not
+        scale = float(carry.scale) - float(np.sum(v * np.asarray(simulation.velocities).T))
+        return Cotangents(carry.model, carry.integrator, x, v, scale, np.asarray(carry.r_cut))
 
 
 def _is_number(leaf: Any) -> bool:
@@ -173,7 +209,7 @@ def _unsorted(a, order):
 
 
 @partial(jax.jit, static_argnames=("wanted", "traced"))
-def _stretch(
+def transposed(
     force: PairForce,
     integrator: Integrator,
     masses: Float[Array, "atoms"],
@@ -188,6 +224,7 @@ def _stretch(
     wanted: frozenset[str],
     traced: bool,
 ):
+    """The transpose of a stretch of steps: the carry before it, the weights of its crossings, its trace."""
     loss, origin, around, onto_total = looking
     order = tables.order
     dtype = rows[1].dtype
