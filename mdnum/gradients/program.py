@@ -28,8 +28,11 @@ from mdnum.md.decide import Tables
 from mdnum.md.verlet import PairTable
 from mdnum.rollout.engine import first_state
 
-#: Steps of a chunk.
+#: Steps of a chunk, at most.
 CHUNK = 16
+#: Bytes that the reverse function of a chunk may keep by a rough count, and what it keeps for each slot of a
+#: list and step by that count.
+_CHUNK_BYTES, _PER_SLOT = 2**28, 256
 
 
 class Inputs(NamedTuple):
@@ -271,15 +274,15 @@ class Steps:
 
     Args:
         problem: the loss of a rollout.
-        chunk: steps of a chunk.
+        chunk: steps of a chunk; None: as many as do not keep too much.
     """
 
-    def __init__(self, problem: Problem, chunk: int = CHUNK):
+    def __init__(self, problem: Problem, chunk: int | None = None):
         simulation = problem.simulation
-        self.problem, self.simulation, self.chunk = problem, simulation, chunk
+        self.problem, self.simulation = problem, simulation
         state = first_state(simulation).state
         rule = simulation.rule
-        self._rule = (rule.every, rule.delay, rule.check)
+        self.rule = (rule.every, rule.delay, rule.check)
         self.fixed = Fixed(
             simulation.force,
             simulation.integrator,
@@ -305,19 +308,24 @@ class Steps:
         self._verlet = simulation.verlet_list()
         # snapshots of one list share the array of the positions at which it was built
         self._used: tuple[Any, int, tuple[PairTable, Tables]] | None = None
+        if chunk is None:
+            row = self.list_of(self.start)[0].slots * simulation.atoms * _PER_SLOT
+            # a power of two: each length is compiled for
+            chunk = min(CHUNK, 1 << max(0, (_CHUNK_BYTES // row).bit_length() - 1))
+        self.chunk = chunk
         looked = problem.loss.looks_at(np.arange(problem.steps + 1), problem.steps)
         self._seen = np.concatenate([looked, np.zeros(chunk, bool)])
         self.frames = int(looked.sum())
 
     def forward(self, at: Snapshot, rows: int | None = None) -> tuple[Snapshot, Leg, Passed]:
         """One chunk on, without a derivative."""
-        between, passed = chunk(self.inputs, at.between, self.fixed, *self._told(at, rows), rule=self._rule)
+        between, passed = chunk(self.inputs, at.between, self.fixed, *self.told(at, rows), rule=self.rule)
         return self._after(at, between, passed)
 
     def keep(self, at: Snapshot, rows: int | None = None) -> tuple[Snapshot, Leg, Passed, Any]:
         """One chunk on, and its reverse function."""
         between, back, passed = keep(
-            self.inputs, at.between, self.fixed, *self._told(at, rows), rule=self._rule
+            self.inputs, at.between, self.fixed, *self.told(at, rows), rule=self.rule
         )
         return *self._after(at, between, passed), back
 
@@ -362,7 +370,13 @@ class Steps:
         none = np.zeros(self.simulation.pair_types)
         return Cotangents(inputs.model, inputs.numbers, x, v, scale, none)
 
-    def _told(self, at: Snapshot, rows: int | None) -> tuple[Place, Tables]:
+    def told(self, at: Snapshot, rows: int | None = None) -> tuple[Place, Tables]:
+        """What a chunk is given beside what it is differentiated by.
+
+        Args:
+            at: where it begins.
+            rows: steps that it does; None: as many as a chunk has.
+        """
         _, tables = self.list_of(at)
         limit = min(self.chunk, self.problem.steps + 1 - at.step) if rows is None else rows
         place = Place(

@@ -26,6 +26,8 @@ from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, first_state, 
 from mdnum.rollout.flips import PairRecorder
 from mdnum.systems.build import Simulation
 
+#: Bytes of recorded stretches that a tape keeps.
+KEPT = 2**29
 #: Fewest rows that a stretch is kept with.
 _LEAST_ROOM = 16
 
@@ -122,7 +124,7 @@ class Tape:
         steps: int,
         *,
         flips: bool = False,
-        budget: int = 2**29,
+        budget: int = KEPT,
         each: Callable[[Stretch], None] | None = None,
         progress: Callable[[int, int], None] | None = None,
     ):

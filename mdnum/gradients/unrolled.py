@@ -11,12 +11,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from mdnum.gradients import parameters
+from mdnum.errors import InputError
+from mdnum.gradients import memory, parameters
 from mdnum.gradients.base import Gradient, Problem, Progress, check, independent
 from mdnum.gradients.checkpoints import keep_everything, keep_few, keep_states
 from mdnum.gradients.parameters import Cotangents
 from mdnum.gradients.primal import Fingerprints
-from mdnum.gradients.program import CHUNK, Leg, Passed, Steps
+from mdnum.gradients.program import Leg, Passed, Steps
 from mdnum.gradients.tape import Tape
 
 
@@ -25,11 +26,13 @@ class _Reverse:
     """What the three ways share.
 
     Attributes:
-        chunk: steps that are linearized together.
+        chunk: steps that are linearized together; None: up to 16, as memory has it.
+        room: bytes that it may take; None: what is free.
         compare: whether to make the run as well and report where this program departs from it.
     """
 
-    chunk: int = CHUNK
+    chunk: int | None = None
+    room: int | None = None
     compare: bool = True
 
     @property
@@ -48,10 +51,10 @@ class _Reverse:
         return f"the derivative of the steps that ran, by JAX, in its own forward pass; {self.how}"
 
     def why_not(self, problem: Problem, names: Sequence[str]) -> str | None:
-        """Not for forces that are rounded after every operation."""
+        """Not for forces that are rounded after every operation, and not beyond the memory there is."""
         if problem.simulation.policy.dtype("force").itemsize < 4:
             return f"forces in {problem.simulation.policy.force} are rounded after every operation"
-        return None
+        return memory.why_not(Steps(problem, self.chunk), self.name, self.room)
 
     @abstractmethod
     def _differentiate(self, program: Steps, watch, told) -> tuple[float, Cotangents, dict[str, Any]]:
@@ -73,7 +76,7 @@ class _Reverse:
                 progress(step, steps, phase)
 
         value, parts, details = self._differentiate(program, watch, told)
-        details = {"steps linearized together": self.chunk, **details}
+        details = {"steps linearized together": program.chunk, **details}
         gradient = {name: parameters.gradient(simulation, parts, name) for name in names}
         notes = independent(problem, gradient, saltation=False)
         if self.compare:
@@ -109,11 +112,18 @@ class Unrolled(_Reverse):
         return "every intermediate result is kept"
 
     def _differentiate(self, program: Steps, watch, told):
-        held = 0
+        held, limit = 0, memory.free() if self.room is None else self.room
 
         def room(kept: int, steps: int) -> None:
             nonlocal held
             held = kept
+            if kept > limit:
+                # its lists are shorter than chunks, which the estimate before the run cannot know
+                raise InputError(
+                    f"{steps} of {program.problem.steps} steps take {memory.in_words(kept)}, and there were "
+                    f"{memory.in_words(limit)}",
+                    remedy="Use the method symmetric, epochs or recursive, or fewer steps",
+                )
 
         value, parts = keep_everything(program, watch, told, room)
         return value, parts, {"bytes kept": held}

@@ -9,9 +9,12 @@ import pytest
 from gradient_problems import everything
 from small_systems import LENNARD_JONES, crystal, make
 
+from mdnum.errors import InputError
+from mdnum.gradients import memory
 from mdnum.gradients.base import Problem
 from mdnum.gradients.checkpoints import _split
 from mdnum.gradients.primal import Fingerprints
+from mdnum.gradients.program import Steps
 from mdnum.gradients.symmetric import Symmetric
 from mdnum.gradients.unrolled import Epochs, Recursive, Unrolled
 from mdnum.systems import build
@@ -85,3 +88,28 @@ def test_states_are_kept_where_the_fewest_chunks_are_run_again():
         for room in range(5):
             assert runs(length, room) == fewest(length, room), (length, room)
     assert runs(1024, 10) < 4 * 1024
+
+
+def test_a_horizon_that_does_not_fit_is_refused_with_amounts(switched):
+    needed = memory.needs(Steps(switched))
+    # states are few numbers for an atom, what reverse mode keeps is some for each slot of its list
+    assert needed["unrolled"] > needed["epochs"] > needed["recursive"]
+    room = needed["epochs"]
+    with pytest.raises(InputError) as error:
+        Unrolled(room=room)(switched, ("sigma",))
+    assert memory.in_words(needed["unrolled"]) in str(error.value)
+    assert memory.in_words(room) in str(error.value)
+    assert "epochs needs about" in str(error.value) and "symmetric needs about" in str(error.value)
+    assert Epochs(room=room).why_not(switched, ("sigma",)) is None
+    assert "no other method" in str(memory.why_not(Steps(switched), "epochs", 0))
+
+
+def test_what_was_foreseen_is_what_is_kept(switched):
+    program = Steps(switched)
+    _, _, _, back = program.keep(program.start)
+    assert program.bytes_of(back) == memory.per_chunk(program)
+    # half of the steps are done by chunks that are not full, which nothing could foresee
+    chunks = -(-(switched.steps + 1) // program.chunk)
+    with pytest.raises(InputError, match="of 40 steps take"):
+        found = Unrolled(room=chunks * memory.per_chunk(program))
+        found._differentiate(program, lambda *_: None, lambda *_: None)
