@@ -8,11 +8,13 @@ from collections.abc import Callable
 from mdnum.errors import InputError
 from mdnum.gradients.base import Method
 from mdnum.gradients.differences import FiniteDifferences
+from mdnum.gradients.reversible import Reversible
 from mdnum.gradients.symmetric import EventAware, Symmetric
 
 #: A method with its defaults, by word; the order is the one that tables show.
 METHODS: dict[str, Callable[[], Method]] = {
     "symmetric": Symmetric,
+    "reversible": Reversible,
     "event-aware": EventAware,
     "finite-differences": FiniteDifferences,
 }

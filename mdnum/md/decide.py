@@ -114,6 +114,15 @@ class PairDecider:
         r2 = dx * dx + dy * dy + dz * dz
         return np.sqrt(r2) if self.space == "r" else r2
 
+    def host_margin(self, displacement, kind) -> Float[np.ndarray, "..."]:
+        """Thresholds minus quantities on the host: positive inside, with the bits of the decision.
+
+        Args:
+            displacement: three components, of the decision's dtype. kind: pair type of each.
+        """
+        thresholds = np.array([threshold.value for threshold in self.thresholds])
+        return thresholds[kind] - self.host_quantity(*displacement).astype(np.float64)
+
     def inside(self, quantity, value):
         """The decision: quantity against threshold value(s), as the convention has it (jax or numpy)."""
         return quantity <= value if self.compare.endswith("<=") else quantity < value
@@ -153,8 +162,13 @@ class Decisions(NamedTuple):
     nearest: Float[Array, ""]
 
 
+def packed(halves: UInt8[Array, "groups atoms"]) -> UInt8[Array, "words atoms"]:
+    """Decisions of groups, two groups to a byte."""
+    return halves[0::2] | (halves[1::2] << jnp.uint8(GROUP))
+
+
 def halves_of(bits: UInt8[Array, "words atoms"]) -> UInt8[Array, "groups atoms"]:
-    """Packed decisions a group at a time, in the low bits: the inverse of `SlotJudge.finish`."""
+    """Packed decisions a group at a time, in the low bits: the inverse of `packed`."""
     mask = jnp.uint8((1 << GROUP) - 1)
     return jnp.stack([bits & mask, bits >> jnp.uint8(GROUP)], axis=1).reshape(-1, bits.shape[-1])
 
@@ -212,9 +226,7 @@ class SlotJudge:
     @staticmethod
     def finish(nearest, halves) -> Decisions:
         """The pass's decisions, two groups to a byte."""
-        low, high = halves[0::2], halves[1::2]
-        bits = low | (high << jnp.uint8(GROUP))
-        return Decisions(bits, jnp.min(nearest, initial=jnp.inf).astype(jnp.float64))
+        return Decisions(packed(halves), jnp.min(nearest, initial=jnp.inf).astype(jnp.float64))
 
 
 def displacements(components, cell: Cell, j):

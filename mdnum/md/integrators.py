@@ -22,6 +22,21 @@ class Integrator(eqx.Module):
     name: ClassVar[str]
     timestep: Float[Array, ""]
 
+    def kick(
+        self,
+        v: Float[Array, "3 atoms"],
+        time: Float[Array, ""],
+        acceleration: Float[Array, "3 atoms"],
+        masses: Float[Array, "atoms"],
+    ) -> Float[Array, "3 atoms"]:
+        """Velocities after an acceleration has acted for a time."""
+        return v + time * acceleration
+
+    def kinetic(self, v: Float[Array, "3 atoms"], masses: Float[Array, "atoms"]) -> Float[Array, ""]:
+        """Kinetic energy."""
+        speed2 = jnp.sum(jnp.square(v.astype(jnp.float64)), axis=0)
+        return 0.5 * jnp.sum(masses * speed2)
+
     @abstractmethod
     def drift(
         self,

@@ -136,7 +136,7 @@ class PairForce(eqx.Module):
             if decisions:
                 bits, nearest = judge.tally(nearest, quantity, inside, threshold)
             if told is not None:
-                asked = _other(inside, told)
+                asked = other_than(inside, told)
                 inside = inside ^ (asked if pinned is None else asked & unpacked(pinned))
             d = d if same else displacements(components, cell, j)
             if same and self.decider.space == "r2":
@@ -193,7 +193,7 @@ class PairForce(eqx.Module):
         return jnp.stack([jnp.stack([xx, xy, xz]), jnp.stack([xy, yy, yz]), jnp.stack([xz, yz, zz])])
 
 
-def _other(inside: Bool[Array, "4 atoms"], told: UInt8[Array, "atoms"]) -> Bool[Array, "4 atoms"]:
+def other_than(inside: Bool[Array, "4 atoms"], told: UInt8[Array, "atoms"]) -> Bool[Array, "4 atoms"]:
     """Where a group is told otherwise than it decides.
 
     A mask made of what is told alone lets the compiler work out distances twice, and one made slot by slot

@@ -67,9 +67,10 @@ class PairDynamics(eqx.Module):
         made = self.force(state.x, self.tables, decisions=False, given=decisions)
         acceleration = made.force.astype(dtype) / self.masses.astype(dtype)
         half = (0.5 * self.integrator.timestep).astype(dtype)
-        v = state.v + jnp.where(state.step == 0, jnp.zeros((), dtype), half) * acceleration
-        x, v, _ = self.integrator.drift(
-            state.x, v + half * acceleration, self.masses, state.step, self.tables.order
-        )
+        mass_row = self.masses.astype(dtype)
+        second_half = jnp.where(state.step == 0, jnp.zeros((), dtype), half)
+        v = self.integrator.kick(state.v, second_half, acceleration, mass_row)
+        v = self.integrator.kick(v, half, acceleration, mass_row)
+        x, v, _ = self.integrator.drift(state.x, v, self.masses, state.step, self.tables.order)
         wrapped, _ = self.force.cell.astype(dtype).wrap(*x)
         return MdState(state.step + 1, jnp.stack(wrapped), v)

@@ -16,6 +16,8 @@ ALL: Mapping[str, np.dtype] = {
     "float16": np.dtype(np.float16),
     "bfloat16": np.dtype(ml_dtypes.bfloat16),
 }
+#: The state in whole numbers: doubles that are multiples of fixed units.
+LATTICE = "lattice"
 _ROUNDINGS = ("nearest", "stochastic")
 
 
@@ -25,6 +27,11 @@ _TOO_SHORT: Mapping[str, str] = {
     "decision": "such coordinates are some hundredths of a distance apart, and their grid would decide",
     "accumulate": "it keeps two or three digits of a sum of some hundred terms, and the small ones are lost",
 }
+
+
+def carrier(name: str) -> np.dtype:
+    """The dtype of the arrays that hold numbers of a policy's word: whole numbers are held by doubles."""
+    return ALL["float64" if name == LATTICE else name]
 
 
 def _check(policy: object, roles: tuple[str, ...], known: Mapping[str, np.dtype]) -> None:
@@ -43,6 +50,8 @@ def check_role(role: str, dtype: str) -> None:
         InputError: no dtype is called that, or it has sixteen bits and the role needs more.
     """
     known = ALL if role == "force" else WIDE
+    if role == "state" and dtype == LATTICE:
+        return
     if dtype in ALL and dtype not in known:
         raise InputError(
             f"{dtype} cannot be the {role} of molecular dynamics: {_TOO_SHORT[role]}",
@@ -58,7 +67,7 @@ class PrecisionPolicy:
     """The dtype of each role of a number in a rollout of molecular dynamics.
 
     Attributes:
-        state: positions and velocities as they are carried from step to step.
+        state: positions and velocities as they are carried from step to step; "lattice" for whole numbers.
         force: distances and pair terms that enter forces and energies. In bfloat16 or float16 displacements
             are those of the decision, rounded, and all that follows has sixteen bits up to the sum.
         decision: the quantity and the threshold that a decision compares.
@@ -76,7 +85,7 @@ class PrecisionPolicy:
 
     def dtype(self, role: str) -> np.dtype:
         """The numpy dtype of a role ("state", "force", "decision" or "accumulate")."""
-        return ALL[getattr(self, role)]
+        return carrier(getattr(self, role))
 
     @property
     def geometry(self) -> np.dtype:

@@ -10,7 +10,7 @@ import numpy as np
 from ase import Atoms
 
 from mdnum.precision import unit_roundoff
-from mdnum.precision.policy import WIDE
+from mdnum.precision.policy import WIDE, carrier
 from mdnum.references.ase_models import Reference, evaluate, independent, reference
 from mdnum.references.closed_forms import pair_forms
 from mdnum.references.findings import finding, plain
@@ -193,7 +193,7 @@ def narrowest(system: System) -> str:
     """The narrowest float type among the roles that energies and forces depend on."""
     precision = system.spec.precision
     roles = (precision.state, precision.force, precision.accumulate)
-    return max(roles, key=unit_roundoff)
+    return max(map(str, map(carrier, roles)), key=unit_roundoff)
 
 
 def _places(system: System) -> str:
@@ -201,7 +201,7 @@ def _places(system: System) -> str:
     precision = system.spec.precision
     if precision.force in WIDE:
         return narrowest(system)
-    return max((precision.state, precision.decision), key=unit_roundoff)
+    return max(map(str, map(carrier, (precision.state, precision.decision))), key=unit_roundoff)
 
 
 def _named(frames: Mapping[str, Atoms] | Sequence[Atoms] | None, simulation: Any) -> dict[str, Atoms]:

@@ -102,14 +102,16 @@ class Start:
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Plain arrays for a checkpoint."""
-        arrays = {f"state_{name}": np.asarray(value) for name, value in self.state._asdict().items()}
+        parts = {name: value for name, value in self.state._asdict().items() if value is not None}
+        arrays = {f"state_{name}": np.asarray(value) for name, value in parts.items()}
         numbers = {"built": self.built, "epoch": self.epoch, "slots": self.slots}
         return arrays | {"reference": self.reference} | {k: np.asarray(v) for k, v in numbers.items()}
 
     @classmethod
     def from_arrays(cls, arrays) -> Start:
         """The inverse of `to_arrays`, bit for bit."""
-        state = State(*(jnp.asarray(arrays[f"state_{name}"]) for name in State._fields))
+        held = {name: f"state_{name}" for name in State._fields}
+        state = State(**{name: jnp.asarray(arrays[key]) for name, key in held.items() if key in arrays})
         return cls(
             state,
             np.asarray(arrays["reference"]),
@@ -122,16 +124,19 @@ class Start:
 def first_state(simulation: Simulation) -> Start:
     """The start of a rollout: positions wrapped, velocities as the system has them."""
     dtype = simulation.policy.dtype("state")
-    wrapped, images = wrap_positions(simulation.cell, simulation.positions)
+    positions, velocities = simulation.first_frame()
+    wrapped, images = wrap_positions(simulation.cell, positions)
     wrapped = wrapped.astype(dtype)
     x = jnp.asarray(wrapped.T)
+    bath = jnp.zeros((3, simulation.atoms), jnp.int64) if simulation.has_bath else None
     state = State(
         jnp.zeros((), jnp.int64),
         x,
-        jnp.asarray(simulation.velocities.T, dtype),
+        jnp.asarray(velocities.T, dtype),
         jnp.asarray(images.T, jnp.int32),
         x,
         jnp.zeros((), jnp.float64),
+        bath,
     )
     return Start(state, np.asarray(wrapped, np.float64))
 
@@ -167,7 +172,7 @@ class Engine:
         rule = simulation.rule
         self.program = Program(
             simulation.force,
-            simulation.integrator,
+            simulation.propagator,
             simulation.cell.astype(np.float64),
             jnp.asarray(simulation.masses),
             jnp.asarray(rule.skin / 2, jnp.float64),
@@ -176,8 +181,8 @@ class Engine:
             rule.check,
             record,
         )
-        leaves, self._structure = jax.tree.flatten(self.program)
-        self._leaves = tuple(leaves)
+        leaves, self.structure = jax.tree.flatten(self.program)
+        self.leaves = tuple(leaves)
         self._records: list[Record | None] = [None, None]
 
     def _room(self, words: int) -> int:
@@ -187,7 +192,7 @@ class Engine:
         # no list is expected to live longer than the run
         return min(1 << (rows.bit_length() - 1), 1 << max(1, int(self.last + 1).bit_length()))
 
-    def _take(self, turn: int, words: int) -> Record:
+    def take(self, turn: int, words: int) -> Record:
         """The record buffer whose turn it is; it is donated to the epoch that fills it."""
         rows, held = self._room(words), self._records[turn]
         self._records[turn] = None
@@ -195,6 +200,10 @@ class Engine:
             return held
         dtype = self.simulation.policy.dtype("state")
         return empty_record(rows, words, self.simulation.atoms, dtype, self.record)
+
+    def give(self, turn: int, record: Record) -> None:
+        """Return a record that nobody reads any more."""
+        self._records[turn] = record
 
     def segments(self) -> Iterator[Segment]:
         """Stretches of steps in order; the last one has `closes` set to "end" or one of FAILURES."""
@@ -260,15 +269,15 @@ class Engine:
         """Start the compiled loop on the device."""
         words = table.slots // 8
         return run_epoch(
-            self._leaves,
-            self._structure,
+            self.leaves,
+            self.structure,
             tables,
             state,
             home,
             jnp.asarray(built, jnp.int64),
             jnp.asarray(self.last, jnp.int64),
             jnp.asarray(look_back),
-            self._take(turn, words),
+            self.take(turn, words),
             *self._pinned(table, first, words),
         )
 

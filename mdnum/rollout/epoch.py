@@ -56,6 +56,7 @@ class State(NamedTuple):
         images: lattice vectors taken off by wrapping so far, shape (3, atoms).
         x_before: positions of the step before, shape (3, atoms).
         heat: energy taken up from the thermostat so far.
+        bath: what friction on a lattice has forgotten since it was last put aside, shape (3, atoms).
     """
 
     step: Int[Array, ""]
@@ -64,6 +65,7 @@ class State(NamedTuple):
     images: Int[Array, "3 atoms"]
     x_before: Float[Array, "3 atoms"]
     heat: Float[Array, ""]
+    bath: Int[Array, "3 atoms"] | None = None
 
 
 class Record(NamedTuple):
@@ -124,7 +126,7 @@ def empty_record(rows: int, words: int, atoms: int, dtype, record: bool) -> Reco
     )
 
 
-def _write(record: Record, row, **values) -> Record:
+def write_row(record: Record, row, **values) -> Record:
     """Write one row of the named columns."""
     return record._replace(
         **{
@@ -192,7 +194,7 @@ def run_epoch(
         return jnp.sqrt(jnp.max(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])).astype(jnp.float64)
 
     def body(carry):
-        step, x, v, images, _, heat, row, _, _, _, largest, record = carry
+        step, x, v, images, _, heat, bath, row, _, _, _, largest, record = carry
         given = {} if told is None else {"given": told[row]}
         if pinned is not None:
             given["where"] = pinned[row]
@@ -200,10 +202,9 @@ def run_epoch(
         acceleration = made.force.astype(dtype) / mass_row
         # the first step of all starts from full-step velocities
         second_half = jnp.where(step == 0, jnp.zeros((), dtype), half_step)
-        v = v + second_half * acceleration
+        v = program.integrator.kick(v, second_half, acceleration, mass_row)
         potential = jnp.sum(made.energy, dtype=jnp.float64)
-        speed2 = jnp.sum(jnp.square(v.astype(jnp.float64)), axis=0)
-        kinetic = 0.5 * jnp.sum(masses * speed2)
+        kinetic = program.integrator.kinetic(v, masses)
         values = {
             "potential": potential,
             "kinetic": kinetic,
@@ -216,9 +217,15 @@ def run_epoch(
             assert d is not None
             values |= {"x": x, "v": v, "images": images, "bits": d.bits}
             values["nearest"] = d.nearest
-        record = _write(record, row, **values)
+        record = write_row(record, row, **values)
         finite = jnp.isfinite(potential) & jnp.isfinite(kinetic)
-        after, v, taken = program.integrator.drift(x, v + half_step * acceleration, masses, step, order)
+        v = program.integrator.kick(v, half_step, acceleration, mass_row)
+        if bath is None:
+            after, v, taken = program.integrator.drift(x, v, masses, step, order)
+        else:
+            after, v, taken, bath = program.integrator.exchange(  # type: ignore[attr-defined]
+                x, v, bath, masses, step, order
+            )
         wrapped, n = cell.wrap(*after)
         runaway = jnp.max(jnp.abs(jnp.stack(n))) > 1
         after, images = jnp.stack(wrapped), images + jnp.stack(n).astype(jnp.int32)
@@ -227,11 +234,15 @@ def run_epoch(
         age = step - built
         allowed = (age >= program.delay) & (age % program.every == 0)
         due = allowed & (largest > program.half_skin) if program.check else allowed
-        return step, after, v, images, x, heat + taken, row + 1, due, finite, runaway, largest, record
+        return step, after, v, images, x, heat + taken, bath, row + 1, due, finite, runaway, largest, record
 
     def go_on(carry):
-        step, _, _, _, _, _, row, due, finite, runaway, _, _ = carry
-        return (step <= last) & (row < record.potential.shape[0]) & ~due & finite & ~runaway
+        step, _, _, _, _, _, bath, row, due, finite, runaway, _, _ = carry
+        more = (step <= last) & (row < record.potential.shape[0]) & ~due & finite & ~runaway
+        if bath is None:
+            return more
+        # a full bath is put aside by whoever wants to go back
+        return more & ((row == 0) | (step % program.integrator.period != 0))  # type: ignore[attr-defined]
 
     carry = (
         state.step,
@@ -240,6 +251,7 @@ def run_epoch(
         images,
         state.x_before[:, order],
         state.heat,
+        None if state.bath is None else state.bath[:, order],
         jnp.zeros((), jnp.int64),
         jnp.zeros((), bool),
         jnp.ones((), bool),
@@ -248,11 +260,13 @@ def run_epoch(
         record,
     )
     done = lax.while_loop(go_on, body, carry)
-    step, x, v, images, x_before, heat, rows, due, finite, runaway, largest, record = done
+    step, x, v, images, x_before, heat, bath, rows, due, finite, runaway, largest, record = done
 
     def unsorted(a):
         return jnp.zeros_like(a).at[:, order].set(a)
 
     end = State(step, unsorted(x), unsorted(v), unsorted(images), unsorted(x_before), heat)
+    if bath is not None:
+        end = end._replace(bath=unsorted(bath))
     flags = jnp.stack([rows, due.astype(rows.dtype), finite.astype(rows.dtype), runaway.astype(rows.dtype)])
     return Outcome(end, flags, largest, before), record

@@ -136,7 +136,6 @@ class PairRecorder:
         decider = simulation.decider
         self._cell, self._decision_cell = HostCell(simulation.cell), HostCell(simulation.cell, decider.dtype)
         self._inclusive = decider.compare.endswith("<=")
-        self._thresholds = np.array([t.value for t in decider.thresholds])
         self._bounds = np.array(decider.bounds)
         self._energy_jumps, self._force_jumps = simulation.jumps()
 
@@ -184,8 +183,7 @@ class PairRecorder:
         """Pair types and margins of pairs at given positions, with the bits of the program's decision."""
         kind = self.simulation.type_of(i, j)
         d = self._decision_cell.displacement(start, end)
-        quantity = self.simulation.decider.host_quantity(*d).astype(np.float64)
-        return kind, self._thresholds[kind] - quantity
+        return kind, self.simulation.decider.host_margin(d, kind)
 
     def flips(self, segment: Segment) -> Ledger:
         """The flips of a segment, sorted by step, i and j (user's labels, i < j).
@@ -345,6 +343,6 @@ def true_pairs(simulation: Simulation, wrapped: Float[np.ndarray, "atoms 3"]) ->
     keep = i < j
     i, j = i[keep], j[keep]
     d = displacement(simulation.cell, wrapped[i], wrapped[j], np.dtype(decider.dtype))
-    values = np.array([t.value for t in decider.thresholds], np.dtype(decider.dtype))
-    inside = decider.inside(decider.host_quantity(*d), values[simulation.type_of(i, j)])
+    margin = decider.host_margin(d, simulation.type_of(i, j))
+    inside = margin >= 0 if decider.compare.endswith("<=") else margin > 0
     return pair_keys(i[inside], j[inside], simulation.atoms)

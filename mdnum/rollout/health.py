@@ -9,6 +9,7 @@ import numpy as np
 from mdnum.events import Ledger
 from mdnum.md.cell import Cell
 from mdnum.precision import distance_bound
+from mdnum.precision.policy import carrier
 from mdnum.rollout.engine import Segment
 from mdnum.rollout.flips import decided_pairs, true_pairs
 from mdnum.store import RunFolder
@@ -186,7 +187,7 @@ def rebuild_ledger(folder: RunFolder) -> Ledger:
     moved = rows["displacement"][chosen]
     system = load(folder.path, world="md")
     reach = Cell.create(np.asarray(system.atoms.cell), system.atoms.pbc).reach(system.atoms.positions)
-    dtype = np.dtype(system.spec.precision.state)
+    dtype = carrier(system.spec.precision.state)
     count = int(chosen.sum())
     return Ledger(
         "rebuild",

@@ -18,11 +18,15 @@ from mdnum.md.cell import Cell, displacement
 from mdnum.md.cutoffs import BY_NAME as CUTOFFS
 from mdnum.md.decide import PairDecider, Tables
 from mdnum.md.integrators import Integrator, Langevin, VelocityVerlet
+from mdnum.md.lattice import Lattice, LatticeDecider
+from mdnum.md.latticeforce import LatticeForce
+from mdnum.md.latticestep import LatticeStep, on_lattice
 from mdnum.md.manyforce import ManyBodyForce
 from mdnum.md.pairforce import PairForce
 from mdnum.md.potentials import CutPotential, LennardJones, Morse, PairPotential, SoftSphere, pair_type
 from mdnum.md.verlet import BUILDERS, SLOTS, PairTable, RebuildRule, VerletList, check_radius
 from mdnum.precision import PrecisionPolicy, unit_roundoff
+from mdnum.precision.policy import LATTICE
 from mdnum.precision.reductions import BY_NAME as REDUCTIONS
 from mdnum.systems import pairs, schema
 from mdnum.systems.load import System, load
@@ -56,6 +60,7 @@ class Simulation:
         policy: dtype by role.
         reduction: order of the force sum.
         integrator: the dynamics.
+        lattice: units of a state in whole numbers; None where it is one of floats.
     """
 
     system: System
@@ -71,6 +76,7 @@ class Simulation:
     policy: PrecisionPolicy
     reduction: Any
     integrator: Integrator
+    lattice: Lattice | None = None
 
     @property
     def units(self) -> Units:
@@ -112,9 +118,39 @@ class Simulation:
         """Forces and decisions over a list, for use in jit."""
         # kept for later calls, so it must hold no tracer even where its first use is inside a jit
         with jax.ensure_compile_time_eval():
+            parts = (self.model, self.cell, self.decider, self.policy, self.reduction)
+            if self.lattice is not None:
+                return LatticeForce.on(self.lattice, *parts)
             if self.pairwise:
-                return PairForce.create(self.model, self.cell, self.decider, self.policy, self.reduction)
+                return PairForce.create(*parts)
             return ManyBodyForce.create(self.model, self.cell, self.decider, self.policy)
+
+    @cached_property
+    def propagator(self) -> Integrator:
+        """The dynamics as the state needs it: the integrator, or its twin in whole numbers.
+
+        Raises:
+            InputError: a friction that a lattice cannot have.
+        """
+        if self.lattice is None:
+            return self.integrator
+        with jax.ensure_compile_time_eval():
+            return on_lattice(self.integrator, self.lattice)
+
+    @property
+    def has_bath(self) -> bool:
+        """Whether a state remembers what friction has forgotten."""
+        return self.lattice is not None and isinstance(self.integrator, Langevin)
+
+    def first_frame(self) -> tuple[Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"]]:
+        """Positions and velocities of step 0 as the state holds them; not wrapped, not narrowed."""
+        if self.lattice is None:
+            return self.positions, self.velocities
+        scheme, masses = self.propagator, jnp.asarray(self.masses)
+        assert isinstance(scheme, LatticeStep)
+        v = scheme.velocity(scheme.momentum(jnp.asarray(self.velocities.T), masses), masses)
+        # an integer has no negative zero
+        return self.lattice.positions(self.positions) + 0.0, np.asarray(v).T + 0.0
 
     @property
     def pair_types(self) -> int:
@@ -169,6 +205,7 @@ class Simulation:
     def with_cell(self, cell: Cell) -> Simulation:
         """The same system in another box."""
         check_radius(cell, self.r_cut, 0.0)
+        cell = cell if self.lattice is None else self.lattice.cell(cell)
         return replace(self, cell=cell, decider=replace(self.decider, reach=cell.reach(self.positions)))
 
     def evaluate(
@@ -290,7 +327,7 @@ def build(system: System | str, overrides: Mapping[str, Any] | None = None) -> S
         )
     else:
         integrator = VelocityVerlet(timestep)
-    return Simulation(
+    simulation = Simulation(
         system,
         cell,
         np.asarray(system.atoms.positions, np.float64),
@@ -306,3 +343,40 @@ def build(system: System | str, overrides: Mapping[str, Any] | None = None) -> S
         REDUCTIONS[precision.reduction],
         integrator,
     )
+    return _in_whole_numbers(simulation) if precision.state == LATTICE else simulation
+
+
+def _in_whole_numbers(simulation: Simulation) -> Simulation:
+    """The simulation on a lattice, in a box that fits it."""
+    spec, masses = simulation.system.spec, simulation.masses
+    roles = (spec.precision.force, spec.precision.decision, spec.precision.accumulate)
+    if roles != ("float64",) * 3:
+        raise InputError(
+            'state = "lattice" decides and sums in whole numbers, from forces in float64',
+            where="precision",
+            remedy="Leave out force, decision and accumulate",
+        )
+    kT = simulation.units.k_B * spec.dynamics.temperature
+    own = masses * np.linalg.norm(simulation.velocities, axis=1)
+    lattice = Lattice.create(
+        simulation.cell,
+        simulation.r_cut + spec.skin,
+        simulation.model,
+        np.maximum(np.sqrt(masses * kT), own / 4),
+        kT,
+        float(simulation.integrator.timestep),
+    )
+    cell, old = lattice.cell(simulation.cell), simulation.decider
+    atoms = simulation.system.atoms.copy()
+    atoms.set_cell(np.asarray(cell.matrix))
+    reach = cell.reach(simulation.positions)
+    made = replace(
+        simulation,
+        system=replace(simulation.system, atoms=atoms),
+        cell=cell,
+        decider=LatticeDecider(old.r_cut, old.compare, "float64", reach, spacing=lattice.spacing),
+        lattice=lattice,
+    )
+    # made here, so that a friction that a lattice cannot have is refused before the run
+    assert made.propagator is not None
+    return made

@@ -63,6 +63,7 @@ __all__ = [
 ]
 
 FloatName = Literal["float64", "float32"]
+StateName = Literal["float64", "float32", "lattice"]
 ForceFloatName = Literal["float64", "float32", "bfloat16", "float16"]
 ReductionName = Literal[
     "sequential",
@@ -207,9 +208,10 @@ Dynamics = Annotated[NVE | Langevin, Discriminator("kind")]
 class Precision(Table):
     """Which float plays which role."""
 
-    state: FloatName = Field(
+    state: StateName = Field(
         default="float64",
-        description="positions and velocities (with sixteen bits a step would move no atom)",
+        description="positions and velocities (with sixteen bits a step would move no atom); lattice: whole "
+        "numbers, whose decisions and sums have no rounding and whose steps can be taken back exactly",
     )
     force: ForceFloatName = Field(
         default="float64",

@@ -1,0 +1,215 @@
+"""A rollout on a lattice taken back: from where it ended to where it began, with lists of its own.
+
+Every step is undone by the integers that it added, so the states that come by are those of the run, bit for
+bit. The lists are built anew at places along the way back, without looking at those of the run: sums of
+integers do not depend on them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from mdnum.errors import InputError, NumericalError
+from mdnum.md.decide import Tables
+from mdnum.md.latticestep import LatticeLangevin
+from mdnum.md.verlet import PairTable, VerletList
+from mdnum.rollout.engine import Engine
+from mdnum.rollout.epoch import Program, Record, State, write_row
+from mdnum.systems.build import Simulation
+
+
+class Back(NamedTuple):
+    """Where a rollout stands on its way back, in the user's order of atoms.
+
+    Attributes:
+        step: the step whose forces come next; -1 when all are done.
+        x: wrapped positions at that step, shape (3, atoms).
+        v: velocities after its first half kick; in the end, those of the start.
+        images: lattice vectors taken off by wrapping so far, shape (3, atoms).
+        bath: what friction had forgotten by then; None without a thermostat.
+    """
+
+    step: Int[Array, ""]
+    x: Float[Array, "3 atoms"]
+    v: Float[Array, "3 atoms"]
+    images: Int[Array, "3 atoms"]
+    bath: Int[Array, "3 atoms"] | None
+
+
+class Stretched(NamedTuple):
+    """Rows that were filled on the way back, earlier steps first, in the order of a list's atoms.
+
+    Attributes:
+        first: step of the first row. rows: how many there are; the record's other rows are void.
+        record: as an epoch's, without kinetic energy, heat and displacement.
+        table: the list.
+        x_before: positions of the step before the first row, shape (3, atoms); at the start, its own.
+        back: where the way back goes on.
+    """
+
+    first: int
+    rows: int
+    record: Record
+    table: PairTable
+    x_before: np.ndarray
+    back: Back
+
+
+@partial(jax.jit, static_argnames=("structure",))
+def _undrifted(leaves, structure, state: State) -> Back:
+    """Where a rollout stood before the last drift."""
+    program: Program = jax.tree.unflatten(structure, leaves)
+    order = jnp.arange(state.x.shape[1])
+    return _before(program, program.masses, order, Back(state.step, *state[1:4], state.bath))
+
+
+def _before(program: Program, masses, order, back: Back) -> Back:
+    """Undo the drift that led to a state: positions, velocities and bath of the step before."""
+    step = back.step - 1
+    x, v, bath = program.integrator.undrift(  # type: ignore[attr-defined]
+        back.x, back.v, back.bath, masses, step, order
+    )
+    wrapped, n = program.cell.wrap(*x)
+    images = back.images + jnp.stack(n).astype(jnp.int32)
+    return Back(step, jnp.stack(wrapped), v, images, bath)
+
+
+@partial(jax.jit, static_argnames=("structure",), donate_argnames=("record",))
+def _run_back(leaves, structure, tables: Tables, back: Back, record: Record):
+    """Undo steps until the skin is used up, the record is full or the bath is to be changed."""
+    program: Program = jax.tree.unflatten(structure, leaves)
+    order = tables.order
+
+    masses = program.masses[order]
+    scheme = program.integrator
+    half = 0.5 * scheme.timestep
+    room = record.potential.shape[0]
+    here = Back(back.step, *jax.tree.map(lambda a: a[:, order], back[1:]))
+    home = here.x
+
+    def moved(x):
+        d = program.cell.minimum_image(*(x - home))
+        return jnp.sqrt(jnp.max(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]))
+
+    def body(carry):
+        here, row, _, record = carry
+        made = program.force(here.x, tables, decisions=True)  # type: ignore[operator]
+        acceleration = made.force / masses
+        v = scheme.kick(here.v, -half, acceleration, masses)
+        record = write_row(
+            record,
+            room - 1 - row,
+            x=here.x,
+            v=v,
+            images=here.images,
+            bits=made.decisions.bits,
+            potential=jnp.sum(made.energy),
+            virial=made.virial,
+        )
+        # the first step of all began from full-step velocities, and no drift led there
+        second = jnp.where(here.step == 0, 0.0, half)
+        v = scheme.kick(v, -second, acceleration, masses)
+        earlier = _before(program, masses, order, here._replace(v=v))
+        start = here._replace(step=here.step - 1, v=v)
+        earlier = jax.tree.map(lambda a, b: jnp.where(here.step == 0, a, b), start, earlier)
+        return earlier, row + 1, moved(earlier.x) > program.half_skin, record
+
+    def go_on(carry):
+        here, row, due, _ = carry
+        more = (here.step >= 0) & (row < room) & ~due
+        if here.bath is None:
+            return more
+        return more & ((row == 0) | (here.step % scheme.period != 0))  # type: ignore[attr-defined]
+
+    start = (here, jnp.zeros((), jnp.int64), jnp.zeros((), bool), record)
+    here, rows, _, record = lax.while_loop(go_on, body, start)
+
+    unsorted = jax.tree.map(lambda a: jnp.zeros_like(a).at[:, order].set(a), here[1:])
+    return Back(here.step, *unsorted), rows, here.x, record
+
+
+class Backward:
+    """Takes a rollout on a lattice back.
+
+    Args:
+        simulation: the system as objects, on a lattice.
+        end: the state after its last step.
+        baths: what was put aside, by the step before which it was.
+
+    Raises:
+        InputError: the state is not in whole numbers.
+    """
+
+    def __init__(self, simulation: Simulation, end: State, baths: Mapping[int, np.ndarray] | None = None):
+        if simulation.lattice is None:
+            raise InputError(
+                "only steps in whole numbers can be taken back",
+                where="precision.state",
+                remedy='Use state = "lattice"',
+            )
+        self.simulation = simulation
+        self.baths = dict(baths or {})
+        # whatever the run did with its lists: these are never used once a pair may be missing
+        rule = replace(simulation.rule, every=1, delay=0, check=True)
+        self._verlet: VerletList = simulation.verlet_list()
+        engine = Engine(replace(simulation, rule=rule), int(end.step) - 1)
+        self._engine = engine
+        self._leaves, self._structure = engine.leaves, engine.structure
+        self.back: Back = _undrifted(self._leaves, self._structure, end)
+
+    def stretches(self) -> Iterator[Stretched]:
+        """Steps in stretches, last stretch first; `back` is where it stands.
+
+        Raises:
+            NumericalError: the bath of a thermostat is not as it was.
+        """
+        simulation = self.simulation
+        while int(self.back.step) >= 0:
+            self._change_bath()
+            positions = np.asarray(self.back.x, np.float64).T.copy()
+            table = self._verlet.build(positions, simulation.cell)
+            tables = simulation.tables(table)
+            record = self._engine.take(0, table.slots // 8)
+            last = int(self.back.step)
+            self.back, rows, x_before, record = _run_back(
+                self._leaves, self._structure, tables, self.back, record
+            )
+            count = int(rows)
+            yield Stretched(
+                last - count + 1, count, _rolled(record, count), table, np.asarray(x_before), self.back
+            )
+            self._engine.give(0, record)
+        self._check_bath()
+
+    def _change_bath(self) -> None:
+        """Where the run had put a bath aside, it is taken up again."""
+        step, scheme = int(self.back.step), self.simulation.propagator
+        if not isinstance(scheme, LatticeLangevin) or step % int(scheme.period):
+            return
+        self._check_bath()
+        if step not in self.baths:
+            raise NumericalError(f"what friction had forgotten before step {step} was not kept")
+        self.back = self.back._replace(bath=jnp.asarray(self.baths[step]))
+
+    def _check_bath(self) -> None:
+        """A bath that was begun anew must have come back to nothing."""
+        if self.back.bath is not None and np.any(np.asarray(self.back.bath)):
+            step = max(int(self.back.step), 0)
+            raise NumericalError(
+                f"taken back, the run is not the one that was made: at step {step} the bath is not empty"
+            )
+
+
+def _rolled(record: Record, rows: int) -> Record:
+    """The rows that were filled from the end, brought to the front; a copy on the host."""
+    columns: list[Any] = [np.roll(np.asarray(column), rows, axis=0) for column in record]
+    return Record(*columns)
