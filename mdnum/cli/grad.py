@@ -29,6 +29,9 @@ def grad(
         metavar="WORD,WORD",
         help="Ways to differentiate, or all; by default those that answer within about a minute.",
     ),
+    replicas: int = typer.Option(
+        0, min=0, metavar="N", help="Other starts, for the standard error of the gradient; none by default."
+    ),
     settings: list[str] | None = output.SET_OPTION,
     out: Path | None = typer.Option(
         None, "-o", "--out", metavar="DIR", help="The gradient folder; runs/grad-NAME-N by default."
@@ -47,6 +50,7 @@ def grad(
             wrt or (),
             steps=steps,
             methods=methods or None,
+            replicas=replicas,
             out=out,
             overrides=overrides,
             report=not no_report,

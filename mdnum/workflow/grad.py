@@ -17,6 +17,14 @@ if TYPE_CHECKING:
     from mdnum.systems.load import System
 
 
+#: What is left out where no replicas are asked for.
+_STARTS = {
+    "what": "standard error",
+    "why": "other starts of the system, a run and a pass of tangents each",
+    "how": "--replicas 8",
+}
+
+
 @dataclass(frozen=True)
 class GradResult:
     """A finished comparison of gradients.
@@ -40,6 +48,7 @@ def grad(
     *,
     steps: int | None = None,
     methods: str | Sequence[str] | None = None,
+    replicas: int = 0,
     out: str | Path | None = None,
     overrides: Mapping[str, Any] | None = None,
     report: bool = True,
@@ -57,6 +66,8 @@ def grad(
         steps: last step; default the system's own, but no more than 500 of molecular dynamics.
         methods: words of `mdnum.gradients.registry.METHODS`, or "all"; default those that answer within
             about a minute. What they leave out is said in the summary.
+        replicas: starts for the standard error of the gradient, at least 2; 0 leaves it out. Each is a run
+            and a pass of tangents.
         out: the new gradient folder; default runs/grad-<name>-<n>.
         overrides: dotted keys to values, such as {"cutoff.kind": "switched"}.
         report: write report.html.
@@ -69,16 +80,23 @@ def grad(
     """
     from mdnum.workflow.grad_words import words
 
+    if replicas < 0 or replicas == 1:
+        raise InputError(f"replicas = {replicas}; a standard error takes at least 2")
     wanted = words(wrt)
     chosen = None if methods is None else words(methods)
     if is_ball(system):
+        if replicas:
+            raise InputError(
+                "replicas are starts of molecular dynamics, and this system is a ball",
+                remedy="Use --methods randomized, an average over noise with its standard error",
+            )
         from mdnum.workflow.grad_ball import grad_ball
 
         return grad_ball(
             system, of, wanted, steps=steps, methods=chosen, out=out, overrides=overrides, report=report,
             progress=progress,
         )  # fmt: skip
-    return _molecules(loaded(system, overrides), of, wanted, chosen, steps, out, report, progress)
+    return _molecules(loaded(system, overrides), of, wanted, chosen, steps, replicas, out, report, progress)
 
 
 def _molecules(
@@ -87,6 +105,7 @@ def _molecules(
     wrt: Sequence[str],
     methods: Sequence[str] | None,
     steps: int | None,
+    replicas: int,
     out: str | Path | None,
     report: bool,
     progress: Progress | None,
@@ -99,13 +118,18 @@ def _molecules(
     folder = opened(system, "grad", out, "grad")
     try:
         told = Log(folder, progress)
-        found = grad_methods.run(plan, problem, names, told)
+        found = grad_methods.run(plan, problem, names, told, replicas)
         grad_record.write(folder, found)
         folder.finalize()
         folder.write_summary(
             grad_record.summarize(problem, word, names, found)
             | {
-                "left_out": [*_shorter(system, steps, problem.steps), *plan.left_out, *found.failed],
+                "left_out": [
+                    *_shorter(system, steps, problem.steps),
+                    *([] if replicas else [_STARTS]),
+                    *plan.left_out,
+                    *found.failed,
+                ],
                 "seconds": time.perf_counter() - began,
             }
         )

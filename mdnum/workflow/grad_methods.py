@@ -14,6 +14,7 @@ from mdnum.gradients.diagnose.agreement import agreement
 from mdnum.gradients.diagnose.flips import flips
 from mdnum.gradients.diagnose.growth import GrowthWatch
 from mdnum.gradients.diagnose.passes import Passed, passed
+from mdnum.gradients.diagnose.trust import trust
 from mdnum.gradients.differences import FiniteDifferences
 from mdnum.gradients.registry import METHODS, by_word
 from mdnum.gradients.symmetric import EventAware, Symmetric, weights
@@ -21,12 +22,12 @@ from mdnum.workflow.fork_question import Progress
 
 if TYPE_CHECKING:
     from mdnum.gradients.base import Method, Problem
-    from mdnum.gradients.diagnose import Agreement, Flips, Growth
+    from mdnum.gradients.diagnose import Agreement, Flips, Growth, Trust
 
 #: Runs every method that applies.
 ALL = "all"
-#: Atoms times steps that are run beside the reverse passes where nothing was said about methods: some 20 s.
-AFFORDABLE = 20_000_000
+#: Atoms times steps that are run for differences where nothing was said about methods: some 6 s.
+AFFORDABLE = 6_000_000
 #: Shifts of finite differences where nothing was said about methods.
 _LEVELS = 2
 #: What is tried where nothing was said about methods.
@@ -54,12 +55,14 @@ class Found:
         agreement: every method and what their differences mean.
         growth: of the gradient with the horizon; None where there was no reverse pass to watch.
         flips: what each of them adds; None where there was no such pass, or no number to add to.
+        trust: how far the gradient means something; None where nothing can tell.
         failed: further parts that could not be had: what, why, and how to ask otherwise.
     """
 
     agreement: Agreement
     growth: Growth | None
     flips: Flips | None
+    trust: Trust | None
     failed: tuple[dict[str, str], ...] = ()
 
 
@@ -91,7 +94,7 @@ def plan(problem: Problem, names: Sequence[str], asked: Sequence[str] | None) ->
 def _why_left_out(word: str, method: Method, problem: Problem, names: Sequence[str]) -> str | None:
     """Why a method is not run where nothing was said about methods."""
     if word not in _QUICK:
-        return "another opinion, which takes its time"
+        return method.says
     # whether it has a derivative by some of them
     alone = [method.why_not(problem, [name]) for name in names]
     if None not in alone:
@@ -103,8 +106,15 @@ def _why_left_out(word: str, method: Method, problem: Problem, names: Sequence[s
     return None
 
 
-def run(plan: Plan, problem: Problem, names: Sequence[str], progress: Progress) -> Found:
-    """Every method of a plan, and how the gradient grows, from the reverse pass that is made anyhow.
+def run(plan: Plan, problem: Problem, names: Sequence[str], progress: Progress, replicas: int = 0) -> Found:
+    """Every method of a plan, how the gradient grows, what flips add, and how far it is trusted.
+
+    Args:
+        plan: the methods.
+        problem: of what.
+        names: full names of the parameters.
+        progress: called with what is done, of how much, and a dictionary with the phase.
+        replicas: starts for the standard error; 0 leaves it out.
 
     Raises:
         InputError: no method applies, with the reason of each. NumericalError: the run blew up.
@@ -117,7 +127,7 @@ def run(plan: Plan, problem: Problem, names: Sequence[str], progress: Progress) 
             remedy="Ask for one with --methods",
         )
     known: dict[str, Gradient] = {}
-    growth, added = None, None
+    growth, added, trusted = None, None, None
     failed: list[dict[str, str]] = []
     asked = {one.name: one for one in plan.methods}
     aware = asked.get("event-aware")
@@ -146,11 +156,15 @@ def run(plan: Plan, problem: Problem, names: Sequence[str], progress: Progress) 
                 {"stretches": len(plainly.tape), "made again": plainly.tape.replayed},
             )
         try:
-            added = flips(
-                problem, names, made=watched, progress=_phases(progress, "contributions of flips: ")
-            )
+            added = flips(problem, names, made=watched, progress=_phases(progress, "flips: "))
         except InputError as error:
             failed.append({"what": "contributions of flips", "why": error.message, "how": error.remedy or ""})
+        # the run and its states are not needed any more
+        del watched
+        try:
+            trusted = trust(problem, names, replicas=replicas, progress=_phases(progress, "trust: "))
+        except InputError as error:
+            failed.append({"what": "the trust horizon", "why": error.message, "how": error.remedy or ""})
     found = agreement(
         problem,
         names,
@@ -159,7 +173,7 @@ def run(plan: Plan, problem: Problem, names: Sequence[str], progress: Progress) 
         growth=1.0 if growth is None else _gain(growth),
         progress=_phases(progress),
     )
-    return Found(found, growth, added, tuple(failed))
+    return Found(found, growth, added, trusted, tuple(failed))
 
 
 def _event_aware(method: EventAware, problem: Problem, made: Passed) -> Gradient:
@@ -180,12 +194,12 @@ def _gain(growth: Growth) -> float:
     return float(seen[-1] / seen[0]) if len(seen) else 1.0
 
 
-def _phases(progress: Progress, method: str = "") -> Callable[[int, int, str], None]:
+def _phases(progress: Progress, part: str = "") -> Callable[[int, int, str], None]:
     """What a method reports, as a rollout would."""
 
     def tell(done: int, of: int, phase: str) -> None:
         unit = "runs" if phase.endswith("differences") else "steps"
-        info: dict[str, Any] = {"phase": f"{method}{phase}", "unit": unit}
+        info: dict[str, Any] = {"phase": f"{part}{phase}", "unit": unit}
         progress(done, of, info)
 
     return tell

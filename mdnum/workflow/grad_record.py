@@ -16,7 +16,7 @@ from mdnum.workflow.grad_words import LOSSES, unit_of_loss, unit_of_parameter
 
 if TYPE_CHECKING:
     from mdnum.gradients.base import Gradient, Problem
-    from mdnum.gradients.diagnose import Opinion
+    from mdnum.gradients.diagnose import Opinion, Trust
     from mdnum.workflow.grad_methods import Found
 
 #: Entries of a derivative that summary.json tells one by one.
@@ -26,7 +26,7 @@ ARRAYS = "gradients.npz"
 
 
 def write(folder: RunFolder, found: Found) -> None:
-    """Puts large derivatives, how the gradient grows and what each flip adds into a folder."""
+    """Puts large derivatives into a folder, and tables of growth, trust and flips."""
     large = {
         f"{one.method}/{name}": np.asarray(value)
         for one in found.agreement.opinions
@@ -42,6 +42,8 @@ def write(folder: RunFolder, found: Found) -> None:
         folder.append("growth", found.growth.table())
     if found.flips is not None and len(found.flips):
         folder.append("flip_contributions", found.flips.table())
+    if found.trust is not None:
+        folder.append("trust", found.trust.table())
 
 
 def summarize(problem: Problem, word: str, names: Sequence[str], found: Found) -> dict[str, Any]:
@@ -76,13 +78,18 @@ def summarize(problem: Problem, word: str, names: Sequence[str], found: Found) -
         "comparisons": [one.plain() for one in agreement.comparisons],
         "growth": None if found.growth is None else found.growth.plain(),
         "flips": None if found.flips is None else found.flips.plain(),
-        "trust": None,
+        "trust": None if found.trust is None else _trust(found.trust),
         "refused": [
             {"method": one.method, "why": one.missing} for one in agreement.opinions if one.found is None
         ],
         "findings": [],
         "status": "complete",
     }
+
+
+def _trust(found: Trust) -> dict[str, Any]:
+    """How far a gradient is trusted, without the rows of trust.parquet."""
+    return {key: value for key, value in found.plain().items() if key not in ("at", "relative", "error")}
 
 
 def _method(opinion: Opinion, found: Gradient) -> dict[str, Any]:

@@ -62,7 +62,7 @@ def _horizons(run: Question) -> Iterator[tuple[float, str]]:
     """How far the gradient is trusted, where that was asked."""
     found = run.summary.get("trust")
     if found and found["limited_by"]:
-        yield found["horizon"], f"trusted up to here ({found['limited_by']})"
+        yield found["horizon"], "trusted to here"
 
 
 def state(run: Question) -> Plot | None:
@@ -99,14 +99,14 @@ def trust(run: Question) -> Plot | None:
     series = [
         Series(f"{words}, {name}", table["horizon"], table[f"{key}.{name}"], mark="line+points", role=role,
                dashed=key == "error")
-        for key, words in (("relative", "against wider"), ("error", "standard error / mean"))
+        for key, words in (("relative", "other rounding"), ("error", "standard error / mean"))
         for role, name in zip(ROLES, (one["name"] for one in run.summary["parameters"]), strict=False)
         if f"{key}.{name}" in table
     ]  # fmt: skip
     if not series:
         return None
     return Plot(
-        "Relative difference from the gradient in wider precision, against the horizon",
+        "What other roundings and other starts make of the gradient, against the horizon",
         "horizon (steps)",
         "relative difference",
         tuple(series),
@@ -166,13 +166,14 @@ def _contributions(run: Question) -> Iterator[tuple[Role, str, np.ndarray, float
 
 def captions(run: Question) -> dict[str, str]:
     """What stands below each figure, by its name."""
+    shadow = (run.summary.get("trust") or {}).get("shadow", "")
     return {
         "growth": "A horizon of h steps is the last h steps of the run; all of them are read off one reverse "
         "pass. Times the parameter's value, a derivative is what a relative change of it does to the loss.",
         "state": "What the loss makes of a change of the state so many steps before the end; velocities are "
         "turned into lengths by a time of 30 steps.",
-        "trust": "Solid: the gradient in the run's precision against that in a wider one. Dashed: the "
-        "standard error over starts against the mean.",
+        "trust": f"Solid: gradients of {shadow}. Dashed: the standard error over starts against the mean, "
+        "where there were several.",
         "ranked": "Where a line is flat, many flips add alike; where it falls from the start, few decide.",
         "running": "At the end: the share of the derivative that the flips add. What is beyond it cancels.",
     }

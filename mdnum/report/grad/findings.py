@@ -18,6 +18,12 @@ from mdnum.report.words import count, listed, many, number, percent
 _HEAVY, _SINGLE = 0.2, 3
 #: Share of the weight of all flips above which what the guard leaves out matters.
 _LEFT_OUT = 0.01
+#: What takes a gradient further, by what limits it.
+_FURTHER = {
+    "rounding": "or run in wider formats: --set precision.state=float64 and the like",
+    "standard error": "or average over more starts with --replicas",
+    "ambiguous decision": "or see with mdnum fork what the other decision would do",
+}
 #: Relative difference from a closed form within which a derivative is that of the exact motion.
 _CLOSE = 0.01
 
@@ -37,7 +43,10 @@ def _headline(run: Question) -> str:
         short = one["name"].rpartition(".")[2]
         value = f"{slope(reference, one['name'], 4)} {slope_unit(summary, one)}".rstrip()
         parts.append(f"d {summary['loss']['word']} / d {short} = {value}")
-    return f"After {many(run.steps, 'step')}, {listed(parts)}."
+    trust = summary.get("trust") or {"limited_by": "", "horizon": run.steps}
+    limited = trust["limited_by"] and trust["horizon"] < run.steps
+    until = f"; trusted up to {many(trust['horizon'], 'step')}" if limited else ""
+    return f"After {many(run.steps, 'step')}, {listed(parts)}{until}."
 
 
 def _evidence(run: Question) -> Iterator[str]:
@@ -51,7 +60,7 @@ def _evidence(run: Question) -> Iterator[str]:
         yield growth["says"]
     added = (summary.get("flips") or {}).get("share", {})
     told = [
-        f"{percent(abs(parts['pair enters'] + parts['pair leaves']))} of that by {name}"
+        f"{percent(round(abs(parts['pair enters'] + parts['pair leaves']), 6))} of that by {name}"
         for name, parts in added.items()
         if None not in parts.values()
     ]
@@ -111,7 +120,7 @@ def _short(run: Question) -> Iterator[Finding]:
             "warning",
             f"trusted up to {many(trust['horizon'], 'step')} of {count(run.steps)}",
             trust["says"],
-            "Ask for a shorter horizon, or for an average over starts with --replicas.",
+            f"Ask for a shorter horizon, {_FURTHER[trust['limited_by']]}.",
         )
 
 
@@ -138,8 +147,13 @@ def _few_flips(run: Question) -> Iterator[Finding]:
             f"few flips decide the derivative by {name}",
             f"{how}: first the pair {pair}, which crosses with a radial speed of {speed} and adds "
             f"{percent(abs(float(added[first]) / total))}. One run then says little of another.",
-            "Average over starts with --replicas.",
+            "" if _replicas(run) else "Average over starts with --replicas.",
         )
+
+
+def _replicas(run: Question) -> bool:
+    """Whether other starts were followed."""
+    return any(name.startswith("error.") for name in run.tables["trust"])
 
 
 def _grazing(run: Question) -> Iterator[Finding]:

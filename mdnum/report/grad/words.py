@@ -48,7 +48,7 @@ def slope_unit(summary: Mapping[str, Any], parameter: Mapping[str, Any]) -> str:
         return ""
     if not below:
         return above
-    above = above or "1"
+    above = f"({above})" if "/" in above else above or "1"
     joined = "/" in below and not below.startswith("√")
     return f"{above}/({below})" if joined else f"{above}/{below}"
 
