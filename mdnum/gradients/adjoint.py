@@ -19,15 +19,16 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from mdnum.errors import InputError
+from mdnum.gradients import conservative
 from mdnum.gradients.crossings import Crossings, crossings, onto_crossings
 from mdnum.gradients.loops import over_rows
 from mdnum.gradients.losses import Frame
 from mdnum.gradients.pairs import FORCE, MODEL, SCALE, pull_back
-from mdnum.gradients.parameters import Cotangents
+from mdnum.gradients.parameters import Cotangents, quantities
 from mdnum.gradients.tape import Stretch, Tape, frame_of, rows_of
 from mdnum.md.integrators import Integrator
+from mdnum.md.manyforce import ManyBodyForce
 from mdnum.md.pairforce import PairForce
-from mdnum.md.potentials import CutPotential
 
 #: Everything that a run is made of.
 ALL = frozenset((MODEL, SCALE, FORCE))
@@ -47,7 +48,7 @@ class Carry(NamedTuple):
 
     x: Float[Array, "3 atoms"]
     v: Float[Array, "3 atoms"]
-    model: CutPotential
+    model: Any
     integrator: Any
     scale: Float[Array, ""]
     origin: tuple[Float[Array, "3 atoms"], Float[Array, "3 atoms"]]
@@ -69,7 +70,7 @@ class Trace(NamedTuple):
 
     x: Float[Array, "room 3 atoms"]
     v: Float[Array, "room 3 atoms"]
-    model: CutPotential
+    model: Any
     integrator: Any
     scale: Float[Array, "room"]
     r_cut: Float[Array, "room types"]
@@ -98,7 +99,7 @@ def reverse(
         The derivatives, and the crossings of every stretch with their weights, last stretch first.
 
     Raises:
-        InputError: a many-body potential.
+        InputError: a many-body potential with its flips.
 
     Error: of the order of a rounding error times the growth of the adjoint; none of truncation, for the
     program as it ran.
@@ -129,16 +130,16 @@ class Backward:
         met: the crossings of the stretch that was gone through last; None where flips do not count.
 
     Raises:
-        InputError: a many-body potential.
+        InputError: a many-body potential with its flips.
     """
 
     def __init__(self, tape: Tape, wanted: frozenset[str], guard: float | None):
         simulation = tape.simulation
         force = simulation.force
-        if not isinstance(force, PairForce):
+        if guard is not None and not isinstance(force, PairForce):
             raise InputError(
-                "this reverse pass is one of pair potentials",
-                remedy="Use the method unrolled for a many-body potential",
+                "what flips add is known for pair potentials only",
+                remedy="Use the method symmetric for a many-body potential",
                 where=simulation.system.name,
             )
         self.tape, self.wanted, self.guard, self.force = tape, wanted, guard, force
@@ -149,7 +150,7 @@ class Backward:
         self.carry = Carry(
             nothing,
             nothing,
-            jax.tree.map(jnp.zeros_like, force.model),
+            jax.tree.map(jnp.zeros_like, quantities(force)),
             jax.tree.map(jnp.zeros_like, numbers),
             jnp.zeros((), force.policy.dtype("force")),
             (nothing, nothing),
@@ -168,7 +169,7 @@ class Backward:
         return (
             self.force,
             simulation.integrator,
-            jnp.asarray(simulation.masses[order]),
+            simulation.masses[order],
             simulation.tables(stretch.table),
             rows_of(stretch),
             stretch.bits,
@@ -176,7 +177,7 @@ class Backward:
             self.tape.seen(stretch),
             (self.tape.loss, self.tape.origin, self.tape.around, self.onto_total),
             None if self.met is None else self.met.on_device(len(stretch.x), simulation.atoms),
-            self.carry._replace(x=self.carry.x[:, order], v=self.carry.v[:, order]),
+            self.carry,
             self.wanted,
             traced,
         )
@@ -185,9 +186,7 @@ class Backward:
         self, stretch: Stretch, *, traced: bool = False
     ) -> tuple[Float[np.ndarray, "room most"], Trace | None]:
         """Carry everything through a stretch: the weights of its crossings, and what each step carried."""
-        carry, (weights, trace) = transposed(*self.arguments(stretch, traced))
-        order = stretch.table.order
-        self.carry = carry._replace(x=_unsorted(carry.x, order), v=_unsorted(carry.v, order))
+        self.carry, (weights, trace) = transposed(*self.arguments(stretch, traced))
         return np.asarray(weights), trace
 
     def cotangents(self) -> Cotangents:
@@ -210,7 +209,7 @@ def _unsorted(a, order):
 
 @partial(jax.jit, static_argnames=("wanted", "traced"))
 def transposed(
-    force: PairForce,
+    force: PairForce | ManyBodyForce,
     integrator: Integrator,
     masses: Float[Array, "atoms"],
     tables,
@@ -227,8 +226,11 @@ def transposed(
     """The transpose of a stretch of steps: the carry before it, the weights of its crossings, its trace."""
     loss, origin, around, onto_total = looking
     order = tables.order
+    # carried from list to list in the user's order
+    carry = carry._replace(x=carry.x[:, order], v=carry.v[:, order])
     dtype = rows[1].dtype
     mass_row = masses.astype(dtype)
+    transpose: Any = pull_back if isinstance(force, PairForce) else conservative.pull_back
     # the noise of a thermostat belongs to the atom, and its size to the length that atoms are measured in
     numbers, rest = eqx.partition(integrator, _is_number)
 
@@ -282,7 +284,7 @@ def transposed(
         )
         onto_v = onto_kicked + loss_v
         w = (half * onto_kicked + second * onto_v) / mass_row
-        made = pull_back(force, x, tables, told, w, onto_potential, onto_virial, wanted)
+        made = transpose(force, x, tables, told, w, onto_potential, onto_virial, wanted)
         model, numbers_bar, scale = carry.model, carry.integrator, carry.scale
         if MODEL in wanted:
             model = jax.tree.map(jnp.add, model, made.model)
@@ -335,4 +337,5 @@ def transposed(
             )
         return after, (weights, trace)
 
-    return over_rows(step, carry, (rows, bits, seen, crossed), used, backward=True)
+    carry, by_row = over_rows(step, carry, (rows, bits, seen, crossed), used, backward=True)
+    return carry._replace(x=_unsorted(carry.x, order), v=_unsorted(carry.v, order)), by_row

@@ -85,17 +85,24 @@ def stretch_of(segment: Segment, start: Start, ledger: Ledger | None = None) -> 
     assert segment.before is not None
     # the record has room for the longest stretch; powers of two, so that not every length is compiled for
     room = min(len(record.x), max(_LEAST_ROOM, 1 << (segment.rows - 1).bit_length()))
+
+    def kept(column) -> np.ndarray:
+        whole = np.asarray(column)
+        copy = np.zeros((room, *whole.shape[1:]), whole.dtype)
+        copy[: segment.rows] = whole[: segment.rows]
+        return copy
+
     return Stretch(
         segment.first,
         segment.rows,
-        np.array(record.x[:room]),
-        np.array(record.v[:room]),
-        np.array(record.images[:room]),
-        np.array(record.bits[:room]),
+        kept(record.x),
+        kept(record.v),
+        kept(record.images),
+        kept(record.bits),
         np.array(segment.before),
         np.asarray(start.state.x_before)[:, order],
-        np.array(record.potential[:room]),
-        np.array(record.virial[:room]),
+        kept(record.potential),
+        kept(record.virial),
         segment.table,
         ledger,
     )
