@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mdnum.events import Ledger
+from mdnum.events.saltation import saltation_flagged
 from mdnum.md.cell import HostCell
 from mdnum.systems.build import Simulation
 
@@ -74,6 +75,17 @@ class Crossings:
     def __len__(self) -> int:
         return len(self.row)
 
+    @property
+    def kick(self) -> Float[np.ndarray, "crossings"]:
+        """How the momentum along the pair follows its distance through the crossing, energy/length per
+        (length/time): the saltation matrix of (distance, momentum), whose threshold is the cutoff."""
+        still = np.zeros_like(self.speed)
+        before, after = np.stack([self.speed, still], axis=1), np.stack([self.speed, self.force], axis=1)
+        normal = np.broadcast_to([1.0, 0.0], before.shape)
+        return saltation_flagged(np.broadcast_to(np.eye(2), (len(self), 2, 2)), before, after, normal)[0][
+            :, 1, 0
+        ]
+
     def _places(self, room: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The crossings sorted by row, their rows, and where each stands among those of its row."""
         counts = np.bincount(self.row, minlength=room)
@@ -93,7 +105,7 @@ class Crossings:
         i[row, place], j[row, place] = self.i[order], self.j[order]
         normal[row, :, place] = self.normal[order]
         # what is left out still has its weight worked out: the sign tells the reverse pass not to apply it
-        push[row, place] = (self.force / self.speed)[order]
+        push[row, place] = self.kick[order]
         kind[row, place] = np.where(self.grazing, -1 - self.kind, self.kind)[order]
         images[row, :, place] = self.images[order]
         return Met(*(jnp.asarray(part) for part in (i, j, normal, push, kind, images)))
