@@ -7,8 +7,14 @@ from collections.abc import Callable
 
 from mdnum.errors import InputError
 from mdnum.gradients.base import Method
+from mdnum.gradients.boundary import Boundary
 from mdnum.gradients.differences import FiniteDifferences
+from mdnum.gradients.ensemble import Ensemble
 from mdnum.gradients.reversible import Reversible
+from mdnum.gradients.reweighting import Reweighting
+from mdnum.gradients.shadow import ShadowDifferences
+from mdnum.gradients.smoothed import SmoothedDifferences
+from mdnum.gradients.surrogate import Surrogate
 from mdnum.gradients.symmetric import EventAware, Symmetric
 
 #: A method with its defaults, by word; the order is the one that tables show.
@@ -17,6 +23,12 @@ METHODS: dict[str, Callable[[], Method]] = {
     "reversible": Reversible,
     "event-aware": EventAware,
     "finite-differences": FiniteDifferences,
+    "shadow-differences": ShadowDifferences,
+    "smoothed-differences": SmoothedDifferences,
+    "surrogate": Surrogate,
+    "ensemble": Ensemble,
+    "reweighting": Reweighting,
+    "boundary": Boundary,
 }
 
 
