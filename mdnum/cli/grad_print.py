@@ -16,7 +16,7 @@ def print_rows(summary: Mapping[str, Any]) -> None:
     size = f"{many:,} {noun}{'' if many == 1 else 's'}"
     out.print(
         f"  {summary['system']}, {size}, {summary['steps']:,} steps; "
-        f"{loss['word']} = {summary['value']:.10g} {loss['unit']}",
+        + f"{loss['word']} = {summary['value']:.10g} {loss['unit']}".rstrip(),
         markup=False,
     )
     _print_methods(summary)
@@ -46,7 +46,8 @@ def _print_methods(summary: Mapping[str, Any]) -> None:
         for name in names:
             cells += [_slope(one, name), _apart(apart.get((one["method"], name)))]
         table.append((one["method"], *cells))
-    columns = [part for name in names for part in (f"d/d {name}", f"from {reference}")]
+    heads = [_head(one) for one in summary["parameters"]]
+    columns = [part for head in heads for part in (head, f"from {reference}")]
     output.print_table("", ("method", *columns), table)
     # one line for each note, whatever it is about
     notes: dict[tuple[str, str], list[str]] = {}
@@ -57,6 +58,12 @@ def _print_methods(summary: Mapping[str, Any]) -> None:
         output.console().print(f"  {method} by {', '.join(about)}: {note}", markup=False)
 
 
+def _head(parameter: Mapping[str, Any]) -> str:
+    """A parameter as the head of a column, with what its entries belong to."""
+    entries = parameter.get("entries")
+    return f"d/d {parameter['name']}" + (f" ({', '.join(entries)})" if entries else "")
+
+
 def _slope(found: Mapping[str, Any], name: str) -> str:
     value = found["gradient"].get(name)
     if isinstance(value, Mapping):
@@ -65,7 +72,7 @@ def _slope(found: Mapping[str, Any], name: str) -> str:
         return ", ".join(f"{entry:.8g}" for entry in value)
     error = found["error"].get(name)
     text = "-" if value is None else f"{value:.8g}"
-    return text if error is None else f"{text} ± {error:.2g}"
+    return f"{text} ± {error:.2g}" if isinstance(error, float) else text
 
 
 def _apart(row: Mapping[str, Any] | None) -> str:

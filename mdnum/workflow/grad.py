@@ -126,7 +126,7 @@ def _molecules(
             | {
                 "left_out": [
                     *_shorter(system, steps, problem.steps),
-                    *([] if replicas else [_STARTS]),
+                    *([] if replicas or found.trust is None else [_STARTS]),
                     *plan.left_out,
                     *found.failed,
                 ],

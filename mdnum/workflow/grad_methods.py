@@ -17,7 +17,7 @@ from mdnum.gradients.diagnose.passes import Passed, passed
 from mdnum.gradients.diagnose.trust import trust
 from mdnum.gradients.differences import FiniteDifferences
 from mdnum.gradients.registry import METHODS, by_word
-from mdnum.gradients.symmetric import EventAware, Symmetric, weights
+from mdnum.gradients.symmetric import GUARD, EventAware, Symmetric, weights
 from mdnum.workflow.fork_question import Progress
 
 if TYPE_CHECKING:
@@ -129,42 +129,46 @@ def run(plan: Plan, problem: Problem, names: Sequence[str], progress: Progress, 
     known: dict[str, Gradient] = {}
     growth, added, trusted = None, None, None
     failed: list[dict[str, str]] = []
-    asked = {one.name: one for one in plan.methods}
-    aware = asked.get("event-aware")
-    if isinstance(aware, EventAware) and aware.why_not(problem, names) is None:
+
+    def attempt(what: str, part: Callable[[], Any]) -> Any:
+        try:
+            return part()
+        except InputError as error:
+            failed.append({"what": what, "why": error.message, "how": error.remedy or ""})
+            return None
+
+    base = _base(plan.methods, problem, names)
+    if base is not None:
+        aware = isinstance(base, EventAware)
         watch = GrowthWatch(problem.simulation, names, problem.steps)
-        watched = passed(
+        made = passed(
             problem,
             names,
-            guard=aware.guard,
+            saltation=aware,
+            guard=base.guard if isinstance(base, EventAware) else GUARD,
             watches=[watch],
-            progress=_phases(progress, "event-aware: "),
+            progress=_phases(progress, f"{base.name}: "),
         )
-        growth = watch.result(watched.gradient)
-        known["event-aware"] = _event_aware(aware, problem, watched)
-        if isinstance(asked.get("symmetric"), Symmetric):
+        growth = watch.result(made.gradient)
+        known[base.name] = _as_method(base, problem, made)
+        plain = next((one for one in plan.methods if isinstance(one, Symmetric)), None)
+        if aware and plain is not None:
             # the same run, so that it need not be made twice
-            plainly = passed(
-                problem, names, saltation=False, tape=watched.tape, progress=_phases(progress, "symmetric: ")
+            again = passed(
+                problem, names, saltation=False, tape=made.tape, progress=_phases(progress, "symmetric: ")
             )
-            known["symmetric"] = Gradient(
-                asked["symmetric"].name,
-                asked["symmetric"].says,
-                plainly.tape.value,
-                plainly.gradient,
-                independent(problem, plainly.gradient, saltation=False),
-                {"stretches": len(plainly.tape), "made again": plainly.tape.replayed},
+            known[plain.name] = _as_method(plain, problem, again)
+        if aware:
+            added = attempt(
+                "contributions of flips",
+                lambda: flips(problem, names, made=made, progress=_phases(progress, "flips: ")),
             )
-        try:
-            added = flips(problem, names, made=watched, progress=_phases(progress, "flips: "))
-        except InputError as error:
-            failed.append({"what": "contributions of flips", "why": error.message, "how": error.remedy or ""})
-        # the run and its states are not needed any more
-        del watched
-        try:
-            trusted = trust(problem, names, replicas=replicas, progress=_phases(progress, "trust: "))
-        except InputError as error:
-            failed.append({"what": "the trust horizon", "why": error.message, "how": error.remedy or ""})
+        trusted = attempt(
+            "the trust horizon",
+            lambda: trust(
+                problem, names, saltation=aware, replicas=replicas, progress=_phases(progress, "trust: ")
+            ),
+        )
     found = agreement(
         problem,
         names,
@@ -176,16 +180,24 @@ def run(plan: Plan, problem: Problem, names: Sequence[str], progress: Progress, 
     return Found(found, growth, added, trusted, tuple(failed))
 
 
-def _event_aware(method: EventAware, problem: Problem, made: Passed) -> Gradient:
+def _base(methods: Sequence[Method], problem: Problem, names: Sequence[str]) -> EventAware | Symmetric | None:
+    """The method whose reverse pass growth and trust are read off; None where none of these is asked for."""
+    for kind in (EventAware, Symmetric):
+        for one in methods:
+            if isinstance(one, kind) and one.why_not(problem, names) is None:
+                return one
+    return None
+
+
+def _as_method(method: EventAware | Symmetric, problem: Problem, made: Passed) -> Gradient:
     """What the method itself would say of this pass."""
-    return Gradient(
-        method.name,
-        method.says,
-        made.tape.value,
-        made.gradient,
-        independent(problem, made.gradient, saltation=True),
-        {"guard": made.guard, **weights(made.crossings)},
-    )
+    aware = isinstance(method, EventAware)
+    if aware:
+        details = {"guard": made.guard, **weights(made.crossings)}
+    else:
+        details = {"stretches": len(made.tape), "made again": made.tape.replayed}
+    notes = independent(problem, made.gradient, saltation=aware)
+    return Gradient(method.name, method.says, made.tape.value, made.gradient, notes, details)
 
 
 def _gain(growth: Growth) -> float:

@@ -10,6 +10,7 @@ import numpy as np
 
 from mdnum.gradients import parameters
 from mdnum.gradients.diagnose.results import plain
+from mdnum.md.potentials import pair_type
 from mdnum.store import RunFolder
 from mdnum.store.atomic import write_bytes
 from mdnum.workflow.grad_words import LOSSES, unit_of_loss, unit_of_parameter
@@ -17,6 +18,7 @@ from mdnum.workflow.grad_words import LOSSES, unit_of_loss, unit_of_parameter
 if TYPE_CHECKING:
     from mdnum.gradients.base import Gradient, Problem
     from mdnum.gradients.diagnose import Opinion, Trust
+    from mdnum.systems.build import Simulation
     from mdnum.workflow.grad_methods import Found
 
 #: Entries of a derivative that summary.json tells one by one.
@@ -69,6 +71,7 @@ def summarize(problem: Problem, word: str, names: Sequence[str], found: Found) -
                 "name": name,
                 "unit": unit_of_parameter(name, units),
                 "value": told(parameters.value(simulation, name)),
+                "entries": _entries(simulation, name),
             }
             for name in names
         ],
@@ -85,6 +88,18 @@ def summarize(problem: Problem, word: str, names: Sequence[str], found: Found) -
         "findings": [],
         "status": "complete",
     }
+
+
+def _entries(simulation: Simulation, name: str) -> list[str] | None:
+    """Which pair each entry of a parameter belongs to; None where it has one entry, or one for each atom."""
+    if name.startswith("initial.") or not np.ndim(parameters.value(simulation, name)):
+        return None
+    species = simulation.system.species
+    found = [""] * simulation.pair_types
+    for i, first in enumerate(species):
+        for j, second in enumerate(species[i:], i):
+            found[int(pair_type(np.array(i), np.array(j), len(species)))] = f"{first}-{second}"
+    return found
 
 
 def _trust(found: Trust) -> dict[str, Any]:

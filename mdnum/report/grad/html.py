@@ -11,7 +11,7 @@ from mdnum.report.fork.question import Question, declared, load, size_of, took, 
 from mdnum.report.grad import figures as drawn
 from mdnum.report.grad import findings, sections
 from mdnum.report.grad.words import EXACT, by, difference, slope, slope_unit, value_text
-from mdnum.report.words import count, number
+from mdnum.report.words import count, heading, number
 from mdnum.store import RunFolder
 
 
@@ -72,7 +72,9 @@ def _key_figures(run: Question) -> Iterator[tuple[str, str, str]]:
 
 def _parameter(run: Question, one: Mapping[str, Any]) -> dict[str, str]:
     """A column of the table of methods."""
-    return {"name": one["name"], "unit": slope_unit(run.summary, one), "value": value_text(one)}
+    unit = slope_unit(run.summary, one)
+    entries = one.get("entries")
+    return {"name": one["name"], "unit": f"{unit}, by {', '.join(entries)}" if entries else unit}
 
 
 def _methods(run: Question) -> Iterator[dict[str, Any]]:
@@ -94,5 +96,8 @@ def _what(run: Question) -> Iterator[tuple[str, str]]:
     summary = run.summary
     yield from size_of(run)
     loss = summary["loss"]
-    yield "Loss", f"{loss['about']} ({loss['unit']})"
+    yield "Loss", f"{loss['about']} ({loss['unit']})" if loss["unit"] else loss["about"]
+    for one in summary["parameters"]:
+        if text := value_text(one):
+            yield heading(one["name"]), text
     yield took(run)

@@ -35,7 +35,12 @@ def shares(run: Question) -> list[dict[str, object]]:
     rows = []
     for name, parts in found.get("share", {}).items():
         unit = next(
-            (slope_unit(run.summary, one) for one in run.summary["parameters"] if one["name"] == name), ""
+            (
+                slope_unit(run.summary, one)
+                for one in run.summary["parameters"]
+                if one["name"] == name.partition("[")[0]
+            ),
+            "",
         )
         rows.append(
             {

@@ -38,7 +38,7 @@ def slope(found: Mapping[str, Any] | None, name: str, digits: int = 6) -> str:
     if isinstance(value, list):
         return ", ".join(number(entry, digits) for entry in value)
     error = (found.get("error") or {}).get(name)
-    return number(value, digits) + (f" ± {number(error, 2)}" if error is not None else "")
+    return number(value, digits) + (f" ± {number(error, 2)}" if isinstance(error, float) else "")
 
 
 def slope_unit(summary: Mapping[str, Any], parameter: Mapping[str, Any]) -> str:
