@@ -21,6 +21,7 @@ STUDIES = (
     "cutoff_sensitivity",
     "fork_atlas",
     "fork_benchmark",
+    "gradient_benchmark",
     "precision_fork",
     "reduction_order",
     "skin_sensitivity",
