@@ -11,6 +11,8 @@ from command_line import call, printed
 
 from mdnum.errors import InputError
 from mdnum.gradients.base import Problem
+from mdnum.gradients.ensemble import Ensemble
+from mdnum.gradients.smoothed import SmoothedDifferences
 from mdnum.report import write
 from mdnum.store import RunFolder
 from mdnum.systems import build
@@ -80,7 +82,23 @@ def test_what_is_not_run_by_default_is_said_with_how_to_ask(monkeypatch):
     assert left["why"] == "5 more runs of 50 steps" and left["how"].startswith("--methods finite-differences")
     monkeypatch.setattr(grad_methods, "AFFORDABLE", 500)
     assert "finite-differences" in {one.name for one in grad_methods.plan(problem, names, None).methods}
+    # what cannot be had is said too, and not how to ask for it
+    reweighting = next(one for one in chosen.left_out if one["what"] == "reweighting")
+    assert "thermostat" in reweighting["why"] and reweighting["how"] == "does not apply"
     assert [one.name for one in grad_methods.plan(problem, names, ("symmetric",)).methods] == ["symmetric"]
+
+
+def test_replicas_are_those_of_every_average():
+    simulation = build(WELL)
+    problem = Problem(simulation, loss("msd", simulation, 50)[1], 50)
+    chosen = grad_methods.plan(problem, ("potential.sigma",), None, replicas=5)
+    mean = next(one for one in chosen.methods if isinstance(one, Ensemble))
+    assert mean.replicas.count == 5 and mean.halvings == 0
+    (smoothed,) = grad_methods.plan(problem, ("potential.sigma",), ("smoothed-differences",), 5).methods
+    assert isinstance(smoothed, SmoothedDifferences) and smoothed.replicas.count == 5
+    assert not any(
+        isinstance(one, Ensemble) for one in grad_methods.plan(problem, ("potential.sigma",), None).methods
+    )
 
 
 @pytest.fixture(scope="module")

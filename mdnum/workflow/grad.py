@@ -114,7 +114,7 @@ def _molecules(
 
     began = time.perf_counter()
     word, problem, names = _problem(system, of, wrt, steps)
-    plan = grad_methods.plan(problem, names, methods)
+    plan = grad_methods.plan(problem, names, methods, replicas)
     folder = opened(system, "grad", out, "grad")
     try:
         told = Log(folder, progress)

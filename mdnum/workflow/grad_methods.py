@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,7 +16,9 @@ from mdnum.gradients.diagnose.growth import GrowthWatch
 from mdnum.gradients.diagnose.passes import Passed, passed
 from mdnum.gradients.diagnose.trust import trust
 from mdnum.gradients.differences import FiniteDifferences
+from mdnum.gradients.ensemble import Ensemble
 from mdnum.gradients.registry import METHODS, by_word
+from mdnum.gradients.smoothed import SmoothedDifferences
 from mdnum.gradients.symmetric import GUARD, EventAware, Symmetric, weights
 from mdnum.workflow.fork_question import Progress
 
@@ -66,44 +68,57 @@ class Found:
     failed: tuple[dict[str, str], ...] = ()
 
 
-def plan(problem: Problem, names: Sequence[str], asked: Sequence[str] | None) -> Plan:
+def plan(problem: Problem, names: Sequence[str], asked: Sequence[str] | None, replicas: int = 0) -> Plan:
     """The methods to run.
 
     Args:
         problem: of what.
         names: full names of the parameters.
         asked: words; None for those that answer soon.
+        replicas: starts of averages; 0 for their own number, and for no average where nothing was asked.
 
     Raises:
         InputError: no such method.
     """
     if asked is not None:
-        return Plan(tuple(by_word(word) for word in (METHODS if ALL in asked else asked)))
+        words = METHODS if ALL in asked else asked
+        return Plan(tuple(_over(by_word(word), replicas) for word in words))
+    quick = (*_QUICK, "ensemble") if replicas else _QUICK
     apply: list[Method] = []
     left: list[dict[str, str]] = []
     for word, make in METHODS.items():
         method = FiniteDifferences(levels=_LEVELS) if word == "finite-differences" else make()
-        why = _why_left_out(word, method, problem, names)
-        if why is None:
-            apply.append(method)
-        else:
+        # by some of the parameters is enough
+        reasons = [method.why_not(problem, [name]) for name in names]
+        if None not in reasons:
+            left.append({"what": word, "why": reasons[0] or "", "how": "does not apply"})
+        elif (why := _too_long(word, method, problem, reasons.count(None), quick)) is not None:
             left.append({"what": word, "why": why, "how": f"--methods {word}, or --methods all"})
+        else:
+            apply.append(_over(method, replicas, horizons=False))
     return Plan(tuple(apply), tuple(left))
 
 
-def _why_left_out(word: str, method: Method, problem: Problem, names: Sequence[str]) -> str | None:
+def _too_long(word: str, method: Method, problem: Problem, names: int, quick: Sequence[str]) -> str | None:
     """Why a method is not run where nothing was said about methods."""
-    if word not in _QUICK:
+    if word not in quick:
         return method.says
-    # whether it has a derivative by some of them
-    alone = [method.why_not(problem, [name]) for name in names]
-    if None not in alone:
-        return alone[0]
-    if word == "finite-differences":
-        runs = 2 * _LEVELS * alone.count(None) + 1
-        if runs * problem.simulation.atoms * problem.steps > AFFORDABLE:
-            return f"{runs} more runs of {problem.steps:,} steps"
+    runs = 2 * _LEVELS * names + 1
+    if word == "finite-differences" and runs * problem.simulation.atoms * problem.steps > AFFORDABLE:
+        return f"{runs} more runs of {problem.steps:,} steps"
     return None
+
+
+def _over(method: Method, replicas: int, horizons: bool = True) -> Method:
+    """A method that averages over starts, over so many of them; other methods as they are.
+
+    Args:
+        horizons: whether it looks at shorter runs too.
+    """
+    if not replicas or not isinstance(method, Ensemble | SmoothedDifferences):
+        return method
+    changed = replace(method, replicas=replace(method.replicas, count=replicas))
+    return replace(changed, halvings=0) if isinstance(changed, Ensemble) and not horizons else changed
 
 
 def run(plan: Plan, problem: Problem, names: Sequence[str], progress: Progress, replicas: int = 0) -> Found:
@@ -210,7 +225,7 @@ def _phases(progress: Progress, part: str = "") -> Callable[[int, int, str], Non
     """What a method reports, as a rollout would."""
 
     def tell(done: int, of: int, phase: str) -> None:
-        unit = "runs" if phase.endswith("differences") else "steps"
+        unit = "runs" if phase.endswith(("differences", "replicas")) else "steps"
         info: dict[str, Any] = {"phase": f"{part}{phase}", "unit": unit}
         progress(done, of, info)
 

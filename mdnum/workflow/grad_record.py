@@ -75,6 +75,7 @@ def summarize(problem: Problem, word: str, names: Sequence[str], found: Found) -
             }
             for name in names
         ],
+        "energy_jump": float(np.max(np.abs(simulation.jumps()[0]))),
         "force_jump": float(np.max(np.abs(simulation.jumps()[1]))),
         "reference": agreement.reference,
         "methods": [_method(one, one.found) for one in agreement.opinions if one.found is not None],

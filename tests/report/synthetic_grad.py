@@ -51,6 +51,7 @@ def summary(**changes: Any) -> dict[str, Any]:
             {"name": name, "unit": unit, "value": value}
             for name, unit, value in zip(NAMES, ("ε", "σ", "√(ε/m)"), values, strict=True)
         ],
+        "energy_jump": 0.02,
         "force_jump": 0.04,
         "reference": "event-aware",
         "methods": [

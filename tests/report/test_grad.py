@@ -94,6 +94,10 @@ def test_findings_follow_the_numbers(tmp_path):
     left = judged(tmp_path / "e", methods=[{**methods[1], "details": details}])
     assert "16 % of the weight" in left["GRAZING"].text
 
+    loss = {"word": "potential", "about": "energy", "unit": "ε"}
+    assert judged(tmp_path / "h", loss=loss)["LOSS_JUMPS"].text.startswith("Symmetric and event-aware know")
+    assert "LOSS_JUMPS" not in judged(tmp_path / "i", loss=loss, energy_jump=0.0)
+
     trust = {"horizon": 300, "limited_by": "rounding", "tolerance": 0.01, "says": "Rounding limits it."}
     assert judged(tmp_path / "f", trust=trust)["BEYOND_TRUST"].title == "trusted up to 300 steps of 500"
     assert "BEYOND_TRUST" not in judged(tmp_path / "g", trust={**trust, "limited_by": ""})

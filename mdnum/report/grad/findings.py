@@ -18,6 +18,9 @@ from mdnum.report.words import count, listed, many, number, percent
 _HEAVY, _SINGLE = 0.2, 3
 #: Share of the weight of all flips above which what the guard leaves out matters.
 _LEFT_OUT = 0.01
+#: Losses that jump at a flip, by what jumps with them; and methods that do not see it.
+_LOSS_JUMPS = {"potential": "energy_jump", "pressure": "force_jump"}
+_BLIND = ("event-aware", "symmetric", "unrolled", "epochs", "recursive", "forward", "ensemble")
 #: What takes a gradient further, by what limits it.
 _FURTHER = {
     "rounding": "or run in wider formats: --set precision.state=float64 and the like",
@@ -73,6 +76,7 @@ def _findings(run: Question) -> Iterator[Finding]:
     yield from _no_dependence(run)
     yield from _unexplained(run)
     yield from _plain_at_a_jump(run)
+    yield from _loss_jumps(run)
     yield from _short(run)
     yield from _few_flips(run)
     yield from _grazing(run)
@@ -109,6 +113,26 @@ def _plain_at_a_jump(run: Question) -> Iterator[Finding]:
             "step, and the derivative by the cutoff comes out as 0.",
             "Add event-aware to --methods, or take a cutoff without a jump: --set cutoff.kind=switched.",
         )
+
+
+def _loss_jumps(run: Question) -> Iterator[Finding]:
+    """A loss that itself jumps at a flip, which moves the momenta and the loss."""
+    summary = run.summary
+    word = summary["loss"]["word"]
+    jump = summary.get(_LOSS_JUMPS.get(word, ""))
+    blind = [one["method"] for one in summary["methods"] if one["method"] in _BLIND]
+    if not jump or not blind:
+        return
+    subject = listed(blind)
+    yield Finding(
+        "LOSS_JUMPS",
+        "warning",
+        f"the {word} itself jumps when a pair crosses its cutoff",
+        f"{subject[:1].upper()}{subject[1:]} know{'s' * (len(blind) == 1)} what a flip does to the motion "
+        "and not that it changes the loss at once, so the derivative by the cutoff is far off.",
+        "Compare with --methods smoothed-differences,boundary, or take a cutoff without a jump: "
+        "--set cutoff.kind=switched.",
+    )
 
 
 def _short(run: Question) -> Iterator[Finding]:
