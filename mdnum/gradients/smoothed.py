@@ -26,8 +26,9 @@ from mdnum.gradients.tape import Stretch, Tape
 class SmoothedDifferences:
     """Central differences with wide steps over replicas that share their random numbers.
 
-    Of several steps, each twice the next, two are extrapolated; the pair with the smallest standard error
-    and difference to the next narrower pair wins.
+    Of several steps, each twice the next, pairs are extrapolated to no step. The widest pair is taken that
+    differs from no narrower one by more than twice the standard error of the difference: narrower steps
+    have more of the noise of single events.
 
     Attributes:
         relative: the widest step as a share of the parameter.
@@ -36,7 +37,7 @@ class SmoothedDifferences:
         count_moved: whether to count the crossings that a step moves to another step of time.
     """
 
-    relative: float = 0.004
+    relative: float = 0.002
     steps: int = 3
     replicas: Replicas = field(default_factory=Replicas)
     count_moved: bool = True
@@ -146,12 +147,11 @@ def _chosen(found: Float[np.ndarray, "steps replicas"]) -> tuple[Estimate, float
         only = Estimate.from_replicas(found[0])
         return only, float(only.error), 0
     flat = [Estimate.from_replicas((4 * fine - wide) / 3) for wide, fine in pairwise(found)]
-    # what is left of truncation: the change to the next narrower pair, where the noise that the two do not
-    # share does not explain it
-    change = np.zeros(len(flat))
-    for k, (one, other) in enumerate(pairwise(flat)):
-        apart = Estimate.from_replicas(other.of - one.of)
-        change[k] = abs(float(apart.mean)) if apart.told_from_zero else 0.0
-    errors = np.hypot([float(one.error) for one in flat], change)
-    best = int(np.argmin(errors))
-    return flat[best], float(errors[best]), best
+    best, left = len(flat) - 1, 0.0
+    for k, one in enumerate(flat):
+        apart = [Estimate.from_replicas(other.of - one.of) for other in flat[k + 1 :]]
+        if all(abs(float(other.mean)) <= 2 * float(other.error) for other in apart):
+            # what the pairs differ by, beyond their noise, may be left of truncation
+            best, left = k, max([abs(float(other.mean)) - float(other.error) for other in apart] + [0.0])
+            break
+    return flat[best], float(np.hypot(flat[best].error, left)), best
