@@ -1,6 +1,9 @@
 """Whether a gradient through a rollout can be trusted, how far, and what it is made of."""
 
 from mdnum.gradients.diagnose.agreement import agreement
+from mdnum.gradients.diagnose.detective import detective
+from mdnum.gradients.diagnose.diagnose import PARTS, diagnose
+from mdnum.gradients.diagnose.edges import edges
 from mdnum.gradients.diagnose.flips import flips
 from mdnum.gradients.diagnose.growth import growth
 from mdnum.gradients.diagnose.horizons import Horizons, horizons
@@ -19,9 +22,12 @@ from mdnum.gradients.diagnose.results import (
     Spectrum,
     Trust,
 )
+from mdnum.gradients.diagnose.scaling import scaling
+from mdnum.gradients.diagnose.spectrum import spectrum
 from mdnum.gradients.diagnose.trust import trust
 
 __all__ = [
+    "PARTS",
     "Agreement",
     "Comparison",
     "Diagnosis",
@@ -37,8 +43,13 @@ __all__ = [
     "Spectrum",
     "Trust",
     "agreement",
+    "detective",
+    "diagnose",
+    "edges",
     "flips",
     "growth",
     "horizons",
+    "scaling",
+    "spectrum",
     "trust",
 ]

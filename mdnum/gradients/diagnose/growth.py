@@ -127,7 +127,11 @@ def growth_rate(size: Float[np.ndarray, "rows"]) -> tuple[float, float, bool]:
     finite.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
-        log = np.log(size)
+        return log_rate(np.log(size))
+
+
+def log_rate(log: Float[np.ndarray, "rows"]) -> tuple[float, float, bool]:
+    """As `growth_rate`, of a size that is given by its logarithm."""
     rows = np.flatnonzero(np.isfinite(log))
     if not len(rows) or len(log) < 10 * BLOCKS:
         return float("nan"), float("nan"), False

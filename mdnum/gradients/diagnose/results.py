@@ -184,14 +184,14 @@ class Spectrum(Plain):
         steps: of the run.
         clock: internal time.
         log_singular: natural logarithm of the largest singular values, largest first, shape (values,).
-        residual: |Phi^T Phi v - s^2 v| / s^2 of each: how exact it is, shape (values,).
+        residual: |Phi^T u - s v| / s of each with its vectors u and v: how exact it is, shape (values,).
         exponents: finite-time Lyapunov exponents log(s) / T per step, shape (values,).
         exponents_time: per unit of time of the system's file.
         horizon: steps at which the curve below has points, shape (points,).
         curve: log stretch of the k-th direction of an orthonormal frame carried forward, shape
             (points, values): its slopes are Lyapunov exponents, largest first.
-        transposed: relative defect of <w, Phi v> = <Phi^T w, v> for random v, w: forward and reverse passes
-            are transposes of one another where it is a rounding error.
+        transposed: relative defect of <w, Phi v> = <Phi^T w, v>: forward and reverse passes are transposes
+            of one another where it is a rounding error.
         word: "both bounded", "forward bounded, gradient not" or "forward not bounded".
         says: the same in a sentence.
     """

@@ -1,0 +1,240 @@
+"""The jump of a gradient across the nearest boundaries of decisions on either side of a parameter.
+
+Between two boundaries every run decides alike, and loss and gradient are smooth functions of the parameter.
+At a boundary one pair is decided otherwise between two adjacent floats. A step of an optimizer that is longer
+than the distance to the nearest boundary crosses into another program, and what the gradient does there says
+what that is worth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from mdnum.errors import InputError, NumericalError
+from mdnum.forks.dials import Dial, dial
+from mdnum.forks.histories import margin
+from mdnum.forks.line import Line
+from mdnum.gradients import parameters
+from mdnum.gradients.base import Problem, Progress
+from mdnum.gradients.diagnose.passes import passed
+from mdnum.gradients.diagnose.results import Edge, Edges
+from mdnum.gradients.symmetric import in_phase
+from mdnum.gradients.tangents import tangents
+from mdnum.gradients.tape import Tape
+from mdnum.md.cell import HostCell
+from mdnum.precision.ulp import ordinal
+from mdnum.systems.build import Simulation
+
+#: How far from the parameter a boundary is looked for, as a share of its value.
+REACH = 0.01
+#: First shift where no forecast is to be had, as a share of the parameter, and how it grows.
+_FIRST, _FACTOR = 1e-12, 8.0
+
+
+def edges(
+    problem: Problem,
+    name: str,
+    *,
+    reach: float = REACH,
+    budget: int = 2**29,
+    progress: Progress | None = None,
+) -> Edges:
+    """The nearest boundary below and above a parameter, and the gradients across them.
+
+    Where a pair first crosses otherwise is forecast with tangents; then runs are compared, on either side,
+    until two adjacent floats differ.
+
+    Args:
+        problem: the loss of a rollout of a pair potential.
+        name: a parameter of one entry, full or short name.
+        reach: how far to look, as a share of the parameter's value.
+        budget: bytes of the recorded run that are kept.
+        progress: called with runs done, runs expected, and a phase in words.
+
+    Raises:
+        InputError: no such parameter, several entries, or a value of 0.
+        NumericalError: the run blew up.
+
+    Error: none in a boundary: its sides are adjacent floats, and their runs decide differently. That no other
+        one lies between it and the parameter is as sure as the forecast: pairs of boundaries that undo one
+        another can hide between two runs that decide alike.
+    """
+    (full,) = parameters.resolve(problem.simulation, [name])
+    here = parameters.value(problem.simulation, full)
+    if here.shape:
+        raise InputError(
+            f"{full} has {here.size} entries; boundaries lie along one number",
+            remedy="Search along a parameter of one entry",
+        )
+    value = float(here)
+    if value == 0 or not 0 < reach < 1:
+        raise InputError(f"{full} = {value:g} and reach = {reach:g}; expected a number, and a share below 1")
+    line = Line(problem.simulation, _dial(problem.simulation, full, value), problem.steps, _no_loss)
+    ahead = _forecast(problem, full, budget, progress)
+    below, above = (_edge(problem, line, full, value, sign, ahead[sign], reach, progress) for sign in (-1, 1))
+    return Edges(full, value, below, above, _sentence(full, value, below, above))
+
+
+def _no_loss(*_: object) -> float:
+    return 0.0
+
+
+def _dial(simulation: Simulation, name: str, value: float) -> Dial:
+    """The parameter as something that can be turned without compiling anew."""
+    if name == "cutoff.radius":
+        return dial(simulation, name)
+
+    def turn(one: Simulation, q: float) -> Simulation:
+        return parameters.with_values(one, {name: q})
+
+    return Dial(name, value, turn, turn, True)
+
+
+def _forecast(problem: Problem, name: str, budget: int, progress: Progress | None) -> dict[int, float]:
+    """Shifts of the parameter, by sign, at which tangents see the first pair cross; infinite where none."""
+    if name == "box.scale":
+        # the images move too, which these differences of positions leave out
+        return {-1: np.inf, 1: np.inf}
+    simulation = problem.simulation
+    tape = Tape(simulation, problem.loss, problem.steps, flips=True, budget=budget)
+    cell, radii = HostCell(simulation.cell), np.asarray(simulation.decider.r_cut)
+    nearest = {-1: np.inf, 1: np.inf}
+    along = 1.0 if name == "cutoff.radius" else 0.0
+    followed = tangents(tape, [name], states=True, progress=in_phase(progress, "tangents"))
+    for part in followed:
+        stretch, moved = part.stretch, part.x
+        assert moved is not None
+        table = stretch.table
+        slot, first = np.nonzero(table.index < len(table.order))
+        second = table.index[slot, first]
+        once = table.order[first] < table.order[second]
+        first, second = first[once], second[once]
+        radius = radii[simulation.type_of(table.order[first], table.order[second])]
+        for row in range(stretch.rows):
+            x, dx = stretch.x[row].astype(np.float64), moved[row, 0].astype(np.float64)
+            apart = np.stack(cell.displacement(x[:, first].T, x[:, second].T))
+            r = np.sqrt(np.sum(apart * apart, axis=0))
+            rate = along - np.sum(apart * (dx[:, second] - dx[:, first]), axis=0) / r
+            with np.errstate(divide="ignore", invalid="ignore"):
+                shift = -(radius - r) / rate
+            for sign in nearest:
+                ahead = shift[(shift * sign > 0) & np.isfinite(shift)] * sign
+                if len(ahead):
+                    nearest[sign] = min(nearest[sign], float(ahead.min()))
+    return nearest
+
+
+def _edge(
+    problem: Problem,
+    line: Line,
+    name: str,
+    value: float,
+    sign: int,
+    ahead: float,
+    reach: float,
+    progress: Progress | None,
+) -> Edge:
+    side = "above" if sign > 0 else "below"
+    before = len(line.known)
+    end = reach * abs(value)
+
+    def tell() -> None:
+        if progress is not None:
+            done = len(line.known) - before
+            progress(done, max(done + 1, 40), f"{name}: boundary {side}")
+
+    home = int(ordinal(np.array([value]))[0])
+    own = line.digest(home)
+    shift = 1.25 * ahead if np.isfinite(ahead) and ahead < end else _FIRST * abs(value)
+    inside, beyond = home, home
+    while beyond == home:
+        shift = min(shift, end)
+        place = int(ordinal(np.array([value + sign * shift]))[0])
+        if place == home:
+            place = home + sign
+        tell()
+        if line.digest(place) != own:
+            beyond = place
+        elif shift >= end:
+            return _nothing(side, len(line.known) - before)
+        else:
+            inside, shift = place, shift * _FACTOR
+    while abs(beyond - inside) > 1:
+        tell()
+        middle = (inside + beyond) // 2
+        if line.digest(middle) == own:
+            inside = middle
+        else:
+            beyond = middle
+    step, i, j = _first(line, inside, beyond)
+    near, far = (line.value(place) for place in (inside, beyond))
+    value_near, gradient_near = _gradients(problem, line.at(inside), name)
+    value_far, gradient_far = _gradients(problem, line.at(beyond), name)
+    runs = len(line.known) - before
+    return Edge(
+        side,
+        True,
+        near,
+        far,
+        abs(near - value),
+        step,
+        i,
+        j,
+        value_near,
+        value_far,
+        gradient_near,
+        gradient_far,
+        runs,
+    )
+
+
+def _nothing(side: str, runs: int) -> Edge:
+    nan = float("nan")
+    return Edge(side, False, nan, nan, nan, -1, -1, -1, nan, nan, {}, {}, runs)
+
+
+def _first(line: Line, inside: int, beyond: int) -> tuple[int, int, int]:
+    """The first decision that differs: the pair that is nearest to its threshold on both sides."""
+    runs = [line.run(place) for place in (inside, beyond)]
+    step = runs[0].first_difference(runs[1])
+    assert step is not None
+    if any(len(run.marks) <= step for run in runs):
+        raise NumericalError(f"{line.dial.key} = {line.value(beyond)!r}: the run blew up at step {step}")
+    looks = [line.look(place, step) for place in (inside, beyond)]
+    differing: Sequence[int] = np.setxor1d(looks[0].pairs, looks[1].pairs, assume_unique=True).tolist()
+
+    def far(key: int) -> float:
+        i, j = divmod(key, line.simulation.atoms)
+        places = zip((inside, beyond), looks, strict=True)
+        return max(abs(margin(line.at(place), seen.x, i, j)) for place, seen in places)
+
+    i, j = divmod(min(differing, key=far), line.simulation.atoms)
+    return step, i, j
+
+
+def _gradients(problem: Problem, simulation: Simulation, name: str) -> tuple[float, dict[str, float]]:
+    """Loss and derivatives by one parameter of another simulation."""
+    tape = Tape(simulation, problem.loss, problem.steps, flips=True)
+    there = Problem(simulation, problem.loss, problem.steps)
+    found: dict[str, float] = {}
+    for word, saltation in (("symmetric", False), ("event-aware", True)):
+        made: Float[np.ndarray, ""] = passed(there, [name], saltation=saltation, tape=tape).gradient[name]
+        found[word] = float(made)
+    return tape.value, found
+
+
+def _sentence(name: str, value: float, below: Edge, above: Edge) -> str:
+    told = []
+    for one in (below, above):
+        if not one.found:
+            told.append(f"none within reach {one.side}")
+            continue
+        jump = one.gradient_beyond["event-aware"] - one.gradient_inside["event-aware"]
+        told.append(
+            f"{one.distance:.2g} {one.side} (pair ({one.i}, {one.j}) at step {one.step}; the loss jumps by "
+            f"{one.value_beyond - one.value_inside:.2g}, the gradient by {jump:.2g})"
+        )
+    return f"Boundaries of decisions around {name} = {value:.6g}: {' and '.join(told)}."
