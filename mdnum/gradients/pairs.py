@@ -7,7 +7,7 @@ Nothing is scattered, no tape is kept, and the decisions are those that the run 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,13 +24,13 @@ class PairCotangents(NamedTuple):
 
     Attributes:
         x: on the positions, shape (3, atoms).
-        model: on the parameters, a CutPotential of arrays; zeros where it was not asked for.
+        model: on the parameters, a pytree of arrays like theirs; zeros where it was not asked for.
         scale: on a common factor of all distances (the box and everything in it), at 1.
         force: the forces themselves, shape (3, atoms), energy/length.
     """
 
     x: Float[Array, "3 atoms"]
-    model: CutPotential
+    model: Any
     scale: Float[Array, ""]
     force: Float[Array, "3 atoms"]
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -39,14 +40,14 @@ class Cotangents:
     """Derivatives of a loss by everything that a rollout is made of.
 
     Attributes:
-        model: by the leaves of the potential with its cutoff.
+        model: by the quantities of the force (`quantities`).
         integrator: by the leaves of the integrator that are numbers.
         x, v: by the positions and velocities of step 0, user's order, shape (3, atoms).
         scale: by a common factor of the box and all positions, at 1.
         r_cut: by the cutoffs through the times of the flips alone, shape (types,); 0 without saltation.
     """
 
-    model: CutPotential
+    model: Any
     integrator: Integrator
     x: Float[np.ndarray, "3 atoms"]
     v: Float[np.ndarray, "3 atoms"]
@@ -55,26 +56,56 @@ class Cotangents:
 
 
 def quantities(force: PairForce | ManyBodyForce) -> Any:
-    """The parameters of a force that are quantities: a pytree of arrays."""
-    if isinstance(force, PairForce):
-        return force.model
-    return eqx.filter(force.potential, eqx.is_inexact_array)
+    """The parameters of a force that are quantities: a pytree of arrays.
+
+    Of a many-body potential they are its arrays and its constants, by name.
+    """
+    return force.model if isinstance(force, PairForce) else _quantities_of(force.potential)
 
 
 def with_quantities(force: PairForce | ManyBodyForce, values: Any) -> PairForce | ManyBodyForce:
     """The force with other quantities; inside jit too."""
     if isinstance(force, PairForce):
         return replace(force, model=values)
-    rest = eqx.filter(force.potential, eqx.is_inexact_array, inverse=True)
-    return replace(force, potential=eqx.combine(values, rest))
+    return replace(force, potential=_with_quantities(force.potential, values))
+
+
+def _leaves_by_path(potential: Any) -> dict[str, Any]:
+    leaves, _ = jax.tree_util.tree_flatten_with_path(potential)
+    return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
+
+
+def _quantities_of(potential: Any) -> dict[str, Any]:
+    found = {name: leaf for name, leaf in _leaves_by_path(potential).items() if eqx.is_inexact_array(leaf)}
+    for field in fields(potential):
+        value = getattr(potential, field.name)
+        # constants that a formula holds; the radius of a table is where it ends, and not one of them
+        if type(value) is float and field.name != "r_cut":
+            found[field.name] = jnp.asarray(value, jnp.float64)
+    return found
+
+
+def _with_quantities(potential: Any, values: Mapping[str, Any]) -> Any:
+    names, tree = list(_leaves_by_path(potential)), jax.tree.structure(potential)
+    leaves = [values.get(name, leaf) for name, leaf in zip(names, jax.tree.leaves(potential), strict=True)]
+    whole = jax.tree.unflatten(tree, leaves)
+    # constants are static fields, so that a module would warn of an array; here they only live for a trace
+    out = object.__new__(type(potential))
+    for field in fields(potential):
+        static = field.name in values and field.name not in names
+        object.__setattr__(out, field.name, values[field.name] if static else getattr(whole, field.name))
+    return out
 
 
 def names(simulation: Simulation) -> tuple[str, ...]:
     """Parameters that a simulation has."""
-    found = [f"potential.{leaf.name}" for leaf in fields(simulation.model.potential)]
-    found += ["cutoff.radius"]
-    if simulation.model.cutoff.switches:
-        found += ["cutoff.onset"]
+    if simulation.pairwise:
+        found = [f"potential.{leaf.name}" for leaf in fields(simulation.model.potential)]
+        found += ["cutoff.radius"]
+        if simulation.model.cutoff.switches:
+            found += ["cutoff.onset"]
+    else:
+        found = [f"potential.{name}" for name in _quantities_of(simulation.model)]
     found += ["dynamics.timestep", "dynamics.temperature"]
     if isinstance(simulation.integrator, Langevin):
         found += ["dynamics.friction"]
@@ -114,7 +145,10 @@ def value(simulation: Simulation, name: str) -> Float[np.ndarray, "..."]:
     units = simulation.units
     model = simulation.model
     if name.startswith("potential."):
-        return _plain(getattr(model.potential, name.partition(".")[2]))
+        key = name.partition(".")[2]
+        if not simulation.pairwise:
+            return np.array(_quantities_of(model)[key], np.float64)
+        return _plain(getattr(model.potential, key))
     if name == "cutoff.radius":
         return _plain(model.r_cut)
     if name == "cutoff.onset":
@@ -157,6 +191,8 @@ def with_values(simulation: Simulation, values: Mapping[str, Any]) -> Simulation
 
 def _changed(simulation: Simulation, name: str, new: np.ndarray) -> Simulation:
     time = simulation.units.time_factor
+    if name.startswith("potential.") and not simulation.pairwise:
+        return _bound(simulation, name.partition(".")[2], new)
     if name.startswith("potential."):
         return _modelled(simulation, lambda m: getattr(m.potential, name.partition(".")[2]), new)
     if name == "cutoff.radius":
@@ -183,6 +219,14 @@ def _changed(simulation: Simulation, name: str, new: np.ndarray) -> Simulation:
 
 def _modelled(simulation: Simulation, where: Callable[[CutPotential], Any], new: np.ndarray) -> Simulation:
     return replace(simulation, model=eqx.tree_at(where, simulation.model, _leaf(new)))
+
+
+def _bound(simulation: Simulation, key: str, new: np.ndarray) -> Simulation:
+    """A many-body potential with another constant or array; its radius may follow."""
+    constant = key not in _leaves_by_path(simulation.model)
+    model = _with_quantities(simulation.model, {key: float(new) if constant else jnp.asarray(new)})
+    decider = replace(simulation.decider, r_cut=(float(model.r_cut),))
+    return replace(simulation, model=model, decider=decider)
 
 
 def _plain(leaf) -> Float[np.ndarray, "..."]:
@@ -222,6 +266,8 @@ def gradient(simulation: Simulation, parts: Cotangents, name: str) -> Float[np.n
     """The derivative by a named parameter, from the derivatives by what a rollout is made of; of the shape
     that the parameter's value has."""
     units = simulation.units
+    if name.startswith("potential.") and not simulation.pairwise:
+        return np.array(parts.model[name.partition(".")[2]], np.float64)
     if name.startswith("potential."):
         return _plain(getattr(parts.model.potential, name.partition(".")[2]))
     if name == "cutoff.radius":

@@ -145,7 +145,11 @@ def chunk(
     half = (0.5 * integrator.timestep).astype(dtype)
     home = place.home[:, order]
     scale = inputs.scale
-    around = fixed.around._replace(matrix=fixed.around.matrix * scale, volume=fixed.around.volume * scale**3)
+    around = fixed.around._replace(
+        matrix=fixed.around.matrix * scale,
+        volume=fixed.around.volume * scale**3,
+        timestep=integrator.timestep,
+    )
     origin = Frame(
         jnp.zeros((), jnp.int64),
         inputs.x * scale.astype(dtype) + (matrix.T @ fixed.images.astype(matrix.dtype)).astype(dtype),

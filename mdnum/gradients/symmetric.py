@@ -14,6 +14,7 @@ from mdnum.gradients.base import Gradient, Problem, Progress, check, independent
 from mdnum.gradients.crossings import Crossings
 from mdnum.gradients.pairs import FORCE, MODEL, SCALE
 from mdnum.gradients.tape import Tape
+from mdnum.md.manyforce import ManyBodyForce
 from mdnum.md.pairforce import PairForce
 from mdnum.systems.build import Simulation
 
@@ -45,7 +46,9 @@ class Symmetric:
         return "the derivative of the steps that ran, their decisions held fixed"
 
     def why_not(self, problem: Problem, names: Sequence[str]) -> str | None:
-        """Pair potentials only."""
+        """Not for forces that are rounded after every operation."""
+        if isinstance(problem.simulation.force, ManyBodyForce):
+            return None
         return pairs_only(problem.simulation)
 
     def __call__(self, problem: Problem, names: Sequence[str], progress: Progress | None = None) -> Gradient:
@@ -169,7 +172,7 @@ def wanted(names: Sequence[str]) -> frozenset[str]:
 def pairs_only(simulation: Simulation) -> str | None:
     """Why the reverse pass does not apply; None where it does."""
     if not isinstance(simulation.force, PairForce):
-        return "its reverse pass is one of pair potentials"
+        return "it is for pair potentials"
     if simulation.policy.dtype("force").itemsize < 4:
         rounded = f"forces in {simulation.policy.force} are rounded after every operation"
         return f"{rounded}, which has no derivative"

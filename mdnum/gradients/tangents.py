@@ -207,7 +207,9 @@ def _stretch(
         start = Frame(_still(origin.step), along.x, along.v, jnp.zeros(()), jnp.zeros(()))
         # of a cube with the box: the volume goes with the trace of what moves the lattice vectors
         stretch = jnp.trace(jnp.linalg.solve(_whole(matrix), along.matrix))
-        here = jax.tree.map(jnp.zeros_like, around)._replace(matrix=along.matrix, volume=volume * stretch)
+        here = jax.tree.map(jnp.zeros_like, around)._replace(
+            matrix=along.matrix, volume=volume * stretch, timestep=along.integrator.timestep
+        )
         _, seen = jax.jvp(loss.observe, (frame, origin, around), (moving, start, here))
         return jax.tree.map(jnp.add, total, seen)
 

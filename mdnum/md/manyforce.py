@@ -6,12 +6,14 @@ interaction radius, so the recorded decision is the one it acted on.
 
 from __future__ import annotations
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, UInt8
 
 from mdnum.md.cell import Cell
 from mdnum.md.decide import Decisions, PairDecider, Tables, decide_table
@@ -61,19 +63,26 @@ class ManyBodyForce(eqx.Module):
         _, _, strain = self._differentiate(positions, tables, self.decide(positions, tables))
         return -0.5 * (strain + strain.T)
 
-    def _differentiate(self, positions, tables: Tables, made: Decisions):
-        """Energy, and its derivatives by positions and by strain."""
+    def neighbors(
+        self, positions: Float[Array, "3 atoms"], tables: Tables, bits: UInt8[Array, "words atoms"]
+    ) -> Any:
+        """The list that the energy function receives: the pairs that are decided to be inside, no others."""
         from mdnum.md import jaxmd
 
         words, slots, atoms = tables.index.shape
         shifts = jnp.arange(slots, dtype=jnp.uint8)[None, :, None]
-        inside = (made.bits[:, None, :] >> shifts) & jnp.uint8(1) == 1
+        inside = (bits[:, None, :] >> shifts) & jnp.uint8(1) == 1
         acted_on = jnp.where(inside, tables.index, atoms).reshape(words * slots, atoms).T
+        x = positions.T.astype(jnp.float64)
+        return jaxmd.as_neighbor_list(acted_on, x, self.potential.format)  # type: ignore[attr-defined]
+
+    def _differentiate(self, positions, tables: Tables, made: Decisions):
+        """Energy, and its derivatives by positions and by strain."""
+        neighbor = self.neighbors(lax.stop_gradient(positions), tables, made.bits)
 
         # the table is in sorted order and so is everything the energy function sees
         def energy(x, strain):
             deform = jnp.eye(3, dtype=jnp.float64) + strain
-            neighbor = jaxmd.as_neighbor_list(acted_on, lax.stop_gradient(x), self.potential.format)  # type: ignore[attr-defined]
             return self.potential.energy(x @ deform, neighbor, self.cell.matrix @ deform)  # type: ignore[attr-defined]
 
         x = positions.T.astype(jnp.float64)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -52,7 +53,7 @@ class StillingerWeber(ManyBody):
     )
 
     @property
-    def r_cut(self) -> float:
+    def r_cut(self) -> Any:
         """a sigma, length."""
         return self.a * self.sigma
 
@@ -62,9 +63,16 @@ class StillingerWeber(ManyBody):
         """Potential energy, energy units of epsilon; see ManyBody.energy."""
         unit = _UNIT[str(jnp.dtype(positions.dtype))]
         vector = displacement(cell, self.pbc)
+
+        def apart(Ra, Rb, **_):
+            # a padded slot may be the atom itself; at distance zero jax-md's derivatives by sigma, A and B
+            # are NaN, and its mask comes after
+            d = vector(Ra, Rb) * unit
+            return jnp.where(jnp.all(d == 0), 2 * self.r_cut * unit, d)
+
         # numbers stay Python floats here: nothing on this path downcasts them, and they take R's dtype
         _, total = upstream().energy.stillinger_weber_neighbor_list(
-            lambda Ra, Rb, **_: vector(Ra, Rb) * unit,
+            apart,
             1.0,
             sigma=self.sigma * unit,
             A=self.A,

@@ -7,6 +7,8 @@ of a padded slot is (beta * 0)^n, whose slope is infinite, and its mask comes af
 
 from __future__ import annotations
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -67,7 +69,7 @@ class Tersoff(ManyBody):
             raise InputError(f"Tersoff's exponent m is 1 or 3; got {self.m}")
 
     @property
-    def r_cut(self) -> float:
+    def r_cut(self) -> Any:
         """R + D, length."""
         return self.R + self.D
 
