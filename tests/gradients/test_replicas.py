@@ -1,0 +1,137 @@
+"""Means over replicas, wide differences, another precision and another program, against what they must be."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pytest
+from small_systems import LENNARD_JONES, crystal, make
+
+from mdnum.errors import InputError
+from mdnum.gradients.base import Gradient, Problem
+from mdnum.gradients.differences import FiniteDifferences
+from mdnum.gradients.ensemble import Ensemble, Replicas, replica
+from mdnum.gradients.losses import Custom, MeanSquaredDisplacement, MeanTemperature
+from mdnum.gradients.shadow import ShadowDifferences
+from mdnum.gradients.smoothed import SmoothedDifferences
+from mdnum.gradients.surrogate import Surrogate
+from mdnum.gradients.symmetric import EventAware, Symmetric
+from mdnum.systems import build
+
+# so short that the force jumps by 0.8
+HARD = {"kind": "hard", "radius": 1.6}
+
+
+@dataclass(frozen=True)
+class Noisy:
+    """A made-up gradient: 1, and the number of steps more or less, in turns."""
+
+    calls: list[int] = field(default_factory=list)
+    name: str = "noisy"
+    says: str = "one plus noise"
+
+    def why_not(self, problem, names):
+        return None
+
+    def __call__(self, problem, names, progress=None) -> Gradient:
+        self.calls.append(problem.steps)
+        noise = problem.steps * (-1) ** len(self.calls)
+        return Gradient("noisy", self.says, 0.0, {name: np.asarray(1.0 + noise) for name in names})
+
+
+@pytest.fixture(scope="module")
+def hard():
+    return build(make(crystal(), LENNARD_JONES, HARD))
+
+
+def test_replicas_differ_in_velocities_of_one_temperature(hard):
+    starts = [replica(hard, seed) for seed in range(30)]
+    again = replica(hard, 3)
+    assert np.array_equal(again.velocities, starts[3].velocities)
+    kinetic = [float(np.sum(one.velocities**2)) / (3 * one.atoms - 3) for one in starts]
+    assert np.mean(kinetic) == pytest.approx(1.0, abs=3 * np.sqrt(2 / (3 * 108 * 30)))
+    assert len({float(one.velocities[0, 0]) for one in starts}) == 30
+    assert np.abs(np.sum(starts[0].velocities, axis=0)).max() < 1e-12
+    settled = replica(hard, 3, settle=5)
+    assert not np.array_equal(settled.positions, hard.positions)
+    with pytest.raises(InputError, match="at least 2"):
+        Replicas(1)
+
+
+def test_the_horizon_of_noise_is_where_the_error_passes_the_mean(hard):
+    """Eight values of one plus and minus T: mean 1, standard error T / sqrt(7)."""
+    problem = Problem(hard, Custom(see=lambda frame, *_: frame.potential), 16)
+    found = Ensemble(Noisy(), Replicas(8), halvings=4)(problem, ("sigma",))
+    assert float(found.gradient["potential.sigma"]) == 1.0
+    assert found.details["error"]["potential.sigma"] == pytest.approx(16 / np.sqrt(7))
+    rows = found.details["horizons"]
+    assert [row["steps"] for row in rows] == [1, 2, 4, 8, 16]
+    assert [row["error"] for row in rows] == pytest.approx([row["steps"] / np.sqrt(7) for row in rows])
+    # sqrt(7) lies between 2 and 4
+    assert found.details["horizon of noise"]["potential.sigma"] == 4
+    with pytest.raises(InputError, match="of its own"):
+        Ensemble()(problem, ("v0",))
+
+
+@pytest.mark.slow
+def test_wide_differences_of_a_melt_agree_with_the_flow_and_not_with_the_steps():
+    """How hot a crystal has become while it melts: replica by replica, what the flips add is many standard
+    errors of the difference, and with it nothing is missing. By the radius, plain is exactly 0."""
+    hard = build(make(crystal(rattle=0), LENNARD_JONES, HARD))
+    problem = Problem(hard, MeanTemperature(first=80), 80)
+    starts, names = Replicas(8), ("potential.sigma", "cutoff.radius")
+    wide = SmoothedDifferences(0.002, 2, starts)(problem, names)
+    assert min(wide.details["moved"].values()) > 0.2
+    plain, aware = (
+        Ensemble(method, starts, halvings=0)(problem, names) for method in (Symmetric(), EventAware())
+    )
+
+    def apart(found: Gradient, name: str) -> tuple[float, float]:
+        difference = np.array(found.details["each"][name]) - np.array(wide.details["each"][name])
+        return abs(difference.mean()), difference.std(ddof=1) / np.sqrt(len(difference))
+
+    for name in names:
+        mean, error = apart(plain, name)
+        assert mean > 5 * error, name
+        near, noise = apart(aware, name)
+        assert near < 2 * noise and near < 0.2 * mean, name
+    assert float(plain.gradient["cutoff.radius"]) == 0.0
+
+
+@pytest.mark.slow
+def test_the_shadow_of_a_narrow_run_has_the_derivative_of_a_wide_one():
+    cutoff = {"kind": "quintic", "radius": 2.2, "onset": 1.8}
+    wide = build(make(crystal(), LENNARD_JONES, cutoff))
+    narrow = dict.fromkeys(("state", "force", "decision", "accumulate"), "float32")
+    problem = Problem(
+        build(make(crystal(), LENNARD_JONES, cutoff, precision=narrow)), MeanSquaredDisplacement(), 30
+    )
+    shadow = ShadowDifferences(levels=2)(problem, ("sigma",))
+    true = Symmetric()(replace(problem, simulation=wide), ("sigma",))
+    assert float(shadow.gradient["potential.sigma"]) == pytest.approx(
+        float(true.gradient["potential.sigma"]), rel=1e-6
+    )
+    # the narrow run's own differences are noise of a rounding over the step
+    own = FiniteDifferences(levels=2)(problem, ("sigma",))
+    assert float(own.gradient["potential.sigma"]) != pytest.approx(
+        float(true.gradient["potential.sigma"]), rel=1e-4
+    )
+    with pytest.raises(InputError, match="no wider format"):
+        ShadowDifferences()(replace(problem, simulation=wide), ("sigma",))
+
+
+def test_a_surrogate_is_the_gradient_of_the_switched_system(hard):
+    problem = Problem(hard, MeanSquaredDisplacement(), 20)
+    found = Surrogate(onset=0.8)(problem, ("sigma",))
+    switched = build(make(crystal(), LENNARD_JONES, {"kind": "quintic", "radius": 1.6, "onset": 1.28}))
+    twin = replace(problem, simulation=switched)
+    assert found.value == pytest.approx(twin.value(), rel=1e-12)
+    assert found.value != pytest.approx(problem.value(), rel=1e-6)
+    own = Symmetric()(twin, ("sigma",))
+    assert float(found.gradient["potential.sigma"]) == pytest.approx(
+        float(own.gradient["potential.sigma"]), rel=1e-10
+    )
+    assert "switched twin" in found.notes["potential.sigma"]
+    with pytest.raises(InputError, match="no force jump"):
+        Surrogate()(twin, ("sigma",))
