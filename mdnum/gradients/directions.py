@@ -22,7 +22,7 @@ class Direction(NamedTuple):
 
     Attributes:
         x, v: of the positions and velocities of step 0, user's order, shape (..., 3, atoms).
-        model: of the leaves of the potential with its cutoff.
+        model: of the quantities of the force.
         integrator: of the numbers of the integrator; None where a leaf is no number.
         matrix: of the lattice vectors, shape (..., 3, 3).
         r_cut: of the cutoffs at which pairs cross, shape (..., types).
@@ -93,10 +93,17 @@ def _direction(simulation: Simulation, column: Column) -> Direction:
     # a scalar by name is the one entry of a leaf by pair type
     r_cut = np.zeros(simulation.pair_types)
     entry = r_cut.copy()
-    entry[index[0] if name.startswith(("potential.", "cutoff.")) and index else 0] = 1.0
+    by_type = simulation.pairwise and name.startswith(("potential.", "cutoff."))
+    entry[index[0] if by_type and index else 0] = 1.0
     moved: dict[str, np.ndarray] = {}
     numbers: dict[str, float] = {}
-    if name.startswith("potential."):
+    values: Any = jax.tree.map(jnp.zeros_like, parameters.quantities(simulation.force))
+    if name.startswith("potential.") and not simulation.pairwise:
+        key = name.partition(".")[2]
+        one = np.zeros(values[key].shape)
+        one[index] = 1.0
+        values = values | {key: jnp.asarray(one, values[key].dtype)}
+    elif name.startswith("potential."):
         moved["potential." + name.partition(".")[2]] = entry
     elif name == "cutoff.radius":
         moved["r_cut"], r_cut = entry, entry
@@ -121,12 +128,10 @@ def _direction(simulation: Simulation, column: Column) -> Direction:
     else:
         assert name == "box.scale", name
         x, matrix = simulation.positions.T, np.asarray(simulation.cell.matrix)
-    model = simulation.force.model  # type: ignore[union-attr]
-    zero = jax.tree.map(jnp.zeros_like, model)
     for where, value in moved.items():
-        leaf = jnp.asarray(value, model.r_cut.dtype)
+        leaf = jnp.asarray(value, values.r_cut.dtype)
         path = where.split(".")
-        zero = eqx.tree_at(lambda one, path=path: _at(one, path), zero, leaf)
+        values = eqx.tree_at(lambda one, path=path: _at(one, path), values, leaf)
     integrator = jax.tree.map(jnp.zeros_like, numbers_of(simulation.integrator))
     for field in fields(integrator):
         if field.name in numbers:
@@ -138,7 +143,7 @@ def _direction(simulation: Simulation, column: Column) -> Direction:
     return Direction(
         jnp.asarray(x, dtype),
         jnp.asarray(v, dtype),
-        zero,
+        values,
         integrator,
         jnp.asarray(matrix, jnp.float64),
         jnp.asarray(r_cut, jnp.float64),

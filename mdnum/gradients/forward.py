@@ -47,10 +47,14 @@ class Forward:
         return "the derivative of the steps that ran, their decisions held fixed, by tangents"
 
     def why_not(self, problem: Problem, names: Sequence[str]) -> str | None:
-        """Pair potentials and few numbers only."""
-        why = pairs_only(problem.simulation)
-        if why is not None:
-            return why
+        """Few numbers only, and pair potentials where flips count."""
+        simulation = problem.simulation
+        if simulation.lattice is not None:
+            return "a state in whole numbers has no tangent; the method reversible serves it"
+        if self.saltation or simulation.pairwise:
+            why = pairs_only(simulation)
+            if why is not None:
+                return why
         many = len(columns_of(problem.simulation, names))
         if many > self.most:
             return f"{many} numbers would need a tangent each, and at most {self.most} are carried"

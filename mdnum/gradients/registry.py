@@ -10,16 +10,22 @@ from mdnum.gradients.base import Method
 from mdnum.gradients.boundary import Boundary
 from mdnum.gradients.differences import FiniteDifferences
 from mdnum.gradients.ensemble import Ensemble
+from mdnum.gradients.forward import Forward
 from mdnum.gradients.reversible import Reversible
 from mdnum.gradients.reweighting import Reweighting
 from mdnum.gradients.shadow import ShadowDifferences
 from mdnum.gradients.smoothed import SmoothedDifferences
 from mdnum.gradients.surrogate import Surrogate
 from mdnum.gradients.symmetric import EventAware, Symmetric
+from mdnum.gradients.unrolled import Epochs, Recursive, Unrolled
 
 #: A method with its defaults, by word; the order is the one that tables show.
 METHODS: dict[str, Callable[[], Method]] = {
     "symmetric": Symmetric,
+    "forward": Forward,
+    "unrolled": Unrolled,
+    "epochs": Epochs,
+    "recursive": Recursive,
     "reversible": Reversible,
     "event-aware": EventAware,
     "finite-differences": FiniteDifferences,

@@ -23,10 +23,12 @@ from mdnum.gradients.crossings import Crossings, Met, crossings, push_through
 from mdnum.gradients.directions import Column, Direction, columns_of, directions
 from mdnum.gradients.loops import over_rows
 from mdnum.gradients.losses import Frame
+from mdnum.gradients.parameters import quantities, with_quantities
 from mdnum.gradients.tape import Stretch, Tape, frame_of, rows_of
 from mdnum.md.decide import Tables
 from mdnum.md.integrators import Integrator
-from mdnum.md.pairforce import PairForce
+from mdnum.md.manyforce import ManyBodyForce
+from mdnum.md.pairforce import Forces, PairForce
 
 
 class Carry(NamedTuple):
@@ -92,14 +94,12 @@ def tangents(
         progress: called with the steps done and the last step.
 
     Raises:
-        InputError: a many-body potential, or saltation with a tape without flips.
+        InputError: saltation with a tape without flips.
 
     Error: a rounding error times the growth of the tangent; none of truncation, for the program as it ran.
     """
     simulation = tape.simulation
     force = simulation.force
-    if not isinstance(force, PairForce):
-        raise InputError("tangents are of pair potentials", where=simulation.system.name)
     columns = columns_of(simulation, names)
     along = directions(simulation, columns)
     carry = Carry(along.x, along.v, _empty(tape.total, len(columns)))
@@ -154,14 +154,19 @@ def _unsorted(a, order):
     return jnp.zeros_like(a).at[..., order].set(a)
 
 
-def _with(force: PairForce, model, matrix) -> PairForce:
-    """The force with other parameters in another box; which image is nearest does not move with the box."""
-    return replace(force, model=model, cell=replace(force.cell, matrix=matrix))
+def _evaluate(force: PairForce | ManyBodyForce, x, tables: Tables, told, values, matrix) -> Forces:
+    """Forces with other quantities in another box; which image is nearest does not move with the box."""
+    other: Any = with_quantities(force, values)
+    other = replace(other, cell=replace(force.cell, matrix=matrix))
+    if isinstance(force, PairForce):
+        return other(x, tables, decisions=False, given=told)
+    # it decides again, at the recorded positions, hence as it did
+    return other(x, tables, decisions=False)
 
 
 @partial(jax.jit, static_argnames=("states",))
 def _stretch(
-    force: PairForce,
+    force: PairForce | ManyBodyForce,
     integrator: Integrator,
     masses: Float[Array, "atoms"],
     tables: Tables,
@@ -186,8 +191,8 @@ def _stretch(
     volume = around.volume
 
     def evaluate(told):
-        def forces(x, model, matrix):
-            made = _with(force, model, matrix)(x, tables, decisions=False, given=told)
+        def forces(x, values, matrix):
+            made = _evaluate(force, x, tables, told, values, matrix)
             return (
                 made.force.astype(dtype) / mass_row,
                 jnp.sum(made.energy, dtype=jnp.float64),
@@ -226,7 +231,7 @@ def _stretch(
             )
             dx, dv = dx + jumps.astype(dtype) * by_x, dv + jumps.astype(dtype) * by_v
         (acceleration, *_), (onto, potential, virial) = jax.jvp(
-            evaluate(told), (x, force.model, matrix), (dx - shift, along.model, along.matrix)
+            evaluate(told), (x, quantities(force), matrix), (dx - shift, along.model, along.matrix)
         )
         kick = half * onto + 0.5 * along.integrator.timestep.astype(dtype) * acceleration
         dv = dv + jnp.where(first, 0, kick)

@@ -52,6 +52,8 @@ class _Reverse:
 
     def why_not(self, problem: Problem, names: Sequence[str]) -> str | None:
         """Not for forces that are rounded after every operation, and not beyond the memory there is."""
+        if problem.simulation.lattice is not None:
+            return "a state in whole numbers has no derivative; the method reversible serves it"
         if problem.simulation.policy.dtype("force").itemsize < 4:
             return f"forces in {problem.simulation.policy.force} are rounded after every operation"
         return memory.why_not(Steps(problem, self.chunk), self.name, self.room)

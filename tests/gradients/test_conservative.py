@@ -12,6 +12,7 @@ from small_systems import LENNARD_JONES, crystal, make
 from mdnum.errors import InputError
 from mdnum.gradients.base import Problem
 from mdnum.gradients.conservative import EnergyFunction, with_potential
+from mdnum.gradients.forward import Forward
 from mdnum.gradients.parameters import names, value
 from mdnum.gradients.symmetric import EventAware, Symmetric
 from mdnum.gradients.unrolled import Epochs
@@ -56,6 +57,13 @@ def test_any_energy_has_the_derivatives_of_the_closed_forms(both):
     for name, one in expected.items():
         # two programs, that have grown apart by rounding for 40 steps
         assert np.max(np.abs(ours.gradient[name] - one)) <= 1e-9 * np.max(np.abs(one)), name
+
+
+def test_tangents_of_any_energy_agree_with_its_reverse_pass(both):
+    by_numbers = [name for name in names(both[1].simulation) if not name.startswith("initial.")]
+    ours, theirs = Forward()(both[1], by_numbers), Symmetric()(both[1], by_numbers)
+    for name, one in theirs.gradient.items():
+        assert ours.gradient[name] == pytest.approx(one, rel=1e-9), name
 
 
 def test_flips_of_any_energy_are_refused(both):
