@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,8 @@ from mdnum.gradients.diagnose.results import Diagnosis, Growth
 from mdnum.gradients.diagnose.scaling import ScalingWatch
 from mdnum.gradients.diagnose.spectrum import spectrum
 from mdnum.gradients.diagnose.trust import TOLERANCE, trust
-from mdnum.gradients.symmetric import EventAware, weights
+from mdnum.gradients.registry import METHODS, by_word
+from mdnum.gradients.symmetric import GUARD, EventAware, Symmetric, weights
 
 #: Parts of a diagnosis by their words; `edges` takes some dozens of runs and is asked for by name.
 PARTS = ("growth", "agreement", "flips", "trust", "spectrum", "detective", "scaling")
@@ -45,7 +47,8 @@ def diagnose(
         problem: the loss of a rollout.
         names: parameters, full or short names.
         parts: which of PARTS.
-        methods: for the agreement; default all that apply.
+        methods: for the agreement; default all that apply. The other parts are read off the reverse pass of
+            event-aware, or of symmetric where only that applies or is asked for.
         edges_of: parameters whose nearest boundaries of decisions are searched for.
         replicas: starts for the standard error in the trust horizon; 0 leaves it out.
         tolerance: relative difference of two precisions that is put up with.
@@ -64,27 +67,40 @@ def diagnose(
     if unknown:
         raise InputError(f"no part {unknown[0]!r} of a diagnosis", remedy=f"There are {', '.join(PARTS)}")
     searched = parameters.resolve(problem.simulation, edges_of) if edges_of else ()
-    aware = EventAware(budget=budget)
-    why = aware.why_not(problem, full)
+    base, why = _base(problem, full, methods, budget)
     made: Passed | None = None
     found: dict[str, Any] = {}
     failed: dict[str, str] = {}
     notes: dict[str, str] = {}
     known: dict[str, Gradient] = {}
     growing: Growth | None = None
-    if why is None:
+    saltation = isinstance(base, EventAware)
+    if base is not None:
         growth_watch = GrowthWatch(problem.simulation, full, problem.steps)
         scaling_watch = ScalingWatch(problem.steps, format)
-        made = passed(problem, full, budget=budget, watches=[growth_watch, scaling_watch], progress=progress)
-        notes = independent(problem, made.gradient, saltation=True)
-        details = {"guard": made.guard, **weights(made.crossings)}
-        value = made.tape.value
-        known["event-aware"] = Gradient(aware.name, aware.says, value, made.gradient, notes, details)
+        made = passed(
+            problem,
+            full,
+            saltation=saltation,
+            guard=base.guard if isinstance(base, EventAware) else GUARD,
+            budget=budget,
+            watches=[growth_watch, scaling_watch],
+            progress=progress,
+        )
+        known[base.name] = _as_method(base, problem, made)
+        notes = known[base.name].notes
+        plain = _asked(methods, Symmetric)
+        if saltation and "agreement" in parts and plain is not None:
+            # the same run, so that it need not be made twice
+            again = passed(problem, full, saltation=False, tape=made.tape, progress=progress)
+            known[plain.name] = _as_method(plain, problem, again)
         growing = growth_watch.result(made.gradient)
         if "growth" in parts:
             found["growth"] = growing
         if "scaling" in parts:
             found["scaling"] = scaling_watch.result()
+        if not saltation and "flips" in parts:
+            failed["flips"] = f"only event-aware knows what flips add{f': {why}' if why else ''}"
     else:
         failed = {part: why for part in parts if part != "agreement"}
 
@@ -105,7 +121,13 @@ def diagnose(
     attempt(
         "trust",
         lambda: trust(
-            problem, full, tolerance=tolerance, replicas=replicas, budget=budget, progress=progress
+            problem,
+            full,
+            tolerance=tolerance,
+            saltation=saltation,
+            replicas=replicas,
+            budget=budget,
+            progress=progress,
         ),
     )
     attempt(
@@ -113,7 +135,13 @@ def diagnose(
     )
     attempt(
         "detective",
-        lambda: detective(problem, full, tape=None if made is None else made.tape, progress=progress),
+        lambda: detective(
+            problem,
+            full,
+            saltation=saltation,
+            tape=None if made is None else made.tape,
+            progress=progress,
+        ),
     )
     around = {}
     for name in searched:
@@ -139,6 +167,41 @@ def diagnose(
         notes,
         failed,
     )
+
+
+def _asked(methods: Sequence[str | Method] | None, kind: type) -> Any:
+    """The method of a kind among those asked for, as an object; None where it was not asked for."""
+    for one in METHODS if methods is None else methods:
+        method = by_word(one) if isinstance(one, str) else one
+        if isinstance(method, kind):
+            return method
+    return None
+
+
+def _base(
+    problem: Problem, names: Sequence[str], methods: Sequence[str | Method] | None, budget: int
+) -> tuple[EventAware | Symmetric | None, str]:
+    """The method whose reverse pass everything is read off, and why it is not event-aware."""
+    why = ""
+    for kind in (EventAware, Symmetric):
+        method = _asked(methods, kind)
+        if method is not None:
+            reason = method.why_not(problem, names)
+            if reason is None:
+                return replace(method, budget=budget), why
+            why = why or reason
+    return None, why or "it is read off a reverse pass, event-aware or symmetric, and neither was asked for"
+
+
+def _as_method(method: EventAware | Symmetric, problem: Problem, made: Passed) -> Gradient:
+    """What the method itself would say of this pass."""
+    aware = isinstance(method, EventAware)
+    if aware:
+        details = {"guard": made.guard, **weights(made.crossings)}
+    else:
+        details = {"stretches": len(made.tape), "made again": made.tape.replayed}
+    notes = independent(problem, made.gradient, saltation=aware)
+    return Gradient(method.name, method.says, made.tape.value, made.gradient, notes, details)
 
 
 def _gain(growing: Growth) -> float:

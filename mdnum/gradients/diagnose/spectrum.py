@@ -25,8 +25,8 @@ def spectrum(
     problem: Problem,
     *,
     values: int = 3,
-    extra: int = 3,
-    rounds: int = 3,
+    extra: int = 4,
+    rounds: int = 4,
     seed: int = 0,
     budget: int = 2**29,
     tape: Tape | None = None,
@@ -49,7 +49,8 @@ def spectrum(
     Raises:
         InputError: no pair potential, or fewer coordinates than values. NumericalError: the run blew up.
 
-    Error: see Spectrum.residual; the values themselves are wrong by about its square.
+    Error: within `residual` of each there is a singular value, relatively; where they are well apart it is
+        nearer still.
     """
     simulation = problem.simulation
     if tape is None:
