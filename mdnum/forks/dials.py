@@ -223,6 +223,9 @@ def _radius(simulation: Simulation, value: float) -> Simulation:
 
 
 def _given_radius(simulation: Simulation, value: float) -> Simulation:
+    if simulation.lattice is not None:
+        # the limit of a decision between whole numbers is a part of its program
+        return _radius(simulation, value)
     return _GivenSimulation(**_parts(_radius(simulation, value)), compiled=simulation.decider)
 
 

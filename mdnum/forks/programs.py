@@ -62,7 +62,7 @@ def _stepped(simulation: Any, steps: int, program: Program) -> np.ndarray:
     table = simulation.verlet_list().build(start.reference, simulation.cell)
     dynamics = PairDynamics(
         simulation.force,
-        simulation.integrator,
+        simulation.propagator,
         jnp.asarray(simulation.masses[table.order]),
         simulation.tables(table),
     )

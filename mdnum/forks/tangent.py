@@ -74,7 +74,7 @@ def tangents(
     Raises:
         InputError: a many-body potential.
     """
-    force = simulation.force
+    force = simulation.smooth.force
     if not isinstance(force, PairForce):
         raise InputError(
             "a many-body potential cannot be told its pairs",

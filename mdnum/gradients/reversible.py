@@ -85,10 +85,9 @@ class ReversibleTape(Tape):
         steps = np.arange(segment.first, segment.last + 1)
         if self.total is None or self.loss.looks_at(steps, self.steps).any():
             self._observe(stretch_of(segment, self.start))
-        columns = [segment.rows_of(name) for name in ("x", "v", "images")]
+        x, v, images = (segment.rows_of(name) for name in ("x", "v", "images"))
         for row in np.flatnonzero(steps % self._every == 0):
-            state = (column[row] for column in columns)
-            self._prints[int(steps[row])] = fingerprint(*state, segment.table.order)
+            self._prints[int(steps[row])] = fingerprint(x[row], v[row], images[row], segment.table.order)
         state, scheme = segment.state, self.simulation.propagator
         if isinstance(scheme, LatticeLangevin) and int(state.step) % int(scheme.period) == 0:
             self.baths[int(state.step)] = np.array(state.bath)

@@ -17,6 +17,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, UInt8
 
+from mdnum.errors import InputError
 from mdnum.md.cell import Cell
 from mdnum.md.cutoffs import AtCutoff
 from mdnum.md.decide import Decisions, SlotJudge, Tables, displacements, halves_of, packed, unpacked
@@ -31,9 +32,20 @@ _ROUND = 1.5 * 2**52
 _ROUND_BITS = int(np.float64(_ROUND).view(np.int64))
 
 
+@jax.custom_jvp
 def counted(x: Float[Array, "*shape"], zero: jax.Array) -> jax.Array:
     """The nearest integer of numbers below 2^51, plus `_ROUND_BITS`: one addition."""
     return lax.bitcast_convert_type(fence(x, zero) + _ROUND, jnp.int64)
+
+
+@counted.defjvp
+def _counted_jvp(primals, tangents):
+    # a derivative of 0 would be taken for an answer
+    raise InputError(
+        "a program in whole numbers has no derivative of its own",
+        where="precision.state",
+        remedy="Use the method reversible or symmetric, which count a rounding as the identity",
+    )
 
 
 class LatticeJudge(SlotJudge):
@@ -189,13 +201,15 @@ class LatticeForce(PairForce):
         slots = tables.index.shape[0] * tables.index.shape[1]
         # of 64-bit integers the sum wraps round, and this takes off what wrapped
         excess = jnp.asarray((slots * _ROUND_BITS + 2**63) % 2**64 - 2**63, jnp.int64)
-        fx, fy, fz, energy, virial = ((total - excess).astype(jnp.float64) for total in totals)
+        *summed, virial = (total - excess for total in totals)
+        fx, fy, fz, energy = (total.astype(jnp.float64) for total in summed)
         reach = max(self.decider.r_cut) / lattice.spacing
         exact = jnp.max(steep) * reach < 2.0**51
         return Forces(
             jnp.stack([fx, fy, fz]) * lattice.force,
             jnp.where(exact, energy, jnp.nan) * (0.5 * lattice.energy),
-            jnp.sum(virial) * (-0.5 * lattice.energy),
+            # both ends of a pair count, and a pressure may be large: summed as integers to the end
+            jnp.sum(virial).astype(jnp.float64) * (-0.5 * lattice.energy),
             judge.finish(nearest, halves) if decisions else None,
         )
 

@@ -104,6 +104,10 @@ class LatticeLangevin(LatticeStep, Langevin):
         u = jax.random.uniform(jax.random.fold_in(self.key, step), shape, jnp.float64, low, 1.0)[:, order]
         return jnp.round(normal_quantile(u, self.zero) * (self.spread * jnp.sqrt(masses)))
 
+    def drift(self, x, v, masses, step, order):
+        """Refused: friction on a lattice needs the bath, which `exchange` takes and gives."""
+        raise InputError("a Langevin step on a lattice cannot be taken without its bath")
+
     def exchange(self, x, v, bath, masses, step, order):
         """The drift with its thermostat: places, velocities, heat and bath."""
         p = self.momentum(v, masses)

@@ -9,12 +9,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Integer
+from jaxtyping import Array, Float, Integer, Num
 
 from mdnum.md.cutoffs import AtCutoff, Cutoff
 
 
-def of_type(leaf: Float[Array, "types"], types: Integer[Array, "..."] | None) -> Float[Array, "..."]:
+def of_type(leaf: Num[Array, "types"], types: Integer[Array, "..."] | None) -> Num[Array, "..."]:
     """The entries of given pair types (None: only one); types come from the list, in range."""
     return leaf[0] if types is None else leaf.at[types].get(mode="promise_in_bounds")
 

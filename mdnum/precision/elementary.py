@@ -42,6 +42,8 @@ def exp(x: jax.Array, zero: jax.Array) -> jax.Array:
 
     Error: below 2 ulp; results below the smallest normal number are 0.
     """
+    # the argument may be a product, which must not be contracted into the reduction
+    x = fence(x, zero)
     n = jnp.round(jnp.clip(fence(x * (1 / math.log(2)), zero), -2000, 2000))
     r = _less(x, n, _LN2, zero)
     p = polynomial([1 / math.factorial(k) for k in range(13, -1, -1)], r, zero)
@@ -67,7 +69,7 @@ def log(x: jax.Array, zero: jax.Array) -> jax.Array:
     m = lax.bitcast_convert_type((bits & _MANTISSA) | (_BIAS << _EXPONENT), jnp.float64)
     large = m > math.sqrt(2)
     m = jnp.where(large, 0.5 * m, m)
-    n = (exponent + large).astype(jnp.float64)
+    n = (exponent + large.astype(jnp.int64)).astype(jnp.float64)
     s = (m - 1) / (m + 1)
     square = fence(s * s, zero)
     tail = polynomial([2 / (2 * k + 1) for k in range(11, 0, -1)], square, zero)
@@ -81,6 +83,7 @@ def cos_sin(x: jax.Array, zero: jax.Array) -> tuple[jax.Array, jax.Array]:
 
     Error: below 1e-15.
     """
+    x = fence(x, zero)
     n = jnp.round(fence(x * (2 / math.pi), zero))
     r = _less(x, n, _HALF_PI, zero)
     square = fence(r * r, zero)

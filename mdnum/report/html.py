@@ -78,7 +78,8 @@ def render(run: Run, verdict: Verdict, pictures: Mapping[str, str]) -> str:
 
 def _titles(run: Run) -> dict[str, str]:
     titles = {"energy": "Energy and its budget against time", "flips": "Flips per step against time"}
-    if len(run.flips["step"]):
+    # without a bound (whole numbers are compared) there is no unit to measure margins in
+    if np.isfinite(run.margins).any():
         titles["margins"] = "Histogram of margins in units of the rounding bound"
     if len(run.stays.all) > 1:
         titles["residence"] = "Histogram of the steps between two flips of a pair"

@@ -155,6 +155,9 @@ def summarize(simulation: Simulation, done: Any, steps: int, status: str) -> dic
             "smoothness": cutoff.smoothness if cutoff is not None else simulation.model.smoothness.order,
             "bound": float(max(simulation.decider.bounds)),
         },
+        "lattice": None
+        if simulation.lattice is None
+        else simulation.lattice.to_dict(float(simulation.integrator.timestep)),
         "ase": None,
         "findings": [],
         "verdict": "",

@@ -138,6 +138,11 @@ class Simulation:
             return on_lattice(self.integrator, self.lattice)
 
     @property
+    def smooth(self) -> Simulation:
+        """The same system in floats: what is linearized, since a whole number has no derivative."""
+        return self if self.lattice is None else replace(self, lattice=None)
+
+    @property
     def has_bath(self) -> bool:
         """Whether a state remembers what friction has forgotten."""
         return self.lattice is not None and isinstance(self.integrator, Langevin)

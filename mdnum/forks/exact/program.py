@@ -92,6 +92,12 @@ def why_not(simulation: Simulation) -> InputError | None:
             remedy="Use a lennard-jones system",
             where="potential.kind",
         )
+    if simulation.lattice is not None:
+        return InputError(
+            "a run in whole numbers is exact already: its decisions and sums have no rounding",
+            remedy="Use --set precision.state=float64",
+            where="precision.state",
+        )
     if not isinstance(simulation.integrator, VelocityVerlet):
         return InputError(
             f"the exact program serves NVE dynamics, not {simulation.integrator.name!r}: its noise is "

@@ -1,0 +1,222 @@
+"""Runs taken back: the states that come by are those of the run, and the gradient is theirs."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import subprocess
+import sys
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small_systems import LENNARD_JONES, crystal, make
+
+from mdnum.errors import InputError, NumericalError
+from mdnum.gradients.adjoint import reverse
+from mdnum.gradients.base import Problem
+from mdnum.gradients.differences import FiniteDifferences
+from mdnum.gradients.losses import Custom, FinalProjection
+from mdnum.gradients.reversible import Reversible, ReversibleTape
+from mdnum.gradients.symmetric import Symmetric
+from mdnum.rollout.engine import Engine
+from mdnum.systems import build
+
+HARD = {"kind": "hard", "radius": 1.5}
+SMOOTH = {"kind": "quintic", "radius": 1.55, "onset": 1.3}
+# friction so strong that the bath is put aside several times
+BATH = {"kind": "langevin", "timestep": 0.004, "temperature": 1.0, "friction": 250.0, "seed": 3}
+STEPS = 120
+
+
+def small(cutoff=HARD, **tables):
+    """32 atoms in a box 3.6 wide, in whole numbers."""
+    return build(make(crystal(repeat=2), LENNARD_JONES, cutoff, precision={"state": "lattice"}, **tables))
+
+
+def everything(atoms: int) -> Custom:
+    """A loss that looks at all that a frame holds, with weights that no symmetry cancels."""
+    rng = np.random.default_rng(0)
+    way, turn = (jnp.asarray(rng.standard_normal((3, atoms))) for _ in range(2))
+
+    def see(frame, origin, around):
+        moved = jnp.sum(way * (frame.x - origin.x)) + jnp.sum(turn * frame.v * jnp.square(origin.v))
+        return moved + 1e-2 * frame.potential + 1e-2 * frame.virial / around.volume
+
+    return Custom(see=see, every=7, first=5)
+
+
+def problem(simulation, steps: int = STEPS) -> Problem:
+    """The loss of a run."""
+    return Problem(simulation, everything(simulation.atoms), steps)
+
+
+def recorded(simulation, steps: int):
+    """What a forward run recorded at every step, in the user's order, with the pairs inside."""
+    found = {}
+    for segment in Engine(simulation, steps).segments():
+        for row in range(segment.rows):
+            i, j = segment.table.decided(segment.rows_of("bits")[row])
+            found[segment.first + row] = (
+                *(segment.unsorted(name, row) for name in ("x", "v", "images")),
+                *(segment.rows_of(name)[row] for name in ("potential", "virial")),
+                frozenset(zip(i.tolist(), j.tolist(), strict=True)),
+            )
+    return found
+
+
+class Stored(ReversibleTape):
+    """The same way back, with every state taken from a stored run."""
+
+    def backward(self):
+        rows = recorded(self.simulation, self.steps)
+        for stretch in super().backward():
+            order, columns = stretch.table.order, []
+            for k, old in enumerate((stretch.x, stretch.v, stretch.images)):
+                new = np.zeros_like(old)
+                for row in range(stretch.rows):
+                    new[row] = rows[stretch.first + row][k].T[:, order]
+                columns.append(new)
+            yield replace(stretch, x=columns[0], v=columns[1], images=columns[2])
+
+
+def compare_ways(simulation, steps: int) -> ReversibleTape:
+    """The way back against the run: states, energies, decisions, and the gradient, all bit for bit."""
+    asked = problem(simulation, steps)
+    tape = ReversibleTape(simulation, asked.loss, steps)
+    rows, seen = recorded(simulation, steps), 0
+    for stretch in tape.backward():
+        for row in range(stretch.rows):
+            x, v, images, potential, virial, inside = rows[stretch.first + row]
+            order = stretch.table.order
+            assert np.array_equal(stretch.x[row], x.T[:, order])
+            assert np.array_equal(stretch.v[row], v.T[:, order])
+            assert np.array_equal(stretch.images[row], images.T[:, order])
+            assert stretch.potential[row] == potential and stretch.virial[row] == virial
+            i, j = stretch.table.decided(stretch.bits[row])
+            assert frozenset(zip(i.tolist(), j.tolist(), strict=True)) == inside
+            seen += 1
+    assert seen == steps + 1
+    ours, _ = reverse(tape)
+    theirs, _ = reverse(Stored(simulation, asked.loss, steps))
+    for a, b in (
+        (ours.x, theirs.x),
+        (ours.v, theirs.v),
+        (ours.model.potential.sigma, theirs.model.potential.sigma),
+    ):
+        assert np.any(np.asarray(a)) and np.array_equal(np.asarray(a), np.asarray(b))
+    return tape
+
+
+def test_the_way_back_is_the_run_and_its_gradient_that_of_the_stored_run():
+    # a hard cutoff, so that decisions change on the way
+    tape = compare_ways(small(), STEPS)
+    assert tape.nbytes == 0
+
+
+@pytest.mark.slow
+def test_friction_is_undone_from_what_it_put_aside():
+    simulation = small(dynamics=BATH)
+    tape = compare_ways(simulation, STEPS)
+    # by the rate at which friction forgets, rounded up to whole numbers of 64 bits
+    bits = STEPS * BATH["friction"] * BATH["timestep"] / np.log(2)
+    assert bits / 64 <= len(tape.baths) <= bits / 30 and len(tape.baths) >= 4
+
+
+@pytest.mark.slow
+def test_derivatives_are_those_of_differences():
+    asked = problem(small(SMOOTH), 40)
+    names = ("sigma", "epsilon", "timestep", "temperature")
+    ours = Reversible()(asked, (*names, "x0", "v0"))
+    # steps far wider than the lattice, so that its roundings average out
+    theirs = FiniteDifferences(relative=1e-3, levels=3)(asked, names)
+    assert ours.value == theirs.value and ours.details["returned to the start"]
+    for name, value in theirs.gradient.items():
+        assert float(ours.gradient[name]) == pytest.approx(float(value), rel=1e-4), name
+    floats = Symmetric()(replace(asked, simulation=asked.simulation.smooth), (*names, "x0", "v0"))
+    for name, value in floats.gradient.items():
+        assert np.allclose(ours.gradient[name], value, rtol=0, atol=1e-6 * np.abs(value).max()), name
+
+
+def test_a_run_that_missed_pairs_is_not_found_back():
+    # lists that are used far beyond their skin; the way back uses none of them so
+    blind = {"skin": 0.02, "rebuild": {"every": 50, "delay": 50, "check": False}}
+    simulation = small(neighbors=blind, dynamics={"kind": "nve", "timestep": 0.004, "temperature": 3.0})
+    with pytest.raises(NumericalError, match=r"astray (at step|between steps) \d+"):
+        Reversible()(Problem(simulation, FinalProjection(), STEPS), ("sigma",))
+
+
+def test_floats_cannot_be_taken_back():
+    simulation = build("argon/crystal-108")
+    with pytest.raises(InputError, match="lattice"):
+        Reversible()(Problem(simulation, FinalProjection(), 10), ("sigma",))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("bath", (False, True))
+def test_a_hundred_thousand_steps_back_to_the_start(bath):
+    """Lists of the way back are built independently; `backward` raises where a bit of the start is wrong."""
+    gentle = {**BATH, "friction": 1.0}
+    simulation = small(**({"dynamics": gentle} if bath else {}))
+    steps = 100_000
+    tape = ReversibleTape(simulation, FinalProjection(), steps)
+    rows = 0
+    for stretch in tape.backward():
+        rows += stretch.rows
+        first = stretch
+    assert rows == steps + 1 and first.first == 0
+    x = simulation.lattice.positions(simulation.positions)
+    matrix = np.asarray(simulation.cell.matrix)
+    back = (first.x[0] + (matrix.T @ first.images[0])).T[np.argsort(first.table.order)]
+    assert np.array_equal(back, x)
+    # far from where it began in between, and no more kept than what friction forgets
+    assert tape.nbytes <= (simulation.atoms * 3 * 8 * 30 if bath else 0)
+
+
+CHILD = """
+import hashlib, sys
+import numpy as np
+sys.path.insert(0, "tests")
+from small_systems import LENNARD_JONES, crystal, make
+from mdnum.rollout.engine import Engine
+from mdnum.systems import build
+digest = hashlib.sha256()
+MORSE = {"kind": "morse", "depth": 1.0, "alpha": 5.0, "r0": 1.1}
+BATH = {"kind": "langevin", "timestep": 0.004, "temperature": 1.0, "friction": 5.0, "seed": 3}
+NVE = {"kind": "nve", "timestep": 0.004, "temperature": 1.0, "seed": 3}
+for potential, cutoff, dynamics in (
+    (LENNARD_JONES, {"kind": "force-shifted", "radius": 1.5}, NVE),
+    (MORSE, {"kind": "cosine", "radius": 1.5, "onset": 1.2}, BATH),
+):
+    system = make(crystal(repeat=2), potential, cutoff, precision={"state": "lattice"}, dynamics=dynamics)
+    for segment in Engine(build(system), 300).segments():
+        for row in range(segment.rows):
+            for name in ("x", "v"):
+                digest.update(segment.unsorted(name, row).tobytes())
+            i, j = segment.table.decided(segment.rows_of("bits")[row])
+            digest.update(np.sort(i * 1000 + j).tobytes())
+        for name in ("potential", "kinetic", "virial", "heat"):
+            digest.update(np.array(segment.rows_of(name)).tobytes())
+print(digest.hexdigest())
+"""
+
+
+@pytest.mark.slow
+def test_instruction_sets_and_optimization_do_not_matter():
+    """The same bits of states, decisions and energies from four compilers' worth of programs."""
+    seen = {}
+    for flags in (
+        "",
+        "--xla_cpu_max_isa=AVX2",
+        "--xla_cpu_max_isa=SSE4_2",
+        "--xla_backend_optimization_level=0",
+    ):
+        environment = {**os.environ, "XLA_FLAGS": flags}
+        environment.pop("JAX_COMPILATION_CACHE_DIR", None)
+        made = subprocess.run(
+            [sys.executable, "-c", CHILD], env=environment, capture_output=True, text=True, check=True
+        )
+        seen[flags] = made.stdout.strip()
+    assert len(set(seen.values())) == 1, seen
+    assert len(seen[""]) == len(hashlib.sha256().hexdigest())
