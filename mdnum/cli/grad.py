@@ -32,6 +32,9 @@ def grad(
     replicas: int = typer.Option(
         0, min=0, metavar="N", help="Other starts, for the standard error of the gradient; none by default."
     ),
+    also: list[str] | None = typer.Option(
+        None, metavar="WORD,WORD", help="Further parts of the diagnosis: spectrum, edges, scaling, or all."
+    ),
     settings: list[str] | None = output.SET_OPTION,
     out: Path | None = typer.Option(
         None, "-o", "--out", metavar="DIR", help="The gradient folder; runs/grad-NAME-N by default."
@@ -51,6 +54,7 @@ def grad(
             steps=steps,
             methods=methods or None,
             replicas=replicas,
+            also=also or (),
             out=out,
             overrides=overrides,
             report=not no_report,

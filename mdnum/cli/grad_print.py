@@ -25,10 +25,12 @@ def print_rows(summary: Mapping[str, Any]) -> None:
             out.print(f"  {part}: {found['says']}", markup=False)
     for one in summary["refused"]:
         out.print(f"  {one['method']} gave none: {one['why']}", markup=False)
-    if left := summary["left_out"]:
-        output.print_table(
-            "left out", ("", "why", "ask with"), [(one["what"], one["why"], one["how"]) for one in left]
-        )
+    left = [one for one in summary["left_out"] if one["how"]]
+    if left:
+        rows = [(one["what"], one["why"], one["how"]) for one in left]
+        output.print_table("left out (--methods all asks for all methods)", ("", "", "ask with"), rows)
+    if never := [one["what"] for one in summary["left_out"] if not one["how"]]:
+        out.print(f"  do not apply (why is in the report): {', '.join(never)}", markup=False)
 
 
 def _print_methods(summary: Mapping[str, Any]) -> None:

@@ -119,7 +119,9 @@ def resolve(simulation: Simulation, words: Sequence[str]) -> tuple[str, ...]:
         InputError: no such parameter, or one that is no quantity.
     """
     known = names(simulation)
-    short = {name.rpartition(".")[2]: name for name in known} | _ALIASES
+    short = {name.rpartition(".")[2]: name for name in known}
+    # a simulation need not have what a short word stands for
+    short |= {word: name for word, name in _ALIASES.items() if name in known}
     out = []
     for word in words:
         name = word if word in known else short.get(word, word)

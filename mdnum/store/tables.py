@@ -107,6 +107,10 @@ COLUMNS: Mapping[str, Mapping[str, pa.DataType]] = MappingProxyType(
             radial_speed=_FLOAT, weight=_FLOAT, grazing=_BOOL,
         ),
         "trust": _columns(horizon=_INT),
+        "scaling": _columns(
+            horizon=_INT, overflow=_INT, underflow=_INT, subnormal=_INT, largest=_FLOAT, smallest=_FLOAT,
+            scaled_overflow=_INT, scaled_underflow=_INT,
+        ),
     }
 )  # fmt: skip
 
@@ -122,7 +126,7 @@ TABLES: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "processes": ("variants", "variant_separations"),
         "certify": ("policies", "ambiguous", "policy_separations"),
         "forecast": ("foretold", "reach"),
-        "grad": ("growth", "flip_contributions", "trust"),
+        "grad": ("growth", "flip_contributions", "trust", "scaling"),
     }
 )
 

@@ -49,6 +49,7 @@ def grad(
     steps: int | None = None,
     methods: str | Sequence[str] | None = None,
     replicas: int = 0,
+    also: str | Sequence[str] = (),
     out: str | Path | None = None,
     overrides: Mapping[str, Any] | None = None,
     report: bool = True,
@@ -68,6 +69,7 @@ def grad(
             about a minute. What they leave out is said in the summary.
         replicas: starts for the standard error of the gradient, at least 2; 0 leaves it out. Each is a run
             and a pass of tangents.
+        also: further parts of the diagnosis, words of `workflow.grad_methods.ALSO`, or "all".
         out: the new gradient folder; default runs/grad-<name>-<n>.
         overrides: dotted keys to values, such as {"cutoff.kind": "switched"}.
         report: write report.html.
@@ -84,7 +86,13 @@ def grad(
         raise InputError(f"replicas = {replicas}; a standard error takes at least 2")
     wanted = words(wrt)
     chosen = None if methods is None else words(methods)
+    further = words(also)
     if is_ball(system):
+        if further:
+            raise InputError(
+                f"{', '.join(further)}: of molecular dynamics, and this system is a ball",
+                remedy="Leave out --also",
+            )
         if replicas:
             raise InputError(
                 "replicas are starts of molecular dynamics, and this system is a ball",
@@ -96,39 +104,45 @@ def grad(
             system, of, wanted, steps=steps, methods=chosen, out=out, overrides=overrides, report=report,
             progress=progress,
         )  # fmt: skip
-    return _molecules(loaded(system, overrides), of, wanted, chosen, steps, replicas, out, report, progress)
+    asked = Asked(of, wanted, steps, chosen, replicas, further)
+    return _molecules(loaded(system, overrides), asked, out, report, progress)
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What is to be differentiated, by what, and what is to be found out beside."""
+
+    of: str | None
+    wrt: tuple[str, ...]
+    steps: int | None
+    methods: tuple[str, ...] | None
+    replicas: int
+    also: tuple[str, ...]
 
 
 def _molecules(
-    system: System,
-    of: str | None,
-    wrt: Sequence[str],
-    methods: Sequence[str] | None,
-    steps: int | None,
-    replicas: int,
-    out: str | Path | None,
-    report: bool,
-    progress: Progress | None,
+    system: System, asked: Asked, out: str | Path | None, report: bool, progress: Progress | None
 ) -> GradResult:
     from mdnum.workflow import grad_methods, grad_record
 
     began = time.perf_counter()
-    word, problem, names = _problem(system, of, wrt, steps)
-    plan = grad_methods.plan(problem, names, methods, replicas)
+    word, problem, names = _problem(system, asked)
+    plan = grad_methods.plan(problem, names, asked.methods, asked.replicas)
+    also = grad_methods.further(asked.also)
     folder = opened(system, "grad", out, "grad")
     try:
         told = Log(folder, progress)
-        found = grad_methods.run(plan, problem, names, told, replicas)
+        found = grad_methods.run(plan, problem, names, told, asked.replicas, also)
         grad_record.write(folder, found)
         folder.finalize()
         folder.write_summary(
             grad_record.summarize(problem, word, names, found)
             | {
                 "left_out": [
-                    *_shorter(system, steps, problem.steps),
-                    *([] if replicas or found.trust is None else [_STARTS]),
+                    *_shorter(system, asked.steps, problem.steps),
+                    *([] if asked.replicas or found.trust is None else [_STARTS]),
+                    *grad_methods.not_asked(also, found),
                     *plan.left_out,
-                    *found.failed,
                 ],
                 "seconds": time.perf_counter() - began,
             }
@@ -136,41 +150,34 @@ def _molecules(
     except BaseException:
         folder.close()
         raise
-    made = {one.method: one.found for one in found.agreement.opinions if one.found is not None}
+    opinions = () if found.agreement is None else found.agreement.opinions
+    made = {one.method: one.found for one in opinions if one.found is not None}
     return GradResult(folder.path, made, finish(folder, report, progress))
 
 
-def _problem(
-    system: System, of: str | None, wrt: Sequence[str], steps: int | None
-) -> tuple[str, Problem, tuple[str, ...]]:
+def _problem(system: System, asked: Asked) -> tuple[str, Problem, tuple[str, ...]]:
     """The loss's word, the problem, and full names of the parameters: what cannot be is refused here."""
     from mdnum.gradients import parameters
     from mdnum.gradients.base import Problem
     from mdnum.systems import build
     from mdnum.workflow.grad_words import LOSSES, loss
 
-    if of is None:
+    if asked.of is None:
         raise InputError(
             "no loss to differentiate",
             where=system.name,
             remedy=f"Add --of LOSS. There are {', '.join(LOSSES)}",
         )
-    last = steps_of(system, steps)
+    last = steps_of(system, asked.steps)
     simulation = build(system)
-    if not simulation.pairwise:
-        raise InputError(
-            "the parameters of a many-body potential have no names here",
-            where=system.name,
-            remedy="Differentiate it in Python, with mdnum.gradients",
-        )
-    word, made = loss(of, simulation, last)
-    if not wrt:
+    word, made = loss(asked.of, simulation, last)
+    if not asked.wrt:
         raise InputError(
             "no parameter to differentiate by",
             where=system.name,
             remedy=f"Add --wrt NAME,NAME. There are {', '.join(parameters.names(simulation))}",
         )
-    return word, Problem(simulation, made, last), parameters.resolve(simulation, wrt)
+    return word, Problem(simulation, made, last), parameters.resolve(simulation, asked.wrt)
 
 
 def _shorter(system: System, asked: int | None, steps: int) -> list[dict[str, str]]:

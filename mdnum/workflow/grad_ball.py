@@ -152,6 +152,10 @@ def _summary(
         "growth": None,
         "flips": None,
         "trust": None,
+        "spectrum": None,
+        "scaling": None,
+        "edges": {},
+        "not_finite": None,
         "methods": [
             {
                 "method": one["method"],

@@ -17,9 +17,8 @@ from mdnum.workflow.grad_words import LOSSES, unit_of_loss, unit_of_parameter
 
 if TYPE_CHECKING:
     from mdnum.gradients.base import Gradient, Problem
-    from mdnum.gradients.diagnose import Opinion, Trust
+    from mdnum.gradients.diagnose import Agreement, Diagnosis, Opinion, Trust
     from mdnum.systems.build import Simulation
-    from mdnum.workflow.grad_methods import Found
 
 #: Entries of a derivative that summary.json tells one by one.
 _FEW = 6
@@ -27,11 +26,11 @@ _FEW = 6
 ARRAYS = "gradients.npz"
 
 
-def write(folder: RunFolder, found: Found) -> None:
-    """Puts large derivatives into a folder, and tables of growth, trust and flips."""
+def write(folder: RunFolder, found: Diagnosis) -> None:
+    """Puts large derivatives into a folder, and tables of growth, trust, flips and ranges."""
     large = {
         f"{one.method}/{name}": np.asarray(value)
-        for one in found.agreement.opinions
+        for one in _agreement(found).opinions
         if one.found is not None
         for name, value in one.found.gradient.items()
         if np.ndim(value) > 1 or np.size(value) > _FEW
@@ -46,11 +45,13 @@ def write(folder: RunFolder, found: Found) -> None:
         folder.append("flip_contributions", found.flips.table())
     if found.trust is not None:
         folder.append("trust", found.trust.table())
+    if found.scaling is not None:
+        folder.append("scaling", found.scaling.table())
 
 
-def summarize(problem: Problem, word: str, names: Sequence[str], found: Found) -> dict[str, Any]:
+def summarize(problem: Problem, word: str, names: Sequence[str], found: Diagnosis) -> dict[str, Any]:
     """The content of summary.json, without headline and findings."""
-    agreement = found.agreement
+    agreement = _agreement(found)
     simulation = problem.simulation
     units = simulation.units
     reference = agreement.gradient(agreement.reference)
@@ -83,6 +84,10 @@ def summarize(problem: Problem, word: str, names: Sequence[str], found: Found) -
         "growth": None if found.growth is None else found.growth.plain(),
         "flips": None if found.flips is None else found.flips.plain(),
         "trust": None if found.trust is None else _trust(found.trust),
+        "spectrum": None if found.spectrum is None else found.spectrum.plain(),
+        "scaling": None if found.scaling is None else found.scaling.plain(),
+        "edges": {name: one.plain() for name, one in found.edges.items()},
+        "not_finite": None if found.not_finite is None else found.not_finite.plain(),
         "refused": [
             {"method": one.method, "why": one.missing} for one in agreement.opinions if one.found is None
         ],
@@ -91,9 +96,18 @@ def summarize(problem: Problem, word: str, names: Sequence[str], found: Found) -
     }
 
 
+def _agreement(found: Diagnosis) -> Agreement:
+    assert found.agreement is not None, "a diagnosis was made without its methods"
+    return found.agreement
+
+
 def _entries(simulation: Simulation, name: str) -> list[str] | None:
     """Which pair each entry of a parameter belongs to; None where it has one entry, or one for each atom."""
-    if name.startswith("initial.") or not np.ndim(parameters.value(simulation, name)):
+    if (
+        not simulation.pairwise
+        or name.startswith("initial.")
+        or not np.ndim(parameters.value(simulation, name))
+    ):
         return None
     species = simulation.system.species
     found = [""] * simulation.pair_types

@@ -62,7 +62,7 @@ _UNITS: Mapping[str, str] = MappingProxyType(
     {
         "sigma": "{length}", "epsilon": "{energy}", "depth": "{energy}", "r0": "{length}",
         "radius": "{length}", "onset": "{length}", "timestep": "{time}", "temperature": "{temperature}",
-        "friction": "1/{time}", "positions": "{length}", "velocities": "√({energy}/{mass})",
+        "friction": "1/{time}", "scale": "", "positions": "{length}", "velocities": "√({energy}/{mass})",
     }
 )  # fmt: skip
 
@@ -125,8 +125,9 @@ def unit_of_loss(word: str, units: Units) -> str:
 
 
 def unit_of_parameter(name: str, units: Units) -> str:
-    """The unit of a parameter by its full name; "" where it has none."""
-    return _in(_UNITS.get(name.rpartition(".")[2], ""), units)
+    """The unit of a parameter by its full name: "" for none, its own name in brackets where nobody says."""
+    short = name.rpartition(".")[2]
+    return _in(_UNITS.get(short, f"[{short}]"), units)
 
 
 def _in(unit: str, units: Units) -> str:

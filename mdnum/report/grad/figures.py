@@ -20,6 +20,7 @@ def plots(run: Question) -> dict[str, Plot]:
     """The figures that the folder has numbers for, by name."""
     drawn = {"growth": growth(run), "state": state(run), "trust": trust(run)}
     drawn |= {"ranked": ranked(run), "running": running(run)}
+    drawn |= {"spectrum": spectrum(run), "scaling": scaling(run)}
     return {name: plot for name, plot in drawn.items() if plot is not None}
 
 
@@ -164,6 +165,45 @@ def _contributions(run: Question) -> Iterator[tuple[Role, str, np.ndarray, float
             yield role, name, added, abs(total[name])
 
 
+def spectrum(run: Question) -> Plot | None:
+    """How far the directions that stretch most have stretched."""
+    found = run.summary.get("spectrum")
+    if not found:
+        return None
+    curve = np.array(found["curve"], float)
+    series = tuple(
+        Series(f"{place + 1}", np.array(found["horizon"]), curve[:, place], role=role)
+        for place, role in zip(range(curve.shape[1]), ROLES, strict=False)
+    )
+    return Plot(
+        "How far the directions that stretch most have stretched", "step", "logarithm of the stretch", series
+    )
+
+
+def scaling(run: Question) -> Plot | None:
+    """Sizes of the numbers that a reverse pass carries."""
+    table, found = run.tables["scaling"], run.summary.get("scaling")
+    if not found or not len(table["horizon"]):
+        return None
+    sizes = {
+        name: np.where(np.isfinite(table[name]), table[name], np.nan) for name in ("largest", "smallest")
+    }
+    series = (
+        Series("largest", table["horizon"], sizes["largest"]),
+        Series("smallest", table["horizon"], sizes["smallest"], role="second"),
+    )
+    lost = table["overflow"] + table["underflow"]
+    if lost.any():
+        series += (Series(f"lost in {found['format']}", table["horizon"], lost.astype(float), role="bad"),)
+    return Plot(
+        f"Numbers of the reverse pass, held against {found['format']}",
+        "horizon (steps)",
+        "magnitude; count",
+        series,
+        y_scale="log",
+    )
+
+
 def captions(run: Question) -> dict[str, str]:
     """What stands below each figure, by its name."""
     shadow = (run.summary.get("trust") or {}).get("shadow", "")
@@ -175,5 +215,9 @@ def captions(run: Question) -> dict[str, str]:
         "trust": f"Solid: gradients of {shadow}. Dashed: the standard error over starts against the mean, "
         "where there were several.",
         "ranked": "Where a line is flat, many flips add alike; where it falls from the start, few decide.",
+        "spectrum": "An orthonormal frame of changes carried along with decisions held; slopes are "
+        "finite-time Lyapunov exponents.",
+        "scaling": "Cotangents of positions and velocities at each step, unscaled; red: how many of them the "
+        "narrow format cannot hold.",
         "running": "At the end: the share of the derivative that the flips add. What is beyond it cancels.",
     }

@@ -197,6 +197,7 @@ def _grazing(run: Question) -> Iterator[Finding]:
 
 
 def _not_finite(run: Question) -> Iterator[Finding]:
+    where = (run.summary.get("not_finite") or {}).get("says") or ""
     for one in run.summary["methods"]:
         broken = [name for name, value in one["gradient"].items() if not _finite(value)]
         if broken:
@@ -204,7 +205,7 @@ def _not_finite(run: Question) -> Iterator[Finding]:
                 "NOT_FINITE",
                 "error",
                 f"{one['method']} is not finite by {listed(broken)}",
-                "Somewhere on the way a number overflowed or was divided by zero.",
+                where or "Somewhere on the way a number overflowed or was divided by zero.",
             )
 
 

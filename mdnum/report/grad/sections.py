@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
 from mdnum.report.browse import Browse, Column, plain_rows
 from mdnum.report.fork.question import Question
 from mdnum.report.grad.words import apart, slope_unit
-from mdnum.report.words import number, typeset
+from mdnum.report.words import count, number, typeset
 
 #: Rows of the table of flips that the page carries.
 TABLE_ROWS = 2_000
@@ -54,6 +55,29 @@ def shares(run: Question) -> list[dict[str, object]]:
 
 def _percent(share: float | None) -> str:
     return "–" if share is None else f"{number(100 * share, 3, signed=True)} %"
+
+
+def edges(run: Question) -> Iterator[dict[str, Any]]:
+    """The nearest boundaries of decisions on either side of each parameter."""
+    for one in (run.summary.get("edges") or {}).values():
+        for side in (one["below"], one["above"]):
+            if not side["found"]:
+                yield {
+                    "name": one["name"], "side": side["side"], "inside": "none within reach", "beyond": "",
+                    "decision": "", "gradients": [],
+                }  # fmt: skip
+                continue
+            yield {
+                "name": one["name"],
+                "side": side["side"],
+                "inside": repr(side["inside"]),
+                "beyond": repr(side["beyond"]),
+                "decision": f"pair {side['i']}–{side['j']} at step {count(side['step'])}",
+                "gradients": [
+                    number(side[where].get("event-aware"), 6)
+                    for where in ("gradient_inside", "gradient_beyond")
+                ],
+            }
 
 
 def flips(run: Question) -> Browse | None:

@@ -61,7 +61,8 @@ def value_text(parameter: Mapping[str, Any]) -> str:
     if isinstance(value, Mapping):
         return " × ".join(f"{side:,}" for side in value["shape"]) + " numbers"
     text = ", ".join(map(repr, value)) if isinstance(value, list) else repr(value)
-    return f"{text} {parameter['unit']}".rstrip()
+    unit = "" if parameter["unit"].startswith("[") else parameter["unit"]
+    return f"{text} {unit}".rstrip()
 
 
 def difference(run: Question, method: str, name: str) -> tuple[str, str, str]:
