@@ -59,6 +59,7 @@ def test_any_energy_has_the_derivatives_of_the_closed_forms(both):
         assert np.max(np.abs(ours.gradient[name] - one)) <= 1e-9 * np.max(np.abs(one)), name
 
 
+@pytest.mark.slow
 def test_tangents_of_any_energy_agree_with_its_reverse_pass(both):
     by_numbers = [name for name in names(both[1].simulation) if not name.startswith("initial.")]
     ours, theirs = Forward()(both[1], by_numbers), Symmetric()(both[1], by_numbers)
