@@ -22,6 +22,7 @@ STUDIES = (
     "fork_atlas",
     "fork_benchmark",
     "gradient_benchmark",
+    "hard_cutoff_gradient",
     "precision_fork",
     "reduction_order",
     "skin_sensitivity",

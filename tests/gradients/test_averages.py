@@ -144,7 +144,7 @@ def test_what_is_no_average_is_refused(pair):
 def test_weights_of_other_parameters_give_their_average(pair):
     """A fifth more attraction, against the integral; the effective size says what is left of the frames."""
     simulation = pair.simulation
-    seen = frames(Tape(simulation, pair.loss, pair.steps), ()).every(10)
+    seen = frames(Tape(simulation, pair.loss, 8000), ()).every(4)
     changed = pair.at({"potential.epsilon": 1.2}).simulation
     same, other = weighed(simulation, seen, simulation), weighed(simulation, seen, changed)
     assert same.effective == pytest.approx(len(seen))

@@ -101,6 +101,7 @@ def test_diffusion_is_told_per_unit_of_time():
     assert Problem(moving, EinsteinDiffusion(), 1).value() == pytest.approx(speed**2 * dt / 6, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_differences(run):
     """All three at once, with weights that no symmetry cancels: one reverse pass to compile."""
     weights = jnp.asarray(np.random.default_rng(1).standard_normal(BINS))
