@@ -22,7 +22,8 @@ How to read it. "off" within about two of its standard errors is agreement. Plai
 and exactly 0 by the radius, whatever the time step: they hold fixed which pairs interact. What is left of the
 event-aware ones is the noise of differences, a few crossings too slow to count, and what a time step leaves
 of a crossing. A melt tells the radius best, since pairs leave it for good; in the liquid its mean effect is
-less than its noise, and neither gradient can be told from differences. Slopes of averages agree where their ratio is 1 within a hundredth.
+less than its noise, and neither gradient can be told from differences. Slopes of averages agree where their
+ratio is 1 within a hundredth.
 """
 
 from __future__ import annotations
