@@ -183,11 +183,17 @@ def _meaning(
         which = one if kind == _AVERAGE else reference
         return _average(name, which, apart)
     if kind == against:
+        passes = "".join(
+            f" {found.method}: {found.details['primal']['says']}."
+            for found in (one, reference)
+            if "primal" in found.details
+        )
         if relative <= scale.primal:
             return "rounding", (
-                f"Roundings of two forward passes, grown {scale.growth:.3g}-fold, explain {scale.primal:.1g}."
+                f"Roundings of two forward passes, grown {scale.growth:.3g}-fold, explain up to "
+                f"{scale.primal:.1g}.{passes}"
             )
-        return "unexplained", f"Rounding explains {scale.primal:.1g} at most."
+        return "unexplained", f"Rounding explains {scale.primal:.1g} at most.{passes}"
     if _VALUES in (kind, against):
         return _of_values(
             name, one if kind == _VALUES else reference, apart, scale, relative, jumps, {kind, against}
@@ -204,12 +210,12 @@ def _meaning(
 
 
 def _average(name: str, which: Gradient, apart: float) -> tuple[str, str]:
-    error = which.details.get("standard error", which.details.get("error", {}))
-    error = error.get(name) if isinstance(error, Mapping) else None
-    if error is not None and np.ndim(error) == 0 and np.isfinite(float(error)):
-        within = abs(apart) / float(error) if float(error) > 0 else float("inf")
+    error = which.details.get("error", {}).get(name)
+    if error is not None:
+        size = float(np.linalg.norm(np.asarray(error, np.float64)))
+        within = abs(apart) / size if size > 0 else float("inf")
         if within <= _ERRORS:
-            return "statistical", f"Within {within:.2g} standard errors of an average over starts."
+            return "statistical", f"Within {within:.2g} standard errors of an average."
     return "an average", f"{which.method} is the slope of an average, not of this one run."
 
 

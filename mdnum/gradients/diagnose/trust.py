@@ -19,6 +19,7 @@ from mdnum.gradients.base import Problem, Progress
 from mdnum.gradients.diagnose.flips import MOST
 from mdnum.gradients.diagnose.horizons import Horizons, first_difference, horizons, spread
 from mdnum.gradients.diagnose.results import Limit, Trust
+from mdnum.gradients.ensemble import replica
 from mdnum.precision import PrecisionPolicy
 from mdnum.rollout.engine import Engine
 from mdnum.rollout.flips import PairRecorder
@@ -58,6 +59,7 @@ def shadow_of(simulation: Simulation, seed: int = 0) -> Shadow:
         wide = replace(
             simulation,
             policy=PrecisionPolicy(),
+            lattice=None,
             decider=replace(simulation.decider, dtype="float64", state="float64"),
         )
         return Shadow(wide, f"{' and '.join(narrow)} against float64", True)
@@ -87,7 +89,8 @@ def trust(
         names: parameters, full or short names; those of many entries (the start) are left out.
         tolerance: relative difference of two precisions that is put up with.
         saltation: whether flips count.
-        replicas: other starts for the standard error; 0 leaves it out. Each is a run and a tangent pass.
+        replicas: starts for the standard error, this one and others with new velocities (`ensemble.replica`);
+            0 leaves it out. Each is a run and a tangent pass.
         points: horizons that are compared, evenly spread.
         budget: bytes of each recorded run that are kept.
         progress: called with the steps done, all steps, and a phase in words.
@@ -106,6 +109,8 @@ def trust(
             f"a trust horizon by {', '.join(full)} would need a tangent for each entry",
             remedy="Name a parameter of one entry too, such as dynamics.temperature",
         )
+    if replicas == 1 or replicas < 0:
+        raise InputError(f"replicas = {replicas}; one start has no standard error", remedy="Give 2 or more")
     if not 0 < tolerance < 1:
         raise InputError(f"tolerance = {tolerance:g}; expected between 0 and 1")
     at = spread(problem, points)
@@ -134,7 +139,7 @@ def trust(
     ]
     scatter: dict[str, np.ndarray] = {}
     if replicas:
-        made = [own, *(follow(_other_start(simulation, k), f"start {k + 1}") for k in range(replicas - 1))]
+        made = [own, *(follow(replica(simulation, k), f"start {k + 1}") for k in range(1, replicas))]
         scatter = standard_error(made)
         limits.append(_scatter(at, scatter, replicas))
     else:
@@ -227,13 +232,3 @@ def ambiguity(problem: Problem) -> Limit:
     return Limit(
         AMBIGUOUS, problem.steps, False, "No decision of the run was within rounding of its threshold."
     )
-
-
-def _other_start(simulation: Simulation, number: int) -> Simulation:
-    """Velocities handed on among atoms of one mass: the same energy and temperature, another motion."""
-    rng = np.random.default_rng(1000 + number)
-    velocities = simulation.velocities.copy()
-    for mass in np.unique(simulation.masses):
-        atoms = np.flatnonzero(simulation.masses == mass)
-        velocities[atoms] = velocities[rng.permutation(atoms)]
-    return replace(simulation, velocities=velocities)

@@ -8,6 +8,7 @@ import pytest
 from mdnum.errors import InputError
 from mdnum.gradients.base import Gradient, Problem
 from mdnum.gradients.diagnose.agreement import Scale, agreement, compare
+from mdnum.gradients.differences import FiniteDifferences
 from mdnum.gradients.losses import Custom
 from mdnum.systems import build
 
@@ -58,20 +59,21 @@ def problem():
 
 
 def test_the_particle_that_leaves_its_well_is_an_eighth_off_without_its_flip(problem):
-    found = agreement(problem, ("x0", "r_cut"), ["symmetric", "event-aware", "finite-differences"])
+    found = agreement(problem, ("x0", "sigma"), ["symmetric", "event-aware", FiniteDifferences(levels=2)])
     assert found.reference == "event-aware"
     by_name = {one.name: one for one in found.comparisons if one.method == "symmetric"}
     assert by_name["initial.positions"].relative == pytest.approx(0.125, abs=5e-3)
-    assert by_name["cutoff.radius"].relative == 1.0
     assert {one.means for one in by_name.values()} == {"missing saltation"}
     # a method that cannot have all parameters is asked for those it can
     shifted = found.gradient("finite-differences")
-    assert shifted is not None and list(shifted.gradient) == ["cutoff.radius"]
+    assert shifted is not None and list(shifted.gradient) == ["potential.sigma"]
     assert all(len(column) == len(found.comparisons) for column in found.table().values())
 
 
 def test_what_does_not_apply_is_listed_with_the_reason(problem):
-    found = agreement(problem, ("x0",), ["event-aware", "finite-differences"])
+    given = Gradient("event-aware", "", 0.0, {"initial.positions": np.ones((2, 3))})
+    words = ["event-aware", "finite-differences"]
+    found = agreement(problem, ("x0",), words, known={"event-aware": given})
     left = found.opinions[1]
     assert left.found is None and "each shift" in left.missing
     with pytest.raises(InputError, match="no method applies"):

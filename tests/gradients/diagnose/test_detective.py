@@ -44,6 +44,7 @@ def meeting():
     return Problem(with_values(simulation, {"initial.velocities": velocities}), VelocityAutocorrelation(), 1)
 
 
+@pytest.mark.slow
 def test_the_pair_whose_second_derivative_overflows_is_named(meeting):
     found = detective(meeting, ("sigma",))
     assert found.found and found.forward and found.step == 1
@@ -53,6 +54,7 @@ def test_the_pair_whose_second_derivative_overflows_is_named(meeting):
     assert "pair (0, 1)" in found.says
 
 
+@pytest.mark.slow
 def test_a_root_of_the_loss_at_zero_is_found_in_the_loss(meeting):
     """The distance that an atom has gone has no derivative at step 0."""
 
@@ -75,6 +77,7 @@ def test_a_loss_that_is_not_finite_itself_is_no_fault_of_the_reverse_pass(meetin
     assert found.says.startswith("The loss itself")
 
 
+@pytest.mark.slow
 def test_a_pass_that_is_finite_is_said_to_be(meeting):
     far = with_values(meeting.simulation, {"initial.velocities": np.zeros((2, 3))})
     found = detective(Problem(far, VelocityAutocorrelation(), 1), ("sigma",))

@@ -17,6 +17,10 @@ from mdnum.systems import build
 APART, RADIUS, SPEED, STEPS = 2.3, 2.2, 1.0, 20
 
 
+# each compiles passes of its own
+pytestmark = pytest.mark.slow
+
+
 @pytest.fixture(scope="module")
 def problem():
     """Two atoms that fly toward one another and enter their cutoff at step 13, and do nothing else."""

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 from small_systems import LENNARD_JONES, crystal, make
 
 from mdnum.errors import InputError
 from mdnum.gradients import Problem
-from mdnum.gradients.diagnose.flips import flips
+from mdnum.gradients.diagnose import Diagnosis, Flips, diagnose, flips
 from mdnum.gradients.losses import MeanSquaredDisplacement
 from mdnum.gradients.symmetric import EventAware, Symmetric
 from mdnum.systems import build
+
+# each compiles a reverse pass and one of tangents
+pytestmark = pytest.mark.slow
 
 NAMES = ("potential.sigma", "cutoff.radius", "dynamics.temperature")
 
@@ -23,8 +28,28 @@ def problem():
 
 
 @pytest.fixture(scope="module")
-def found(problem):
-    return flips(problem, (*NAMES, "v0"))
+def whole(problem) -> Diagnosis:
+    parts = ("growth", "agreement", "flips", "detective", "scaling")
+    return diagnose(problem, (*NAMES, "v0"), parts=parts, methods=["event-aware", "symmetric"])
+
+
+@pytest.fixture(scope="module")
+def found(whole) -> Flips:
+    return whole.flips
+
+
+def test_all_parts_tell_of_one_run(problem, whole):
+    assert not whole.failed and whole.value == problem.value()
+    aware = whole.agreement.gradient("event-aware")
+    for name in NAMES:
+        value = float(aware.gradient[name])
+        assert whole.growth.gradient[name][-1] == pytest.approx(value, rel=1e-12)
+        assert whole.flips.total[name] == pytest.approx(value, rel=1e-12)
+    means = {(one.name, one.means) for one in whole.agreement.comparisons}
+    assert ("cutoff.radius", "missing saltation") in means
+    assert not whole.not_finite.found and whole.scaling.format == "float16"
+    written = json.loads(json.dumps(whole.plain(), allow_nan=False))
+    assert written["growth"]["word"] == whole.growth.word and written["trust"] is None
 
 
 def test_contributions_sum_to_what_event_aware_adds(problem, found):

@@ -33,6 +33,7 @@ def grown(problem):
     return growth(problem, ("sigma", "temperature", "v0"), saltation=False)
 
 
+@pytest.mark.slow
 def test_each_row_is_the_gradient_of_a_run_that_starts_there(problem, grown):
     simulation, horizon = problem.simulation, 50
     step = STEPS - horizon
@@ -52,6 +53,7 @@ def test_each_row_is_the_gradient_of_a_run_that_starts_there(problem, grown):
     assert grown.gradient["potential.sigma"][horizon] == pytest.approx(slope, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_the_last_row_is_the_gradient_of_the_run(problem, grown):
     whole: Gradient = Symmetric()(problem, ("sigma", "temperature", "v0"))
     for name in ("potential.sigma", "dynamics.temperature"):
@@ -74,6 +76,7 @@ def test_a_rate_is_told_where_growth_is_exponential_alone():
     assert np.isnan(growth_rate(broken)[0])
 
 
+@pytest.mark.slow
 def test_a_horizon_without_an_effect_is_said_to_have_none(problem):
     still = replace(problem, loss=FinalProjection(direction=jnp.zeros(3)))
     found = growth(still, ("sigma",), saltation=False)

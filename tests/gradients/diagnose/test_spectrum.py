@@ -21,6 +21,10 @@ from mdnum.systems import build
 STEPS = 60
 
 
+# each compiles passes of its own
+pytestmark = pytest.mark.slow
+
+
 @pytest.fixture(scope="module")
 def problem():
     """Four atoms that collide."""

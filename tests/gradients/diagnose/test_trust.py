@@ -81,6 +81,7 @@ def test_a_shadow_is_wider_where_there_is_a_wider_format(problem):
     assert narrow.simulation.decider.dtype == "float64"
 
 
+@pytest.mark.slow
 def test_a_shell_at_the_cutoff_is_an_ambiguous_decision(problem):
     shell = build(make(crystal(rattle=0), LENNARD_JONES, {"kind": "quintic", "radius": 1.8, "onset": 1.5}))
     found = ambiguity(replace(problem, simulation=shell))
