@@ -4,12 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
+from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from mdnum.errors import InputError
 from mdnum.gradients import parameters
 from mdnum.gradients.base import Gradient, Problem, Progress, check
+from mdnum.gradients.noise import choose_step
+
+#: The widest step that is tried, and the spacing of the values that the noise is estimated from in rounding
+#: errors of the parameter, as shares of it.
+_WIDEST, _SPACING = 1e-4, 64.0
+#: About how many runs it takes to choose a step: for the noise, and for one or two steps.
+_CHOOSING = 15
 
 
 @dataclass(frozen=True)
@@ -67,12 +77,13 @@ class FiniteDifferences:
     """Values of the loss at shifted parameters, extrapolated; scalars only.
 
     Attributes:
-        relative: the largest step as a share of the parameter.
+        relative: the largest step as a share of the parameter; None for one that the noise of the loss and
+            its third derivative ask for. In a long run the loss is straight over tiny steps only.
         levels: steps of the extrapolation.
     """
 
-    relative: float = 1e-4
-    levels: int = 6
+    relative: float | None = None
+    levels: int = 3
 
     @property
     def name(self) -> str:
@@ -84,16 +95,22 @@ class FiniteDifferences:
         """Which derivative it gives."""
         return "differences of the loss between runs with shifted parameters, extrapolated to no shift"
 
+    @property
+    def runs(self) -> int:
+        """About how many runs a parameter takes."""
+        return 2 * self.levels + (0 if self.relative is not None else _CHOOSING)
+
     def why_not(self, problem: Problem, names: Sequence[str]) -> str | None:
         """Scalars only."""
         large = [name for name in names if np.ndim(parameters.value(problem.simulation, name))]
         return f"{', '.join(large)}: a value for each shift of each entry would be needed" if large else None
 
     def __call__(self, problem: Problem, names: Sequence[str], progress: Progress | None = None) -> Gradient:
-        """The derivative by the named parameters; its error estimates are in the details."""
+        """The derivative by the named parameters; its errors, steps and the noise are in the details."""
         names = check(self, problem, names)
-        gradient, errors, tables = {}, {}, {}
-        done, runs = 0, 2 * self.levels * len(names)
+        gradient: dict[str, np.ndarray] = {}
+        details: dict[str, dict[str, Any]] = {"error": {}, "step": {}, "noise": {}, "table": {}}
+        done, runs = 0, self.runs * len(names)
         for name in names:
             here = float(parameters.value(problem.simulation, name))
             if here == 0:
@@ -101,14 +118,29 @@ class FiniteDifferences:
                     f"{name} is 0, and a step is a share of it", remedy="Shift another parameter"
                 )
 
+            @cache
             def at(q: float, name: str = name) -> float:
                 nonlocal done
                 done += 1
                 if progress is not None:
-                    progress(done, runs, "differences")
+                    progress(min(done, runs), runs, "differences")
                 return problem.value({name: q})
 
-            found = richardson(at, here, self.relative * abs(here), self.levels)
-            gradient[name], errors[name], tables[name] = np.asarray(found.value), found.error, found.table
-        details = {"error": errors, "table": tables}
+            if self.relative is None:
+                spacing = _SPACING * _rounding(problem) * abs(here)
+                chosen = choose_step(at, here, _WIDEST * abs(here), spacing)
+                found = richardson(at, here, 2 * chosen.size, self.levels)
+                details["noise"][name] = chosen.noise
+                error = max(found.error, chosen.noise / found.step)
+            else:
+                found = richardson(at, here, self.relative * abs(here), self.levels)
+                error = found.error
+            gradient[name] = np.asarray(found.value)
+            details["error"][name], details["step"][name] = error, found.step
+            details["table"][name] = found.table
         return Gradient(self.name, self.says, problem.value(), gradient, {}, details)
+
+
+def _rounding(problem: Problem) -> float:
+    """Relative spacing of the numbers that a parameter is kept in: a shift below it is none."""
+    return float(jnp.finfo(problem.simulation.policy.dtype("force")).eps)

@@ -28,8 +28,6 @@ ALL = "all"
 NEVER = ""
 #: Atoms times steps that are run for differences where nothing was said about methods: some 6 s.
 AFFORDABLE = 6_000_000
-#: Shifts of finite differences where nothing was said about methods.
-_LEVELS = 2
 #: Parts of a diagnosis that are always had; those that are asked for, and what each is.
 _PARTS = ("agreement", "growth", "flips", "trust")
 EDGES = "edges"
@@ -74,7 +72,7 @@ def plan(problem: Problem, names: Sequence[str], asked: Sequence[str] | None, re
     apply: list[Method] = []
     left: list[dict[str, str]] = []
     for word, make in METHODS.items():
-        method = FiniteDifferences(levels=_LEVELS) if word == "finite-differences" else make()
+        method = make()
         # by some of the parameters is enough
         reasons = [method.why_not(problem, [name]) for name in names]
         if None not in reasons:
@@ -90,9 +88,10 @@ def _too_long(word: str, method: Method, problem: Problem, names: int, quick: Se
     """Why a method is not run where nothing was said about methods."""
     if word not in quick:
         return method.says
-    runs = 2 * _LEVELS * names + 1
-    if word == "finite-differences" and runs * problem.simulation.atoms * problem.steps > AFFORDABLE:
-        return f"{runs} more runs of {problem.steps:,} steps"
+    if isinstance(method, FiniteDifferences):
+        runs = method.runs * names + 1
+        if runs * problem.simulation.atoms * problem.steps > AFFORDABLE:
+            return f"about {runs} more runs of {problem.steps:,} steps"
     return None
 
 
