@@ -7,6 +7,7 @@ fingerprint here that does not depend on the order of atoms or of lists.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -122,3 +123,55 @@ def _mixed(words: UInt64[Array, "..."] | Int[Array, "..."]) -> UInt64[Array, "..
     z = (z ^ (z >> jnp.uint64(30))) * jnp.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> jnp.uint64(27))) * jnp.uint64(0x94D049BB133111EB)
     return z ^ (z >> jnp.uint64(31))
+
+
+@dataclass(frozen=True)
+class ScanDeparture:
+    """A loop as it runs, and as it runs inside `jax.value_and_grad`.
+
+    Attributes:
+        first: first step after which a bit differs; None if none does.
+        separation: largest difference of a number after each step, shape (steps,).
+        value, inside: the loss by either program.
+    """
+
+    first: int | None
+    separation: Float[np.ndarray, "steps"]
+    value: float
+    inside: float
+
+
+def of_scan(
+    step: Callable[[Any, Any], Any], parameters: Any, state: Any, steps: int, loss: Callable[[Any], Array]
+) -> ScanDeparture:
+    """Where a loop of anybody's, differentiated by JAX, departs from the same loop that is only run.
+
+    Both are compiled whole, as `jax.jit` of a `jax.lax.scan` and of `jax.value_and_grad` of it. All that
+    reverse mode keeps of all steps must fit into memory.
+
+    Args:
+        step: (parameters, state) to the next state, a pytree of arrays.
+        parameters: what is differentiated by.
+        state: where it starts.
+        steps: how many steps.
+        loss: last state to a scalar.
+    """
+
+    def run(parameters):
+        def one(state, _):
+            state = step(parameters, state)
+            return state, [leaf for leaf in jax.tree.leaves(state) if jnp.issubdtype(leaf.dtype, jnp.inexact)]
+
+        last, all_states = lax.scan(one, state, None, length=steps)
+        return loss(last), all_states
+
+    value, plain = jax.jit(run)(parameters)
+    (inside, other), _ = jax.jit(jax.value_and_grad(run, has_aux=True))(parameters)
+    apart = np.zeros(steps)
+    differs = np.zeros(steps, bool)
+    for a, b in zip(plain, other, strict=True):
+        a, b = (np.asarray(leaf).reshape(steps, -1) for leaf in (a, b))
+        differs |= (a != b).any(axis=1)
+        apart = np.maximum(apart, np.abs(a.astype(np.float64) - b).max(axis=1, initial=0.0))
+    first = _first(differs)
+    return ScanDeparture(None if first is None else first + 1, apart, float(value), float(inside))
