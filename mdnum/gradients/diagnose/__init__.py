@@ -7,18 +7,14 @@ from mdnum.gradients.diagnose.edges import edges
 from mdnum.gradients.diagnose.flips import flips
 from mdnum.gradients.diagnose.growth import growth
 from mdnum.gradients.diagnose.horizons import Horizons, horizons
+from mdnum.gradients.diagnose.places import Edge, Edges, Flips, NotFinite, Scaling
 from mdnum.gradients.diagnose.results import (
     Agreement,
     Comparison,
     Diagnosis,
-    Edge,
-    Edges,
-    Flips,
     Growth,
     Limit,
-    NotFinite,
     Opinion,
-    Scaling,
     Spectrum,
     Trust,
 )

@@ -18,7 +18,7 @@ from mdnum.gradients import parameters
 from mdnum.gradients.adjoint import Backward, Trace, transposed
 from mdnum.gradients.base import Problem, Progress
 from mdnum.gradients.diagnose.operations import Operation, first_not_finite
-from mdnum.gradients.diagnose.results import NotFinite
+from mdnum.gradients.diagnose.places import NotFinite
 from mdnum.gradients.symmetric import GUARD, in_phase, radial_speed, wanted
 from mdnum.gradients.tape import Stretch, Tape, frame_of, rows_of
 from mdnum.md.cell import HostCell

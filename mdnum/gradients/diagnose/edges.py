@@ -20,7 +20,7 @@ from mdnum.forks.line import Line
 from mdnum.gradients import parameters
 from mdnum.gradients.base import Problem, Progress
 from mdnum.gradients.diagnose.passes import passed
-from mdnum.gradients.diagnose.results import Edge, Edges
+from mdnum.gradients.diagnose.places import Edge, Edges
 from mdnum.gradients.symmetric import in_phase
 from mdnum.gradients.tangents import tangents
 from mdnum.gradients.tape import Tape

@@ -18,7 +18,7 @@ from mdnum.errors import InputError
 from mdnum.gradients import parameters
 from mdnum.gradients.base import Problem, Progress
 from mdnum.gradients.diagnose.passes import Passed, passed
-from mdnum.gradients.diagnose.results import Flips
+from mdnum.gradients.diagnose.places import Flips
 from mdnum.gradients.directions import columns_of
 from mdnum.gradients.symmetric import GUARD, in_phase
 from mdnum.gradients.tangents import by_column, tangents

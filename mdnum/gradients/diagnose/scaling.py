@@ -16,7 +16,7 @@ from mdnum.gradients import parameters
 from mdnum.gradients.adjoint import Trace
 from mdnum.gradients.base import Problem, Progress
 from mdnum.gradients.diagnose.passes import passed
-from mdnum.gradients.diagnose.results import Scaling
+from mdnum.gradients.diagnose.places import Scaling
 from mdnum.gradients.tape import Stretch
 from mdnum.precision import formats
 

@@ -58,6 +58,7 @@ def problem():
     return Problem(simulation, loss, 2000)
 
 
+@pytest.mark.slow
 def test_the_particle_that_leaves_its_well_is_an_eighth_off_without_its_flip(problem):
     found = agreement(problem, ("x0", "sigma"), ["symmetric", "event-aware", FiniteDifferences(levels=2)])
     assert found.reference == "event-aware"
