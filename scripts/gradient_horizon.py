@@ -33,7 +33,8 @@ from mdnum.gradients.losses import MeanSquaredDisplacement
 from mdnum.systems import Simulation, build
 
 CUTOFFS = ("hard", "quintic")
-NARROW = dict.fromkeys(("state", "force", "decision", "accumulate"), "float32")
+NARROW: dict[str, str] = dict.fromkeys(("state", "force", "decision", "accumulate"), "float32")
+PRECISIONS: tuple[dict[str, str], ...] = ({}, NARROW)
 #: Doublings between the roundings of the two formats.
 BETWEEN = 29 * np.log(2)
 
@@ -77,8 +78,7 @@ def made(atoms: int, cutoff: str, precision: dict[str, str]) -> Simulation:
 def follow(atoms: int, steps: int, points: int, replicas: int, tolerance: float, cutoff: str) -> Found:
     """Growth, spectrum and both trust horizons of one cutoff."""
     wide, narrow = (
-        Problem(made(atoms, cutoff, precision), MeanSquaredDisplacement(), steps)
-        for precision in ({}, NARROW)
+        Problem(made(atoms, cutoff, precision), MeanSquaredDisplacement(), steps) for precision in PRECISIONS
     )
     say(f"{cutoff}: growth")
     grown = growth(wide, ["sigma"])
@@ -120,6 +120,7 @@ def draw(found: dict[str, Found], tolerance: float, path: Path) -> None:
 def main() -> None:
     """Parse, follow, print, draw."""
     line = parser(__file__, __doc__)
+    line.add_argument("--cutoffs", nargs="+", default=list(CUTOFFS), choices=CUTOFFS, help="of these")
     line.add_argument("--atoms", type=int, default=256, help="about so many (default 256)")
     line.add_argument("--steps", type=int, default=2400, help="the longest horizon (default 2400)")
     line.add_argument("--points", type=int, default=60, help="horizons that are compared (default 60)")
@@ -128,7 +129,7 @@ def main() -> None:
     asked = line.parse_args()
     found = {
         cutoff: follow(asked.atoms, asked.steps, asked.points, asked.replicas, asked.tolerance, cutoff)
-        for cutoff in CUTOFFS
+        for cutoff in asked.cutoffs
     }
     rows = []
     for cutoff, one in found.items():
