@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
+from ase.build import bulk
 from small_systems import LENNARD_JONES, crystal, make
 
 from mdnum.errors import InputError
@@ -78,9 +79,10 @@ def test_the_horizon_of_noise_is_where_the_error_passes_the_mean(hard):
 def test_wide_differences_of_a_melt_agree_with_the_flow_and_not_with_the_steps():
     """How hot a crystal has become while it melts: replica by replica, what the flips add is some standard
     errors of the difference, and with it nothing is missing. By the radius, plain is exactly 0."""
-    hard = build(make(crystal(rattle=0), LENNARD_JONES, HARD))
-    problem = Problem(hard, MeanTemperature(first=80), 80)
-    starts, names = Replicas(8), ("potential.sigma", "cutoff.radius")
+    atoms = bulk("Ar", "sc", a=0.8442 ** (-1 / 3), cubic=True).repeat(5)
+    atoms.set_masses([1.0] * len(atoms))
+    problem = Problem(build(make(atoms, LENNARD_JONES, HARD)), MeanTemperature(first=80), 80)
+    starts, names = Replicas(5), ("potential.sigma", "cutoff.radius")
     wide = SmoothedDifferences(0.002, 2, starts)(problem, names)
     assert min(wide.details["moved"].values()) > 0.2
     plain, aware = (
