@@ -98,6 +98,12 @@ def test_findings_follow_the_numbers(tmp_path):
     assert judged(tmp_path / "h", loss=loss)["LOSS_JUMPS"].text.startswith("Symmetric and event-aware know")
     assert "LOSS_JUMPS" not in judged(tmp_path / "i", loss=loss, energy_jump=0.0)
 
+    primal = {"first state": 3, "first decision": None, "says": "a bit differs from step 3 on"}
+    departs = [{**methods[1], "details": {"primal": primal}}]
+    assert judged(tmp_path / "j", methods=departs)["ANOTHER_PRIMAL"].severity == "info"
+    departs[0]["details"]["primal"]["first decision"] = 40
+    assert judged(tmp_path / "k", methods=departs)["ANOTHER_PRIMAL"].severity == "warning"
+
     trust = {"horizon": 300, "limited_by": "rounding", "tolerance": 0.01, "says": "Rounding limits it."}
     assert judged(tmp_path / "f", trust=trust)["BEYOND_TRUST"].title == "trusted up to 300 steps of 500"
     assert "BEYOND_TRUST" not in judged(tmp_path / "g", trust={**trust, "limited_by": ""})

@@ -31,7 +31,6 @@ KINDS: Mapping[str, str] = {
     "reweighting": _AVERAGE,
     "boundary": _AVERAGE,
     "surrogate": _OTHER,
-    "reversible": _OTHER,
 }
 #: Below so many rounding errors, times what they grew by, two derivatives agree.
 _ROUNDINGS = 1e4

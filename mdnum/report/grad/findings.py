@@ -79,6 +79,7 @@ def _findings(run: Question) -> Iterator[Finding]:
     yield from _loss_jumps(run)
     yield from _short(run)
     yield from _few_flips(run)
+    yield from _departs(run)
     yield from _grazing(run)
     yield from _off_the_motion(run)
     yield from _refused(run)
@@ -178,6 +179,22 @@ def _few_flips(run: Question) -> Iterator[Finding]:
 def _replicas(run: Question) -> bool:
     """Whether other starts were followed."""
     return any(name.startswith("error.") for name in run.tables["trust"])
+
+
+def _departs(run: Question) -> Iterator[Finding]:
+    """Methods that differentiate a forward pass of their own, and where it leaves the run."""
+    for one in run.summary["methods"]:
+        primal = one["details"].get("primal") or {}
+        if primal.get("first state") is None:
+            continue
+        decided = primal.get("first decision")
+        yield Finding(
+            "ANOTHER_PRIMAL",
+            "info" if decided is None else "warning",
+            f"{one['method']} differentiates a forward pass of its own",
+            f"{primal['says'][:1].upper()}{primal['says'][1:].rstrip('.')}.",
+            "" if decided is None else "Use symmetric or event-aware, which linearize at the run itself.",
+        )
 
 
 def _grazing(run: Question) -> Iterator[Finding]:
