@@ -26,10 +26,10 @@ from mdnum.md.potentials import CutPotential
 
 #: Listed distances are below 2^30 spacings: three of their squares fit a 64-bit integer.
 REACH_BITS = 30
-# momenta of this many thermal ones, and totals of this many energies, are still whole numbers
-_MOMENTUM_BITS, _ENERGY_BITS = 44, 46
-# steps of a force as large as the scale of energy over the cutoff
-_FORCE_BITS = 38
+# steps of a thermal momentum, of a force of the scale of energy over the cutoff, and of that scale itself in
+# a system of at least so many atoms
+_MOMENTUM_BITS, _FORCE_BITS, _ENERGY_BITS = 44, 36, 48
+_FEWEST = 1024
 
 
 def power_of_two(x: float) -> float:
@@ -84,7 +84,7 @@ class Lattice:
         scale = max(_depth(model), kT)
         force = scale / float(np.max(model.r_cut)) / 2**_FORCE_BITS
         force = max(force, 2 / timestep * float(np.max(momentum)) / 2**_MOMENTUM_BITS)
-        energy = scale * len(momentum) / 2**_ENERGY_BITS
+        energy = scale * max(len(momentum), _FEWEST) / 2**_ENERGY_BITS
         made = cls(spacing, power_of_two(force), power_of_two(energy))
         edges = np.diag(np.asarray(cell.matrix, np.float64))
         rounded = np.diag(np.asarray(made.cell(cell).matrix))

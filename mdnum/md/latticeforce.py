@@ -77,8 +77,8 @@ class LatticeJudge(SlotJudge):
         # what is further away than any listed pair is outside; its square might not fit
         squares = []
         for c in d:
-            whole = lax.bitcast_convert_type(jnp.clip(c, -edge, edge) + _ROUND, jnp.int64) - _ROUND_BITS
-            # thirty bits and a sign: a product of two halves, which every processor has
+            whole = lax.bitcast_convert_type(jnp.clip(c, -edge, edge) + _ROUND, jnp.int64)
+            # the low half is the integer: a product of two halves is one that every processor has
             whole = whole.astype(jnp.int32).astype(jnp.int64)
             squares.append(whole * whole)
         r2 = squares[0] + squares[1] + squares[2]
@@ -107,9 +107,11 @@ class LatticeForce(PairForce):
 
     Attributes:
         lattice: the units.
+        closest: squared distance below which a pair leaves the range of exact sums.
     """
 
     lattice: Lattice = eqx.field(static=True, kw_only=True)
+    closest: Float[Array, ""] = eqx.field(kw_only=True)
 
     @classmethod
     def on(
@@ -124,6 +126,7 @@ class LatticeForce(PairForce):
             policy,
             reduction,
             lattice=lattice,
+            closest=jnp.asarray(_closest(model, lattice), jnp.float64),
         )
 
     @property
@@ -166,9 +169,11 @@ class LatticeForce(PairForce):
         at = law.at_cutoff()
         unit = lattice.spacing * lattice.spacing
         steps = lattice.spacing / lattice.force
+        # what a pair outside is evaluated at
+        far = max(self.decider.r_cut) ** 2
 
         def block(carry, listed):
-            totals, nearest, steep = carry
+            totals, nearest, close = carry
             (j, types), told, pinned = listed
             d, quantity, inside, threshold = judge.group(j, types)
             bits = None
@@ -178,11 +183,12 @@ class LatticeForce(PairForce):
                 asked = other_than(inside, told)
                 inside = inside ^ (asked if pinned is None else asked & unpacked(pinned))
             # the argument is masked, not only the result: a padded slot may be at distance zero
-            r2 = jnp.where(inside, quantity.astype(jnp.float64) * unit, 1.0)
+            r2 = jnp.where(inside, quantity.astype(jnp.float64) * unit, far)
             energy, slope = law.evaluate(r2, types, at)
             energy, slope = jnp.where(inside, energy, 0), jnp.where(inside, slope, 0)
             pull = slope + slope
-            force = pull * steps
+            # worked out once: each component's loop would work it out again
+            force, d = lax.optimization_barrier((pull * steps, d))
             terms = (*(force * c for c in d), energy * (1 / lattice.energy), pull * r2 * (1 / lattice.energy))
             added = []
             for total, term in zip(totals, terms, strict=True):
@@ -190,21 +196,20 @@ class LatticeForce(PairForce):
                 for k in range(whole.shape[0]):
                     total = total + whole[k]
                 added.append(total)
-            for k in range(force.shape[0]):
-                steep = jnp.maximum(steep, jnp.abs(force[k]))
-            return (tuple(added), nearest, steep), bits
+            for k in range(r2.shape[0]):
+                close = jnp.minimum(close, r2[k])
+            return (tuple(added), nearest, close), bits
 
         atoms = judge.atoms
-        start = ((jnp.zeros(atoms, jnp.int64),) * 5, judge.start(), jnp.zeros(atoms, jnp.float64))
+        start = ((jnp.zeros(atoms, jnp.int64),) * 5, judge.start(), jnp.full(atoms, far))
         told, pinned = (None if bits is None else halves_of(bits) for bits in (given, where))
-        (totals, nearest, steep), halves = lax.scan(block, start, (tables.groups(), told, pinned))
+        (totals, nearest, close), halves = lax.scan(block, start, (tables.groups(), told, pinned))
         slots = tables.index.shape[0] * tables.index.shape[1]
         # of 64-bit integers the sum wraps round, and this takes off what wrapped
         excess = jnp.asarray((slots * _ROUND_BITS + 2**63) % 2**64 - 2**63, jnp.int64)
         *summed, virial = (total - excess for total in totals)
         fx, fy, fz, energy = (total.astype(jnp.float64) for total in summed)
-        reach = max(self.decider.r_cut) / lattice.spacing
-        exact = jnp.max(steep) * reach < 2.0**51
+        exact = jnp.min(close) > self.closest
         return Forces(
             jnp.stack([fx, fy, fz]) * lattice.force,
             jnp.where(exact, energy, jnp.nan) * (0.5 * lattice.energy),
@@ -231,6 +236,20 @@ class LatticeForce(PairForce):
         totals, _ = lax.scan(block, start, tables.groups())
         xx, yy, zz, yz, xz, xy = (-jnp.sum(total) for total in totals)
         return jnp.stack([jnp.stack([xx, xy, xz]), jnp.stack([xy, yy, yz]), jnp.stack([xz, yz, zz])])
+
+
+def _closest(model: CutPotential, lattice: Lattice) -> float:
+    """Squared distance down to which energy, force and virial of a pair are below 2^50 units."""
+    r_cut, atom = np.asarray(model.r_cut, np.float64), model.at_cutoff()
+    r = r_cut * np.geomspace(1, 1e-3, 4000)[:, None]
+    energy, slope = (
+        np.asarray(part) for part in model.evaluate(jnp.asarray(r * r), jnp.arange(len(r_cut)), atom)
+    )
+    with np.errstate(over="ignore", invalid="ignore"):
+        force = 2 * np.abs(slope) * r
+        counts = [np.abs(energy) / lattice.energy, force / lattice.force, force * r / lattice.energy]
+    beyond = ~np.all(np.stack(counts) < 2.0**50, axis=0)
+    return float(np.max(np.where(beyond, r * r, 0.0)))
 
 
 class _Reproducible(eqx.Module):

@@ -52,6 +52,9 @@ def _run(
     addable: dict[Any, bool] = dict.fromkeys(program.constvars, True)
     addable.update(zip(program.invars, safe, strict=True))
 
+    # a literal divides as any compiler divides by it, and cannot be looked up
+    shared: set[Any] = set()
+
     def value(atom: Any) -> Any:
         return atom.val if isinstance(atom, Literal) else known[atom]
 
@@ -78,11 +81,13 @@ def _run(
             if any(isinstance(param, Jaxpr | ClosedJaxpr) for param in equation.params.values()):
                 raise TypeError(f"{name} cannot be run operation by operation")
             inputs = [fenced(atom) if name in _SUMS else value(atom) for atom in equation.invars]
-            if name == "div" and _is_float(inputs[1]) and jnp.ndim(inputs[1]):
+            if name == "div" and not isinstance(equation.invars[1], Literal) and equation.invars[1] in shared:
                 # of a divisor that all entries share, XLA takes the reciprocal once
-                inputs[1] = fence(jnp.asarray(inputs[1]), zero)
+                inputs[1] = fence(inputs[1], zero)
             outputs = equation.primitive.bind(*inputs, **equation.params)
             outputs = list(outputs) if equation.primitive.multiple_results else [outputs]
+            if name == "broadcast_in_dim":
+                shared.update(equation.outvars)
         known.update(zip(equation.outvars, outputs, strict=True))
         addable.update(zip(equation.outvars, fine, strict=True))
     return [value(atom) for atom in program.outvars], [is_safe(atom) for atom in program.outvars]

@@ -121,6 +121,13 @@ def test_labels_do_not_matter(liquid):
     same(run(liquid, 120), run(relabelled(liquid, labels), 120), labels)
 
 
+def test_a_pair_too_close_to_count_stops_the_run(liquid):
+    close = np.array(liquid.positions)
+    close[1] = close[0] + np.array([0.3, 0.0, 0.0])
+    segments = list(Engine(replace(liquid, positions=close), 120).segments())
+    assert segments[-1].closes == "blow-up" and segments[-1].last == 0
+
+
 @pytest.mark.slow
 def test_neither_lists_nor_the_order_of_sums_matter(liquid):
     plain = run(liquid, 400)
