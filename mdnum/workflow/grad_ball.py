@@ -162,7 +162,7 @@ def _summary(
                 "says": one["says"],
                 "value": one["value"],
                 "gradient": one["gradient"],
-                "error": {},
+                "error": dict(one["details"].get("standard_error", {})),
                 "notes": {
                     name: why for name, why in one["why"].items() if not one["depends"].get(name, True)
                 },

@@ -152,7 +152,7 @@ def trust(
     if limited:
         says = f"Trusted up to {horizon} of {problem.steps} steps; the limit is {limited}. {met[0].says}"
     else:
-        says = f"Trusted over all {problem.steps} steps: none of the limits was met."
+        says = f"Trusted over all {problem.steps} steps: none of the limits that were looked at was met."
     return Trust(horizon, limited, tuple(limits), tolerance, shadow.words, at, apart, scatter, says)
 
 

@@ -79,7 +79,7 @@ def state(run: Question) -> Plot | None:
         middle = float(np.exp(np.mean(np.log(norm[half:]))))
         line = middle * np.exp(rate * (horizon - np.mean(horizon[half:])))
         shown = np.where(line >= norm[norm > 0].min(), line, np.nan)
-        series.append(Series("a factor e in 1/rate", horizon, shown, role="bad", dashed=True))
+        series.append(Series(f"a factor e in {1 / rate:.3g} steps", horizon, shown, role="bad", dashed=True))
     unit = run.summary["loss"]["unit"]
     per = f"{unit or '1'}/{run.units.length}"
     return Plot(
