@@ -43,7 +43,7 @@ from mdnum.systems import Simulation, System, SystemSpec, build
 SIGMA, EPSILON, TEMPERATURE, DENSITY = 3.405, 0.0103235, 150.0, 0.5 / 3.405**3
 """Argon (Rahman 1964), hot and half as dense as the liquid: Å, eV, K, atoms per Å³."""
 TIMESTEP, EVERY = 0.008, 5
-NAMES = ("potential.sigma", "potential.epsilon")
+NAMES: tuple[str, ...] = ("potential.sigma", "potential.epsilon")
 METHODS = ("event-aware", "symmetric")
 
 
