@@ -13,7 +13,8 @@ from mdnum.gradients.tape import KEPT
 
 #: Share of the free memory that a method may plan with.
 _SHARE = 0.8
-#: No reverse function was seen to keep more than this for each slot of a list and step, in bytes.
+#: No reverse function of pair forces was seen to keep more than a third of this for each slot of a list
+#: and step, in bytes.
 _MOST_PER_SLOT = 1024
 #: What the two records of a rollout and its compiled programs take, bytes.
 _RUN = 2**28
@@ -53,9 +54,13 @@ def needs(program: Steps) -> dict[str, int]:
 
     Lists that end early make chunks that are not full, so that these are lower bounds.
     """
+    return _with_chunks_of(program, per_chunk(program))
+
+
+def _with_chunks_of(program: Steps, chunk: int) -> dict[str, int]:
     steps, state = program.problem.steps + 1, program.start.nbytes
     chunks = -(-steps // program.chunk)
-    chunk, table = per_chunk(program), program.list_of(program.start)[0]
+    table = program.list_of(program.start)[0]
     # what a rollout records of a step: positions, velocities, images, decisions
     row = program.simulation.atoms * (2 * 24 + 12 + table.slots // 8)
     return {
@@ -75,11 +80,11 @@ def why_not(program: Steps, method: str, room: int | None) -> str | None:
         room: bytes; None: what is free.
     """
     room = free() if room is None else room
-    table = program.list_of(program.start)[0]
-    rows = program.problem.steps + 1 + program.chunk
-    if method == "unrolled" and _RUN + rows * table.slots * program.simulation.atoms * _MOST_PER_SLOT < room:
-        # far from it: not worth the second that exact numbers take
-        return None
+    if program.simulation.pairwise:
+        slots = program.list_of(program.start)[0].slots * program.simulation.atoms
+        if _with_chunks_of(program, program.chunk * slots * _MOST_PER_SLOT)[method] <= room:
+            # far from it: not worth the seconds that exact numbers take
+            return None
     needed = needs(program)
     if needed[method] <= room:
         return None

@@ -313,7 +313,9 @@ class Steps:
         # snapshots of one list share the array of the positions at which it was built
         self._used: tuple[Any, int, tuple[PairTable, Tables]] | None = None
         if chunk is None:
-            row = self.list_of(self.start)[0].slots * simulation.atoms * _PER_SLOT
+            slots = self.list_of(self.start)[0].slots
+            # other potentials may have a term for every two neighbors of an atom
+            row = slots * (1 if simulation.pairwise else slots) * simulation.atoms * _PER_SLOT
             # a power of two: each length is compiled for
             chunk = min(CHUNK, 1 << max(0, (_CHUNK_BYTES // row).bit_length() - 1))
         self.chunk = chunk
