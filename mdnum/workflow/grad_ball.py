@@ -164,7 +164,9 @@ def _summary(
                 "gradient": one["gradient"],
                 "error": dict(one["details"].get("standard_error", {})),
                 "notes": {
-                    name: why for name, why in one["why"].items() if not one["depends"].get(name, True)
+                    name: why
+                    for name, why in one["why"].items()
+                    if not one["depends"].get(name, True) or one["gradient"].get(name) == 0
                 },
                 "details": one["details"],
             }

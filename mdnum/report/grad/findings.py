@@ -242,8 +242,8 @@ def _no_dependence(run: Question) -> Iterator[Finding]:
         yield Finding(
             "NO_DEPENDENCE",
             "warning",
-            f"the loss does not depend on {name}",
-            f"Every method gives exactly 0: {next(filter(None, notes), 'nothing that ran used it')}.",
+            f"no method finds a dependence on {name}",
+            f"The derivative is exactly 0: {next(filter(None, notes), 'nothing that ran used it')}.",
             "Look at another loss, or run longer.",
         )
 
