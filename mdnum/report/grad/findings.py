@@ -102,8 +102,11 @@ def _plain_at_a_jump(run: Question) -> Iterator[Finding]:
     """Only methods that hold decisions fixed, where flips count."""
     summary = run.summary
     aware = {"event-aware", "smoothed-differences", "ensemble", "closed form"}
-    methods = [one["method"] for one in summary["methods"]]
-    if summary.get("force_jump") and not aware & {*methods, summary["reference"]}:
+    # averages over states know no motion, and a switched twin has no jump
+    without = {"boundary", "reweighting", "surrogate"}
+    asked = {one["method"] for one in summary["methods"]}
+    methods = [one["method"] for one in summary["methods"] if one["method"] not in without]
+    if summary.get("force_jump") and methods and not aware & {*asked, summary["reference"]}:
         jump = f"{number(summary['force_jump'])} {run.units.energy}/{run.units.length}"
         held = f"{listed(methods)} hold{'s' * (len(methods) == 1)} decisions fixed"
         yield Finding(
