@@ -7,15 +7,17 @@ parameters (or of others, with --others, and then has a noise of its own). The c
 that many pairs cross it where the force jumps; gradients are made with what these flips add (event-aware)
 and without (symmetric).
 
-    start       the guess
-    found       where the descent ended, and how far from the truth that is
+    off         how far from the truth the descent ended
     loss        of the last step
+    first       gradient of the guess: its size and its direction, against the event-aware one
 
 How to read it. Event-aware descent ends within a hundredth of the truth. A gradient without what the flips
 add is one of a program whose pairs are fixed: where it points roughly the same way, the descent arrives as
 well, by another path, because a loss that is zero at the truth forgives a wrong slope; the last columns say
-how far its first gradient is from the event-aware one in size and direction. With --others the target has a
-noise of its own, and what is found is off by it: by some tenths of a percent in sigma and some percent in
+how far its first gradient is from the event-aware one in size and direction. What flips add is right on
+average and noisy replica by replica, and L-BFGS takes that noise for curvature: with --radius 4.4, where
+each flip weighs more, twenty steps with four replicas leave epsilon 10 % off. With --others the target has
+a noise of its own, and what is found is off by it: by some tenths of a percent in sigma and some percent in
 epsilon with four replicas, which g(r) and D of so short a run depend on ten times less.
 """
 

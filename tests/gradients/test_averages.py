@@ -47,6 +47,7 @@ def quintic(r, onset, radius):
     return lennard_jones(r) * (1 - 10 * t**3 + 15 * t**4 - 6 * t**5)
 
 
+@pytest.mark.slow
 def test_a_smooth_cutoff_has_no_boundary():
     simulation = liquid({"kind": "quintic", "radius": 2.2, "onset": 1.8})
     problem = Problem(simulation, MeanPotential(every=5), 40)

@@ -123,6 +123,7 @@ def test_the_shadow_of_a_narrow_run_has_the_derivative_of_a_wide_one():
         ShadowDifferences()(replace(problem, simulation=wide), ("sigma",))
 
 
+@pytest.mark.slow
 def test_a_surrogate_is_the_gradient_of_the_switched_system(hard):
     problem = Problem(hard, MeanSquaredDisplacement(), 20)
     found = Surrogate(onset=0.8)(problem, ("sigma",))
