@@ -207,14 +207,10 @@ print(digest.hexdigest())
 
 @pytest.mark.slow
 def test_instruction_sets_and_optimization_do_not_matter():
-    """The same bits of states, decisions and energies from four compilers' worth of programs."""
+    """The same bits of states, decisions and energies from programs that a compiler makes differently."""
     seen = {}
-    for flags in (
-        "",
-        "--xla_cpu_max_isa=AVX2",
-        "--xla_cpu_max_isa=SSE4_2",
-        "--xla_backend_optimization_level=0",
-    ):
+    # with fused multiply-add, without it, and without a compiler's rearrangements
+    for flags in ("", "--xla_cpu_max_isa=SSE4_2", "--xla_backend_optimization_level=0"):
         environment = {**os.environ, "XLA_FLAGS": flags}
         environment.pop("JAX_COMPILATION_CACHE_DIR", None)
         made = subprocess.run(
