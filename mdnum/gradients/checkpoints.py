@@ -7,7 +7,8 @@ from math import comb
 from typing import Any
 
 from mdnum.gradients.parameters import Cotangents
-from mdnum.gradients.program import Between, Inputs, Leg, Passed, Snapshot, Steps
+from mdnum.gradients.program import Between, Inputs, Passed
+from mdnum.gradients.steps import Leg, Snapshot, Steps
 
 #: Called with a chunk that was linearized, what it told and its list.
 Watch = Callable[[Leg, Passed, Any], None]

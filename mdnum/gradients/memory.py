@@ -8,7 +8,8 @@ from pathlib import Path
 
 import jax
 
-from mdnum.gradients.program import Steps, keep
+from mdnum.gradients.program import keep
+from mdnum.gradients.steps import Steps
 from mdnum.gradients.tape import KEPT
 
 #: Share of the free memory that a method may plan with.

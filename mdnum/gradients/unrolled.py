@@ -17,7 +17,8 @@ from mdnum.gradients.base import Gradient, Problem, Progress, check, independent
 from mdnum.gradients.checkpoints import keep_everything, keep_few, keep_states
 from mdnum.gradients.parameters import Cotangents
 from mdnum.gradients.primal import Fingerprints
-from mdnum.gradients.program import Leg, Passed, Steps
+from mdnum.gradients.program import Passed
+from mdnum.gradients.steps import Leg, Steps
 from mdnum.gradients.tape import Tape
 
 

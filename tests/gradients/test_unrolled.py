@@ -14,7 +14,7 @@ from mdnum.gradients import memory
 from mdnum.gradients.base import Problem
 from mdnum.gradients.checkpoints import _split
 from mdnum.gradients.primal import Fingerprints
-from mdnum.gradients.program import Steps
+from mdnum.gradients.steps import Steps
 from mdnum.gradients.symmetric import Symmetric
 from mdnum.gradients.unrolled import Epochs, Recursive, Unrolled
 from mdnum.systems import build
