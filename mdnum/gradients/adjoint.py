@@ -44,6 +44,7 @@ class Carry(NamedTuple):
         scale: of a common factor of all distances, so far.
         origin: of the frame of step 0 where the loss compares with it, user's order.
         r_cut: of the cutoffs by the times of flips, so far, shape (types,).
+        frame: of potential energy and virial in the frame that the loss looks at next in time.
     """
 
     x: Float[Array, "3 atoms"]
@@ -53,6 +54,7 @@ class Carry(NamedTuple):
     scale: Float[Array, ""]
     origin: tuple[Float[Array, "3 atoms"], Float[Array, "3 atoms"]]
     r_cut: Float[Array, "types"]
+    frame: tuple[Float[Array, ""], Float[Array, ""]]
 
 
 class Trace(NamedTuple):
@@ -155,6 +157,7 @@ class Backward:
             jnp.zeros((), force.policy.dtype("force")),
             (nothing, nothing),
             jnp.zeros(simulation.pair_types, jnp.float64),
+            (jnp.zeros((), jnp.float64), jnp.zeros((), jnp.float64)),
         )
 
     def arguments(self, stretch: Stretch, traced: bool) -> tuple[Any, ...]:
@@ -175,7 +178,7 @@ class Backward:
             stretch.bits,
             stretch.rows,
             self.tape.seen(stretch),
-            (self.tape.loss, self.tape.origin, self.tape.around, self.onto_total),
+            (self.tape.loss, self.tape.origin, self.tape.around, self.onto_total, self.tape.pace),
             None if self.met is None else self.met.on_device(len(stretch.x), simulation.atoms),
             self.carry,
             self.wanted,
@@ -224,7 +227,7 @@ def transposed(
     traced: bool,
 ):
     """The transpose of a stretch of steps: the carry before it, the weights of its crossings, its trace."""
-    loss, origin, around, onto_total = looking
+    loss, origin, around, onto_total, pace = looking
     order = tables.order
     # carried from list to list in the user's order
     carry = carry._replace(x=carry.x[:, order], v=carry.v[:, order])
@@ -314,17 +317,23 @@ def transposed(
             scale,
             jax.tree.map(jnp.add, carry.origin, onto_origin),
             carry.r_cut,
+            (
+                jnp.where(see, onto_potential.astype(jnp.float64), carry.frame[0]),
+                jnp.where(see, onto_virial.astype(jnp.float64), carry.frame[1]),
+            ),
         )
         trace = Trace(after.x, after.v, model, numbers_bar, scale, carry.r_cut) if traced else None
         weights = jnp.zeros(0)
         if met is not None:
             # the forces are there wherever the derivative by scale is wanted
             arriving = v - half * made.force / mass_row
+            share = pace.share(number, integrator.timestep)
             push, weights, by_radius, by_scale = onto_crossings(
                 met,
                 after.x,
                 after.v,
                 (x, arriving, jnp.asarray(force.cell.matrix)),
+                (share * after.frame[0], share * after.frame[1]),
                 masses,
                 integrator.timestep,
                 carry.r_cut.shape[0],

@@ -5,6 +5,9 @@ after. Differentiating the steps of a program never sees that, because the steps
 crossing; the error does not shrink with the time step. The term is the saltation term of mdnum.events, with
 the cutoff's sphere as the threshold, written for the reverse pass.
 
+A loss that sees the potential energy or the virial jumps with them too, in the frames that it looks at: where
+they follow one another at equal times, a later crossing moves the jump across a share of them.
+
 Source: for a pair with the radial force jump f (positive: repulsive) and the radial speed s, a perturbation
 dr of the distance moves the crossing by -dr/s and the momentum along the pair by f dr/s.
 """
@@ -33,6 +36,7 @@ class Met(NamedTuple):
         push: signed force jump over radial speed, energy/length per (length/time); 0 where it is left out.
         kind: pair type; -1 - kind where it is left out.
         images: lattice vectors from the nearest image of atom j to its wrapped position, (rows, 3, most).
+        potential, virial: their jumps over the radial speed, energy per (length/time).
     """
 
     i: Int[Array, "*rows most"]
@@ -41,6 +45,8 @@ class Met(NamedTuple):
     push: Float[Array, "*rows most"]
     kind: Int[Array, "*rows most"]
     images: Int[Array, "*rows 3 most"]
+    potential: Float[Array, "*rows most"]
+    virial: Float[Array, "*rows most"]
 
 
 @dataclass(frozen=True)
@@ -53,6 +59,7 @@ class Crossings:
         normal: unit vector from i to j at the crossing, shape (crossings, 3).
         speed: radial speed there, length per internal time: negative where the pair enters.
         force: radial force that the flip adds, energy/length.
+        energy, virial: what the flip adds to the potential energy and to the virial, energy.
         kind: pair type.
         images: lattice vectors from the nearest image of atom j to its wrapped position, (crossings, 3).
         grazing: slower than the guard: left out.
@@ -67,6 +74,8 @@ class Crossings:
     normal: Float[np.ndarray, "crossings 3"]
     speed: Float[np.ndarray, "crossings"]
     force: Float[np.ndarray, "crossings"]
+    energy: Float[np.ndarray, "crossings"]
+    virial: Float[np.ndarray, "crossings"]
     kind: Int[np.ndarray, "crossings"]
     images: Int[np.ndarray, "crossings 3"]
     grazing: Bool[np.ndarray, "crossings"]
@@ -100,15 +109,19 @@ class Crossings:
         most = 1 << max(3, int(place.max(initial=0)).bit_length())
         i, j = np.full((room, most), atoms), np.full((room, most), atoms)
         normal, push = np.zeros((room, 3, most)), np.zeros((room, most))
+        potential, virial = np.zeros((room, most)), np.zeros((room, most))
         images = np.zeros((room, 3, most), np.int64)
         kind = np.zeros((room, most), np.int64)
         i[row, place], j[row, place] = self.i[order], self.j[order]
         normal[row, :, place] = self.normal[order]
         # what is left out still has its weight worked out: the sign tells the reverse pass not to apply it
         push[row, place] = self.kick[order]
+        potential[row, place] = (self.energy / self.speed)[order]
+        virial[row, place] = (self.virial / self.speed)[order]
         kind[row, place] = np.where(self.grazing, -1 - self.kind, self.kind)[order]
         images[row, :, place] = self.images[order]
-        return Met(*(jnp.asarray(part) for part in (i, j, normal, push, kind, images)))
+        parts = (i, j, normal, push, kind, images, potential, virial)
+        return Met(*(jnp.asarray(part) for part in parts))
 
     def gathered(self, values: Float[np.ndarray, "room most *rest"]) -> Float[np.ndarray, "crossings *rest"]:
         """Values of padded rows, in the order of the crossings."""
@@ -127,6 +140,7 @@ def onto_crossings(
     onto_x: Float[Array, "3 atoms"],
     onto_v: Float[Array, "3 atoms"],
     here: tuple[Float[Array, "3 atoms"], Float[Array, "3 atoms"], Float[Array, "3 3"]],
+    onto_sums: tuple[Float[Array, ""], Float[Array, ""]],
     masses: Float[Array, "atoms"],
     timestep: Float[Array, ""],
     types: int,
@@ -140,6 +154,8 @@ def onto_crossings(
         met: the crossings between the step before and this one.
         onto_x, onto_v: cotangents of this step's positions and of the velocities that lead there.
         here: these wrapped positions and velocities themselves, and the lattice vectors.
+        onto_sums: cotangents of the potential energy and of the virial per time, as frames at equal times see
+            them.
         masses: shape (atoms,).
         timestep: internal time.
         types: number of pair types.
@@ -152,6 +168,8 @@ def onto_crossings(
     half = (0.5 * timestep).astype(dtype)
     x, v, matrix = here
     pull = met.push.astype(dtype) * _along(met, (onto_v + half * onto_x) / masses.astype(dtype))
+    onto_potential, onto_virial = onto_sums
+    pull = pull + (onto_potential * met.potential + onto_virial * met.virial).astype(dtype)
     applied = jnp.where(met.kind >= 0, pull, 0)
     along = applied * met.normal.astype(dtype)
     push = jnp.zeros_like(onto_x).at[:, met.j].add(along, mode="drop").at[:, met.i].add(-along, mode="drop")
@@ -183,7 +201,7 @@ def push_through(
     timestep: Float[Array, ""],
     r_cut: Float[Array, "types"],
     matrix: Float[Array, "3 3"],
-) -> tuple[Float[Array, "most"], tuple[Float[Array, "3 atoms"], Float[Array, "3 atoms"]]]:
+) -> tuple[Float[Array, "most"], tuple[Float[Array, "3 atoms"], Float[Array, "3 atoms"]], Float[Array, "2"]]:
     """The saltation of one step's crossings, on one tangent.
 
     Args:
@@ -194,17 +212,19 @@ def push_through(
         r_cut, matrix: tangents of the cutoffs and of the lattice vectors.
 
     Returns:
-        tangents of the distances at the crossings, and what is added to x and v.
+        tangents of the distances at the crossings, what is added to x and v, and the times by which the
+        jumps of potential energy and virial come earlier, times these jumps, summed.
     """
     dtype = x.dtype
     half = (0.5 * timestep).astype(dtype)
     dr = _along(met, x - half * v, matrix)
     kind = jnp.where(met.kind >= 0, met.kind, 0)
-    late = jnp.where(met.kind >= 0, met.push.astype(dtype) * (dr - r_cut[kind].astype(dtype)), 0)
-    along = late * met.normal.astype(dtype)
+    ahead = jnp.where(met.kind >= 0, dr - r_cut[kind].astype(dtype), 0)
+    along = met.push.astype(dtype) * ahead * met.normal.astype(dtype)
     kick = jnp.zeros_like(x).at[:, met.j].add(along, mode="drop").at[:, met.i].add(-along, mode="drop")
     kick = kick / masses.astype(dtype)
-    return dr.astype(jnp.float64), (half * kick, kick)
+    sums = jnp.stack([jnp.sum(jump * ahead.astype(jnp.float64)) for jump in (met.potential, met.virial)])
+    return dr.astype(jnp.float64), (half * kick, kick), sums
 
 
 def crossings(
@@ -245,6 +265,8 @@ def crossings(
     # a distance that did not change has no time of crossing at all
     grazing = ~(np.abs(speed) > guard) | (speed == 0)
     safe = np.where(speed == 0, np.inf, speed)
+    force = np.asarray(ledger.extra["force_jump"], np.float64)
+    kind = np.asarray(simulation.type_of(low, high), np.int64)
     return Crossings(
         ledger,
         row,
@@ -252,8 +274,10 @@ def crossings(
         j,
         normal,
         safe,
-        np.asarray(ledger.extra["force_jump"]),
-        np.asarray(simulation.type_of(low, high), np.int64),
+        force,
+        np.asarray(ledger.jump, np.float64),
+        force * np.asarray(simulation.decider.r_cut)[kind],
+        kind,
         images,
         grazing,
         np.full(len(row), np.nan),

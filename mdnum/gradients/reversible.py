@@ -20,7 +20,7 @@ from mdnum.gradients.adjoint import reverse
 from mdnum.gradients.base import Gradient, Problem, Progress, check, independent
 from mdnum.gradients.losses import Loss
 from mdnum.gradients.symmetric import in_phase, pairs_only, wanted
-from mdnum.gradients.tape import Stretch, Tape, frame_of_start, stretch_of, surroundings
+from mdnum.gradients.tape import Stretch, Tape, frame_of_start, pace_of, stretch_of, surroundings
 from mdnum.md.latticestep import LatticeLangevin, forgotten_bits
 from mdnum.rollout.backward import Backward, Stretched
 from mdnum.rollout.engine import FAILURES, Engine, Segment, State, first_state
@@ -57,6 +57,7 @@ class ReversibleTape(Tape):
         self.simulation, self.loss, self.steps = simulation, loss, steps
         self.start = first_state(simulation)
         self.around = surroundings(simulation)
+        self.pace = pace_of(loss, steps)
         self.origin = frame_of_start(self.start, simulation)
         self.flips = flips
         self.total: Any = None

@@ -20,6 +20,11 @@ from mdnum.systems.build import Simulation
 
 #: Default guard of event-aware gradients, as a share of the rms radial speed of a pair.
 GUARD = 1e-3
+#: Said of a loss that jumps where a slope cannot tell.
+_SINGLE_FRAMES = (
+    "the loss looks at energy or virial in single frames, and these jump with a flip: that has a slope in an "
+    "average over frames at equal times alone"
+)
 #: Crossings of the largest weight that are named in the details.
 _NAMED = 10
 
@@ -117,7 +122,10 @@ class EventAware:
         )
         gradient = {name: parameters.gradient(simulation, parts, name) for name in names}
         notes = independent(problem, gradient, saltation=True)
-        details = {"guard": guard, **weights(found)}
+        unseen = bool(np.any(simulation.jumps())) and tape.jumps_unseen
+        if unseen:
+            notes |= dict.fromkeys(names, _SINGLE_FRAMES)
+        details = {"guard": guard, "loss jumps": unseen, **weights(found)}
         return Gradient(self.name, self.says, tape.value, gradient, notes, details)
 
 

@@ -38,11 +38,13 @@ class Carry(NamedTuple):
         x: of the positions as if the box had no faces, at the step that comes next, (columns, 3, atoms).
         v: of the half-kicked velocities that lead there, same shape.
         total: of the sums of the loss.
+        waiting: of potential energy and virial, by flips since the last frame that the loss looked at.
     """
 
     x: Float[Array, "columns 3 atoms"]
     v: Float[Array, "columns 3 atoms"]
     total: Any
+    waiting: Float[Array, "columns 2"]
 
 
 @dataclass(frozen=True)
@@ -102,7 +104,7 @@ def tangents(
     force = simulation.force
     columns = columns_of(simulation, names)
     along = directions(simulation, columns)
-    carry = Carry(along.x, along.v, _empty(tape.total, len(columns)))
+    carry = Carry(along.x, along.v, _empty(tape.total, len(columns)), jnp.zeros((len(columns), 2)))
     for stretch in tape.forward():
         order = stretch.table.order
         met = None
@@ -121,7 +123,7 @@ def tangents(
             stretch.bits,
             stretch.rows,
             tape.seen(stretch),
-            (tape.loss, tape.origin, tape.around),
+            (tape.loss, tape.origin, tape.around, tape.pace),
             None if met is None else met.on_device(len(stretch.x), simulation.atoms),
             carry._replace(x=carry.x[..., order], v=carry.v[..., order]),
             along,
@@ -181,7 +183,7 @@ def _stretch(
     jumps: Float[Array, ""],
     states: bool,
 ):
-    loss, origin, around = looking
+    loss, origin, around, pace = looking
     order = tables.order
     dtype = rows[1].dtype
     mass_row = masses.astype(dtype)
@@ -223,27 +225,30 @@ def _stretch(
         number, x, v = row[0], row[1], row[2]
         dx, dv = carry.x, carry.v
         half, first = (0.5 * integrator.timestep).astype(dtype), number == 0
-        dr = jnp.zeros(0)
+        dr, waiting = jnp.zeros(0), carry.waiting
         shift = (along.matrix.T @ row[3].astype(matrix.dtype)).astype(dtype)
         if met is not None:
-            dr, (by_x, by_v) = push_through(
+            dr, (by_x, by_v), ahead = push_through(
                 met, dx - shift, dv, masses, integrator.timestep, along.r_cut, along.matrix
             )
             dx, dv = dx + jumps.astype(dtype) * by_x, dv + jumps.astype(dtype) * by_v
+            waiting = waiting + jumps * pace.share(number, integrator.timestep) * ahead
         (acceleration, *_), (onto, potential, virial) = jax.jvp(
             evaluate(told), (x, quantities(force), matrix), (dx - shift, along.model, along.matrix)
         )
         kick = half * onto + 0.5 * along.integrator.timestep.astype(dtype) * acceleration
         dv = dv + jnp.where(first, 0, kick)
+        potential, virial = potential + waiting[0], virial + waiting[1]
         total = lax.cond(
             see, look, lambda row, total, *_: total, row, carry.total, dx, dv, potential, virial, along
         )
+        waiting = jnp.where(see, 0, waiting)
         _, (after_x, after_v) = jax.jvp(
             lambda x, v, numbers: drift(x, v, numbers, number),
             (x, v + half * acceleration, numbers),
             (dx, dv + kick, along.integrator),
         )
-        return Carry(after_x, after_v, total), (dx, dv), dr
+        return Carry(after_x, after_v, total, waiting), (dx, dv), dr
 
     def step(carry, given):
         row, told, see, met = given

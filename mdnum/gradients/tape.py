@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -108,6 +108,33 @@ def stretch_of(segment: Segment, start: Start, ledger: Ledger | None = None) -> 
     )
 
 
+class Pace(NamedTuple):
+    """How often a loss looks.
+
+    Attributes:
+        between: steps from one frame to the next; 0 where they are not a series at equal times.
+        first: step of the first frame.
+    """
+
+    between: Int[Array, ""]
+    first: Int[Array, ""]
+
+    def share(self, step: Int[Array, ""], timestep: Float[Array, ""]) -> Float[Array, ""]:
+        """Frames per time around a step: by how many of them a jump just before this step comes earlier when
+        it comes earlier by a time; on average, as a step decides when a frame is taken."""
+        within = (self.between > 0) & (step > self.first - self.between)
+        time = jnp.maximum(self.between, 1).astype(jnp.float64) * timestep.astype(jnp.float64)
+        return jnp.where(within, 1 / time, 0.0)
+
+
+def pace_of(loss: Loss, steps: int) -> Pace:
+    """How often a loss looks at a run of so many steps."""
+    seen = np.flatnonzero(loss.looks_at(np.arange(steps + 1), steps))
+    apart = np.unique(np.diff(seen))
+    between = int(apart[0]) if len(apart) == 1 else 0
+    return Pace(jnp.asarray(between), jnp.asarray(int(seen[0]) if len(seen) else 0))
+
+
 class Tape:
     """A run that has been made, and its loss.
 
@@ -138,6 +165,7 @@ class Tape:
         self.simulation, self.loss, self.steps = simulation, loss, steps
         self.start = first_state(simulation)
         self.around = surroundings(simulation)
+        self.pace = pace_of(loss, steps)
         self.origin = frame_of_start(self.start, simulation)
         recorder = PairRecorder(simulation) if flips else None
         self._starts: list[Start] = []
@@ -174,6 +202,20 @@ class Tape:
     def replayed(self) -> int:
         """Stretches that are made again in a reverse pass."""
         return len(self._starts) - len(self._kept)
+
+    @property
+    def jumps_unseen(self) -> bool:
+        """Whether the loss looks at energy or virial in single frames: where they jump with a flip, so does
+        the loss, and no slope stands for that. In frames at equal times it is part of the average."""
+        if int(self.pace.between) > 0:
+            return False
+
+        def at(potential, virial):
+            frame = self.origin._replace(potential=potential, virial=virial)
+            return self.loss.value(self.loss.observe(frame, frame, self.around), 1)
+
+        one = jnp.ones((), jnp.float64)
+        return any(float(slope) != 0 for slope in jax.grad(at, argnums=(0, 1))(one, one))
 
     def __len__(self) -> int:
         return len(self._starts)

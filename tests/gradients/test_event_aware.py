@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import mpmath
 import numpy as np
 import pytest
 import sympy
 
 from mdnum.gradients.base import Problem
+from mdnum.gradients.forward import Forward
 from mdnum.gradients.losses import Custom
 from mdnum.gradients.symmetric import EventAware, Symmetric
 from mdnum.systems import build
@@ -80,3 +82,65 @@ def test_a_crossing_slower_than_the_guard_is_left_out_and_listed(well):
     # its weight is what it would have added to the derivative by the radius
     assert row["weight"] == pytest.approx(exact()["cutoff.radius"], abs=1e-4)
     assert found.details["weight left out"] == abs(row["weight"])
+
+
+def averages(w: str, time: float) -> dict[str, float]:
+    """Derivatives of the time average of energy ("u") or virial ("w") of the particle that leaves the well.
+
+    Dwelling at a distance goes with one over the speed: the average is the integral of what is seen over
+    v(r), from the start to the cutoff, over the time.
+    """
+    mpmath.mp.dps = 30
+
+    def average(r0, v0, r_cut, sigma, epsilon):
+        def u(r):
+            return 4 * epsilon * ((sigma / r) ** 12 - (sigma / r) ** 6)
+
+        def seen(r):
+            return u(r) if w == "u" else 4 * epsilon * (12 * (sigma / r) ** 12 - 6 * (sigma / r) ** 6)
+
+        def density(r):
+            return seen(r) / mpmath.sqrt(v0**2 + 2 * u(r0) - 2 * u(r))
+
+        return mpmath.quad(density, [r0, r_cut]) / time
+
+    at = [mpmath.mpf(q) for q in ("1.8", "1", "2.5", "1", "1")]
+    order = (0, 1, 2, 3, 4)
+    found = [mpmath.diff(average, at, tuple(int(k == n) for k in order)) for n in order]
+    names = NAMES
+    return {name: float(value) for name, value in zip(names, found, strict=True)}
+
+
+@pytest.mark.parametrize("w", ["u", "w"])
+def test_what_a_loss_sees_jump_moves_with_the_crossing(well, w):
+    """Energy and virial jump with the flip: by the radius their averages have no other derivative."""
+    simulation, axis = well[0].simulation, well[1]
+    steps = 2000
+    see = (lambda frame, *_: frame.potential) if w == "u" else (lambda frame, *_: frame.virial)
+    time = (steps + 1) * float(simulation.integrator.timestep)
+    exact = averages(w, time)
+    for every in (1, 4):
+        problem = Problem(simulation, Custom(see=see, every=every), steps)
+        got = along(EventAware()(problem, NAMES).gradient, axis)
+        plain = along(Symmetric()(problem, NAMES).gradient, axis)
+        assert plain["cutoff.radius"] == 0
+        for name, value in exact.items():
+            # frames are a rule of rectangles for the integral
+            assert got[name] == pytest.approx(value, abs=2e-3 * every * max(map(abs, exact.values()))), name
+        # what the crossing adds has no such error: its frame is as early as late
+        assert got["cutoff.radius"] == pytest.approx(exact["cutoff.radius"], rel=1e-5 if every == 1 else 2e-3)
+        tangent = Forward(saltation=True)(problem, ("cutoff.radius", "potential.sigma"))
+        for name, value in tangent.gradient.items():
+            assert float(value) == pytest.approx(got[name], rel=1e-11)
+
+
+def test_a_single_frame_that_jumps_is_told(well):
+    simulation = well[0].simulation
+    late = Custom(see=lambda frame, *_: frame.potential, first=20)
+    found = EventAware()(Problem(simulation, late, 20), ("potential.sigma",))
+    assert found.details["loss jumps"] and "single frames" in found.notes["potential.sigma"]
+    often = Custom(see=lambda frame, *_: frame.potential, every=2)
+    found = EventAware()(Problem(simulation, often, 20), ("potential.sigma",))
+    assert not found.details["loss jumps"] and not found.notes
+    speed = EventAware()(Problem(simulation, Custom(see=lambda f, *_: f.v[0, 0], first=20), 20), ("sigma",))
+    assert not speed.details["loss jumps"]

@@ -94,9 +94,9 @@ def test_findings_follow_the_numbers(tmp_path):
     left = judged(tmp_path / "e", methods=[{**methods[1], "details": details}])
     assert "16 % of the weight" in left["GRAZING"].text
 
-    loss = {"word": "potential", "about": "energy", "unit": "ε"}
-    assert judged(tmp_path / "h", loss=loss)["LOSS_JUMPS"].text.startswith("Symmetric and event-aware know")
-    assert "LOSS_JUMPS" not in judged(tmp_path / "i", loss=loss, energy_jump=0.0)
+    jumps = [{**one, "details": {**one["details"], "loss jumps": True}} for one in methods]
+    assert "no slope" in judged(tmp_path / "h", methods=jumps)["LOSS_JUMPS"].text
+    assert "LOSS_JUMPS" not in judged(tmp_path / "i", methods=methods)
 
     primal = {"first state": 3, "first decision": None, "says": "a bit differs from step 3 on"}
     departs = [{**methods[1], "details": {"primal": primal}}]

@@ -18,9 +18,6 @@ from mdnum.report.words import count, listed, many, number, percent
 _HEAVY, _SINGLE = 0.2, 3
 #: Share of the weight of all flips above which what the guard leaves out matters.
 _LEFT_OUT = 0.01
-#: Losses that jump at a flip, by what jumps with them; and methods that do not see it.
-_LOSS_JUMPS = {"potential": "energy_jump", "pressure": "force_jump"}
-_BLIND = ("event-aware", "symmetric", "unrolled", "epochs", "recursive", "forward", "ensemble")
 #: What takes a gradient further, by what limits it.
 _FURTHER = {
     "rounding": "or run in wider formats: --set precision.state=float64 and the like",
@@ -120,21 +117,17 @@ def _plain_at_a_jump(run: Question) -> Iterator[Finding]:
 
 
 def _loss_jumps(run: Question) -> Iterator[Finding]:
-    """A loss that itself jumps at a flip, which moves the momenta and the loss."""
-    summary = run.summary
-    word = summary["loss"]["word"]
-    jump = summary.get(_LOSS_JUMPS.get(word, ""))
-    blind = [one["method"] for one in summary["methods"] if one["method"] in _BLIND]
-    if not jump or not blind:
+    """A loss that itself jumps at a flip, in frames that no average is over."""
+    if not any(one["details"].get("loss jumps") for one in run.summary["methods"]):
         return
-    subject = listed(blind)
+    word = run.summary["loss"]["word"]
     yield Finding(
         "LOSS_JUMPS",
         "warning",
         f"the {word} itself jumps when a pair crosses its cutoff",
-        f"{subject[:1].upper()}{subject[1:]} know{'s' * (len(blind) == 1)} what a flip does to the motion "
-        "and not that it changes the loss at once, so the derivative by the cutoff is far off.",
-        "Compare with --methods smoothed-differences,boundary, or take a cutoff without a jump: "
+        "It is looked at in single frames: what a flip does to the motion is part of the gradient, and that "
+        "it changes the loss at once has no slope.",
+        "Average over frames, compare with --methods smoothed-differences, or take a cutoff without a jump: "
         "--set cutoff.kind=switched.",
     )
 
