@@ -53,6 +53,7 @@ def agree(ours, theirs):
         assert np.max(np.abs(ours[name] - value)) <= 1e-9 * scale, name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("jumps", [False, True])
 def test_tangents_agree_with_the_reverse_pass(hot, forward, backward, jumps):
     names = resolve(hot.simulation, WORDS)
@@ -63,6 +64,7 @@ def test_tangents_agree_with_the_reverse_pass(hot, forward, backward, jumps):
     assert (theirs["cutoff.radius"] != 0) == jumps
 
 
+@pytest.mark.slow
 def test_what_flips_add_is_the_sum_of_their_weights(hot, forward, backward):
     names = resolve(hot.simulation, WORDS)
     (plain, _), (parts, found) = backward[False], backward[True]
@@ -78,6 +80,7 @@ def test_what_flips_add_is_the_sum_of_their_weights(hot, forward, backward):
     agree(gathered(hot.simulation, names, np.asarray(added)), difference)
 
 
+@pytest.mark.slow
 def test_the_tangent_of_a_state_is_that_of_differences(hot, forward):
     """Of the last positions by sigma, against two runs that make the same decisions."""
 
