@@ -183,7 +183,11 @@ class Tape:
                     remedy="Use a smaller time step, or a start without overlapping atoms",
                 )
             if segment.closes == "displacement" and segment.moved > simulation.rule.skin:
-                raise NumericalError(f"a list missed pairs at step {segment.last}", remedy="Widen the skin")
+                raise NumericalError(
+                    f"a list missed pairs at step {segment.last}: an atom moved {segment.moved:.3g} since it "
+                    f"was built, and the skin is {simulation.rule.skin:.3g}",
+                    remedy="Use a smaller time step if one step moves atoms that far, else a wider skin",
+                )
             self._ledgers.append(None if recorder is None else recorder.flips(segment))
             stretch = stretch_of(segment, start, self._ledgers[-1])
             self._observe(stretch)

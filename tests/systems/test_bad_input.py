@@ -136,7 +136,7 @@ def test_a_mistake_in_the_file(folder: Path, old: str, new: str, line: int | Non
         ("dynamics.kind", "langevin", ["key 'temperature' missing"]),
         ("potential.kind", "morse", ["depth", "missing"]),
         ("precision.force", "half", ["--set precision.force", '"float32", "bfloat16" or "float16"']),
-        ("precision.state", "float16", ["--set precision.state", '"float64", "float32" or "lattice"', "move no atom"]),
+        ("precision.state", "float16", ["--set precision.state", '"float32" or "lattice"', "move no atom"]),
     ],
 )
 def test_a_mistake_on_the_command_line(folder: Path, key: str, value: str, words: list[str]):
