@@ -162,7 +162,7 @@ def test_a_hundred_thousand_steps_back_to_the_start(bath):
     simulation = small(**({"dynamics": gentle} if bath else {}))
     assert simulation.lattice is not None
     # with friction a step takes three times as long, and nothing more is to be seen
-    steps = 20_000 if bath else 100_000
+    steps = 5_000 if bath else 100_000
     tape = ReversibleTape(simulation, FinalProjection(), steps)
     rows = 0
     for stretch in tape.backward():

@@ -111,7 +111,7 @@ def test_the_search_of_jax_md_finds_the_same(configuration):
 @pytest.mark.slow
 @pytest.mark.jax_md
 @pytest.mark.filterwarnings("ignore:scatter inputs")
-@settings(max_examples=70)
+@settings(max_examples=40)
 @given(configurations())
 def test_the_search_of_jax_md_finds_the_same_in_many_boxes(configuration):
     positions, cell, radius = configuration
