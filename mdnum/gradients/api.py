@@ -7,6 +7,7 @@ reverse rule of its own, and whatever stands before or behind it is differentiat
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -43,6 +44,9 @@ def value_and_grad(
     Raises:
         InputError: no such parameter or method, or it does not apply; the loss is not a scalar.
 
+    Warns:
+        UserWarning: a derivative that is exactly zero, with the reason.
+
     Error: that of the method.
     """
     method = by_word(method) if isinstance(method, str) else method
@@ -51,6 +55,7 @@ def value_and_grad(
 
     def function(values: Values | None = None):
         found = method(problem.at(_in_full(problem, values or {}, full)), full)
+        _warn(found)
         gradient = {asked[name]: found.gradient[name] for name in full}
         return ((found.value, found) if has_aux else found.value), gradient
 
@@ -100,6 +105,7 @@ def differentiable(
 
     def forward(values: Values):
         found = method(at(values), full)
+        _warn(found)
         if told is not None:
             told(found)
         by_name = {}
@@ -113,6 +119,14 @@ def differentiable(
 
     loss.defvjp(forward, backward)
     return loss
+
+
+def _warn(found: Gradient) -> None:
+    """Say of a derivative that is exactly zero why it is: a training loop would not look at notes."""
+    for name, value in found.gradient.items():
+        if not np.any(np.asarray(value)):
+            note = found.notes.get(name, "exactly 0 in this run")
+            warnings.warn(f"{found.method} by {name}: {note}", UserWarning, stacklevel=3)
 
 
 def _in_full(problem: Problem, values: Values, full: Sequence[str]) -> dict[str, np.ndarray]:

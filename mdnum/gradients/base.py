@@ -144,7 +144,9 @@ def independent(problem: Problem, gradient: Mapping[str, Any], *, saltation: boo
     jumps = bool(np.any(problem.simulation.jumps()[1] != 0))
     for name, value in gradient.items():
         if not np.any(np.asarray(value)):
-            notes[name] = "no step that ran depends on it on the way to the loss"
+            notes[name] = (
+                "exactly 0 in this run: no step on the way to the loss depends on it, or what does cancels"
+            )
             if name == "cutoff.radius" and jumps and not saltation:
                 notes[name] = (
                     "exactly 0 because it only decides which pairs interact, and decisions are not "

@@ -14,10 +14,13 @@ from mdnum.errors import InputError
 from mdnum.gradients import parameters
 from mdnum.gradients.base import Gradient, Problem, Progress, check
 from mdnum.gradients.noise import choose_step
+from mdnum.precision.policy import LATTICE
 
 #: The widest step that is tried, and the spacing of the values that the noise is estimated from in rounding
 #: errors of the parameter, as shares of it.
 _WIDEST, _SPACING = 1e-4, 64.0
+#: Relative rounding of a state in whole numbers.
+_LATTICE = 2.0**-30
 #: About how many runs it takes to choose a step: for the noise, and for one or two steps.
 _CHOOSING = 15
 
@@ -138,9 +141,16 @@ class FiniteDifferences:
             gradient[name] = np.asarray(found.value)
             details["error"][name], details["step"][name] = error, found.step
             details["table"][name] = found.table
-        return Gradient(self.name, self.says, problem.value(), gradient, {}, details)
+        notes = {
+            name: "the loss was the same at all shifts"
+            for name, value in gradient.items()
+            if not np.any(value)
+        }
+        return Gradient(self.name, self.says, problem.value(), gradient, notes, details)
 
 
 def _rounding(problem: Problem) -> float:
     """Relative spacing of the numbers that a parameter is kept in: a shift below it is none."""
-    return float(jnp.finfo(problem.simulation.policy.dtype("force")).eps)
+    policy = problem.simulation.policy
+    # in whole numbers an impulse is rounded to a share of its unit, however exact the parameter
+    return _LATTICE if policy.state == LATTICE else float(jnp.finfo(policy.dtype("force")).eps)

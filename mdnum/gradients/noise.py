@@ -13,6 +13,8 @@ from jaxtyping import Float
 _AGREE = 4.0
 #: What a step is shrunk to at most at a time: a first truncation may be anything.
 _MOST_SHRINK = 1e-3
+#: How often the spacing is widened where all values are the same.
+_WIDENINGS = 4
 #: Values of which a noise is estimated.
 _POINTS = 7
 
@@ -78,7 +80,14 @@ def choose_step(f: Callable[[float], float], x: float, first: float, spacing: fl
     Error: the truncation is estimated from differences over one and two steps, so a function that jumps in
     between has one that is too small by chance; extrapolate and compare.
     """
-    noise = noise_of(np.array([f(x + k * spacing) for k in range(_POINTS)]))
+    values = np.full(_POINTS, f(x))
+    for _ in range(_WIDENINGS):
+        values = np.array([f(x + k * spacing) for k in range(_POINTS)])
+        if np.ptp(values) > 0:
+            break
+        # what a rounding hides has a noise that was not seen, not none
+        spacing *= 64
+    noise = noise_of(values)
     # a value has at least the rounding error of its last operation
     noise = max(noise, float(np.finfo(np.float64).eps) * abs(f(x)))
     size = first

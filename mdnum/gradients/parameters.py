@@ -106,7 +106,10 @@ def names(simulation: Simulation) -> tuple[str, ...]:
             found += ["cutoff.onset"]
     else:
         found = [f"potential.{name}" for name in _quantities_of(simulation.model)]
-    found += ["dynamics.timestep", "dynamics.temperature"]
+    found += ["dynamics.timestep"]
+    # without one there is nothing that a temperature would scale
+    if simulation.system.spec.dynamics.temperature:
+        found += ["dynamics.temperature"]
     if isinstance(simulation.integrator, Langevin):
         found += ["dynamics.friction"]
     return (*found, "initial.positions", "initial.velocities", "box.scale")

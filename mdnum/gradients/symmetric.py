@@ -121,12 +121,19 @@ class EventAware:
             progress=in_phase(progress, "reverse pass"),
         )
         gradient = {name: parameters.gradient(simulation, parts, name) for name in names}
-        notes = independent(problem, gradient, saltation=True)
-        unseen = bool(np.any(simulation.jumps())) and tape.jumps_unseen
-        if unseen:
-            notes |= dict.fromkeys(names, _SINGLE_FRAMES)
-        details = {"guard": guard, "loss jumps": unseen, **weights(found)}
+        notes, details = aware(problem, tape, gradient, guard, found)
         return Gradient(self.name, self.says, tape.value, gradient, notes, details)
+
+
+def aware(
+    problem: Problem, tape: Tape, gradient: Mapping[str, Any], guard: float, found: Sequence[Crossings]
+) -> tuple[dict[str, str], dict[str, Any]]:
+    """Notes and details of an event-aware gradient."""
+    notes = independent(problem, gradient, saltation=True)
+    unseen = bool(np.any(problem.simulation.jumps())) and tape.jumps_unseen
+    if unseen:
+        notes |= dict.fromkeys(gradient, _SINGLE_FRAMES)
+    return notes, {"guard": guard, "loss jumps": unseen, **weights(found)}
 
 
 def weights(found: Sequence[Crossings]) -> dict[str, Any]:

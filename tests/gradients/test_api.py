@@ -58,6 +58,14 @@ def test_jax_differentiates_through_a_users_own_tree(problem):
         assert float(ours) == pytest.approx((shifted(1e-5) - shifted(-1e-5)) / 2e-5, rel=1e-5)
 
 
+def test_a_derivative_that_is_exactly_zero_is_never_silent(problem):
+    hard = Problem(problem.simulation.with_cutoff("hard"), problem.loss, STEPS)
+    with pytest.warns(UserWarning, match="symmetric by cutoff.radius: exactly 0"):
+        value_and_grad(hard, ("r_cut", "sigma"), "symmetric")()
+    with pytest.warns(UserWarning, match="cutoff.radius"):
+        jax.grad(differentiable(hard, ("r_cut",), "symmetric"))({"r_cut": jnp.asarray(2.2)})
+
+
 def test_what_cannot_be_traced_or_named_is_refused(problem):
     loss = differentiable(problem, ("sigma",), "symmetric")
     with pytest.raises(InputError, match="outside of jit"):

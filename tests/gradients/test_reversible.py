@@ -134,6 +134,9 @@ def test_derivatives_are_those_of_differences():
     assert ours.value == theirs.value and ours.details["returned to the start"]
     for name, value in theirs.gradient.items():
         assert float(ours.gradient[name]) == pytest.approx(float(value), rel=1e-4), name
+    # left alone they must not fall between two whole numbers
+    (alone,) = FiniteDifferences()(asked, ("epsilon",)).gradient.values()
+    assert float(alone) == pytest.approx(float(ours.gradient["potential.epsilon"]), rel=1e-3)
     floats = Symmetric()(replace(asked, simulation=asked.simulation.smooth), (*names, "x0", "v0"))
     for name, value in floats.gradient.items():
         assert np.allclose(ours.gradient[name], value, rtol=0, atol=1e-6 * np.abs(value).max()), name

@@ -198,6 +198,8 @@ def _meaning(
             name, one if kind == _VALUES else reference, apart, scale, relative, jumps, {kind, against}
         )
     # one of the steps, the other with the times of the flips
+    if any(found.details.get("crossings") == 0 for found in (one, reference)):
+        return "rounding", "No pair crossed its cutoff: what is left is rounding around zero."
     if jumps:
         return "missing saltation", (
             f"{one.method if kind == _STEPS else reference.method} holds decisions fixed; "

@@ -22,7 +22,7 @@ from mdnum.gradients.diagnose.scaling import ScalingWatch
 from mdnum.gradients.diagnose.spectrum import spectrum
 from mdnum.gradients.diagnose.trust import TOLERANCE, trust
 from mdnum.gradients.registry import METHODS, by_word
-from mdnum.gradients.symmetric import GUARD, EventAware, Symmetric, weights
+from mdnum.gradients.symmetric import GUARD, EventAware, Symmetric, aware
 
 #: Parts of a diagnosis by their words; `edges` takes some dozens of runs and is asked for by name.
 PARTS = ("growth", "agreement", "flips", "trust", "spectrum", "detective", "scaling")
@@ -77,14 +77,15 @@ def diagnose(
     saltation = isinstance(base, EventAware)
     if base is not None:
         growth_watch = GrowthWatch(problem.simulation, full, problem.steps)
-        scaling_watch = ScalingWatch(problem.steps, format)
+        # its counts grow with the steps
+        scaling_watch = ScalingWatch(problem.steps, format) if "scaling" in parts else None
         made = passed(
             problem,
             full,
             saltation=saltation,
             guard=base.guard if isinstance(base, EventAware) else GUARD,
             budget=budget,
-            watches=[growth_watch, scaling_watch],
+            watches=[growth_watch, *([] if scaling_watch is None else [scaling_watch])],
             progress=progress,
         )
         known[base.name] = _as_method(base, problem, made)
@@ -97,7 +98,7 @@ def diagnose(
         growing = growth_watch.result(made.gradient)
         if "growth" in parts:
             found["growth"] = growing
-        if "scaling" in parts:
+        if scaling_watch is not None:
             found["scaling"] = scaling_watch.result()
         if not saltation and "flips" in parts:
             failed["flips"] = f"only event-aware knows what flips add{f': {why}' if why else ''}"
@@ -195,12 +196,11 @@ def _base(
 
 def _as_method(method: EventAware | Symmetric, problem: Problem, made: Passed) -> Gradient:
     """What the method itself would say of this pass."""
-    aware = isinstance(method, EventAware)
-    if aware:
-        details = {"guard": made.guard, **weights(made.crossings)}
+    if isinstance(method, EventAware):
+        notes, details = aware(problem, made.tape, made.gradient, made.guard, made.crossings)
     else:
         details = {"stretches": len(made.tape), "made again": made.tape.replayed}
-    notes = independent(problem, made.gradient, saltation=aware)
+        notes = independent(problem, made.gradient, saltation=False)
     return Gradient(method.name, method.says, made.tape.value, made.gradient, notes, details)
 
 

@@ -165,6 +165,8 @@ def _sentence(word: str, size, rate: float, error: float, per_time: float, time:
         return f"{told}, by {rate:.3g} ± {error:.1g} a step{unit}, while the run itself stayed bounded."
     if word == WORDS[2]:
         return f"{told}, and the run itself did not stay bounded."
+    if not np.isfinite(rate):
+        return f"{told}; too few steps to tell whether that goes on."
     return f"{told}, no faster than in proportion to the steps."
 
 

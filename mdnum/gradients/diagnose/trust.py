@@ -152,7 +152,9 @@ def trust(
     if limited:
         says = f"Trusted up to {horizon} of {problem.steps} steps; the limit is {limited}. {met[0].says}"
     else:
-        says = f"Trusted over all {problem.steps} steps: none of the limits that were looked at was met."
+        free = " or ".join(one.what for one in looked)
+        beside = "" if replicas else "; whether other starts agree was not looked at"
+        says = f"Trusted over all {problem.steps} steps: not limited by {free}{beside}."
     return Trust(horizon, limited, tuple(limits), tolerance, shadow.words, at, apart, scatter, says)
 
 

@@ -102,6 +102,8 @@ def _plain_at_a_jump(run: Question) -> Iterator[Finding]:
     # averages over states know no motion, and a switched twin has no jump
     without = {"boundary", "reweighting", "surrogate"}
     asked = {one["method"] for one in summary["methods"]}
+    # differences decide anew at each shift: between shifts that flip nothing they are those of the steps
+    without |= {"finite-differences", "shadow-differences"}
     methods = [one["method"] for one in summary["methods"] if one["method"] not in without]
     if summary.get("force_jump") and methods and not aware & {*asked, summary["reference"]}:
         jump = f"{number(summary['force_jump'])} {run.units.energy}/{run.units.length}"
@@ -234,12 +236,14 @@ def _no_dependence(run: Question) -> Iterator[Finding]:
         sizes = [size(method["gradient"].get(name)) for method in run.summary["methods"]]
         if any(sizes) or None in sizes:
             continue
-        notes = [method["notes"].get(name) for method in run.summary["methods"]]
+        # what the reference says first: it leaves nothing out
+        ranked = sorted(run.summary["methods"], key=lambda one: one["method"] != run.summary["reference"])
+        notes = [method["notes"].get(name) for method in ranked]
         yield Finding(
             "NO_DEPENDENCE",
             "warning",
             f"no method finds a dependence on {name}",
-            f"The derivative is exactly 0: {next(filter(None, notes), 'nothing that ran used it')}.",
+            f"By {name}: {next(filter(None, notes), 'exactly 0, nothing that ran used it')}.",
             "Look at another loss, or run longer.",
         )
 
