@@ -81,6 +81,7 @@ def run(
     if check:
         say("check")
         _compare(folder, result)
+        _beside_float64(folder, result)
     if report:
         say("report")
     _judge(folder, report)
@@ -102,6 +103,33 @@ def _compare(folder: RunFolder, result: RunResult) -> None:
     summary = folder.summary
     summary["ase"] = compared.worst
     summary["findings"] = [*summary["findings"], *compared.findings]
+    folder.write_summary(summary)
+
+
+#: Steps of a run in whole numbers that are made in float64 too.
+_BESIDE = 2000
+
+
+def _beside_float64(folder: RunFolder, result: RunResult) -> None:
+    """Puts how well a run in whole numbers keeps its energy into the summary, and the same in float64."""
+    import numpy as np
+
+    from mdnum.md.integrators import Langevin
+    from mdnum.rollout.engine import FAILURES, Engine
+
+    simulation, summary = result.simulation, folder.summary
+    if simulation.lattice is None or isinstance(simulation.integrator, Langevin):
+        return
+    steps = min(int(summary["steps"]), _BESIDE)
+    there = []
+    for segment in Engine(simulation.smooth, steps).segments():
+        if segment.closes in FAILURES:
+            return
+        there.append(segment.rows_of("potential") + segment.rows_of("kinetic"))
+    ours = np.asarray(folder.read("series")["total"])[: steps + 1]
+    for key, energy in (("energy_std", ours), ("energy_std_float64", np.concatenate(there))):
+        summary["lattice"][key] = float(np.std(energy)) / simulation.atoms
+    summary["lattice"]["energy_steps"] = steps
     folder.write_summary(summary)
 
 
