@@ -25,7 +25,7 @@ from mdnum.gradients.loops import over_rows
 from mdnum.gradients.losses import Frame
 from mdnum.gradients.pairs import FORCE, MODEL, SCALE, pull_back
 from mdnum.gradients.parameters import Cotangents, quantities
-from mdnum.gradients.tape import Stretch, Tape, frame_of, rows_of
+from mdnum.gradients.tape import Stretch, Tape, frame_of, rows_of, unsorted
 from mdnum.md.integrators import Integrator
 from mdnum.md.manyforce import ManyBodyForce
 from mdnum.md.pairforce import PairForce
@@ -206,10 +206,6 @@ def _is_number(leaf: Any) -> bool:
     return eqx.is_inexact_array(leaf)
 
 
-def _unsorted(a, order):
-    return jnp.zeros_like(a).at[:, order].set(a)
-
-
 @partial(jax.jit, static_argnames=("wanted", "traced"))
 def transposed(
     force: PairForce | ManyBodyForce,
@@ -347,4 +343,4 @@ def transposed(
         return after, (weights, trace)
 
     carry, by_row = over_rows(step, carry, (rows, bits, seen, crossed), used, backward=True)
-    return carry._replace(x=_unsorted(carry.x, order), v=_unsorted(carry.v, order)), by_row
+    return carry._replace(x=unsorted(carry.x, order), v=unsorted(carry.v, order)), by_row

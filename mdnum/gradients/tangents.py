@@ -24,7 +24,7 @@ from mdnum.gradients.directions import Column, Direction, columns_of, directions
 from mdnum.gradients.loops import over_rows
 from mdnum.gradients.losses import Frame
 from mdnum.gradients.parameters import quantities, with_quantities
-from mdnum.gradients.tape import Stretch, Tape, frame_of, rows_of
+from mdnum.gradients.tape import Stretch, Tape, frame_of, rows_of, unsorted
 from mdnum.md.decide import Tables
 from mdnum.md.integrators import Integrator
 from mdnum.md.manyforce import ManyBodyForce
@@ -130,7 +130,7 @@ def tangents(
             jnp.asarray(float(saltation)),
             states,
         )
-        carry = carry._replace(x=_unsorted(carry.x, order), v=_unsorted(carry.v, order))
+        carry = carry._replace(x=unsorted(carry.x, order), v=unsorted(carry.v, order))
         x, v = (np.asarray(part)[: stretch.rows] for part in by_row) if states else (None, None)
         moved = None if met is None else met.gathered(np.moveaxis(np.asarray(dr), 1, 2))
         cuts = None if met is None else np.asarray(along.r_cut).T[met.kind]
@@ -150,10 +150,6 @@ def by_column(tape: Tape, total: Any) -> Float[np.ndarray, "columns"]:
 
 def _empty(total: Any, columns: int) -> Any:
     return jax.tree.map(lambda one: jnp.zeros((columns, *one.shape), one.dtype), total)
-
-
-def _unsorted(a, order):
-    return jnp.zeros_like(a).at[..., order].set(a)
 
 
 def _evaluate(force: PairForce | ManyBodyForce, x, tables: Tables, told, values, matrix) -> Forces:
@@ -209,7 +205,7 @@ def _stretch(
 
     def look(row, total, x, v, potential, virial, along):
         frame = frame_of(row, order, around.matrix)
-        whole = frame._replace(x=_unsorted(x, order), v=_unsorted(v, order))
+        whole = frame._replace(x=unsorted(x, order), v=unsorted(v, order))
         moving = whole._replace(step=_still(frame.step), potential=potential, virial=virial)
         start = Frame(_still(origin.step), along.x, along.v, jnp.zeros(()), jnp.zeros(()))
         # of a cube with the box: the volume goes with the trace of what moves the lattice vectors

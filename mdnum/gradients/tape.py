@@ -267,15 +267,16 @@ def rows_of(stretch: Stretch):
     return (stretch.steps, stretch.x, stretch.v, stretch.images, stretch.potential, stretch.virial)
 
 
+def unsorted(a: Float[Any, "*rest atoms"], order: Int[Any, "atoms"]) -> Float[Array, "*rest atoms"]:
+    """An array over the atoms of a list, in the user's order."""
+    return jnp.zeros_like(a).at[..., order].set(a)
+
+
 def frame_of(row, order: Int[Array, "atoms"], matrix: Float[Array, "3 3"]) -> Frame:
     """A row in the user's order, without the faces of the box."""
     step, x, v, images, potential, virial = row
-
-    def unsorted(a):
-        return jnp.zeros_like(a).at[:, order].set(a)
-
     whole = x + (matrix.T @ images.astype(matrix.dtype)).astype(x.dtype)
-    return Frame(step, unsorted(whole), unsorted(v), potential, virial)
+    return Frame(step, unsorted(whole, order), unsorted(v, order), potential, virial)
 
 
 @jax.jit
