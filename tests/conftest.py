@@ -49,6 +49,7 @@ _CHECKED = [
     "mdnum.rollout",
     "mdnum.forks",
     "mdnum.gradients",
+    "mdnum.trajectories",
     "mdnum.doctor",
 ]
 typing_rules.keep_numba_whole()

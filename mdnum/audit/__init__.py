@@ -1,0 +1,1 @@
+"""Anybody's potential: is this ASE calculator safe to run and to differentiate?"""

@@ -1,0 +1,75 @@
+"""Flips between consecutive frames as columns, and the pairs that were inside at the first frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+
+@dataclass(frozen=True)
+class Members:
+    """The pairs inside at one frame, sorted by (i, j, rank), each once.
+
+    Attributes:
+        i: first atom, an index into the file's atoms. Where a rule is symmetric, i <= j.
+        j: second atom; i == j for an atom and an image of itself.
+        rank: 0 for the nearest image of j, 1 for the next, and so on. A name for images that wrapping an
+            atom back into its box does not change.
+        distance: length.
+    """
+
+    i: Int[np.ndarray, "pairs"]
+    j: Int[np.ndarray, "pairs"]
+    rank: Int[np.ndarray, "pairs"]
+    distance: Float[np.ndarray, "pairs"]
+
+    def __len__(self) -> int:
+        return len(self.i)
+
+
+@dataclass(frozen=True)
+class Flips:
+    """A row per decision that differs from the frame before, sorted by (frame, i, j, rank).
+
+    Attributes:
+        frame: position among the frames looked at (not the number in the file); never 0.
+        i: first atom, as in `Members`.
+        j: second atom.
+        rank: image, as in `Members`.
+        entered: whether the pair is inside at `frame`.
+        distance: at `frame`, length.
+        before: distance at the frame before, length; nan where it is not known.
+        margin: signed distance to the threshold at `frame`, positive inside, length.
+        margin_before: the same at the frame before; nan where it is not known.
+        bound: how far a margin can be off through the file's resolution and rounding, length.
+        ambiguous: one of the two margins is within the bound: the file cannot tell that the flip happened.
+    """
+
+    frame: Int[np.ndarray, "flips"]
+    i: Int[np.ndarray, "flips"]
+    j: Int[np.ndarray, "flips"]
+    rank: Int[np.ndarray, "flips"]
+    entered: Bool[np.ndarray, "flips"]
+    distance: Float[np.ndarray, "flips"]
+    before: Float[np.ndarray, "flips"]
+    margin: Float[np.ndarray, "flips"]
+    margin_before: Float[np.ndarray, "flips"]
+    bound: Float[np.ndarray, "flips"]
+    ambiguous: Bool[np.ndarray, "flips"]
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Flips]) -> Flips:
+        """The rows of parts, one after the other; at least one part."""
+        return cls(**{one.name: np.concatenate([getattr(p, one.name) for p in parts]) for one in fields(cls)})
+
+    @classmethod
+    def none(cls) -> Flips:
+        """No row."""
+        whole, real, yes = np.zeros(0, np.int64), np.zeros(0), np.zeros(0, bool)
+        return cls(whole, whole, whole, whole, yes, real, real, real, real, real, yes)
