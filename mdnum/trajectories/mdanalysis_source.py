@@ -1,0 +1,229 @@
+"""Trajectories that MDAnalysis reads, and the tables of atoms that its topologies hold."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from mdnum.errors import InputError
+from mdnum.trajectories.frame import Box, Frame
+from mdnum.trajectories.slices import chosen
+from mdnum.trajectories.source import AtomTable, Trajectory, UnreadableFrame
+
+# what readers raise on files that end early or hold something else
+_UNREADABLE = (OSError, EOFError, ValueError, RuntimeError, StopIteration, IndexError, KeyError, TypeError)
+
+
+class MDAnalysisTrajectory(Trajectory):
+    """A file behind an MDAnalysis Universe. Coordinates pass through float32 there, whatever it holds."""
+
+    reader = "MDAnalysis"
+    bits = 32
+
+    def __init__(self, path: Path, topology: str | Path | None, frames: slice, format: str | None = None):
+        self.path, self.slice = path, frames
+        self._universe, said = open_universe(path, topology, format)
+        self.table = table_of(self._universe.atoms)
+        trajectory = self._universe.trajectory
+        self.format = str(trajectory.format if isinstance(trajectory.format, str) else trajectory.format[0])
+        self.length = "Å"
+        self.time = "frame" if _has_no_times(trajectory, said) else "ps"
+        self.notes = tuple(_notes(self.table))
+
+    @property
+    def in_file(self) -> int | None:
+        return int(self._universe.trajectory.n_frames)
+
+    @property
+    def universe(self) -> Any:
+        return self._universe
+
+    def frames(self) -> Iterator[Frame]:
+        trajectory = self._universe.trajectory
+        at = None
+        for number in chosen(self.slice, self.in_file):
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                try:
+                    # some formats go forward only, so that the next frame is asked for as the next
+                    step = at is not None and number == at + 1 and trajectory.ts.frame == at
+                    ts = trajectory.next() if step else trajectory[number]
+                    frame = frame_of(ts, number, self.time == "frame")
+                except _UNREADABLE as error:
+                    raise UnreadableFrame(
+                        f"frame {number} cannot be read ({first_line(error)})",
+                        frame=number,
+                        where=str(self.path),
+                    ) from error
+            at = number
+            yield frame
+
+
+def frame_of(ts: Any, number: int, untimed: bool = False) -> Frame:
+    """A frame from an MDAnalysis timestep, copied."""
+    return Frame(
+        index=number,
+        time=float(number) if untimed else float(ts.time),
+        positions=np.array(ts.positions, np.float64),
+        box=box_of(ts.dimensions),
+        velocities=np.array(ts.velocities, np.float64) if ts.has_velocities else None,
+    )
+
+
+def box_of(dimensions: Float[np.ndarray, "6"] | None) -> Box:
+    """The box with these lengths and angles: a along x, b in the xy plane, as MDAnalysis has it.
+
+    Args:
+        dimensions: lengths in Å and angles in degrees; None where the frame has no box. An axis of length 0
+            with right angles does not repeat.
+
+    Error: MDAnalysis keeps lengths and angles in float32: lattice vectors are off by 1e-7 of themselves.
+    """
+    from MDAnalysis.lib.mdamath import triclinic_vectors
+
+    if dimensions is None or not np.any(dimensions):
+        return Box()
+    lengths, angles = np.asarray(dimensions[:3], np.float64), np.asarray(dimensions[3:], np.float64)
+    if (lengths == 0).any() and (angles == 90).all():
+        return Box(np.diag(lengths), lengths > 0)
+    matrix = np.asarray(triclinic_vectors(dimensions, dtype=np.float64), np.float64)
+    if not matrix.any():
+        # lengths and angles that no box has: left for whoever needs the box to refuse
+        matrix = np.full((3, 3), np.nan)
+    return Box(matrix, np.ones(3, bool))
+
+
+def open_universe(
+    path: Path, topology: str | Path | None, format: str | None = None
+) -> tuple[Any, list[str]]:
+    """A Universe of a trajectory, and the warnings that opening it gave.
+
+    Raises:
+        InputError: nobody reads it, or it has another number of atoms than its topology.
+    """
+    import MDAnalysis
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        if topology is None:
+            universe = _opened(path, lambda: MDAnalysis.Universe(str(path), format=format), path)
+        else:
+            universe = _opened(Path(topology), lambda: MDAnalysis.Universe(str(topology)), path)
+            atoms = len(universe.atoms)
+            if (other := atoms_in(path, atoms, format)) not in (None, atoms):
+                raise InputError(
+                    f"the topology {Path(topology).name} has {atoms:,} atoms and the trajectory {other:,}",
+                    remedy="Give the topology that the trajectory was written with, or a selection of it",
+                    where=str(path),
+                )
+            _opened(path, lambda: universe.load_new(str(path), format=format), path)
+        if len(universe.trajectory) == 0:
+            raise InputError("the file holds no frame", remedy="Check how it was written", where=str(path))
+    return universe, [str(one.message) for one in caught]
+
+
+def _opened(file: Path, act: Any, trajectory: Path) -> Any:
+    try:
+        return act()
+    except ImportError as error:
+        raise InputError(
+            f"reading it needs a package that is not installed ({first_line(error)})",
+            remedy="Install the package, or convert the file to xtc or extxyz",
+            where=str(file),
+        ) from error
+    except _UNREADABLE as error:
+        hint = "Check that the file is whole and of the kind its name says"
+        if file == trajectory:
+            hint += "; a trajectory without names of atoms needs its topology (-s TOPOLOGY)"
+        raise InputError(
+            f"MDAnalysis cannot open it ({first_line(error)})", remedy=hint, where=str(file)
+        ) from error
+
+
+def atoms_in(path: Path, topology: int, format: str | None = None) -> int | None:
+    """Atoms in a trajectory; None where its format does not tell.
+
+    Args:
+        topology: atoms of its topology, which some readers want to know first.
+    """
+    from MDAnalysis.core._get_readers import get_reader_for
+
+    try:
+        reader: Any = get_reader_for(str(path), format=format)
+        return int(reader.parse_n_atoms(str(path), n_atoms=topology))
+    except Exception:
+        # a format without that question, or a file that opening will say more about
+        return None
+
+
+def table_of(atoms: Any) -> AtomTable:
+    """What a topology says of its atoms.
+
+    Args:
+        atoms: an MDAnalysis AtomGroup.
+    """
+    count = len(atoms)
+    has = {name: hasattr(atoms, name) for name in ("names", "types", "elements", "resnames", "resids")}
+    names = np.array(atoms.names, dtype=object) if has["names"] else None
+    types = np.array([str(one) for one in atoms.types], dtype=object) if has["types"] else None
+    elements = np.array(atoms.elements, dtype=object) if has["elements"] else np.full(count, "", dtype=object)
+    guessed = False
+    if names is not None and any(not one for one in elements):
+        from MDAnalysis.guesser.tables import SYMB2Z
+
+        found = {one: _element(str(one), SYMB2Z) for one in set(names)}
+        rest = types if types is not None else names
+        elements = np.array(
+            [e or found[n] or str(t) for e, n, t in zip(elements, names, rest, strict=True)], dtype=object
+        )
+        guessed = any(found.values())
+    elif any(not one for one in elements):
+        elements = types if types is not None else np.full(count, "X", dtype=object)
+    named = names is not None or types is not None or has["elements"]
+    return AtomTable(
+        names=names if names is not None else elements,
+        species=elements,
+        residue_names=(
+            np.array([str(one) for one in atoms.resnames], dtype=object)
+            if has["resnames"]
+            else np.full(count, "", dtype=object)
+        ),
+        residue_ids=np.array(atoms.resids if has["resids"] else np.zeros(count), np.int64),
+        residues=np.array(atoms.resindices, np.int64),
+        named=named,
+        guessed=guessed,
+    )
+
+
+def _element(name: str, known: dict[str, int]) -> str:
+    """The element in an atom's name; "" where there is none ("OW1" -> "O", "CL" -> "Cl", "CA" -> "C")."""
+    from MDAnalysis.guesser.default_guesser import DefaultGuesser
+
+    found = str(DefaultGuesser(None).guess_atom_element(name)).capitalize()
+    return found if found in known else ""
+
+
+def _has_no_times(trajectory: Any, said: list[str]) -> bool:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        _ = trajectory.dt
+    return any("no dt information" in one for one in [*said, *(str(w.message) for w in caught)])
+
+
+def _notes(table: AtomTable) -> Iterator[str]:
+    yield "MDAnalysis hands every coordinate over in float32, whatever the file stores."
+    if not table.named:
+        yield "The file says how many atoms there are and nothing else; names and elements need a topology."
+    elif table.guessed:
+        yield "Elements are guessed from the names of the atoms."
+
+
+def first_line(error: BaseException) -> str:
+    """What an error says, in a line."""
+    text = str(error).strip().splitlines()
+    return text[0].rstrip(".") if text else type(error).__name__

@@ -1,0 +1,214 @@
+"""Trajectories of any code as frames in float64: the contract, and which reader a file gets.
+
+Positions are those of the file: nothing is wrapped, made whole or centered. Readers differ in what they keep:
+ASE's and mdnum's own keep every digit, MDAnalysis's narrow every coordinate to float32 (`Trajectory.bits`).
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Int
+
+from mdnum.errors import InputError
+from mdnum.trajectories.frame import Frame
+from mdnum.trajectories.slices import parse_slice, split_path
+
+
+class UnreadableFrame(InputError):
+    """A frame in the middle of a file cannot be read; those before it were given out.
+
+    Args:
+        frame: its number in the file, from 0.
+    """
+
+    def __init__(self, message: str, *, frame: int, where: str, remedy: str | None = None):
+        super().__init__(
+            message,
+            remedy=remedy
+            or f"The frames before it were read; to go without the rest add @:{frame} to the path",
+            where=where,
+        )
+        self.frame = frame
+
+
+@dataclass(frozen=True)
+class AtomTable:
+    """What a topology says of every atom, one entry an atom.
+
+    Attributes:
+        names: as in the file ("OW"); the species where it has no names.
+        species: chemical element where it is known or can be guessed, else the file's atom type.
+        residue_names: "" where there are none.
+        residue_ids: number of the residue as the file has it; 0 where there are none.
+        residues: index of the atom's residue from 0, different for two residues of one number.
+        named: False where the file says nothing of its atoms but how many they are.
+        guessed: whether the species were guessed from names.
+    """
+
+    names: np.ndarray
+    species: np.ndarray
+    residue_names: np.ndarray
+    residue_ids: Int[np.ndarray, "atoms"]
+    residues: Int[np.ndarray, "atoms"]
+    named: bool = True
+    guessed: bool = False
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @classmethod
+    def plain(cls, species: list[str], named: bool = True) -> AtomTable:
+        """Atoms that have a species and belong to no residue."""
+        words, none = np.array(species, dtype=object), np.zeros(len(species), np.int64)
+        return cls(words, words, np.full(len(species), "", dtype=object), none, none, named)
+
+
+class Trajectory(ABC):
+    """Frames of one file, read lazily and in order, as often as wanted.
+
+    Attributes:
+        path: the file.
+        format: the file's format in the reader's word ("XTC", "extxyz").
+        reader: who reads it ("MDAnalysis", "ASE", "mdnum").
+        bits: width of a coordinate as it comes from the reader, 32 or 64; frames are float64 either way.
+        length: unit of length in words; "" where the file does not say.
+        time: unit of time in words; "frame" where the file has no times, whose numbers then stand for them
+            (velocities are per ps there, if the file has any).
+        table: what is known of the atoms.
+        notes: what a reader of the results should know about the reading, each a sentence.
+        slice: the frames asked for.
+    """
+
+    path: Path
+    format: str
+    reader: str
+    bits: int = 64
+    length: str = "Å"
+    time: str = "frame"
+    table: AtomTable
+    notes: tuple[str, ...] = ()
+    slice: slice
+
+    @property
+    def atoms(self) -> int:
+        """Atoms in every frame."""
+        return len(self.table)
+
+    @property
+    def species(self) -> np.ndarray:
+        """Species of every atom, words, shape (atoms,)."""
+        return self.table.species
+
+    @property
+    def name(self) -> str:
+        """The file's name, with what was asked for of its frames."""
+        return self.path.name
+
+    @property
+    @abstractmethod
+    def in_file(self) -> int | None:
+        """Frames in the file; None where they are not known without reading it."""
+
+    @property
+    def count(self) -> int | None:
+        """Frames that `frames` gives; None where they are not known without reading the file."""
+        if self.in_file is None:
+            return None
+        return len(range(*self.slice.indices(self.in_file)))
+
+    @property
+    def universe(self) -> Any:
+        """The MDAnalysis Universe behind it, or None: another reader has none."""
+        return None
+
+    @abstractmethod
+    def frames(self) -> Iterator[Frame]:
+        """The frames asked for, in order, one in memory at a time. Each call starts at the first again.
+
+        Raises:
+            UnreadableFrame: one cannot be read. Those before it have been given.
+            InputError: a frame has another number of atoms.
+        """
+
+
+def open_trajectory(
+    path: str | Path, topology: str | Path | None = None, slice: str = "", format: str | None = None
+) -> Trajectory:
+    """Opens a file that MDAnalysis or ASE reads, or the folder of an mdnum run.
+
+    Args:
+        path: the file; may end in @START:STOP:STEP.
+        topology: a file that says what the atoms are, where the trajectory does not (xtc, trr, dcd, ...):
+            anything that MDAnalysis takes for one.
+        slice: frames to read, as behind the @.
+        format: the format in MDAnalysis's or ASE's word, where the name of the file does not tell it.
+
+    Raises:
+        InputError: no such file, nobody reads it, or it does not belong to the topology.
+    """
+    file, words = split_path(str(path))
+    if words and slice:
+        raise InputError(f"frames are named twice, by @{words} and by {slice!r}", remedy="Name them once")
+    frames = parse_slice(slice or words, where=str(path))
+    if file.is_dir() and (file / "trajectory.traj").exists():
+        file = file / "trajectory.traj"
+    if file.is_dir() and (file / "summary.json").exists():
+        raise InputError(
+            "this run folder has no trajectory",
+            remedy="Run again with --save-every 1 (or another number of steps)",
+            where=str(file),
+        )
+    for one in (file, None if topology is None else Path(topology).expanduser()):
+        if one is not None and not one.exists():
+            raise InputError("no such file", remedy="Check the path", where=str(one))
+    reader = _reader_of(file, format)
+    if reader == "ase":
+        from mdnum.trajectories.ase_source import AseTrajectory
+
+        return AseTrajectory(file, topology, frames, format)
+    from mdnum.trajectories.mdanalysis_source import MDAnalysisTrajectory
+
+    return MDAnalysisTrajectory(file, topology, frames, format)
+
+
+# MDAnalysis reads XYZ too, but neither boxes nor more than float32 of it; the others it does not know
+_ASE_SUFFIXES = frozenset({".traj", ".extxyz", ".json", ".db", ".bundle", ".castep", ".xsf", ".con"})
+
+
+def _reader_of(file: Path, format: str | None) -> str:
+    """Which reader a file gets: "ase" or "mdanalysis"."""
+    suffix = (file.with_suffix("") if file.suffix in (".gz", ".bz2") else file).suffix.lower()
+    if format is not None:
+        return "mdanalysis" if format.upper() in _mdanalysis_formats() else "ase"
+    if suffix in _ASE_SUFFIXES:
+        return "ase"
+    if suffix == ".xyz" and _is_extended(file):
+        return "ase"
+    if suffix[1:].upper() in _mdanalysis_formats():
+        return "mdanalysis"
+    return "ase"
+
+
+def _mdanalysis_formats() -> set[str]:
+    import MDAnalysis
+
+    return set(MDAnalysis._READERS)
+
+
+def _is_extended(file: Path) -> bool:
+    """Whether the comment line of an XYZ file says what its columns are, or its box."""
+    from ase.io.formats import open_with_compression
+
+    try:
+        with open_with_compression(str(file), "r") as lines:
+            lines.readline()
+            comment = lines.readline().lower()
+    except (OSError, UnicodeDecodeError):
+        return False
+    return "lattice=" in comment or "properties=" in comment
