@@ -29,6 +29,9 @@ class MDAnalysisTrajectory(Trajectory):
         self.path, self.slice = path, frames
         self._universe, said = open_universe(path, topology, format)
         self.table = table_of(self._universe.atoms)
+        if self.table.guessed and not hasattr(self._universe.atoms, "elements"):
+            # for selections by element
+            self._universe.add_TopologyAttr("elements", self.table.species)
         trajectory = self._universe.trajectory
         self.format = str(trajectory.format if isinstance(trajectory.format, str) else trajectory.format[0])
         self.length = "Å"

@@ -1,0 +1,78 @@
+"""Frames that hold what no simulation writes: coordinates that are not numbers, or were never written."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+from jaxtyping import Int
+
+from mdnum.errors import InputError
+from mdnum.trajectories.frame import Frame
+
+
+class FrameError(InputError):
+    """A frame was read and holds what cannot be right.
+
+    Args:
+        frame: its number in the file, from 0.
+    """
+
+    def __init__(self, message: str, *, frame: int, remedy: str, where: str | None = None):
+        super().__init__(message, remedy=remedy, where=where)
+        self.frame = frame
+
+
+def checked(
+    frames: Iterable[Frame], atoms: Int[np.ndarray, "chosen"] | None = None, where: str | None = None
+) -> Iterator[Frame]:
+    """The frames, each looked at before it is given on.
+
+    Args:
+        frames: of a trajectory.
+        atoms: the atoms that matter, ascending; None for all.
+        where: the file, for messages.
+
+    Raises:
+        FrameError: a coordinate is not finite, or more than one atom is at exactly 0, 0, 0.
+    """
+    for frame in frames:
+        check_frame(frame, atoms, where)
+        yield frame
+
+
+def check_frame(
+    frame: Frame, atoms: Int[np.ndarray, "chosen"] | None = None, where: str | None = None
+) -> None:
+    """As `checked`, for one frame."""
+    x = frame.positions if atoms is None else frame.positions[atoms]
+    # a sum is finite unless a term is not, or the terms are of no use anyway
+    if not np.isfinite(x.sum()) and (bad := np.flatnonzero(~np.isfinite(x).all(axis=1))).size:
+        first = int(bad[0] if atoms is None else atoms[bad[0]])
+        values = ", ".join(f"{value:g}" for value in frame.positions[first])
+        raise FrameError(
+            f"frame {frame.index}: atom {first} is at ({values}){_and_others(bad.size)}",
+            frame=frame.index,
+            remedy="The simulation or the writing of it failed there; stop before that frame "
+            f"(@:{frame.index})",
+            where=where,
+        )
+    # one atom may well be at the origin; two cannot be at one place
+    zero = np.flatnonzero(~x.any(axis=1))
+    if zero.size > 1:
+        first = int(zero[0] if atoms is None else atoms[zero[0]])
+        what = (
+            "all coordinates are 0"
+            if zero.size == len(x)
+            else f"atom {first} is at exactly 0, 0, 0{_and_others(zero.size)}"
+        )
+        raise FrameError(
+            f"frame {frame.index}: {what}, as where coordinates were never written",
+            frame=frame.index,
+            remedy="Leave the frame out with @START:STOP, or the atoms with --between",
+            where=where,
+        )
+
+
+def _and_others(count: int) -> str:
+    return "" if count == 1 else f", and {count - 1:,} other{'s' if count > 2 else ''} likewise"
