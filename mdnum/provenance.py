@@ -20,8 +20,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Protocol
 
-import mdnum.precision  # noqa: F401 (float64 is among the settings recorded)
-
 # code generation differs between processors that differ in these; the rest of the flags is noise
 _FLAGS_THAT_MATTER = ("sse4_2", "avx", "fma", "avx2", "avx512f", "avx512_bf16", "amx_tile", "asimd", "sve")
 _PACKAGES = (
@@ -65,8 +63,10 @@ def collect(system: _System) -> dict[str, Any]:
     """
     import jax
 
-    versions = package_versions()
-    processor = cpu()
+    import mdnum.precision  # noqa: F401 (float64 is among the settings recorded)
+
+    around = surroundings()
+    versions, processor = around["versions"], around["cpu"]
     devices = [{"platform": device.platform, "kind": device.device_kind} for device in jax.devices()]
     settings = {name: getattr(jax.config, name, None) for name in _JAX_SETTINGS}
     environment = {
@@ -75,20 +75,15 @@ def collect(system: _System) -> dict[str, Any]:
     precision = getattr(system.spec, "precision", None)
     dtypes = precision.model_dump(mode="json") if precision is not None else {}
     return {
-        "started": datetime.now(UTC).isoformat(timespec="seconds"),
-        "command": shlex.join(sys.argv),
-        "folder": str(Path.cwd()),
+        **{name: around[name] for name in ("started", "command", "folder")},
         "system": system.name,
         "hashes": hashes(system),
         "dtypes": dtypes,
-        "versions": versions,
-        "python": platform.python_version(),
-        "platform": platform.platform(),
-        "cpu": processor,
+        **{name: around[name] for name in ("versions", "python", "platform", "cpu")},
         "devices": devices,
         "jax_settings": settings,
         "environment": environment,
-        "commit": commit(Path(__file__).resolve().parent),
+        "commit": around["commit"],
         "fingerprint": fingerprint(
             {
                 "versions": {name: versions.get(name) for name in _ARITHMETIC},
@@ -100,6 +95,20 @@ def collect(system: _System) -> dict[str, Any]:
                 "dtypes": dtypes,
             }
         ),
+    }
+
+
+def surroundings() -> dict[str, Any]:
+    """When, where and with what something was computed that ran no system and needs no jax."""
+    return {
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+        "command": shlex.join(sys.argv),
+        "folder": str(Path.cwd()),
+        "versions": package_versions(),
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "cpu": cpu(),
+        "commit": commit(Path(__file__).resolve().parent),
     }
 
 

@@ -16,7 +16,7 @@ from ase import Atoms
 from ase.io import read as ase_read
 
 from mdnum.errors import FolderError
-from mdnum.store import COLUMNS, TABLES, RunFolder, atomic, frames, tables
+from mdnum.store import COLUMNS, TABLES, RunFolder, atomic, columns_of, frames, tables
 
 
 def series_rows(start: int, stop: int) -> dict[str, np.ndarray]:
@@ -246,7 +246,7 @@ def test_empty_run_has_the_tables_of_its_world_with_columns(tmp_path, world):
     folder.finalize()
     assert sorted(path.stem for path in folder.path.glob("*.parquet")) == sorted(TABLES[world])
     for name in TABLES[world]:
-        assert list(folder.read(name)) == list(COLUMNS[name])
+        assert list(folder.read(name)) == list(columns_of(world, name))
     again = RunFolder.open(folder.path)
     assert again.world == world
     again.resume()

@@ -3,6 +3,6 @@
 from __future__ import annotations
 
 from mdnum.store.folder import RunFolder
-from mdnum.store.tables import COLUMNS, TABLES
+from mdnum.store.tables import COLUMNS, TABLES, columns_of
 
-__all__ = ["COLUMNS", "TABLES", "RunFolder"]
+__all__ = ["COLUMNS", "TABLES", "RunFolder", "columns_of"]

@@ -125,7 +125,7 @@ class RunFolder:
         """Adds rows to a table (see `TABLES`); cheap, kept in memory until a checkpoint.
 
         Args:
-            columns: equally long arrays by column name, at least those in `COLUMNS[table]`.
+            columns: equally long arrays by column name, at least those in `columns_of(world, table)`.
 
         Raises:
             ValueError: a column is missing, not expected or of another length.
@@ -247,7 +247,9 @@ class RunFolder:
             columns: only these.
             rows: at most the first rows.
         """
-        return TableStream(self.path, name).read(columns, min(self.rows(name), rows or sys.maxsize))
+        return TableStream(self.path, name, self.world).read(
+            columns, min(self.rows(name), rows or sys.maxsize)
+        )
 
     def read(
         self, name: str, columns: Sequence[str] | None = None, rows: int | None = None
@@ -258,7 +260,7 @@ class RunFolder:
 
     def rows(self, name: str) -> int:
         """Rows of a table that `table` gives."""
-        stream = TableStream(self.path, name)
+        stream = TableStream(self.path, name, self.world)
         if stream.parts() and self.has_checkpoint():
             # series and flips of an unfinished run agree with one another only at a checkpoint
             return self._read_checkpoint()[1]["rows"].get(name, 0)
@@ -283,7 +285,7 @@ class RunFolder:
 
     def _stream(self, name: str) -> TableStream:
         if name not in self._streams:
-            self._streams[name] = TableStream(self.path, name)
+            self._streams[name] = TableStream(self.path, name, self.world)
         return self._streams[name]
 
     def _rows(self) -> dict[str, int]:

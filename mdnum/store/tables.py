@@ -111,8 +111,47 @@ COLUMNS: Mapping[str, Mapping[str, pa.DataType]] = MappingProxyType(
             horizon=_INT, overflow=_INT, underflow=_INT, subnormal=_INT, largest=_FLOAT, smallest=_FLOAT,
             scaled_overflow=_INT, scaled_underflow=_INT,
         ),
+        "frames": _columns(
+            rule=_SHORT, frame=_INT, number=_INT, time=_FLOAT, pairs=_INT, near=_INT, entered=_INT,
+            left=_INT, ambiguous=_INT, min_margin=_FLOAT, fewest=_SHORT, neighbors=_FLOAT, most=_SHORT,
+        ),
+        "members": _columns(rule=_SHORT, i=_SHORT, j=_SHORT, rank=_SHORT, distance=_FLOAT),
+        "lifetimes": _columns(
+            rule=_SHORT, frames=_INT, time=_FLOAT, at_risk=_INT, survival=_FLOAT, error=_FLOAT,
+            intermittent=_FLOAT, residence=_FLOAT, again=_FLOAT,
+        ),
+        "neighbors": _columns(rule=_SHORT, neighbors=_INT, counted=_INT),
+        "residues": _columns(rule=_SHORT, residue=_TEXT, between=_INT, within=_INT),
+        "busiest": _columns(rule=_SHORT, i=_SHORT, j=_SHORT, rank=_SHORT, flips=_INT, inside=_INT),
+        "apart": _columns(
+            frame=_INT, time=_FLOAT, time_b=_FLOAT, furthest=_FLOAT, typical=_FLOAT, atom=_SHORT,
+            pairs_a=_INT, pairs_b=_INT, only_a=_INT, only_b=_INT,
+        ),
+        "differing": _columns(
+            rule=_SHORT, frame=_INT, i=_SHORT, j=_SHORT, rank=_SHORT, inside=_TEXT, distance_a=_FLOAT,
+            distance_b=_FLOAT, margin_a=_FLOAT, margin_b=_FLOAT, bound=_FLOAT, ambiguous=_BOOL,
+        ),
     }
 )  # fmt: skip
+
+#: Tables that go by another world's name and have columns of their own, by world and name.
+_OWN: Mapping[tuple[str, str], Mapping[str, pa.DataType]] = MappingProxyType(
+    {
+        ("flips", "flips"): _columns(
+            rule=_SHORT, frame=_INT, i=_SHORT, j=_SHORT, rank=_SHORT, entered=_BOOL, distance=_FLOAT,
+            before=_FLOAT, margin=_FLOAT, margin_before=_FLOAT, bound=_FLOAT, ambiguous=_BOOL,
+        ),
+        ("flips", "contacts"): _columns(
+            rule=_SHORT, i=_SHORT, j=_SHORT, rank=_SHORT, begin=_INT, end=_INT, began=_BOOL, ended=_BOOL,
+        ),
+    }
+)  # fmt: skip
+
+
+def columns_of(world: str, table: str) -> Mapping[str, pa.DataType]:
+    """The columns of a table in a folder of some world; empty for a table that is not declared."""
+    return _OWN.get((world, table)) or COLUMNS.get(table, {})
+
 
 #: The tables that a folder has, whether they hold a row or not, by the world that was run; folders that
 #: answer another question than what a run does or where two part go by that question.
@@ -127,6 +166,8 @@ TABLES: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "certify": ("policies", "ambiguous", "policy_separations"),
         "forecast": ("foretold", "reach"),
         "grad": ("growth", "flip_contributions", "trust", "scaling"),
+        "flips": ("flips", "frames", "members", "contacts", "lifetimes", "neighbors", "residues", "busiest"),
+        "flips-compare": ("apart", "differing"),
     }
 )
 
@@ -143,8 +184,9 @@ class TableStream:
     leaves a folder whose rows cannot be told apart, wherever it was killed.
     """
 
-    def __init__(self, root: Path, name: str):
+    def __init__(self, root: Path, name: str, world: str = "md"):
         self.name = name
+        self._known = columns_of(world, name)
         self.merged_path = root / f"{name}.parquet"
         self.parts_folder = root / "parts"
         self._buffer: list[pa.Table] = []
@@ -246,7 +288,7 @@ class TableStream:
         if not self.parts() and self.merged_path.exists():
             return
         if self._schema is None:
-            self._schema = pa.schema(list(COLUMNS.get(self.name, {}).items()))
+            self._schema = pa.schema(list(self._known.items()))
         temporary = self.merged_path.with_name(f".{self.merged_path.name}.part")
         with disk_errors(self.merged_path):
             try:
@@ -283,7 +325,7 @@ class TableStream:
             tables.append(batch)
             have += batch.num_rows
         if not tables:
-            fields = COLUMNS.get(self.name, {})
+            fields = self._known
             names = fields if columns is None else columns
             return pa.schema([(name, fields[name]) for name in names]).empty_table()
         table = pa.concat_tables(tables)
@@ -292,7 +334,7 @@ class TableStream:
     def _table(self, columns: Mapping[str, Any]) -> pa.Table:
         schema = self._schema
         if schema is None:
-            known = COLUMNS.get(self.name, {})
+            known = self._known
             extra = {key: pa.array(np.asarray(columns[key])).type for key in columns if key not in known}
             schema = pa.schema([*known.items(), *extra.items()])
         missing = [name for name in schema.names if name not in columns]
