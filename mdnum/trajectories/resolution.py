@@ -1,0 +1,220 @@
+"""How finely a file tells where atoms are, found from its numbers, and what that leaves undecided.
+
+A file that keeps three decimals has moved every coordinate by up to half a unit of the third: whether a pair
+is inside a cutoff cannot be told when its distance is closer to it than what that does to a distance. `infer`
+looks for the decimal grid that all coordinates lie on, so that a precision nobody wrote down is found too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import islice
+
+import numpy as np
+from jaxtyping import Float
+
+from mdnum.trajectories.frame import Box, Frame
+from mdnum.trajectories.source import Trajectory
+
+#: Frames looked at by `infer`.
+SAMPLE = 8
+# Coordinates looked at: chance hits decide nothing long before.
+_ENOUGH = 6000
+# Decimal steps tried, in Å or in fractions of the box: from 1 down.
+_STEPS = tuple(one * 10.0**-k for k in range(13) for one in (1.0, 0.5, 0.2))
+# A grid counts as found where chance would put all coordinates on it with no more than this probability.
+_CHANCE = 1e-6
+# Roundings that a number in the file may have seen beside those to its grid (a product in the writer, reading,
+# nm to Å), for finding the grid; and those that a coordinate in float32 has seen for certain or nearly so.
+_SLACK, _ROUNDINGS = 3.0, 2.0
+_UNIT = {32: 2.0**-24, 64: 2.0**-53}
+# Formats whose box is written with fewer digits than a float has: lengths in Å, angles in degrees.
+_BOX_STEPS = {"PDB": (1e-3, 1e-2), "ENT": (1e-3, 1e-2), "GRO": (1e-4, 0.0)}
+
+
+@dataclass(frozen=True)
+class Resolution:
+    """The resolution of the positions in a file.
+
+    Attributes:
+        kind: "grid" (decimals of a length), "fractions" (decimals of the box's vectors), "float32" or
+            "float64".
+        step: of the grid: length for "grid", a pure number for "fractions"; 0 for floats.
+        bits: width of a coordinate as the reader hands it over, 32 or 64.
+        frames: frames it was found from.
+        moved: whether atoms moved between them. Where none did, the grid may be the structure's and not the
+            file's.
+        box: step of the box's lengths, length, and of its angles, degrees, where the format rounds them.
+    """
+
+    kind: str
+    step: float
+    bits: int
+    frames: int
+    moved: bool = True
+    box: tuple[float, float] = (0.0, 0.0)
+
+    def bound(self, frame: Frame) -> float:
+        """How far a distance in this frame can be from that of the positions before they were written.
+
+        The worst case, length: both atoms moved by half a step along every axis, in opposite directions, and a
+        pair across the boundary by what rounding did to the box. For float64 it is the rounding of the distance.
+
+        Error: for a pair through one period of the box; further images add as much of the box's part again.
+        """
+        largest, lattice = _extent(frame)
+        coordinate, box = self._half(frame.box), 0.0
+        if self._narrow:
+            # the box comes through the same reader
+            coordinate += _ROUNDINGS * _UNIT[32] * largest
+            box = _ROUNDINGS * _UNIT[32] * lattice
+        if frame.box.periodic:
+            box += np.sqrt(3) / 2 * self.box[0]
+            # right angles are meant to be right
+            if np.count_nonzero(frame.box.matrix[frame.box.pbc]) > frame.box.pbc.sum():
+                box += np.sqrt(3) / 2 * np.radians(self.box[1]) * lattice
+        arithmetic = 16 * _UNIT[64] * (largest + lattice)
+        return float(2 * np.sqrt(3) * coordinate + box + arithmetic)
+
+    def typical(self, frame: Frame) -> float:
+        """Standard deviation of a distance's error: rounding errors spread evenly within a step, length."""
+        largest, _ = _extent(frame)
+        half = self._half(frame.box)
+        if half == 0:
+            half = _UNIT[32 if self._narrow else 64] * largest
+        # two atoms, each with variance step²/12 along the line between them
+        return float(np.sqrt(2 / 12) * 2 * half)
+
+    def words(self, length: str = "Å") -> str:
+        """A sentence on the resolution, for people."""
+        unit = f" {length}" if length else ""
+        through = (
+            " The reader hands coordinates over in float32, whatever the file stores."
+            if self.bits == 32 and self.kind == "float32"
+            else ""
+        )
+        unsure = (
+            ""
+            if self.moved
+            else " No atom moved between the frames looked at, so this may be the structure's."
+        )
+        if self.kind == "grid":
+            return f"Every coordinate is a multiple of {self.step:g}{unit}: the file keeps no more.{unsure}"
+        if self.kind == "fractions":
+            return (
+                f"Every coordinate is a multiple of {self.step:g} of the box: the file keeps no more.{unsure}"
+            )
+        digits = {"float32": "about 7", "float64": "about 16"}[self.kind]
+        return f"Coordinates have the resolution of {self.kind}, {digits} digits.{through}"
+
+    @property
+    def _narrow(self) -> bool:
+        return self.kind == "float32" or self.bits == 32
+
+    def _half(self, box: Box) -> float:
+        """Half a step along an axis at worst, length."""
+        if self.kind == "fractions":
+            return self.step / 2 * float(np.abs(box.matrix).sum(axis=0).max())
+        return self.step / 2
+
+
+def infer(trajectory: Trajectory, frames: int = SAMPLE) -> Resolution:
+    """The resolution of a file, from the first frames asked for.
+
+    Args:
+        trajectory: its frames are read from the first on.
+        frames: how many of them at most.
+    """
+    sample = list(islice(trajectory.frames(), frames))
+    return infer_from(sample, trajectory.bits, trajectory.format)
+
+
+def infer_from(sample: Sequence[Frame], bits: int = 64, format: str = "") -> Resolution:
+    """The resolution of frames.
+
+    Args:
+        sample: frames of one file, at least one.
+        bits: width of a coordinate as the reader hands it over.
+        format: in the reader's word, for what formats are known to round.
+    """
+    moved = _moved(sample)
+    values, fractions = _values(sample, moved), _fractions(sample, moved)
+    box = _BOX_STEPS.get(format, (0.0, 0.0))
+    unit = _SLACK * _UNIT[bits]
+    step, part, size = _grid(values, unit * np.abs(values)), 0.0, 0.0
+    if fractions is not None:
+        size = max(float(np.abs(frame.box.matrix).max()) for frame in sample)
+        # a product of three and a solution of three equations lie between
+        part = _grid(fractions, 8 * unit * (np.abs(fractions) + np.abs(values).max() / size))
+    narrow = bits == 32 or bool((values == values.astype(np.float32)).all())
+    kind = "float32" if narrow else "float64"
+    if step or part:
+        # decimals of a box with few decimals are decimals too, of a finer grid
+        kind, step = ("fractions", part) if part * size > 2 * step else ("grid", step)
+    return Resolution(kind, step, bits, len(sample), bool(moved.any()), box)
+
+
+def _grid(values: Float[np.ndarray, "values"], slack: Float[np.ndarray, "values"]) -> float:
+    """The coarsest decimal step that all values are multiples of; 0.0 where there is none."""
+    values, index = np.unique(values, return_index=True)
+    slack = slack[index]
+    worth = values != 0
+    values, slack = values[worth], slack[worth]
+    if not len(values):
+        return 0.0
+    for step in _STEPS:
+        # the part of a step that would pass by chance, of every value
+        chance = np.minimum(2 * slack / step, 1.0)
+        if np.log(np.maximum(chance, 1e-300)).sum() > np.log(_CHANCE):
+            # finer steps are told from chance less well still
+            return 0.0
+        ratio = values / step
+        if (np.abs(ratio - np.round(ratio)) * step <= slack).all():
+            return step
+    return 0.0
+
+
+def _moved(sample: Sequence[Frame]) -> np.ndarray:
+    """Which atoms are not at one place in all frames, shape (atoms,)."""
+    first = sample[0].positions
+    moved = np.zeros(len(first), bool)
+    for frame in sample[1:]:
+        moved |= (frame.positions != first).any(axis=1)
+    return moved
+
+
+def _values(sample: Sequence[Frame], moved: np.ndarray) -> Float[np.ndarray, "values"]:
+    """Coordinates to look at: of atoms that move, the frames after the first first.
+
+    A run that starts from a crystal has its first frame on the crystal's sites.
+    """
+    frames = sample[1:] if moved.any() and len(sample) > 1 else sample
+    rows = moved if moved.any() else np.ones(len(moved), bool)
+    values = np.concatenate([frame.positions[rows].ravel() for frame in frames])
+    return _thinned(values)
+
+
+def _fractions(sample: Sequence[Frame], moved: np.ndarray) -> Float[np.ndarray, "values"] | None:
+    """As `_values`, in fractions of the box; None without a box of three vectors."""
+    frames = sample[1:] if moved.any() and len(sample) > 1 else sample
+    rows = moved if moved.any() else np.ones(len(moved), bool)
+    parts = []
+    for frame in frames:
+        matrix = frame.box.matrix
+        if not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) == 0:
+            return None
+        parts.append(np.linalg.solve(matrix.T, frame.positions[rows].T).T.ravel())
+    return _thinned(np.concatenate(parts))
+
+
+def _thinned(values: Float[np.ndarray, "values"]) -> Float[np.ndarray, "fewer"]:
+    values = values[np.isfinite(values)]
+    return values[:: max(len(values) // _ENOUGH, 1)]
+
+
+def _extent(frame: Frame) -> tuple[float, float]:
+    """Largest coordinate, and largest sum of the lattice's components along an axis, length."""
+    largest = float(np.abs(frame.positions).max()) if len(frame.positions) else 0.0
+    rows = frame.box.matrix[frame.box.pbc]
+    return largest, float(np.abs(rows).sum(axis=0).max()) if len(rows) else 0.0
