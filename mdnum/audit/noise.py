@@ -1,0 +1,168 @@
+"""How far a calculator's answers scatter for reasons of rounding alone: measured, not assumed."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from ase import Atoms
+from jaxtyping import Float
+
+from mdnum.audit.base import Subject
+from mdnum.audit.subject import CalculatorError
+
+#: Å between the points of the line along which noise is measured: a smooth function's fourth difference over
+#: it is below 1e-16 eV for any chemistry, while even single precision tells neighboring points apart.
+_SPACING = 1e-5
+_POINTS = 9
+#: Å by which atoms are moved from where they were given, so that no distance sits on a threshold by design.
+RATTLE = 0.03
+#: Atoms below which symmetry may hide the noise.
+FEW = 8
+
+
+@dataclass(frozen=True)
+class Noise:
+    """What an answer may differ by without anything being wrong.
+
+    Attributes:
+        energy: standard deviation, eV.
+        force: standard deviation of a component, of the atom that scatters most, eV/Å.
+    """
+
+    energy: float
+    force: float
+
+
+def along_a_line(subject: Subject, atoms: Atoms, rng: np.random.Generator) -> Noise:
+    """Noise from differences of high order over equally spaced points: what is smooth drops out of them.
+
+    Args:
+        subject: the calculator.
+        atoms: where; no threshold nearby.
+        rng: picks the line.
+
+    Source:
+        J. J. Moré and S. M. Wild, Estimating computational noise, SIAM J. Sci. Comput. 33, 1292 (2011).
+    """
+    line = direction(len(atoms), rng)
+    energies, forces = [], []
+    for at in range(_POINTS):
+        there = displaced(atoms, (at - _POINTS // 2) * _SPACING * line)
+        energies.append(subject.energy(there))
+        forces.append(subject.forces(there))
+    energy = float(_scatter(np.array(energies)[:, None])[0])
+    force = float(np.max(_scatter(np.array(forces).reshape(_POINTS, -1))))
+    # values that round to the same number at every point still carry the rounding of one operation
+    floor = np.finfo(float).eps
+    return Noise(
+        max(energy, floor * max(abs(value) for value in energies)),
+        max(force, floor * float(np.max(np.abs(forces)))),
+    )
+
+
+def _scatter(values: Float[np.ndarray, "points columns"]) -> Float[np.ndarray, "columns"]:
+    """Standard deviation of the noise in each column, the middle one of three orders of difference."""
+    found = []
+    for order in (4, 5, 6):
+        difference = np.diff(values, n=order, axis=0)
+        weight = math.factorial(order) ** 2 / math.factorial(2 * order)
+        found.append(np.sqrt(weight * np.mean(difference**2, axis=0)))
+    return np.median(found, axis=0)
+
+
+def under_jitter(
+    subject: Subject, atoms: Atoms, size: float, rng: np.random.Generator, draws: int = 4
+) -> Noise:
+    """The largest change of energy and of a force component when all atoms are moved by `size` at random.
+
+    Rounding coordinates of another image or of a turned structure moves atoms like this.
+
+    Args:
+        subject: the calculator.
+        atoms: where.
+        size: Å, of the order of an ulp of the largest coordinate.
+        rng: draws the moves.
+        draws: how many are tried.
+    """
+    energy, forces = subject.energy(atoms), subject.forces(atoms)
+    worst_energy = worst_force = 0.0
+    for _ in range(draws):
+        there = displaced(atoms, size * rng.uniform(-1, 1, (len(atoms), 3)))
+        worst_energy = max(worst_energy, abs(subject.energy(there) - energy))
+        worst_force = max(worst_force, float(np.max(np.abs(subject.forces(there) - forces), initial=0.0)))
+    return Noise(worst_energy, worst_force)
+
+
+def settled(
+    subject: Subject, rng: np.random.Generator, tries: int = 5, at_least: int = 1
+) -> tuple[Atoms, Noise]:
+    """The structure with its atoms moved a little, away from any threshold, and the noise there.
+
+    In a perfect crystal a whole shell of neighbors can sit on a cutoff; a check that is not about
+    thresholds must not stand on one. A step of the energy inside the line shows as noise, so the quietest
+    of a few draws is taken.
+
+    Args:
+        subject: the calculator.
+        rng: draws the moves.
+        tries: how many structures are looked at.
+        at_least: atoms; a smaller cell is repeated, where it repeats.
+    """
+    given = roomy(subject.atoms, at_least)
+    best: tuple[Atoms, Noise] | None = None
+    for _ in range(tries):
+        there = displaced(given, RATTLE * rng.uniform(-1, 1, (len(given), 3)))
+        noise = along_a_line(subject, there, rng)
+        if best is None or noise.energy < 0.1 * best[1].energy:
+            best = there, noise
+        # quiet enough to be rounding of single precision or better
+        if noise.energy < 1e-6 * max(1.0, abs(subject.energy(there))):
+            break
+    assert best is not None
+    there, noise = best
+    return there, louder(noise, _of_more_atoms(subject, there, rng))
+
+
+def roomy(atoms: Atoms, at_least: int) -> Atoms:
+    """A structure of so many atoms or more, repeated along its periodic axes; itself where none repeats."""
+    if len(atoms) >= at_least or not len(atoms) or not atoms.pbc.any():
+        return atoms
+    times = math.ceil((at_least / len(atoms)) ** (1 / int(atoms.pbc.sum())))
+    return atoms.repeat(np.where(atoms.pbc, times, 1))
+
+
+def louder(one: Noise, other: Noise) -> Noise:
+    """The larger of two, each part by itself."""
+    return Noise(max(one.energy, other.energy), max(one.force, other.force))
+
+
+def _of_more_atoms(subject: Subject, atoms: Atoms, rng: np.random.Generator) -> Noise:
+    """Noise of a supercell where there are few atoms: terms that cancel by symmetry leave no trace of theirs."""
+    if len(atoms) >= FEW or not atoms.pbc.any():
+        return Noise(0.0, 0.0)
+    many = roomy(atoms, FEW)
+    many.positions += RATTLE * rng.uniform(-1, 1, many.positions.shape)
+    try:
+        return along_a_line(subject, many, rng)
+    except CalculatorError:
+        return Noise(0.0, 0.0)
+
+
+def direction(atoms: int, rng: np.random.Generator) -> Float[np.ndarray, "atoms 3"]:
+    """A random displacement of all atoms, the furthest by 1."""
+    drawn = rng.standard_normal((atoms, 3))
+    return drawn / np.max(np.linalg.norm(drawn, axis=1))
+
+
+def displaced(atoms: Atoms, by: Float[np.ndarray, "atoms 3"]) -> Atoms:
+    """A copy with every atom moved.
+
+    Args:
+        atoms: left as it is.
+        by: Å.
+    """
+    there = atoms.copy()
+    there.positions += by
+    return there

@@ -1,0 +1,412 @@
+"""What a calculator object remembers: the same question must have the same answer, whatever came before it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from ase import Atoms
+
+from mdnum.audit.base import Part, Progress, Subject
+from mdnum.audit.noise import FEW, Noise, displaced, roomy, settled
+from mdnum.audit.subject import CalculatorError
+from mdnum.references.findings import finding
+
+#: How many times the noise one object may differ from another by: a list that was built elsewhere sums its
+#: terms in another order.
+_ALLOWED = 40.0
+_REPEATS = 3
+#: Å between two parts that cannot feel one another.
+_FAR = 60.0
+
+
+@dataclass(frozen=True)
+class Asked:
+    """A structure in a sequence that one calculator object is asked about.
+
+    Attributes:
+        what: how it differs from the one before, in words.
+        atoms: the structure.
+    """
+
+    what: str
+    atoms: Atoms
+
+
+@dataclass
+class State:
+    """Repeated calls, and one object through structures that grow, shrink, move and strain, beside new ones.
+
+    Args:
+        seed: of structures.
+    """
+
+    name: str = "state"
+    seed: int = 0
+    structures: dict[str, Atoms] = field(default_factory=dict)
+
+    def __call__(self, subject: Subject, progress: Progress | None = None) -> Part:
+        """Ask it; see `Check`."""
+        began = time.perf_counter()
+        rng = np.random.default_rng(self.seed)
+        atoms, noise = settled(subject.fresh(), rng, at_least=FEW)
+        sequences = {
+            "sizes": list(sizes(atoms, rng)),
+            "a slow drift": list(drift(atoms, rng)),
+            "two atoms head on": list(head_on(atoms)),
+            "strain": list(strain(atoms)),
+            "wrapping": list(wrapping(atoms, rng)),
+        }
+        total = sum(map(len, sequences.values()))
+        done, rows = 0, []
+        for word, sequence in sequences.items():
+            for row in _through(subject, sequence, noise, word):
+                rows.append(row)
+                done += 1
+                if progress is not None:
+                    progress(done, total, {"phase": "state", "unit": "structures"})
+        repeats = _repeated(subject, atoms)
+        alone, skipped = _alone(subject, atoms, noise)
+        stale = [row for row in rows if row["remembers"]]
+        skipped += [(row["structure"], row["refused"]) for row in rows if row["refused"]]
+        return Part(
+            name=self.name,
+            title="Memory",
+            says=_says(rows, stale, repeats),
+            findings=[*self._stale(stale), *_unsteady(repeats), *_of_alone(alone)],
+            tables={
+                "One object, asked again and again, beside new ones": [_row(row) for row in rows],
+                "The same question again": [repeats],
+                "Atoms alone": alone,
+            },
+            numbers={
+                "structures": len(rows),
+                "remembered": len(stale),
+                "largest": max((row["energy"] for row in rows), default=0.0),
+                "bit_identical": repeats["bit-identical"],
+                "bit_identical_objects": repeats["bit-identical between objects"],
+            },
+            skipped=skipped,
+            seconds=time.perf_counter() - began,
+        )
+
+    def _stale(self, stale: list[dict[str, Any]]) -> Iterator[dict[str, str]]:
+        if not stale:
+            return
+        worst = max(stale, key=lambda row: row["energy"])
+        self.structures["stale-before"], self.structures["stale-after"] = worst["before"], worst["atoms"]
+        where = sorted({row["sequence"] for row in stale})
+        yield finding(
+            "STALE_STATE",
+            "error",
+            "the answer depends on what the calculator was asked before",
+            f"After {worst['structure']}, an object that had been in use differs from a new one by "
+            f"{worst['energy']:.3g} eV and {worst['force']:.3g} eV/Å, where rounding explains "
+            f"{worst['allowed']:.1g} eV. {len(stale)} questions were answered so ({', '.join(where)}). The "
+            "structures are saved as stale-before and stale-after.",
+            "Look for a neighbor list that is not rebuilt when the cell, the order or the number of atoms "
+            "changes or when atoms have used up half the skin, and for a buffer whose tail keeps old entries.",
+        )
+
+
+def sizes(atoms: Atoms, rng: np.random.Generator) -> Iterator[Asked]:
+    """More atoms, fewer atoms, more and fewer neighbors, other species' places, other periodicity."""
+    yield Asked("the structure", atoms)
+    larger = atoms.repeat(np.where(atoms.pbc, 2, 1)) if len(atoms) <= 64 and atoms.pbc.any() else None
+    if larger is not None:
+        yield Asked("the structure grew to its supercell", larger)
+        yield Asked("it shrank back", atoms)
+    if len(atoms) > 2:
+        yield Asked("its last third was removed", atoms[: max(1, 2 * len(atoms) // 3)])
+        yield Asked("all but two atoms were removed", atoms[:2])
+        yield Asked("all atoms came back", atoms)
+    yield Asked("all distances grew by half: fewer neighbors", _scaled(atoms, 1.5))
+    yield Asked("they shrank again: more neighbors", atoms)
+    yield Asked("all distances shrank by 6 %: more neighbors", _scaled(atoms, 0.94))
+    yield Asked("they grew again: fewer neighbors", atoms)
+    if len(atoms) > 1:
+        order = rng.permutation(len(atoms))
+        yield Asked("the atoms came in another order", atoms[order])
+        yield Asked("they came in the first order", atoms)
+    if atoms.pbc.any():
+        cluster = atoms.copy()
+        cluster.pbc = False
+        yield Asked("the periods were switched off", cluster)
+        yield Asked("they were switched on", atoms)
+    if len(set(atoms.numbers)) > 1:
+        swapped = atoms.copy()
+        swapped.numbers = np.roll(atoms.numbers, 1)
+        yield Asked("the species changed places", swapped)
+        yield Asked("they changed back", atoms)
+
+
+def drift(atoms: Atoms, rng: np.random.Generator) -> Iterator[Asked]:
+    """All atoms move a little each time, in directions of their own: what uses up a skin slowly."""
+    there = atoms
+    heading = rng.standard_normal((len(atoms), 3))
+    heading /= np.linalg.norm(heading, axis=1)[:, None]
+    yield Asked("the structure", there)
+    for number in range(12):
+        # there and back, so that atoms do not run into one another
+        there = displaced(there, (0.04 if number < 6 else -0.04) * heading)
+        yield Asked(f"all atoms moved by 0.04 Å, {number + 1} times", there)
+
+
+def head_on(atoms: Atoms) -> Iterator[Asked]:
+    """One atom, then two, move toward another in steps: what a criterion without its half does not see."""
+    if len(atoms) < 2:
+        return
+    yield Asked("the structure", atoms)
+    distances = atoms.get_distances(0, range(1, len(atoms)), mic=bool(atoms.pbc.any()), vector=True)
+    other = 1 + int(np.argmax(np.linalg.norm(distances, axis=1)))
+    line = distances[other - 1] / np.linalg.norm(distances[other - 1])
+    for moving, word in (((0,), "one atom"), ((0, other), "two atoms")):
+        there = atoms
+        for number in range(5):
+            step = np.zeros((len(atoms), 3))
+            for who in moving:
+                step[who] = (0.09 if who == 0 else -0.09) * line
+            there = displaced(there, step)
+            yield Asked(f"{word} moved by 0.09 Å toward another, {number + 1} times", there)
+        yield Asked("the structure", atoms)
+
+
+def strain(atoms: Atoms) -> Iterator[Asked]:
+    """The cell changes with the atoms, and without them."""
+    if not atoms.pbc.any():
+        return
+    yield Asked("the structure", atoms)
+    for scaled, word in ((True, "cell and atoms"), (False, "the cell alone")):
+        there = atoms
+        for number in range(4):
+            there = there.copy()
+            there.set_cell(there.cell.array * 0.985, scale_atoms=scaled)
+            yield Asked(f"{word} shrank by 1.5 %, {number + 1} times", there)
+        yield Asked("the structure", atoms)
+    sheared = atoms.copy()
+    sheared.set_cell(atoms.cell.array @ np.array([[1, 0, 0], [0.05, 1, 0], [0, 0, 1]]), scale_atoms=True)
+    yield Asked("cell and atoms were sheared by 5 %", sheared)
+    yield Asked("the structure", atoms)
+
+
+def wrapping(atoms: Atoms, rng: np.random.Generator) -> Iterator[Asked]:
+    """Atoms jump to other images between calls, as codes that wrap positions make them."""
+    if not atoms.pbc.any():
+        return
+    there = atoms
+    yield Asked("the structure", there)
+    for number in range(4):
+        boxes = rng.integers(-1, 2, (len(atoms), 3)) * atoms.pbc
+        there = displaced(there, boxes @ atoms.cell.array + 0.02 * rng.uniform(-1, 1, (len(atoms), 3)))
+        yield Asked(f"atoms moved a little and were put into other boxes, {number + 1} times", there)
+    folded = there.copy()
+    folded.wrap(eps=0)
+    yield Asked("all atoms were wrapped", folded)
+
+
+def _scaled(atoms: Atoms, factor: float) -> Atoms:
+    there = atoms.copy()
+    there.set_cell(factor * atoms.cell.array)
+    there.positions = factor * atoms.positions
+    return there
+
+
+def _through(subject: Subject, sequence: list[Asked], noise: Noise, word: str) -> Iterator[dict[str, Any]]:
+    """One object through a sequence; each answer beside that of an object that has seen nothing."""
+    used = subject.fresh()
+    before = None
+    known: dict[int, tuple[float, np.ndarray] | str] = {}
+    for asked in sequence:
+        new = known.get(id(asked.atoms))
+        if new is None:
+            new = known[id(asked.atoms)] = _answer(subject.fresh(), asked.atoms)
+        old = _answer(used, asked.atoms)
+        row: dict[str, Any] = {
+            "sequence": word, "structure": asked.what, "before": before or asked.atoms, "atoms": asked.atoms,
+            "energy": 0.0, "force": 0.0, "allowed": 0.0, "remembers": False, "refused": "",
+        }  # fmt: skip
+        before = asked.atoms
+        if isinstance(new, str):
+            # what nobody can answer says nothing about memory
+            yield row | {"refused": new}
+            continue
+        if isinstance(old, str):
+            yield row | {"remembers": True, "energy": float("inf"), "force": float("inf")}
+            continue
+        share = max(1.0, abs(new[0]) / max(abs(known_energy(known)), 1e-300))
+        allowed = _ALLOWED * noise.energy * share
+        force = float(np.max(np.abs(old[1] - new[1]), initial=0.0))
+        scale = max(1.0, float(np.max(np.abs(new[1]), initial=0.0)))
+        change = abs(old[0] - new[0])
+        remembers = change > allowed or force > _ALLOWED * max(noise.force, np.finfo(float).eps * scale) * share
+        yield row | {"energy": change, "force": force, "allowed": allowed, "remembers": remembers}
+
+
+def known_energy(known: Mapping[int, tuple[float, np.ndarray] | str]) -> float:
+    """The first energy of a sequence."""
+    return next((one[0] for one in known.values() if not isinstance(one, str)), 0.0)
+
+
+def _answer(subject: Subject, atoms: Atoms) -> tuple[float, np.ndarray] | str:
+    try:
+        return subject.energy(atoms), subject.forces(atoms)
+    except CalculatorError as error:
+        return error.message
+
+
+def _repeated(subject: Subject, atoms: Atoms) -> dict[str, Any]:
+    """The same structure again: of one object with another structure between, and of new objects."""
+    used = subject.fresh()
+    aside = displaced(atoms, np.full((len(atoms), 3), 0.011))
+    within = []
+    for _ in range(_REPEATS):
+        within.append((used.energy(atoms), used.forces(atoms)))
+        used.energy(aside)
+    objects = [within[0]]
+    for _ in range(_REPEATS - 1):
+        new = subject.fresh()
+        objects.append((new.energy(atoms), new.forces(atoms)))
+    return {
+        "bit-identical": _identical(within),
+        "energies scatter by": float(np.ptp([energy for energy, _ in within])),
+        "forces scatter by": float(np.max(np.ptp([force for _, force in within], axis=0), initial=0.0)),
+        "bit-identical between objects": _identical(objects),
+        "energies between objects": float(np.ptp([energy for energy, _ in objects])),
+    }
+
+
+def _identical(answers: list[tuple[float, np.ndarray]]) -> bool:
+    first = answers[0]
+    return all(energy == first[0] and force.tobytes() == first[1].tobytes() for energy, force in answers)
+
+
+def _alone(
+    subject: Subject, atoms: Atoms, noise: Noise
+) -> tuple[list[dict[str, Any]], list[tuple[str, str]]]:
+    """Atoms without a neighbor: no force, and energies that add up."""
+    rows: list[dict[str, Any]] = []
+    skipped: list[tuple[str, str]] = []
+    species = list(dict.fromkeys(atoms.symbols))
+    single: dict[str, float] = {}
+    for symbol in species:
+        for periodic in (False, True):
+            one = Atoms(symbol, positions=[[1.0, 2.0, 3.0]], cell=[2 * _FAR] * 3, pbc=periodic)
+            what = f"one {symbol} atom{' in a large periodic cell' if periodic else ''}"
+            found = _answer(subject.fresh(), one)
+            if isinstance(found, str):
+                skipped.append((what, found))
+                continue
+            single.setdefault(symbol, found[0])
+            rows.append(_lonely(what, found, single[symbol], noise))
+    pair = Atoms([species[0], species[-1]], positions=[[1.0, 2.0, 3.0], [1.0 + _FAR, 2.0, 3.0]])
+    pair.set_cell([4 * _FAR] * 3)
+    expected = [single.get(one) for one in (species[0], species[-1])]
+    found = _answer(subject.fresh(), pair)
+    what = f"{species[0]} and {species[-1]} {_FAR:g} Å apart"
+    if isinstance(found, str):
+        skipped.append((what, found))
+    elif expected[0] is not None and expected[1] is not None:
+        rows.append(_lonely(what, found, expected[0] + expected[1], noise))
+    _beside_cluster(subject, atoms, single, noise, rows, skipped)
+    return rows, skipped
+
+
+def _beside_cluster(
+    subject: Subject,
+    atoms: Atoms,
+    single: Mapping[str, float],
+    noise: Noise,
+    rows: list[dict[str, Any]],
+    skipped: list[tuple[str, str]],
+) -> None:
+    """A cluster, and the same with an atom far away: it alone has no neighbors."""
+    cluster = roomy(atoms, 1)[: min(len(atoms), 12)]
+    cluster.pbc = False
+    cluster.set_cell([6 * _FAR] * 3)
+    symbol = str(atoms.symbols[0])
+    what = f"a {symbol} atom {_FAR:g} Å from a cluster"
+    far = cluster.copy()
+    far += Atoms(symbol, positions=[cluster.positions.max(axis=0) + _FAR])
+    both = _answer(subject.fresh(), cluster), _answer(subject.fresh(), far)
+    if isinstance(both[0], str) or isinstance(both[1], str):
+        skipped.append((what, next(one for one in both if isinstance(one, str))))
+    elif symbol in single:
+        rows.append(_lonely(what, (both[1][0], both[1][1][-1:]), both[0][0] + single[symbol], noise))
+
+
+def _lonely(what: str, found: tuple[float, np.ndarray], expected: float, noise: Noise) -> dict[str, Any]:
+    force = float(np.max(np.abs(found[1]), initial=0.0))
+    eps = np.finfo(float).eps
+    return {
+        "atoms": what,
+        "energy (eV)": found[0],
+        "expected": expected,
+        "force (eV/Å)": force,
+        "adds up": abs(found[0] - expected) <= _ALLOWED * max(noise.energy, eps * abs(expected)),
+        "no force": force <= _ALLOWED * max(noise.force, eps),
+    }
+
+
+def _unsteady(repeats: Mapping[str, Any]) -> Iterator[dict[str, str]]:
+    if repeats["bit-identical"] and repeats["bit-identical between objects"]:
+        return
+    within = not repeats["bit-identical"]
+    size = repeats["energies scatter by"] if within else repeats["energies between objects"]
+    yield finding(
+        "NOT_REPEATABLE",
+        "warning",
+        "the same question has not the same answer to the last bit",
+        f"Asked {_REPEATS} times about one structure, {'one object' if within else 'new objects'} gave energies "
+        f"that scatter by {size:.2g} eV. Two runs of one input will part, as all that differ in a last bit do.",
+        "Look for sums in the order of threads or of atomic additions, and for a list kept from the call before.",
+    )
+
+
+def _of_alone(rows: list[dict[str, Any]]) -> Iterator[dict[str, str]]:
+    pushed = [row for row in rows if not row["no force"]]
+    if pushed:
+        worst = max(pushed, key=lambda row: row["force (eV/Å)"])
+        yield finding(
+            "LONELY_FORCE",
+            "error",
+            "an atom without neighbors feels a force",
+            f"On {worst['atoms']} acts a force of {worst['force (eV/Å)']:.3g} eV/Å.",
+            "Look at empty neighborhoods: a sum over no neighbors, or a normalization by their number.",
+        )
+    apart = [row for row in rows if not row["adds up"]]
+    if apart:
+        worst = max(apart, key=lambda row: abs(row["energy (eV)"] - row["expected"]))
+        yield finding(
+            "LONELY_ENERGY",
+            "warning",
+            "energies of parts that cannot feel one another do not add up",
+            f"{worst['atoms'][0].upper()}{worst['atoms'][1:]}: {worst['energy (eV)']:.10g} eV, expected "
+            f"{worst['expected']:.10g}.",
+            "Look for terms of the whole structure (a mean over atoms, a background charge), or for a cutoff "
+            f"beyond {_FAR:g} Å.",
+        )
+
+
+def _row(row: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        "sequence": row["sequence"],
+        "what happened": row["structure"],
+        "energy differs by": row["energy"],
+        "allowed": row["allowed"],
+        "forces differ by": row["force"],
+        "same": not row["remembers"],
+    }
+
+
+def _says(rows: list[dict[str, Any]], stale: list[dict[str, Any]], repeats: Mapping[str, Any]) -> str:
+    bits = "are" if repeats["bit-identical"] else "are not"
+    tail = f"Repeated calls {bits} bit-identical."
+    if stale:
+        return (
+            f"{len(stale)} of {len(rows)} answers of an object in use differ from those of a new one, by up to "
+            f"{max(row['energy'] for row in stale):.3g} eV: the calculator remembers. {tail}"
+        )
+    return f"An object asked {len(rows)} times in five sequences answered as new ones do. {tail}"

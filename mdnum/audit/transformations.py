@@ -1,0 +1,286 @@
+"""Other ways to write down the same structure: energy and forces must not tell them apart."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+from ase import Atoms
+from jaxtyping import Float, Int
+
+#: Coordinates that should be 0 and are not quite: a denormal-like displacement that was seen to cost 5 eV,
+#: one that is lost when it is added to a cell's length, and half an ulp of 1.
+_TINY = (1e-52, 1e-17, 2.0**-53)
+
+
+@dataclass(frozen=True)
+class Same:
+    """A structure that is the same as another, written down otherwise.
+
+    Attributes:
+        what: in words.
+        code: of the finding when the calculator tells it apart.
+        atoms: the other way.
+        copies: how many times the structure it holds.
+        order: atom of the structure that each of its atoms is.
+        turn: a rotation or reflection R, new positions being R x.
+        rounding: Å by which writing it down moved an atom, at most.
+        before: compare with this instead of the structure itself.
+    """
+
+    what: str
+    code: str
+    atoms: Atoms
+    order: Int[np.ndarray, "same"]
+    copies: int = 1
+    turn: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))
+    rounding: float = 0.0
+    before: Atoms | None = None
+
+
+def all_of(atoms: Atoms, given: Atoms, rng: np.random.Generator) -> Iterator[Same]:
+    """Every way that applies to a structure.
+
+    Args:
+        atoms: no distance of it on a threshold by design.
+        given: the structure as it was given, where one may be.
+        rng: draws shifts, orders and rotations.
+    """
+    yield from translated(atoms, rng)
+    yield from imaged(atoms, rng)
+    yield from on_a_face(atoms, rng)
+    yield from permuted(atoms, rng)
+    yield from by_an_ulp(atoms, given)
+    yield from repeated(atoms)
+    yield from skewed(atoms)
+    yield from turned(atoms, rng)
+    yield from without_periods(atoms)
+
+
+def translated(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
+    """All atoms moved together, by lattice vectors and by anything."""
+    every = np.arange(len(atoms))
+    if atoms.pbc.any():
+        for count in (1, -3):
+            by = count * atoms.cell.array[atoms.pbc].sum(axis=0)
+            words = "one lattice vector" if count == 1 else "three lattice vectors back"
+            yield _moved(f"all atoms moved by {words} along each periodic axis", "TRANSLATION", atoms, by)
+        for _ in range(2):
+            share = rng.uniform(0, 1, 3) * atoms.pbc
+            there = _moved(
+                "all atoms moved by fractions of the lattice vectors", "TRANSLATION", atoms, share @ atoms.cell
+            )
+            yield there
+            folded = there.atoms.copy()
+            folded.wrap(eps=0)
+            what = "all atoms moved by fractions of the lattice vectors and wrapped"
+            yield Same(what, "IMAGES", folded, every, rounding=_ulp(folded, there.atoms))
+    free = ~atoms.pbc
+    if free.any():
+        for length in (7.3, -250.0):
+            by = np.zeros(3)
+            by += length * _outward(atoms, free)
+            what = f"all atoms moved by {length:g} Å along {'the free axes' if atoms.pbc.any() else 'x, y, z'}"
+            yield _moved(what, "TRANSLATION", atoms, by)
+
+
+def imaged(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
+    """Each atom in a box of its own choice: unwrapped trajectories look like this."""
+    if not atoms.pbc.any():
+        return
+    every = np.arange(len(atoms))
+    folded = atoms.copy()
+    folded.wrap(eps=0)
+    yield Same(
+        "atoms wrapped into the cell", "IMAGES", folded, every, rounding=_ulp(folded, atoms)
+    )
+    for most in (1, 3, 20):
+        boxes = rng.integers(-most, most + 1, (len(atoms), 3)) * atoms.pbc
+        there = atoms.copy()
+        there.positions += boxes @ atoms.cell.array
+        what = f"each atom moved by lattice vectors of its own, up to {most} of them"
+        yield Same(what, "IMAGES", there, every, rounding=_ulp(there, atoms))
+
+
+def on_a_face(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
+    """One atom on the face of the cell, a hair outside, and on the opposite face."""
+    if not atoms.pbc.any():
+        return
+    every = np.arange(len(atoms))
+    axes = np.flatnonzero(atoms.pbc)
+    for who in dict.fromkeys((0, int(rng.integers(len(atoms))))):
+        base = atoms.copy()
+        base.positions -= atoms.positions[who]
+        base.positions[who] = 0.0
+        slack = _ulp(base, atoms)
+        yield Same(f"atom {who} at 0", "FACES", base, every, rounding=slack)
+        there = base.copy()
+        there.positions[who] = atoms.cell.array[axes].sum(axis=0)
+        yield Same(f"atom {who} at L on every periodic axis", "FACES", there, every, rounding=slack)
+        for axis in axes:
+            there = base.copy()
+            there.positions[who] = atoms.cell.array[axis]
+            yield Same(f"atom {who} at L along {'abc'[axis]}", "FACES", there, every, rounding=slack)
+        there = base.copy()
+        there.positions[who] = np.nextafter(atoms.cell.array[axes].sum(axis=0), 0.0)
+        yield Same(f"atom {who} one ulp short of L", "FACES", there, every, rounding=slack)
+        for tiny in _TINY:
+            there = base.copy()
+            there.positions[who, axes] = -tiny
+            yield Same(f"atom {who} at {-tiny:.0e} Å", "FACES", there, every, rounding=slack + tiny)
+        there = base.copy()
+        there.positions[who, axes] = -0.0
+        yield Same(f"atom {who} at -0", "FACES", there, every, rounding=slack)
+
+
+def permuted(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
+    """Atoms in another order."""
+    if len(atoms) < 2:
+        return
+    for _ in range(2):
+        order = rng.permutation(len(atoms))
+        yield Same("atoms in another order", "ORDER", atoms[order], order)
+    order = np.arange(len(atoms))[::-1].copy()
+    yield Same("atoms in reverse order", "ORDER", atoms[order], order)
+
+
+def by_molecule(atoms: Atoms, rng: np.random.Generator) -> Same | None:
+    """Whole groups of atoms in another order, where the species repeat in groups; None where they do not."""
+    size = group(atoms)
+    if size is None:
+        return None
+    order = (rng.permutation(len(atoms) // size)[:, None] * size + np.arange(size)).ravel()
+    return Same(f"groups of {size} atoms in another order", "ORDER", atoms[order], order)
+
+
+def images_by_molecule(atoms: Atoms, rng: np.random.Generator) -> Same | None:
+    """Whole groups of atoms moved by lattice vectors of their own; None as for `by_molecule`."""
+    size = group(atoms)
+    if size is None or not atoms.pbc.any():
+        return None
+    boxes = rng.integers(-2, 3, (len(atoms) // size, 3)) * atoms.pbc
+    there = atoms.copy()
+    there.positions += np.repeat(boxes, size, axis=0) @ atoms.cell.array
+    what = f"groups of {size} atoms moved by lattice vectors of their own"
+    return Same(what, "IMAGES", there, np.arange(len(atoms)), rounding=_ulp(there, atoms))
+
+
+def group(atoms: Atoms) -> int | None:
+    """Atoms in a group, above 1, that the order of species repeats; None for one species, or no repeat."""
+    numbers = atoms.numbers
+    for size in range(2, len(atoms) // 2 + 1):
+        if len(atoms) % size == 0 and np.array_equal(numbers[size:], numbers[:-size]):
+            return size if len(set(numbers[:size])) > 1 else None
+    return None
+
+
+def by_an_ulp(atoms: Atoms, given: Atoms) -> Iterator[Same]:
+    """The cell an ulp larger and smaller, atoms where they were."""
+    if not atoms.pbc.any():
+        return
+    every = np.arange(len(atoms))
+    for what, base in (("", atoms), (", of the structure as it was given", given)):
+        for toward, word in ((np.inf, "larger"), (0.0, "smaller")):
+            there = base.copy()
+            cell = base.cell.array
+            # away from zero, whatever the sign, and zeros stay zeros
+            target = np.copysign(toward, cell)
+            there.set_cell(np.where(cell == 0, cell, np.nextafter(cell, target)))
+            yield Same(
+                f"cell one ulp {word}{what}", "CELL_ULP", there, every,
+                rounding=2 * float(np.spacing(np.max(np.abs(cell)))), before=base,
+            )  # fmt: skip
+
+
+def repeated(atoms: Atoms) -> Iterator[Same]:
+    """Supercells."""
+    wanted = [tuple(2 if n == axis else 1 for n in range(3)) for axis in np.flatnonzero(atoms.pbc)]
+    if len(wanted) > 1 and len(atoms) <= 64:
+        wanted.append(tuple(2 if repeats else 1 for repeats in atoms.pbc))
+    for counts in wanted:
+        there = atoms.repeat(counts)
+        copies = len(there) // len(atoms)
+        order = np.tile(np.arange(len(atoms)), copies)
+        what = f"{' x '.join(map(str, counts))} supercell"
+        yield Same(what, "EXTENSIVE", there, order, copies=copies, rounding=_ulp(there, atoms))
+
+
+def skewed(atoms: Atoms) -> Iterator[Same]:
+    """The same lattice from other lattice vectors."""
+    if not atoms.pbc.all():
+        return
+    every = np.arange(len(atoms))
+    for what, matrix in (
+        ("b replaced by a + b", [[1, 0, 0], [1, 1, 0], [0, 0, 1]]),
+        ("c replaced by c - a + b", [[1, 0, 0], [0, 1, 0], [-1, 1, 1]]),
+        ("a, b, c replaced by b, c, a", [[0, 1, 0], [0, 0, 1], [1, 0, 0]]),
+    ):
+        there = atoms.copy()
+        there.set_cell(np.array(matrix) @ atoms.cell.array)
+        yield Same(f"the same lattice, {what}", "LATTICE", there, every, rounding=_ulp(there, atoms))
+    # the other hand: a left-handed cell is as good as any
+    there = atoms.copy()
+    there.set_cell(atoms.cell.array[[1, 0, 2]])
+    yield Same("the same lattice, a and b exchanged", "LATTICE", there, every, rounding=_ulp(there, atoms))
+
+
+def turned(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
+    """Structure and cell turned together, by anything, by axes, and mirrored."""
+    every = np.arange(len(atoms))
+    q, r = np.linalg.qr(rng.standard_normal((3, 3)))
+    anyhow = q * np.sign(np.diag(r))
+    anyhow *= np.sign(np.linalg.det(anyhow))
+    cyclic = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+    for what, code, turn in (
+        ("structure and cell rotated", "ROTATION", anyhow),
+        ("x, y, z exchanged in a cycle", "ROTATION", cyclic),
+        ("structure and cell mirrored", "MIRROR", np.diag([-1.0, 1.0, 1.0])),
+    ):
+        there = atoms.copy()
+        there.set_cell(atoms.cell.array @ turn.T)
+        there.positions = atoms.positions @ turn.T
+        yield Same(what, code, there, every, turn=turn, rounding=4 * _ulp(there, atoms))
+
+
+def without_periods(atoms: Atoms) -> Iterator[Same]:
+    """A cluster in cells that do not repeat: what is written in them must not matter."""
+    every = np.arange(len(atoms))
+    base = atoms.copy()
+    base.pbc = False
+    base.set_cell(np.zeros((3, 3)))
+    span = np.ptp(base.positions, axis=0).max() + 30.0
+    for what, cell in (
+        ("a large one", np.diag([span] * 3)),
+        ("one shorter than the cluster", np.diag([2.0, 3.0, 4.0])),
+        ("a skewed one", np.array([[5.0, 0.0, 0.0], [4.0, 3.0, 0.0], [1.0, 2.0, 6.0]])),
+    ):
+        there = base.copy()
+        there.set_cell(cell)
+        yield Same(f"without periods, in {what}", "DUMMY_CELL", there, every, before=base)
+
+
+def _moved(what: str, code: str, atoms: Atoms, by: Float[np.ndarray, "3"]) -> Same:
+    there = atoms.copy()
+    there.positions += by
+    return Same(what, code, there, np.arange(len(atoms)), rounding=_ulp(there, atoms))
+
+
+def _outward(atoms: Atoms, free: np.ndarray) -> np.ndarray:
+    """A direction along the axes that do not repeat, of unit length, and across those that do."""
+    if free.all():
+        return np.array([1.0, -0.7, 0.4]) / np.linalg.norm([1.0, -0.7, 0.4])
+    if not atoms.cell.array[~free].any():
+        return np.eye(3)[free][0]
+    # perpendicular to the lattice vectors that repeat
+    _, _, basis = np.linalg.svd(atoms.cell.array[~free])
+    return basis[-1]
+
+
+def _ulp(*structures: Atoms) -> float:
+    """An ulp of the largest coordinate or cell entry of some structures, Å."""
+    largest = max(
+        max(np.max(np.abs(one.positions), initial=0.0), np.max(np.abs(one.cell.array), initial=0.0))
+        for one in structures
+    )
+    return float(np.spacing(largest))
