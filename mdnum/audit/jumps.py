@@ -1,0 +1,336 @@
+"""Where a curve jumps or has a kink: found by scanning and zooming, located to neighboring doubles, measured.
+
+A curve is an energy and the force along one coordinate. Each value is predicted from the points on its left
+and, independently, from those on its right. Across a smooth stretch the two predictions meet with the fourth
+power of the spacing; across a jump they never do, and across a kink only with the first power: so how fast
+the mismatch falls while one zooms in tells what is there, whatever the curve looks like elsewhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+#: A value is predicted half a spacing beyond the last of four points (Lagrange's cubic).
+_EXTRAPOLATE = np.array([-0.3125, 1.3125, -2.1875, 2.1875])
+#: One-sided first derivative from five points, error fourth power of the spacing.
+_SLOPE = np.array([-25.0, 48.0, -36.0, 16.0, -3.0]) / 12.0
+
+_DIVISIONS = 24
+_NARROWER = 6
+"""How much each zoom narrows: four of the divisions are kept."""
+
+_LEVELS = 7
+_OUTLIER = 4.0
+"""A mismatch this many times those around it is looked at more closely."""
+
+_SURE = 6.0
+"""A jump this many times what rounding and truncation could make of nothing is one."""
+
+_CLOSER = (3e-9, 1e-7, 1e-6, 1e-5)
+"""Spacings (relative) at which scatter is looked for: a float32 calculator is constant over the first."""
+
+_WIDTHS = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2)
+"""Spacings from which a one-sided slope is taken; the one with the smallest error is kept."""
+
+SMOOTH = 3
+"""Order given to a threshold at which neither energy, force nor curvature jumps, and no more is known."""
+
+
+class Curve:
+    """Energy and force along one coordinate, each place evaluated once.
+
+    Args:
+        at: gives (energy, force = -dE/dx) at a coordinate.
+    """
+
+    def __init__(self, at: Callable[[float], tuple[float, float]]):
+        self._at = at
+        self.known: dict[float, tuple[float, float]] = {}
+
+    def __call__(self, x: float) -> tuple[float, float]:
+        """(energy, force) at x."""
+        x = float(x)
+        if x not in self.known:
+            self.known[x] = self._at(x)
+        return self.known[x]
+
+    def many(self, places: Sequence[float] | np.ndarray) -> Float[np.ndarray, "2 points"]:
+        """Energies and forces as rows."""
+        return np.array([self(float(x)) for x in places]).T
+
+
+@dataclass(frozen=True)
+class Jump:
+    """A place where the curve or one of its derivatives jumps.
+
+    Attributes:
+        low: the last coordinate before it.
+        high: the first one after it; the next double after low where `exact`.
+        energy: energy after minus energy before.
+        force: the same of the force.
+        curvature: the same of the second derivative of the energy.
+        doubt: how large each of the three could look where nothing jumps.
+        order: 0 where the energy jumps, 1 the force, 2 the curvature; 3 where none of them does beyond doubt.
+        exact: whether low and high are neighbors among the doubles.
+    """
+
+    low: float
+    high: float
+    energy: float
+    force: float
+    curvature: float
+    doubt: tuple[float, float, float]
+    order: int
+    exact: bool
+
+    @property
+    def at(self) -> float:
+        """Where it is."""
+        return self.low if self.exact else 0.5 * (self.low + self.high)
+
+
+def find_jumps(curve: Curve, low: float, high: float, step: float, most: int = 24) -> tuple[list[Jump], int]:
+    """Every jump of energy, force or curvature that stands out of a scan.
+
+    Args:
+        curve: what is looked at; must be defined a little beyond both ends.
+        low, high: where to look.
+        step: spacing of the scan. Two thresholds closer together than this may be told as one.
+        most: how many places are looked at closely, those that stand out most.
+
+    Returns:
+        (jumps by coordinate, how many places that stood out were left out).
+    """
+    places = np.linspace(low, high, max(int(np.ceil((high - low) / step)), 12) + 1)
+    suspects = _outliers(curve, places)
+    found: list[Jump] = []
+    for _, left, right in suspects[:most]:
+        if any(jump.low >= left and jump.high <= right for jump in found):
+            continue
+        for jump in _zoom(curve, left, right):
+            if not any(abs(jump.at - other.at) <= _same(jump, other) for other in found):
+                found.append(jump)
+    return sorted(found, key=lambda jump: jump.at), max(len(suspects) - most, 0)
+
+
+def bisect(told: Callable[[float], bool], low: float, high: float) -> tuple[float, float]:
+    """Neighboring doubles between which an answer changes.
+
+    Args:
+        told: the question; its answers at low and at high differ.
+        low, high: low < high.
+    """
+    before = told(low)
+    while True:
+        middle = low + 0.5 * (high - low)
+        if not low < middle < high:
+            return low, high
+        if told(middle) == before:
+            low = middle
+        else:
+            high = middle
+
+
+def measure(curve: Curve, low: float, high: float, room: float, exact: bool) -> Jump:
+    """The jumps between low and high, and how large they could look where there are none.
+
+    Energy and force are taken at the last representable coordinates on either side (medians of four, so that
+    one unlucky rounding does not decide), the curvature from one-sided differences of the force.
+
+    Args:
+        curve: what is looked at.
+        low, high: the two sides.
+        room: how far to either side the curve can be used, coordinate.
+        exact: whether low and high are neighboring doubles.
+    """
+    left, right = _close(curve, low, -np.inf), _close(curve, high, np.inf)
+    values = np.median(right, axis=1) - np.median(left, axis=1)
+    floor = scatter(curve, low, high, room).max(axis=0)
+    spread = np.maximum(np.ptp(left, axis=1), np.ptp(right, axis=1)) + 4 * floor
+    if not exact:  # between the two sides the curve goes its smooth way too
+        force = abs(curve(low)[1]) + abs(curve(high)[1])
+        slope_left, _ = _slope(curve, low, -1, room, floor[1])
+        slope_right, _ = _slope(curve, high, 1, room, floor[1])
+        steepest = max(abs(slope_left), abs(slope_right))
+        spread = spread + (high - low) * np.array([force, steepest])
+    before, doubt_before = _slope(curve, low, -1, room, floor[1])
+    after, doubt_after = _slope(curve, high, 1, room, floor[1])
+    curvature, doubt = before - after, doubt_before + doubt_after  # E'' is -F'
+    jumps, doubts = (*values, curvature), (*spread, doubt)
+    order = SMOOTH
+    for k in (2, 1, 0):
+        if abs(jumps[k]) > _SURE * doubts[k]:
+            order = k
+    return Jump(
+        low, high, float(jumps[0]), float(jumps[1]), float(jumps[2]),
+        (float(doubts[0]), float(doubts[1]), float(doubts[2])), order, exact,
+    )  # fmt: skip
+
+
+def scatter(curve: Curve, low: float, high: float, room: float) -> Float[np.ndarray, "2 2"]:
+    """Scatter of energy and force (columns) from rounding, before low and after high (rows).
+
+    The largest that any of some spacings shows: a calculator in float32 is constant over the smallest.
+    """
+    sides = []
+    for start, sign in ((low, -1.0), (high, 1.0)):
+        worst = np.zeros(2)
+        for relative in _CLOSER:
+            width = max(abs(start), 1.0) * relative
+            if 9 * width > room:
+                break
+            values = curve.many(start + sign * width * np.arange(1, 9))
+            worst = np.maximum(worst, np.abs(np.diff(values, 4, axis=1)).max(axis=1) / np.sqrt(70.0))
+        sides.append(worst)
+    return np.array(sides)
+
+
+def decay_power(curve: Curve, edge: float, room: float) -> float | None:
+    """Power with which the force vanishes toward an edge beyond which it is zero; None where unclear.
+
+    Args:
+        curve: what is looked at; zero beyond the edge.
+        edge: where it dies, approached from below.
+        room: how far below the edge the curve has no other threshold.
+    """
+    distances = room * 0.5 ** np.arange(2, 14)
+    forces = np.abs(curve.many(edge - distances)[1])
+    floor = max(float(scatter(curve, edge - room / 3, edge, room / 3)[0, 1]), 1e-300)
+    good = forces > 1e3 * floor
+    if good.sum() < 4:
+        return None
+    x, y = np.log(distances[good]), np.log(forces[good])
+    slopes = np.diff(y) / np.diff(x)
+    return float(np.median(slopes[-4:]))
+
+
+def _outliers(curve: Curve, places: Float[np.ndarray, "points"]) -> list[tuple[float, float, float]]:
+    """(how far it stands out, left, right) of intervals whose mismatch stands out, the worst first."""
+    middle = places[len(places) // 2]
+    noise = scatter(curve, middle, middle, places[-1] - places[0]).min(axis=0)
+    floors = 64 * np.array([*noise, 2 * noise[0] + (places[1] - places[0]) * noise[1]])
+    kept: dict[int, float] = {}
+    for row, least in zip(_mismatch(curve, places), floors, strict=True):
+        for k, value in enumerate(row):
+            around = np.concatenate([row[max(k - 12, 0) : max(k - 3, 0)], row[k + 4 : k + 13]])
+            usual = max(float(np.median(around)) if len(around) else 0.0, float(least), 1e-300)
+            if value >= row[max(k - 3, 0) : k + 4].max() and value > _OUTLIER * usual:
+                kept[k] = max(kept.get(k, 0.0), value / usual)
+    # three points on either side have no mismatch of their own
+    ranked = sorted(((ratio, k) for k, ratio in kept.items()), reverse=True)
+    return [(ratio, float(places[k + 3]), float(places[k + 4])) for ratio, k in ranked]
+
+
+def _mismatch(curve: Curve, places: Float[np.ndarray, "points"]) -> Float[np.ndarray, "3 intervals"]:
+    """How badly each interval joins its two sides: energy, force, and energy against the force's work.
+
+    The first two are |prediction from the left minus prediction from the right| in its middle, the third is
+    the change of the energy without the integral of the force (fifth power of the spacing where smooth),
+    which shows an energy that jumps on its own far sooner.
+    """
+    values = curve.many(places)
+    windows = np.lib.stride_tricks.sliding_window_view(values, 4, axis=1)
+    ends = np.abs((windows @ _EXTRAPOLATE)[:, :-4] - (windows @ _EXTRAPOLATE[::-1])[:, 4:])
+    width = places[1] - places[0]
+    work = width / 24 * (windows[1] @ np.array([-1.0, 13.0, 13.0, -1.0]))
+    unexplained = np.abs(np.diff(values[0])[1:-1] + work)
+    return np.vstack([ends, unexplained[2:-2]])
+
+
+def _zoom(curve: Curve, left: float, right: float) -> list[Jump]:
+    """What is about left to right, down to neighboring doubles where a value jumps."""
+    room = right - left
+    left, right = left - 1.5 * room, right + 1.5 * room
+    noise = np.maximum(scatter(curve, left, right, room).max(axis=0), 1e-300)
+    history: list[np.ndarray] = []
+    clear: list[np.ndarray] = []
+    for _ in range(_LEVELS):
+        width = (right - left) / _DIVISIONS
+        mismatch = _mismatch(curve, np.linspace(left - 4 * width, right + 4 * width, _DIVISIONS + 9))
+        floor = np.array([*noise, 2 * noise[0] + width * noise[1]])
+        best = int(np.argmax((mismatch / floor[:, None]).max(axis=0)))
+        history.append(mismatch[:, best])
+        clear.append(mismatch[:, best] > 30 * floor)
+        # a jump shows more in the intervals beside it than in its own
+        left, right = left + (best - 2.5) * width, left + (best + 1.5) * width
+        if not clear[-1].any():
+            break
+        if len(history) < 2:
+            continue
+        falls = history[-1] / np.maximum(history[-2], 1e-300)
+        for channel in (0, 1, 2):
+            row = channel % 2  # what the work of the force does not explain is a jump of the energy
+            jumped = abs(_level(curve, row, left)(right) - curve(left)[row])
+            now = history[-1][channel]
+            if clear[-1][channel] and falls[channel] > 0.5 and 0.7 * jumped < now < 1.4 * jumped:
+                low, high = _split(curve, row, left, right)
+                jump = measure(curve, low, high, room, exact=True)
+                return [jump] if jump.order < SMOOTH else []
+        if len(history) > 2 and (falls < _NARROWER**-2.5).all():
+            break
+    bends = [row[1] for row, yes in zip(history, clear, strict=True) if yes[1]]
+    if len(bends) < 2 or bends[-1] < bends[-2] / _NARROWER**1.6:
+        return []
+    return _kink(curve, left, right, room)
+
+
+def _split(curve: Curve, row: int, left: float, right: float) -> tuple[float, float]:
+    """Neighboring doubles between which a value goes from that at left to that at right."""
+    level = _level(curve, row, left)
+    middle = 0.5 * (level(left) + level(right))
+    rising = level(right) > level(left)
+    return bisect(lambda x: (level(x) > middle) == rising, left, right)
+
+
+def _level(curve: Curve, row: int, left: float) -> Callable[[float], float]:
+    """The force, or the energy without the work done on the way from left: what is left of it are jumps."""
+    if row == 1:
+        return lambda x: curve(x)[1]
+    return lambda x: curve(x)[0] + 0.5 * (x - left) * (curve(left)[1] + curve(x)[1])
+
+
+def _kink(curve: Curve, left: float, right: float, room: float) -> list[Jump]:
+    """A place where the force bends: where its continuations from both sides meet."""
+    width = min(room / 8, 1e-3)
+    middle, reach = 0.5 * (left + right), max(0.5 * (right - left), width / 8)
+    steps = reach + width * np.arange(7)
+    before = np.polyfit(-steps, curve.many(middle - steps)[1], 3)
+    after = np.polyfit(steps, curve.many(middle + steps)[1], 3)
+    roots = np.roots(before - after)
+    real = roots[np.abs(roots.imag) < 1e-9].real
+    near = real[np.abs(real) <= 2 * reach]
+    if len(near):
+        middle, reach = middle + float(near[np.argmin(np.abs(near))]), min(reach, 1e-7)
+    jump = measure(curve, middle - reach, middle + reach, room, exact=False)
+    return [jump] if jump.order < SMOOTH else []
+
+
+def _slope(curve: Curve, start: float, sign: int, room: float, noise: float) -> tuple[float, float]:
+    """(dF/dx at start from one side, its error) at the spacing that makes the error least."""
+    best = (0.0, np.inf)
+    for relative in _WIDTHS:
+        width = max(abs(start), 1.0) * relative
+        if 8 * width > 2 * room and np.isfinite(best[1]):
+            break
+        fine = curve.many(start + sign * width * np.arange(5))[1] @ _SLOPE * sign / width
+        coarse = curve.many(start + sign * 2 * width * np.arange(5))[1] @ _SLOPE * sign / (2 * width)
+        error = abs(fine - coarse) + 12 * noise / width + 1e-14 * abs(fine)
+        if error < best[1]:
+            best = (float(fine), float(error))
+    return best
+
+
+def _close(curve: Curve, start: float, toward: float) -> Float[np.ndarray, "2 points"]:
+    places = [start]
+    for _ in range(3):
+        places.append(float(np.nextafter(places[-1], toward)))
+    return curve.many(places)
+
+
+def _same(one: Jump, other: Jump) -> float:
+    """How near two places are that are one."""
+    return 1e-9 * max(abs(one.at), 1.0) if one.exact and other.exact else 2e-4
