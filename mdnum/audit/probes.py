@@ -1,0 +1,161 @@
+"""Two particles on a line: the arrangement in which a calculator shows where its pair interaction changes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations_with_replacement
+
+import numpy as np
+from ase import Atoms
+
+from mdnum.audit.base import Subject
+from mdnum.audit.jumps import Curve
+from mdnum.audit.subject import CalculatorError
+
+#: What a calculator may want around two atoms, the simplest first: (a cell, periodic).
+_SURROUNDINGS = ((False, False), (True, False), (True, True))
+
+#: A scan does not go further apart than this, in the unit of length.
+FARTHEST = 30.0
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two particles, single atoms or whole molecules, that can be put at any distance.
+
+    Attributes:
+        species: symbols of the two reference atoms; molecules by the heaviest of their atoms.
+        first: the particle that stays, its reference atom at the origin.
+        second: the particle that moves along x, its reference atom at the origin.
+        lead: index of second's reference atom.
+        box: edge of the cubic cell around them, 0 for none.
+        periodic: whether the cell repeats.
+        name: formulas of the two.
+    """
+
+    species: tuple[str, str]
+    first: Atoms
+    second: Atoms
+    box: float
+    periodic: bool
+    name: str
+
+    def at(self, distance: float) -> Atoms:
+        """The two at a distance (of the reference atoms), which is exact in the last bit."""
+        moved = self.second.copy()
+        moved.positions[:, 0] += distance
+        both = self.first + moved
+        if self.box:
+            both.set_cell([self.box] * 3)
+        both.pbc = self.periodic
+        return both
+
+    def curve(self, subject: Subject) -> Curve:
+        """Energy against distance, and the force that drives the second away from the first."""
+
+        def at(distance: float) -> tuple[float, float]:
+            atoms = self.at(distance)
+            energy = subject.energy(atoms)
+            return energy, float(subject.forces(atoms)[len(self.first) :, 0].sum())
+
+        return Curve(at)
+
+
+def pairs(subject: Subject, most: int = 6) -> tuple[list[Pair], list[tuple[str, str]]]:
+    """Two of each species of the structure that the calculator answers for, the most frequent first.
+
+    Single atoms where it takes them; where it takes none (rigid water), molecules of the structure.
+
+    Returns:
+        (pairs, what was left out and why).
+    """
+    symbols = subject.atoms.get_chemical_symbols()
+    species = sorted(set(symbols), key=lambda one: (-symbols.count(one), one))
+    wanted = list(combinations_with_replacement(species, 2))
+    wanted.sort(key=lambda two: -symbols.count(two[0]) * symbols.count(two[1]))
+    found: list[Pair] = []
+    skipped: list[tuple[str, str]] = []
+    for one, other in wanted[:most]:
+        pair, why = _answered(subject, (one, other), Atoms(one, [(0, 0, 0)]), Atoms(other, [(0, 0, 0)]))
+        if pair is None:
+            skipped.append((f"pair {one}-{other}", why))
+        else:
+            found.append(pair)
+    skipped += [
+        (f"pair {one}-{other}", f"the {most} most frequent pairs were walked") for one, other in wanted[most:]
+    ]
+    if not found:
+        pair = _molecules(subject)
+        if pair is not None:
+            return [pair], skipped
+    return found, skipped
+
+
+def molecules(atoms: Atoms) -> list[np.ndarray]:
+    """Indices of the atoms of each molecule: those that bonds connect, by covalent radii."""
+    from ase.neighborlist import natural_cutoffs, neighbor_list
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    first, second = neighbor_list("ij", atoms, [1.1 * radius for radius in natural_cutoffs(atoms)])
+    graph = coo_array((np.ones(len(first)), (first, second)), shape=(len(atoms), len(atoms)))
+    count, label = connected_components(graph, directed=False)
+    order = np.argsort(label, kind="stable")
+    return np.split(order, np.searchsorted(label[order], np.arange(1, count)))
+
+
+def whole(atoms: Atoms, indices: np.ndarray) -> Atoms:
+    """One molecule in one piece, its heaviest atom at the origin; no cell."""
+    part = _part(atoms, indices)
+    lead = int(np.argmax(part.get_masses()))
+    offsets = part.get_distances(lead, np.arange(len(part)), mic=bool(atoms.pbc.any()), vector=True)
+    return Atoms(part.get_chemical_symbols(), offsets)
+
+
+def _molecules(subject: Subject) -> Pair | None:
+    """Two molecules of the structure, where it consists of several."""
+    groups = molecules(subject.atoms)
+    if not 2 <= len(groups) <= len(subject.atoms) / 2:
+        return None
+    one, other = (whole(subject.atoms, group) for group in _two_alike(subject.atoms, groups))
+    leads = [part.get_chemical_symbols()[int(np.argmax(part.get_masses()))] for part in (one, other)]
+    pair, _ = _answered(subject, (leads[0], leads[1]), one, other)
+    return pair
+
+
+def _part(atoms: Atoms, indices: np.ndarray) -> Atoms:
+    part = atoms[indices]
+    assert isinstance(part, Atoms)
+    return part
+
+
+def _two_alike(atoms: Atoms, groups: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    first = groups[0]
+    formula = _part(atoms, first).get_chemical_formula()
+    for other in groups[1:]:
+        if _part(atoms, other).get_chemical_formula() == formula:
+            return first, other
+    return first, groups[1]
+
+
+def _answered(
+    subject: Subject, species: tuple[str, str], first: Atoms, second: Atoms
+) -> tuple[Pair | None, str]:
+    """The simplest surroundings in which the calculator gives energy and forces, or why there are none."""
+    why = ""
+    for cell, periodic in _SURROUNDINGS:
+        box = 2.5 * FARTHEST if cell else 0.0
+        name = "-".join(part.get_chemical_formula() for part in (first, second))
+        pair = Pair(species, first, second, box, periodic, name)
+        for distance in (3.0, 6.0):
+            try:
+                atoms = pair.at(distance)
+                subject.energy(atoms)
+                subject.forces(atoms)
+            except CalculatorError as error:
+                why = why or error.message
+                break
+        else:
+            return pair, ""
+    return None, why

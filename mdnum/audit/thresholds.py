@@ -1,0 +1,244 @@
+"""Where a calculator's interactions change their program: found from its answers, never asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from jaxtyping import Float
+
+from mdnum.audit.base import Progress, Subject
+from mdnum.audit.jumps import (
+    SMOOTH,
+    Curve,
+    Jump,
+    bisect,
+    decay_power,
+    find_jumps,
+    measure,
+    scatter,
+)
+from mdnum.audit.probes import FARTHEST, Pair, pairs
+from mdnum.audit.subject import CalculatorError
+
+STEP = 0.025
+"""Spacing of a scan, in the unit of length. Two thresholds closer than this may be told as one."""
+
+_NEAREST = 0.3
+_COSTLY = 1000.0
+"""Distances are walked down to where two particles cost this many kT."""
+
+_SMOOTHEST = 6
+"""Orders above this are told as this one: that smooth or smoother."""
+
+
+@dataclass(frozen=True)
+class Threshold:
+    """A distance at which the energy or one of its derivatives jumps, or beyond which nothing is left.
+
+    Attributes:
+        radius: the distance, length.
+        species: of the two atoms (of the reference atoms of two molecules).
+        order: the lowest derivative of the energy that jumps: 0 the energy, 1 the force, 2 the curvature, 3
+            the third derivative, and so on; 6 stands for 6 or smoother.
+        jumps: of energy (eV), force along the line (eV/Å) and curvature (eV/Å²): beyond minus before.
+        doubt: how large each of them could look where nothing jumps.
+        inside: the last distance before it that was told apart.
+        outside: the first one beyond it; the next double where a value jumps.
+        dies: whether the two do not interact beyond it.
+        located: how far off radius can be, length.
+    """
+
+    radius: float
+    species: tuple[str, str]
+    order: int
+    jumps: tuple[float, float, float]
+    doubt: tuple[float, float, float]
+    inside: float
+    outside: float
+    dies: bool
+    located: float
+
+
+@dataclass(frozen=True)
+class PairWalk:
+    """Two particles brought from far apart to as near as they come.
+
+    Attributes:
+        pair: who they are.
+        thresholds: by distance.
+        distance: those of the scan, length.
+        energy: against far apart, eV.
+        force: that drives them apart, eV/Å.
+        cutoff: distance beyond which they do not interact; None if they still do at the farthest.
+        left_out: places that stood out of the scan and were not looked at closely.
+        calls: places at which the calculator was asked.
+    """
+
+    pair: Pair
+    thresholds: tuple[Threshold, ...]
+    distance: Float[np.ndarray, "points"]
+    energy: Float[np.ndarray, "points"]
+    force: Float[np.ndarray, "points"]
+    cutoff: float | None
+    left_out: int
+    calls: int
+
+
+@dataclass(frozen=True)
+class PairWalks:
+    """What walking pairs told: the walks, and what was left out and why."""
+
+    walks: tuple[PairWalk, ...]
+    skipped: tuple[tuple[str, str], ...]
+
+
+_known: WeakKeyDictionary[Any, PairWalks] = WeakKeyDictionary()
+
+
+def find_thresholds(subject: Subject) -> list[Threshold]:
+    """Every distance at which a pair interaction of the calculator changes its program.
+
+    Found by walking two of each species from far apart to as near as 1000 kT lets them. What only shows
+    among many (an angle's own cutoff, a cap on neighbors) is for the walks through whole environments.
+
+    Args:
+        subject: the calculator; asked once, remembered afterwards.
+
+    Returns:
+        thresholds by pair of species and distance.
+    """
+    return [one for walk in walk_pairs(subject).walks for one in walk.thresholds]
+
+
+def walk_pairs(subject: Subject, progress: Progress | None = None) -> PairWalks:
+    """Walk every pair of species through its distances; remembered for the subject."""
+    if subject not in _known:
+        found, skipped = pairs(subject)
+        walks = []
+        for k, pair in enumerate(found):
+            if progress:
+                progress(k, len(found), {"phase": f"walking {pair.name}"})
+            try:
+                walks.append(walk(pair, pair.curve(subject), subject.kT))
+            except CalculatorError as error:
+                skipped.append((f"pair {pair.name}", error.message))
+        _known[subject] = PairWalks(tuple(walks), tuple(skipped))
+    return _known[subject]
+
+
+def walk(pair: Pair, curve: Curve, kT: float, step: float = STEP) -> PairWalk:
+    """Walk one pair.
+
+    Raises:
+        CalculatorError: the calculator fails at distances at which it had answered before.
+    """
+    coarse, far = _coarse(curve)
+    energy_far, force_far = curve(far)
+    noise = 8 * scatter(curve, far, far, 1.0)[0]
+
+    def alive(distance: float) -> bool:
+        energy, force = curve(distance)
+        return abs(energy - energy_far) > noise[0] or abs(force) > noise[1]
+
+    costs = np.abs(curve.many(coarse)[0] - energy_far) > _COSTLY * kT
+    near = float(coarse[np.flatnonzero(costs)[-1] + 1]) if costs[:-1].any() else float(coarse[0])
+    edge = None if alive(far) and force_far else _edge(coarse, alive)
+    if edge is None and not alive(float(coarse[-2])):
+        end = near  # nothing anywhere
+    else:
+        end = edge[1] if edge else min(far, 15.0)
+    thresholds: list[Threshold] = []
+    left_out = 0
+    margin = 8 * step
+    if end > near + 12 * step:
+        jumps, left_out = find_jumps(curve, near + margin, end + margin, step)
+        thresholds = [_threshold(pair, jump) for jump in jumps]
+    if edge is not None:
+        thresholds = _with_edge(pair, curve, edge, thresholds, near)
+    distance = np.linspace(near, max(end + 0.5, near + 1.0), 400)
+    values = curve.many(distance)
+    return PairWalk(
+        pair, tuple(sorted(thresholds, key=lambda one: one.radius)), distance, values[0] - energy_far,
+        values[1], thresholds[-1].radius if edge and thresholds else None, left_out, len(curve.known),
+    )  # fmt: skip
+
+
+def _coarse(curve: Curve) -> tuple[Float[np.ndarray, "points"], float]:
+    """Distances from where the calculator first answers to the farthest."""
+    places = np.concatenate([np.arange(_NEAREST, 3.0, 0.1), np.arange(3.0, FARTHEST + 0.1, 0.25)])
+    first = len(places)
+    for k in range(len(places) - 1, -1, -1):
+        try:
+            curve(float(places[k]))
+        except CalculatorError:
+            break
+        first = k
+    if first > len(places) - 4:
+        curve(float(places[-4]))  # says why
+    return places[first:], float(places[-1])
+
+
+def _edge(coarse: Float[np.ndarray, "points"], alive: Callable[[float], bool]) -> tuple[float, float] | None:
+    """Neighboring distances, the last at which anything is felt and the next; None where nothing ever is.
+
+    A smooth switch may be lost in rounding, here and there, before it ends: whatever is felt beyond what
+    was found moves the search outward.
+    """
+    for k in range(len(coarse) - 2, -1, -1):
+        if alive(float(coarse[k])):
+            low, high = float(coarse[k]), float(coarse[k + 1])
+            break
+    else:
+        return None
+    top = high
+    for _ in range(20):
+        low, high = bisect(alive, low, high)
+        beyond = [low + (top - low) * 0.5**power for power in range(1, 40)]
+        felt = [place for place in beyond if place > high and alive(place)]
+        if not felt:
+            return low, high
+        low, high = max(felt), top
+    return low, high
+
+
+def _threshold(pair: Pair, jump: Jump) -> Threshold:
+    return Threshold(
+        jump.high if jump.exact else jump.at, pair.species, jump.order,
+        (jump.energy, jump.force, jump.curvature), jump.doubt, jump.low, jump.high, False,
+        jump.high - jump.low,
+    )  # fmt: skip
+
+
+def _with_edge(
+    pair: Pair, curve: Curve, edge: tuple[float, float], found: list[Threshold], near: float
+) -> list[Threshold]:
+    """The thresholds with the one beyond which nothing is left, measured as such."""
+    inner = [one.radius for one in found if one.radius < edge[0] - 1e-3]
+    room = min(edge[0] - max([near, *inner]), 0.5)
+    jump = measure(curve, *edge, room, exact=True)
+    order, radius = jump.order, edge[1]
+    power = decay_power(curve, edge[1], room) if order >= 2 else None
+    if power is not None:
+        order = int(np.clip(round(power) + 1, 2, _SMOOTHEST))
+        if order > SMOOTH - 1:  # it may have been lost in rounding before its end
+            radius = max(_root(curve, edge[1], room, round(power)), edge[1])
+    jumps = (jump.energy, jump.force, jump.curvature if order <= SMOOTH - 1 else 0.0)
+    last = Threshold(
+        radius, pair.species, order, jumps, jump.doubt, *edge, True, max(radius - edge[0], edge[1] - edge[0])
+    )
+    # what the scan took for a threshold of its own there is this one
+    return [one for one in found if abs(one.radius - edge[1]) > 1e-3] + [last]
+
+
+def _root(curve: Curve, edge: float, room: float, power: int) -> float:
+    """Where a force that falls with this power of the distance to its end would vanish."""
+    places = edge - room * np.array([0.02, 0.01])
+    near, nearer = np.abs(curve.many(places)[1]) ** (1.0 / power)
+    if near <= nearer:
+        return edge
+    root = places[1] + nearer * (places[1] - places[0]) / (near - nearer)
+    return float(root) if abs(root - edge) < 1e-3 * max(room, 1.0) else edge
