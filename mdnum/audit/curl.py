@@ -178,11 +178,14 @@ def _finding(wrong: list[Loop], count: int) -> dict[str, str]:
         "CURL",
         "error" if worst.share > _SMALL else "warning",
         "the forces do work around a closed loop",
-        f"Around a circle of {worst.radius:g} Å ({worst.what}) the forces do {worst.work:.3g} eV of work: the "
+        f"Around a circle of {worst.radius:g} Å ({worst.what}) the forces do {worst.work:.3g} eV of work: "
+        "the "
         f"derivative of the forces has an antisymmetric part of {worst.curl:.3g} ± {worst.error:.1g} eV/Å², "
-        f"{worst.share:.1g} of its symmetric part. {len(wrong)} of {count} loops do work. No energy has these "
+        f"{worst.share:.1g} of its symmetric part. {len(wrong)} of {count} loops do work. No energy has "
+        "these "
         "forces: a run gains or loses energy however small its time step.",
-        "Derive the forces from the energy. Where they are predicted, do not use them for NVE; where they are "
+        "Derive the forces from the energy. Where they are predicted, do not use them for NVE; where they "
+        "are "
         "derived, look for a stopped gradient or a neighbor that only one of two atoms counts.",
     )
 
@@ -203,10 +206,12 @@ def _says(loops: list[Loop], wrong: list[Loop]) -> str:
     if wrong:
         worst = max(wrong, key=lambda one: one.share)
         return (
-            f"Around {len(wrong)} of {len(loops)} small loops the forces do work: the antisymmetric part of their "
+            f"Around {len(wrong)} of {len(loops)} small loops the forces do work: the antisymmetric part of "
+            "their "
             f"derivative is up to {worst.share:.2g} of the symmetric one. No energy has these forces."
         )
     return (
-        f"Around {len(loops)} small loops the forces do no work that could be told from rounding: their curl is "
+        f"Around {len(loops)} small loops the forces do no work that could be told from rounding: their "
+        "curl is "
         f"below {max(abs(one.curl) + one.error for one in loops):.1g} eV/Å²."
     )

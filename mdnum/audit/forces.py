@@ -195,7 +195,7 @@ def _judged(slopes: list[Slope], scale: float) -> Iterator[dict[str, str]]:
             "error",
             "the energy steps within a millionth of an Å of the structure",
             f"Moving {worst.what}, energies at +-{_LADDER[-1]:.0e} Å differ by {worst.jump:.3g} eV more than "
-            f"the force explains, and so at every larger distance.",
+            "the force explains, and so at every larger distance.",
             "Shift or switch the potential to zero at its cutoff.",
         )
     wrong = [one for one in slopes if not one.agrees and not one.jump]
@@ -207,10 +207,12 @@ def _judged(slopes: list[Slope], scale: float) -> Iterator[dict[str, str]]:
             "error" if apart > _SMALL * scale else "warning",
             "forces are not the derivative of the energy",
             f"Moving {worst.what}, the energy falls by {-worst.difference:.8g} eV/Å (differences at "
-            f"{worst.step:.1g} Å, error {worst.error:.1g}), the forces say {-worst.force:.8g}: {apart:.2g} eV/Å "
+            f"{worst.step:.1g} Å, error {worst.error:.1g}), the forces say {-worst.force:.8g}: {apart:.2g} "
+            "eV/Å "
             f"apart, {apart / scale if scale else float('inf'):.1g} of the root mean square force. "
             f"{len(wrong)} of {len(slopes)} directions disagree.",
-            "Compare the force with the derivative term by term; look for a shift, a switch or a weight that is "
+            "Compare the force with the derivative term by term; look for a shift, a switch or a weight "
+            "that is "
             "in the energy and not in the force, and for forces that are predicted rather than derived.",
         )
 
@@ -224,7 +226,9 @@ def _judged_sums(sums: list[dict[str, Any]], scale: float) -> Iterator[dict[str,
             "error" if row["found"] > _SMALL * scale else "warning",
             f"there is a {row['sum'].split(' (')[0]}",
             f"It is {row['found']:.3g}, where rounding explains {row['rounding explains']:.1g}: "
-            + ("the structure pushes itself along." if code == "NET_FORCE" else "the structure turns itself."),
+            + (
+                "the structure pushes itself along." if code == "NET_FORCE" else "the structure turns itself."
+            ),
             "Look for pairs that only one of the two atoms counts, and for forces that are predicted.",
         )
 
@@ -245,13 +249,15 @@ def _says(slopes: list[Slope], worst: Slope, scale: float) -> str:
     wrong = sum(not one.agrees for one in slopes)
     if wrong:
         return (
-            f"Along {wrong} of {len(slopes)} directions the forces are not the derivative of the energy: up to "
+            f"Along {wrong} of {len(slopes)} directions the forces are not the derivative of the energy: up "
+            "to "
             f"{max(abs(one.difference - one.force) for one in slopes):.2g} eV/Å apart, at a root mean square "
             f"force of {scale:.3g} eV/Å."
         )
     return (
         f"Along {len(slopes)} directions the forces are the derivative of the energy to within "
-        f"{max(abs(one.difference - one.force) for one in slopes):.1g} eV/Å, which is what the differences can "
+        f"{max(abs(one.difference - one.force) for one in slopes):.1g} eV/Å, which is what the differences "
+        "can "
         f"tell (their largest error is {max(one.error for one in slopes):.1g} eV/Å)."
     )
 

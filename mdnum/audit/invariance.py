@@ -26,47 +26,52 @@ _SMALL = 1e-3
 #: What it means that two ways of writing down one structure differ, and what to do: title, remedy.
 _MEANING: Mapping[str, tuple[str, str]] = {
     "TRANSLATION": (
-        "the energy depends on where the structure stands",
+        "the answer depends on where the structure stands",
         "Use differences of positions only, and wrap them the same way everywhere.",
     ),
     "IMAGES": (
-        "the energy depends on which image of an atom is given",
-        "Wrap positions inside the calculator before pairs are searched, or search with shifts for atoms that "
+        "the answer depends on which image of an atom is given",
+        "Wrap positions inside the calculator before pairs are searched, or search with shifts for atoms "
+        "that "
         "are any number of boxes away.",
     ),
     "FACES": (
         "an atom on a face of the cell is treated otherwise than its image",
-        "Look at how positions are wrapped: -tiny modulo L rounds to L itself, which is no cell of the search.",
+        "Look at how positions are wrapped: -tiny modulo L rounds to L itself, which is no cell of the "
+        "search.",
     ),
     "ORDER": (
-        "the energy depends on the order of the atoms",
+        "the answer depends on the order of the atoms",
         "Look for a limit on the number of neighbors (max_num_neighbors), which keeps those that come first.",
     ),
     "CELL_ULP": (
-        "the last bit of the cell changes the energy",
-        "A pair is found or lost by rounding in the search or in a decision: compute both ends of a pair by the "
+        "the last bit of the cell changes the answer",
+        "A pair is found or lost by rounding in the search or in a decision: compute both ends of a pair by "
+        "the "
         "same arithmetic, and make the potential smooth at its cutoff.",
     ),
     "EXTENSIVE": (
-        "a supercell has not the energy of its parts",
+        "a supercell is not the sum of its parts",
         "Look at cells shorter than two cutoffs: more images than the nearest one must be searched.",
     ),
     "LATTICE": (
-        "the energy depends on the choice of lattice vectors",
+        "the answer depends on the choice of lattice vectors",
         "Search images by the distance between planes of the cell, not by the length of its vectors.",
     ),
     "ROTATION": (
-        "the energy depends on the orientation of the structure",
-        "Where the model is not meant to be equivariant only approximately, look for a step that singles out an "
+        "the answer depends on the orientation of the structure",
+        "Where the model is not meant to be equivariant only approximately, look for a step that singles "
+        "out an "
         "axis (a cell forced to be upper triangular, a grid).",
     ),
     "MIRROR": (
-        "the energy tells a structure from its mirror image",
+        "the answer tells a structure from its mirror image",
         "Where this is not meant, look at signs of cross products and of dihedral angles.",
     ),
     "DUMMY_CELL": (
-        "a cell that does not repeat changes the energy",
-        "Respect the periodicity of each axis: do not wrap along an axis that does not repeat, and do not take "
+        "a cell that does not repeat changes the answer",
+        "Respect the periodicity of each axis: do not wrap along an axis that does not repeat, and do not "
+        "take "
         "the cell's length for the extent of the search.",
     ),
 }
@@ -162,7 +167,9 @@ class Invariance:
         wrong = self._explained(wrong, judged, refused)
         yield from judged.notes
         for code, group in wrong.items():
-            worst = max(group, key=lambda one: one.energy / one.allowed_energy + one.force / one.allowed_force)
+            worst = max(
+                group, key=lambda one: one.energy / one.allowed_energy + one.force / one.allowed_force
+            )
             title, remedy = _MEANING[code]
             tried = sum(one.same.code == code for one in differences)
             slug = code.lower().replace("_", "-")
@@ -173,8 +180,10 @@ class Invariance:
                 code,
                 severity,
                 title,
-                f"With {worst.same.what} the energy differs by {worst.energy:.3g} eV ({worst.jump_kT:.2g} kT, "
-                f"where rounding explains {worst.allowed_energy:.1g} eV) and a force by {worst.force:.3g} eV/Å "
+                f"With {worst.same.what} the energy differs by {worst.energy:.3g} eV ({worst.jump_kT:.2g} "
+                "kT, "
+                f"where rounding explains {worst.allowed_energy:.1g} eV) and a force by {worst.force:.3g} "
+                "eV/Å "
                 f"(rounding: {worst.allowed_force:.1g}). {len(group)} of {tried} such structures differ. "
                 f"Both are saved as {slug}-before and {slug}-after.",
                 remedy,
@@ -215,7 +224,8 @@ class Invariance:
                 "WHOLE_MOLECULES",
                 "warning",
                 "a molecule cut by a face of the cell has another energy",
-                f"With {worst.same.what} the energy differs by {worst.energy:.3g} eV; when whole molecules are "
+                f"With {worst.same.what} the energy differs by {worst.energy:.3g} eV; when whole molecules "
+                "are "
                 "moved, by nothing.",
                 "Make molecules whole before the calculator sees them: a wrapped trajectory is wrong for it.",
             )
@@ -248,13 +258,20 @@ class _Judge:
             found = self._compared(self.subject.fresh(), same, energy, forces, allowed)
         return found
 
-    def _compared(self, worker: Subject, same: Same, energy: float, forces: Any, allowed: Noise) -> _Difference:
+    def _compared(
+        self, worker: Subject, same: Same, energy: float, forces: Any, allowed: Noise
+    ) -> _Difference:
         there = worker.energy(same.atoms) / same.copies
         expected = forces[same.order] @ same.turn.T
         force = float(np.max(np.abs(worker.forces(same.atoms) - expected), initial=0.0))
         change = abs(there - energy)
         return _Difference(
-            same, change, force, allowed.energy, allowed.force, change / self.subject.kT if self.subject.kT else 0.0
+            same,
+            change,
+            force,
+            allowed.energy,
+            allowed.force,
+            change / self.subject.kT if self.subject.kT else 0.0,
         )
 
     def _reference(self, base: Atoms, rounding: float) -> tuple[float, Any, Noise]:
@@ -295,7 +312,8 @@ def _says(differences: list[_Difference], wrong: list[_Difference], noise: Noise
     if wrong:
         worst = max(wrong, key=lambda one: one.energy)
         return (
-            f"{len(wrong)} of {len(differences)} ways of writing the same structure down give another answer, "
+            f"{len(wrong)} of {len(differences)} ways of writing the same structure down give another "
+            "answer, "
             f"by up to {worst.energy:.3g} eV ({worst.same.what}).{tail}"
         )
     return (

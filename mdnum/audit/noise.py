@@ -139,7 +139,7 @@ def louder(one: Noise, other: Noise) -> Noise:
 
 
 def _of_more_atoms(subject: Subject, atoms: Atoms, rng: np.random.Generator) -> Noise:
-    """Noise of a supercell where there are few atoms: terms that cancel by symmetry leave no trace of theirs."""
+    """Noise of a supercell where there are few atoms: terms that cancel by symmetry leave no trace."""
     if len(atoms) >= FEW or not atoms.pbc.any():
         return Noise(0.0, 0.0)
     many = roomy(atoms, FEW)

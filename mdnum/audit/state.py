@@ -1,4 +1,4 @@
-"""What a calculator object remembers: the same question must have the same answer, whatever came before it."""
+"""What a calculator object remembers: one question has one answer, whatever was asked before."""
 
 from __future__ import annotations
 
@@ -108,7 +108,8 @@ class State:
             f"{worst['allowed']:.1g} eV. {len(stale)} questions were answered so ({', '.join(where)}). The "
             "structures are saved as stale-before and stale-after.",
             "Look for a neighbor list that is not rebuilt when the cell, the order or the number of atoms "
-            "changes or when atoms have used up half the skin, and for a buffer whose tail keeps old entries.",
+            "changes or when atoms have used up half the skin, and for a buffer whose tail keeps old "
+            "entries.",
         )
 
 
@@ -241,7 +242,9 @@ def _through(subject: Subject, sequence: list[Asked], noise: Noise, word: str) -
         force = float(np.max(np.abs(old[1] - new[1]), initial=0.0))
         scale = max(1.0, float(np.max(np.abs(new[1]), initial=0.0)))
         change = abs(old[0] - new[0])
-        remembers = change > allowed or force > _ALLOWED * max(noise.force, np.finfo(float).eps * scale) * share
+        remembers = (
+            change > allowed or force > _ALLOWED * max(noise.force, np.finfo(float).eps * scale) * share
+        )
         yield row | {"energy": change, "force": force, "allowed": allowed, "remembers": remembers}
 
 
@@ -359,9 +362,12 @@ def _unsteady(repeats: Mapping[str, Any]) -> Iterator[dict[str, str]]:
         "NOT_REPEATABLE",
         "warning",
         "the same question has not the same answer to the last bit",
-        f"Asked {_REPEATS} times about one structure, {'one object' if within else 'new objects'} gave energies "
-        f"that scatter by {size:.2g} eV. Two runs of one input will part, as all that differ in a last bit do.",
-        "Look for sums in the order of threads or of atomic additions, and for a list kept from the call before.",
+        f"Asked {_REPEATS} times about one structure, {'one object' if within else 'new objects'} gave "
+        "energies "
+        f"that scatter by {size:.2g} eV. Two runs of one input will part, as all that differ in a last bit "
+        "do.",
+        "Look for sums in the order of threads or of atomic additions, and for a list kept from the call "
+        "before.",
     )
 
 
@@ -406,7 +412,8 @@ def _says(rows: list[dict[str, Any]], stale: list[dict[str, Any]], repeats: Mapp
     tail = f"Repeated calls {bits} bit-identical."
     if stale:
         return (
-            f"{len(stale)} of {len(rows)} answers of an object in use differ from those of a new one, by up to "
+            f"{len(stale)} of {len(rows)} answers of an object in use differ from those of a new one, by up "
+            "to "
             f"{max(row['energy'] for row in stale):.3g} eV: the calculator remembers. {tail}"
         )
     return f"An object asked {len(rows)} times in five sequences answered as new ones do. {tail}"

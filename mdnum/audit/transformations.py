@@ -69,7 +69,10 @@ def translated(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
         for _ in range(2):
             share = rng.uniform(0, 1, 3) * atoms.pbc
             there = _moved(
-                "all atoms moved by fractions of the lattice vectors", "TRANSLATION", atoms, share @ atoms.cell
+                "all atoms moved by fractions of the lattice vectors",
+                "TRANSLATION",
+                atoms,
+                share @ atoms.cell,
             )
             yield there
             folded = there.atoms.copy()
@@ -81,7 +84,9 @@ def translated(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
         for length in (7.3, -250.0):
             by = np.zeros(3)
             by += length * _outward(atoms, free)
-            what = f"all atoms moved by {length:g} Å along {'the free axes' if atoms.pbc.any() else 'x, y, z'}"
+            what = (
+                f"all atoms moved by {length:g} Å along {'the free axes' if atoms.pbc.any() else 'x, y, z'}"
+            )
             yield _moved(what, "TRANSLATION", atoms, by)
 
 
@@ -92,9 +97,7 @@ def imaged(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
     every = np.arange(len(atoms))
     folded = atoms.copy()
     folded.wrap(eps=0)
-    yield Same(
-        "atoms wrapped into the cell", "IMAGES", folded, every, rounding=_ulp(folded, atoms)
-    )
+    yield Same("atoms wrapped into the cell", "IMAGES", folded, every, rounding=_ulp(folded, atoms))
     for most in (1, 3, 20):
         boxes = rng.integers(-most, most + 1, (len(atoms), 3)) * atoms.pbc
         there = atoms.copy()

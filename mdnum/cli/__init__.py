@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 
 import typer
 
-from mdnum.cli import ball, check, doctor, fork, grad, report, run, systems
+from mdnum.cli import audit, ball, check, doctor, flips, fork, grad, report, run, systems
 from mdnum.cli.output import EXIT_STOPPED, EXIT_USAGE, print_error
 from mdnum.errors import InputError, MdnumError
 
@@ -30,6 +30,8 @@ app.command("run")(run.run)
 app.command("ball")(ball.ball)
 app.command("fork")(fork.fork)
 app.command("grad")(grad.grad)
+app.command("flips")(flips.flips)
+app.command("audit")(audit.audit)
 app.add_typer(_systems, name="systems")
 app.add_typer(_check, name="check")
 app.command("report")(report.report)

@@ -111,6 +111,15 @@ COLUMNS: Mapping[str, Mapping[str, pa.DataType]] = MappingProxyType(
             horizon=_INT, overflow=_INT, underflow=_INT, subnormal=_INT, largest=_FLOAT, smallest=_FLOAT,
             scaled_overflow=_INT, scaled_underflow=_INT,
         ),
+        "curves": _columns(part=_TEXT, curve=_TEXT, line=_TEXT, x=_FLOAT, y=_FLOAT),
+        "energies": _columns(
+            run=_TEXT, step=_INT, time=_FLOAT, potential=_FLOAT, kinetic=_FLOAT, total=_FLOAT, entered=_INT,
+            left=_INT, jumps=_FLOAT, rest=_FLOAT,
+        ),
+        "crossings": _columns(
+            run=_TEXT, step=_INT, i=_INT, j=_INT, rank=_INT, entered=_BOOL, threshold=_FLOAT,
+            distance=_FLOAT, margin=_FLOAT, energy_jump=_FLOAT,
+        ),
         "frames": _columns(
             rule=_SHORT, frame=_INT, number=_INT, time=_FLOAT, pairs=_INT, near=_INT, entered=_INT,
             left=_INT, ambiguous=_INT, min_margin=_FLOAT, fewest=_SHORT, neighbors=_FLOAT, most=_SHORT,
@@ -165,6 +174,7 @@ TABLES: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "processes": ("variants", "variant_separations"),
         "certify": ("policies", "ambiguous", "policy_separations"),
         "forecast": ("foretold", "reach"),
+        "audit": ("curves", "energies", "crossings"),
         "grad": ("growth", "flip_contributions", "trust", "scaling"),
         "flips": ("flips", "frames", "members", "contacts", "lifetimes", "neighbors", "residues", "busiest"),
         "flips-compare": ("apart", "differing"),

@@ -1,0 +1,55 @@
+"""`mdnum audit`: is this potential safe to run and to differentiate?"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import typer
+
+from mdnum.cli import output
+from mdnum.cli.audit_print import print_rows
+from mdnum.cli.progress import watched
+
+
+def audit(
+    calculator: str = typer.Argument(
+        metavar="CALCULATOR",
+        help="package.module:Class(argument=value), a Python file that makes a calculator, or a SYSTEM.",
+    ),
+    structure: Path | None = typer.Option(
+        None, "-s", "--structure", metavar="FILE", help="A structure; one is built by default."
+    ),
+    checks: list[str] | None = typer.Option(
+        None,
+        metavar="WORD,WORD",
+        help="Only these: smoothness, invariance, forces, curl, state, dynamics.",
+    ),
+    temperature: float | None = typer.Option(
+        None, min=0.0, metavar="KELVIN", help="For kT and for the run; 300 K by default."
+    ),
+    timestep: float | None = typer.Option(
+        None, min=0.0, metavar="FS", help="Of the run, fs; from the fastest vibration by default."
+    ),
+    steps: int | None = typer.Option(None, min=16, help="Of the run; 400, or what takes half a minute."),
+    out: Path | None = typer.Option(
+        None, "-o", "--out", metavar="DIR", help="The audit folder; runs/audit-NAME-N by default."
+    ),
+    no_report: bool = typer.Option(False, "--no-report", help="Do not write report.html."),
+    as_json: bool = output.JSON_OPTION,
+) -> int:
+    """Ask any ASE calculator: is it smooth, invariant, conservative, forgetful, and does it keep energy?"""
+    from mdnum.workflow.audit import audit as ask
+
+    with watched() as progress:
+        result = ask(
+            calculator,
+            structure,
+            checks=checks or None,
+            temperature=temperature,
+            timestep=timestep,
+            steps=steps,
+            out=out,
+            report=not no_report,
+            progress=progress,
+        )
+    return output.answer(result.folder, result.summary, print_rows, as_json=as_json)

@@ -1,0 +1,245 @@
+"""`mdnum audit` as a function: every check of a calculator, a verdict, and a report to attach to an issue."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mdnum.errors import InputError
+from mdnum.workflow.fork_question import Log, Progress, finish
+
+if TYPE_CHECKING:
+    from ase import Atoms
+
+    from mdnum.audit.base import Check, Part
+    from mdnum.audit.load import Loaded
+    from mdnum.audit.subject import CalculatorSubject
+
+#: Checks in the order in which they are made.
+CHECKS = ("smoothness", "invariance", "forces", "curl", "state", "dynamics")
+_BOLTZMANN = 8.617333262e-5
+"""eV/K (CODATA 2018, exact)."""
+
+
+@dataclass(frozen=True)
+class AuditResult:
+    """A finished audit.
+
+    Attributes:
+        folder: the audit folder.
+        parts: what each check found, by its name.
+        summary: what summary.json says, findings included.
+    """
+
+    folder: Path
+    parts: Mapping[str, Part]
+    summary: dict[str, Any]
+
+    @property
+    def findings(self) -> list[dict[str, str]]:
+        """All findings, errors first."""
+        return self.summary["findings"]
+
+
+def audit(
+    calculator: str | Callable[[], Any],
+    structure: Atoms | str | Path | None = None,
+    *,
+    checks: str | Sequence[str] | None = None,
+    temperature: float | None = None,
+    timestep: float | None = None,
+    steps: int | None = None,
+    out: str | Path | None = None,
+    report: bool = True,
+    progress: Progress | None = None,
+) -> AuditResult:
+    """Ask a calculator whether it is safe to run and to differentiate.
+
+    Args:
+        calculator: as the command line names one, or a function that makes a new ASE calculator.
+        structure: ASE's atoms or a file that ASE reads; by default what comes with the calculator, or one
+            that is built for it.
+        checks: words of `CHECKS`; default all.
+        temperature: K, of kT and of the run; default the system's own, or 300.
+        timestep: fs, of the run; default a fraction of the fastest vibration.
+        steps: of the run; default as many as take half a minute, 400 at most.
+        out: the new audit folder; default runs/audit-<name>-<n>.
+        report: write report.html.
+        progress: called now and then with what is done, of how much, and a dictionary of figures.
+
+    Raises:
+        InputError: no such calculator, structure or check.
+        FolderError: the folder cannot be used.
+    """
+    from mdnum.audit.verdict import judge
+    from mdnum.provenance import surroundings
+    from mdnum.store import RunFolder
+    from mdnum.store.naming import default_folder
+    from mdnum.workflow import audit_record
+
+    began = time.perf_counter()
+    wanted = _wanted(checks)
+    loaded = _loaded(calculator)
+    atoms = _atoms(structure, loaded)
+    folder = RunFolder.create(default_folder(f"audit-{loaded.stem}") if out is None else out, world="audit")
+    try:
+        subject = _subject(loaded, atoms, temperature, folder.path)
+        folder.write_provenance(surroundings() | {"calculator": loaded.name})
+        audit_record.write_structures(folder.path, {"structure": subject.atoms})
+        told = Log(folder, progress)
+        parts: list[Part] = []
+        pairs: dict[str, Atoms] = {}
+        for check in _checks(wanted, parts, temperature, timestep, steps):
+            told(0, 0, {"phase": check.name})
+            parts.append(_ask(check, subject, told))
+            pairs |= getattr(check, "structures", {})
+            tables: Mapping[str, Any] = getattr(check, "recorded", {})
+            for name, columns in tables.items():
+                folder.append(name, columns)
+        audit_record.write_parts(folder, parts)
+        audit_record.write_structures(folder.path, pairs)
+        if pairs:
+            names = [name.removesuffix("-before") for name in pairs if name.endswith("-before")]
+            (folder.path / audit_record.SCRIPT).write_text(
+                audit_record.script(loaded.name, names), encoding="utf-8"
+            )
+        folder.finalize()
+        units = (subject.units.length, subject.units.energy)
+        summary = audit_record.summarize(
+            loaded.name, subject.atoms, subject.kT, units, parts, judge(loaded.name, parts)
+        )
+        summary["reproduce"] = bool(pairs)
+        folder.write_summary(summary | {"seconds": time.perf_counter() - began})
+    except BaseException:
+        folder.close()
+        raise
+    return AuditResult(folder.path, {part.name: part for part in parts}, finish(folder, report, progress))
+
+
+def _wanted(checks: str | Sequence[str] | None) -> tuple[str, ...]:
+    import difflib
+
+    if checks is None:
+        return CHECKS
+    texts = (checks,) if isinstance(checks, str) else checks
+    words = [word.strip() for text in texts for word in text.split(",") if word.strip()]
+    for word in words:
+        if word not in CHECKS:
+            close = difflib.get_close_matches(word, CHECKS, n=1)
+            hint = f"Did you mean {close[0]}? " if close else ""
+            raise InputError(f"no check {word!r}", remedy=f"{hint}There are {', '.join(CHECKS)}")
+    if not words:
+        raise InputError("no check is named", remedy=f"There are {', '.join(CHECKS)}")
+    return tuple(name for name in CHECKS if name in words)
+
+
+def _loaded(calculator: str | Callable[[], Any]) -> Loaded:
+    from mdnum.audit.load import Loaded, load_calculator
+
+    if isinstance(calculator, str):
+        return load_calculator(calculator)
+    if not callable(calculator):
+        raise InputError(
+            f"that is a {type(calculator).__name__}, neither words nor a function that makes a calculator",
+            remedy="Say lambda: LennardJones(), so that a new one can be made for each check",
+        )
+    name = getattr(calculator, "__name__", type(calculator).__name__)
+    name = "calculator" if name == "<lambda>" else name
+    return Loaded(name, name, calculator)
+
+
+def _atoms(structure: Atoms | str | Path | None, loaded: Loaded) -> Atoms:
+    from ase import Atoms
+
+    if isinstance(structure, Atoms):
+        atoms = structure
+    elif structure is not None:
+        atoms = _read(Path(structure))
+    elif loaded.atoms is not None:
+        atoms = loaded.atoms
+    else:
+        from mdnum.audit.structures import default_structure
+
+        atoms = default_structure(loaded)
+    if not len(atoms):
+        raise InputError("a structure without atoms", remedy="Give one with atoms: -s FILE")
+    return atoms
+
+
+def _read(path: Path) -> Atoms:
+    from ase.io import read
+
+    if not path.is_file():
+        raise InputError("no such file", where=str(path), remedy="Give a structure file that ASE reads")
+    try:
+        found = read(path)
+    except Exception as error:  # whatever a reader raises
+        raise InputError(
+            f"ASE cannot read it: {type(error).__name__}: {error}",
+            where=str(path),
+            remedy="Give a structure file that ASE reads, extxyz or cif say",
+        ) from error
+    return found[-1] if isinstance(found, list) else found
+
+
+def _subject(loaded: Loaded, atoms: Atoms, temperature: float | None, folder: Path) -> CalculatorSubject:
+    from mdnum.audit.subject import CalculatorSubject
+
+    kT = 300.0 * _BOLTZMANN if loaded.kT is None else loaded.kT
+    if temperature is not None:
+        kT = temperature * loaded.units.k_B
+    return CalculatorSubject(
+        loaded.name, loaded.make, atoms, kT=kT, folder=folder / "structures", units=loaded.units
+    )
+
+
+def _checks(
+    wanted: Sequence[str],
+    parts: Sequence[Part],
+    temperature: float | None,
+    timestep: float | None,
+    steps: int | None,
+):
+    """The checks asked for, one after the other: a later one may use what an earlier one found."""
+    from mdnum.audit.curl import Curl
+    from mdnum.audit.forces import Forces
+    from mdnum.audit.invariance import Invariance
+    from mdnum.audit.state import State
+
+    simple: dict[str, Callable[[], Check]] = {
+        "invariance": Invariance, "forces": Forces, "curl": Curl, "state": State,
+    }  # fmt: skip
+    for name in wanted:
+        if name in simple:
+            yield simple[name]()
+
+
+def _ask(check: Check, subject: CalculatorSubject, told: Log) -> Part:
+    """A check's answer; of a calculator that fails where a check cannot go on, the failure as a finding."""
+    from mdnum.audit.base import Part
+    from mdnum.audit.subject import CalculatorError
+    from mdnum.references.findings import finding
+
+    began = time.perf_counter()
+    try:
+        return check(subject, told)
+    except CalculatorError as error:
+        saved = f" The structure is saved as {error.structure.name}." if error.structure else ""
+        failed = finding(
+            "CALCULATOR_FAILED",
+            "error",
+            "the calculator fails on a structure near the one it was asked about",
+            f"During the check of {check.name} it {error.message}.{saved}",
+            "Run it on that structure by itself to see where it fails.",
+        )
+        return Part(
+            check.name,
+            check.name.capitalize(),
+            f"The calculator failed: it {error.message}.",
+            findings=[failed],
+            skipped=[(f"the rest of {check.name}", error.message)],
+            seconds=time.perf_counter() - began,
+        )
