@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
 from mdnum.errors import InputError
 from mdnum.trajectories.frame import Frame
@@ -34,17 +34,34 @@ def checked(
         where: the file, for messages.
 
     Raises:
-        FrameError: a coordinate is not finite, or more than one atom is at exactly 0, 0, 0.
+        FrameError: a coordinate is not finite, more than one atom is at exactly 0, 0, 0, or the box repeats
+            along other axes than in the first frame (most often: there is none).
     """
+    pbc = None
     for frame in frames:
-        check_frame(frame, atoms, where)
+        pbc = frame.box.pbc if pbc is None else pbc
+        check_frame(frame, atoms, pbc, where)
         yield frame
 
 
 def check_frame(
-    frame: Frame, atoms: Int[np.ndarray, "chosen"] | None = None, where: str | None = None
+    frame: Frame,
+    atoms: Int[np.ndarray, "chosen"] | None = None,
+    pbc: Bool[np.ndarray, "3"] | None = None,
+    where: str | None = None,
 ) -> None:
-    """As `checked`, for one frame."""
+    """As `checked`, for one frame.
+
+    Args:
+        pbc: axes along which the first frame repeats; None for any.
+    """
+    if pbc is not None and (frame.box.pbc != pbc).any():
+        raise FrameError(
+            f"frame {frame.index} {_repeats(frame.box.pbc)}, and the first one looked at {_repeats(pbc)}",
+            frame=frame.index,
+            remedy="Leave out the frames that differ with @START:STOP: distances in the two do not compare",
+            where=where,
+        )
     x = frame.positions if atoms is None else frame.positions[atoms]
     # a sum is finite unless a term is not, or the terms are of no use anyway
     if not np.isfinite(x.sum()) and (bad := np.flatnonzero(~np.isfinite(x).all(axis=1))).size:
@@ -72,6 +89,16 @@ def check_frame(
             remedy="Leave the frame out with @START:STOP, or the atoms with --between",
             where=where,
         )
+
+
+def _repeats(pbc: np.ndarray) -> str:
+    if not pbc.any():
+        return "has no box"
+    if pbc.all():
+        return "has a box"
+    return (
+        f"has a box that repeats along {', '.join(name for name, yes in zip('abc', pbc, strict=True) if yes)}"
+    )
 
 
 def _and_others(count: int) -> str:

@@ -15,8 +15,8 @@ from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.slices import chosen
 from mdnum.trajectories.source import AtomTable, Trajectory, UnreadableFrame
 
-# what readers raise on files that end early or hold something else
-_UNREADABLE = (OSError, EOFError, ValueError, RuntimeError, StopIteration, IndexError, KeyError, TypeError)
+#: what readers raise on files that end early or hold something else
+READING_FAILS = (OSError, EOFError, ValueError, RuntimeError, StopIteration, IndexError, KeyError, TypeError)
 
 
 class MDAnalysisTrajectory(Trajectory):
@@ -57,7 +57,7 @@ class MDAnalysisTrajectory(Trajectory):
                     step = at is not None and number == at + 1 and trajectory.ts.frame == at
                     ts = trajectory.next() if step else trajectory[number]
                     frame = frame_of(ts, number, self.time == "frame")
-                except _UNREADABLE as error:
+                except READING_FAILS as error:
                     raise UnreadableFrame(
                         f"frame {number} cannot be read ({first_line(error)})",
                         frame=number,
@@ -139,7 +139,7 @@ def _opened(file: Path, act: Any, trajectory: Path) -> Any:
             remedy="Install the package, or convert the file to xtc or extxyz",
             where=str(file),
         ) from error
-    except _UNREADABLE as error:
+    except READING_FAILS as error:
         hint = "Check that the file is whole and of the kind its name says"
         if file == trajectory:
             hint += "; a trajectory without names of atoms needs its topology (-s TOPOLOGY)"

@@ -25,8 +25,8 @@ _ENOUGH = 6000
 _STEPS = tuple(one * 10.0**-k for k in range(13) for one in (1.0, 0.5, 0.2))
 # A grid counts as found where chance would put all coordinates on it with no more than this probability.
 _CHANCE = 1e-6
-# Roundings that a number in the file may have seen beside those to its grid (a product in the writer, reading,
-# nm to Å), for finding the grid; and those that a coordinate in float32 has seen for certain or nearly so.
+# Roundings that a number in the file may have seen beside those to its grid (a product in the writer,
+# reading, nm to Å), for finding the grid; and those that a coordinate in float32 has seen, nm to Å included.
 _SLACK, _ROUNDINGS = 3.0, 2.0
 _UNIT = {32: 2.0**-24, 64: 2.0**-53}
 # Formats whose box is written with fewer digits than a float has: lengths in Å, angles in degrees.
@@ -58,8 +58,8 @@ class Resolution:
     def bound(self, frame: Frame) -> float:
         """How far a distance in this frame can be from that of the positions before they were written.
 
-        The worst case, length: both atoms moved by half a step along every axis, in opposite directions, and a
-        pair across the boundary by what rounding did to the box. For float64 it is the rounding of the distance.
+        The worst case, length: both atoms moved by half a step along every axis, in opposite directions, and
+        a pair across the boundary by what rounding did to the box. For float64 it is the distance's rounding.
 
         Error: for a pair through one period of the box; further images add as much of the box's part again.
         """

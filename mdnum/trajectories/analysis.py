@@ -1,0 +1,301 @@
+"""Flips as an MDAnalysis analysis: `NeighborFlips(universe, r_cut=8.5).run().results.flips`.
+
+Frames may be spread over processes. A flip belongs to two frames, so that a process whose frames begin in the
+middle looks at the frame before its first one too: nothing is lost between two parts, and the results are
+those of one process to the last bit. What two parts found at the frame that both looked at is compared.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from MDAnalysis.analysis.base import AnalysisBase
+from MDAnalysis.analysis.results import ResultsGroup
+from MDAnalysis.core.groups import AtomGroup, UpdatingAtomGroup
+from MDAnalysis.core.universe import Universe
+
+from mdnum.errors import InputError
+from mdnum.trajectories.checked import FrameError, check_frame
+from mdnum.trajectories.frame import Frame
+from mdnum.trajectories.joined import Part, RuleResult, joined
+from mdnum.trajectories.mdanalysis_source import READING_FAILS, first_line, frame_of, table_of
+from mdnum.trajectories.resolution import SAMPLE, Resolution, infer_from
+from mdnum.trajectories.rules import Cutoff, Rule, SpeciesCutoffs
+from mdnum.trajectories.source import UnreadableFrame
+from mdnum.trajectories.table import Flips
+from mdnum.trajectories.tracker import Tracker
+
+
+@dataclass(frozen=True)
+class _Failure:
+    """Why a part ended before its last frame.
+
+    Attributes:
+        frame: its number in the file.
+        message: what was seen.
+        read: whether reading failed, rather than what was read being wrong.
+    """
+
+    frame: int
+    message: str
+    read: bool
+
+
+class NeighborFlips(AnalysisBase):
+    """Which pairs entered or left a cutoff between the frames of a trajectory.
+
+    After `run`, `results` has for one rule all that `RuleResult` has (`flips`, `pairs`, `near`, `min_margin`,
+    `initial`, `last`), and for several the same in each of `results.rules`; `results.resolution` says how
+    finely the file tells where atoms are and `results.bound` what that does to a margin, per frame. `frames`
+    and `times` are those of the frames looked at; `Flips.frame` counts among them.
+
+    When a frame cannot be read or holds what cannot be right, the results of the frames before it are kept
+    and the error names it.
+
+    Args:
+        universe_or_atomgroup: atoms of which pairs are made.
+        r_cut: the cutoff, Å; {("O", "H"): 2.5} for pairs of species; a list of them for several at once.
+        other: with it, pairs of one atom of each group; atoms may be in both.
+        rule: any membership rule or several, in the place of r_cut or beside it.
+        bound: how far a margin can be off, Å; None for what the resolution of the file gives.
+        verbose: show progress.
+
+    Raises:
+        InputError: an empty or changing group, groups of two universes, no rule.
+
+    Error: MDAnalysis hands coordinates over in float32; from there on everything is float64.
+    """
+
+    _analysis_algorithm_is_parallelizable = True
+
+    @classmethod
+    def get_supported_backends(cls) -> tuple[str, ...]:
+        """Where frames can be spread to."""
+        return ("serial", "multiprocessing", "dask")
+
+    def __init__(
+        self,
+        universe_or_atomgroup: Any,
+        r_cut: Any = None,
+        *,
+        other: Any = None,
+        rule: Rule | Sequence[Rule] | None = None,
+        bound: float | None = None,
+        verbose: bool = False,
+    ):
+        everything = isinstance(universe_or_atomgroup, Universe)
+        group = _group(universe_or_atomgroup.atoms if everything else universe_or_atomgroup, "atoms")
+        super().__init__(group.universe.trajectory, verbose=verbose)
+        self._first = None if everything and other is None else _indices(group)
+        self._second = None
+        if other is not None:
+            second = _group(other, "other")
+            if second.universe is not group.universe:
+                raise InputError(
+                    "the two groups belong to two universes", remedy="Select both from one universe"
+                )
+            self._second = _indices(second)
+        self.rules = _rules(r_cut, rule)
+        self._species = None
+        if any(one.needs_species for one in self.rules):
+            self._species = [str(one) for one in table_of(group.universe.atoms).species]
+        self._seen = _seen(self._first, self._second)
+        self._bound = bound
+        self._resolution: Resolution | None = None
+        self._pbc: np.ndarray | None = None
+        self._numbers = np.zeros(0, np.int64)
+        self._at = 0
+        self._trackers: list[Tracker] = []
+        self._done, self._reading = 0, True
+
+    def run(self, *args: Any, **kwargs: Any) -> NeighborFlips:
+        """As MDAnalysis's: start, stop, step, frames, verbose, backend, n_workers, n_parts.
+
+        Raises:
+            UnreadableFrame: a frame cannot be read; `results`, `frames` and `times` have those before it.
+            FrameError: likewise, a frame that holds what cannot be right.
+        """
+        super().run(*args, **kwargs)
+        failure = self.results.failure
+        if failure is not None:
+            kind = UnreadableFrame if failure.read else FrameError
+            where = getattr(self._trajectory, "filename", None)
+            raise kind(
+                failure.message,
+                frame=failure.frame,
+                where=str(where) if where is not None else "the trajectory",
+                remedy=f"The results of the {len(self.frames):,} frames before it are kept",
+            )
+        return self
+
+    def _setup_computation_groups(self, *args: Any, **kwargs: Any) -> list[np.ndarray]:
+        """MDAnalysis's, and what all parts must agree on: done once, before frames are spread."""
+        groups = super()._setup_computation_groups(*args, **kwargs)
+        self._numbers = np.concatenate([one[:, 1] for one in groups]).astype(np.int64)
+        sample = []
+        for number in self._numbers[:SAMPLE]:
+            try:
+                sample.append(self._frame(self._trajectory[int(number)]))
+            except READING_FAILS:
+                # met again in its turn, and told there
+                break
+        if sample:
+            self._resolution = infer_from(sample, 32, _format(self._trajectory))
+            self._pbc = sample[0].box.pbc
+        return groups
+
+    def _compute(self, indexed_frames: np.ndarray, verbose: Any = None, **kwargs: Any) -> NeighborFlips:
+        self._at = int(indexed_frames[0, 0]) if len(indexed_frames) else 0
+        self._done, self._reading = 0, True
+        self.results.failures = [None]
+        try:
+            super()._compute(indexed_frames, verbose, **kwargs)
+        except FrameError as error:
+            self._stopped(_Failure(error.frame, error.message, False))
+        except READING_FAILS as error:
+            if not self._reading:
+                raise
+            # reading the frame before the first of this part has failed where done is -1
+            number = int(self._numbers[self._at + self._done])
+            self._stopped(_Failure(number, f"frame {number} cannot be read ({first_line(error)})", True))
+        for part, tracker in zip(self.results.parts[0], self._trackers, strict=True):
+            part.last = tracker.members() if part.pairs else None
+        # what a process sends back is what it found, not what it needed for that
+        self._trackers = []
+        return self
+
+    def _stopped(self, failure: _Failure) -> None:
+        self.results.failures = [failure]
+        done = max(self._done, 0)
+        self.frames, self.times = self.frames[:done], self.times[:done]
+
+    def _prepare(self) -> None:
+        self._trackers = [
+            Tracker(rule, self._first, self._second, self._species, self._bound or 0.0) for rule in self.rules
+        ]
+        self.results.parts = [[Part() for _ in self.rules]]
+        self.results.bounds = [[]]
+        if self._at:
+            self._done = -1
+            self._before(self._trajectory[int(self._numbers[self._at - 1])])
+            self._done = 0
+
+    def _before(self, ts: Any) -> None:
+        """Looks at the frame before the first of this part."""
+        self._reading = False
+        frame = self._checked(ts)
+        bound = self._bound_at(frame)
+        for part, tracker in zip(self.results.parts[0], self._trackers, strict=True):
+            self._stepped(tracker, frame, bound)
+            part.before = tracker.members()
+        self._reading = True
+
+    def _single_frame(self) -> None:
+        self._reading = False
+        frame = self._checked(self._ts)
+        bound = self._bound_at(frame)
+        flips = [self._stepped(tracker, frame, bound) for tracker in self._trackers]
+        for part, tracker, rows in zip(self.results.parts[0], self._trackers, flips, strict=True):
+            if len(rows):
+                part.flips.append(rows)
+            if self._at == 0 and self._done == 0:
+                part.initial = tracker.members()
+            part.pairs.append(tracker.pairs)
+            part.near.append(tracker.near)
+            part.min_margin.append(tracker.min_margin)
+        self.results.bounds[0].append(bound)
+        self._done += 1
+        self._reading = True
+
+    def _stepped(self, tracker: Tracker, frame: Frame, bound: float) -> Flips:
+        try:
+            return tracker.step(frame, bound=bound)
+        except InputError as error:
+            raise FrameError(
+                f"frame {frame.index}: {error.message}", frame=frame.index, remedy=error.remedy or ""
+            ) from error
+
+    def _checked(self, ts: Any) -> Frame:
+        frame = self._frame(ts)
+        check_frame(frame, self._seen, self._pbc)
+        return frame
+
+    def _frame(self, ts: Any) -> Frame:
+        return frame_of(ts, int(ts.frame))
+
+    def _bound_at(self, frame: Frame) -> float:
+        if self._bound is not None or self._resolution is None:
+            return self._bound or 0.0
+        return self._resolution.bound(frame)
+
+    def _get_aggregator(self) -> ResultsGroup:
+        flat = ResultsGroup.flatten_sequence
+        return ResultsGroup(lookup={"parts": flat, "bounds": flat, "failures": flat})
+
+    def _conclude(self) -> None:
+        results = self.results
+        failures = list(results.failures)
+        failed = [k for k, one in enumerate(failures) if one is not None]
+        # parts after the one that failed are of frames after a frame that nobody knows
+        kept = failed[0] + 1 if failed else len(failures)
+        done = sum(len(one) for one in results.bounds[:kept])
+        self.frames, self.times = self.frames[:done], self.times[:done]
+        found = [
+            joined(rule, [part[k] for part in results.parts[:kept]]) for k, rule in enumerate(self.rules)
+        ]
+        bound = np.array([value for one in results.bounds[:kept] for value in one], np.float64)
+        for name in ("parts", "bounds", "failures"):
+            del results[name]
+        results.failure = failures[failed[0]] if failed else None
+        results.rules, results.bound, results.resolution = found, bound, self._resolution
+        if len(found) == 1:
+            for one in fields(RuleResult):
+                results[one.name] = getattr(found[0], one.name)
+
+
+def _group(atoms: Any, name: str) -> AtomGroup:
+    if isinstance(atoms, UpdatingAtomGroup):
+        raise InputError(
+            f"the group {name} changes from frame to frame, and a pair not looked at any more has not left",
+            remedy="Give atoms.select_atoms(...) without updating=True",
+        )
+    if not isinstance(atoms, AtomGroup):
+        raise InputError(
+            f"{type(atoms).__name__} where atoms are expected", remedy="Give a Universe or an AtomGroup"
+        )
+    if len(atoms) == 0:
+        raise InputError(f"the group {name} is empty", remedy="Check the selection")
+    return atoms
+
+
+def _indices(group: AtomGroup) -> np.ndarray:
+    return np.unique(np.asarray(group.indices, np.int64))
+
+
+def _seen(first: np.ndarray | None, second: np.ndarray | None) -> np.ndarray | None:
+    """The atoms that are in any pair; None for all."""
+    if first is None:
+        return None
+    return first if second is None else np.union1d(first, second)
+
+
+def _rules(r_cut: Any, rule: Rule | Sequence[Rule] | None) -> list[Rule]:
+    rules: list[Rule] = []
+    if r_cut is not None:
+        for one in r_cut if isinstance(r_cut, list | tuple | np.ndarray) else [r_cut]:
+            rules.append(SpeciesCutoffs(one) if isinstance(one, dict) else Cutoff(float(one)))
+    if rule is not None:
+        rules.extend(rule if isinstance(rule, Sequence) else [rule])
+    if not rules:
+        raise InputError(
+            "no cutoff", remedy="Give r_cut=8.5 (Å), several as a list, or a rule of mdnum.trajectories.rules"
+        )
+    return rules
+
+
+def _format(trajectory: Any) -> str:
+    word = trajectory.format
+    return str(word if isinstance(word, str) else word[0])
