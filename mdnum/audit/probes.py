@@ -11,7 +11,7 @@ from ase import Atoms
 
 from mdnum.audit.base import Subject
 from mdnum.audit.jumps import Curve
-from mdnum.audit.subject import CalculatorError
+from mdnum.audit.subject import CalculatorError, only_trying
 
 #: What a calculator may want around two atoms, the simplest first: (a cell, periodic).
 _SURROUNDINGS = ((False, False), (True, False), (True, True))
@@ -149,10 +149,11 @@ def _answered(
         name = "-".join(part.get_chemical_formula() for part in (first, second))
         pair = Pair(species, first, second, box, periodic, name)
         for distance in (3.0, 6.0):
+            atoms = pair.at(distance)
             try:
-                atoms = pair.at(distance)
-                subject.energy(atoms)
-                subject.forces(atoms)
+                with only_trying(subject):
+                    subject.energy(atoms)
+                    subject.forces(atoms)
             except CalculatorError as error:
                 why = why or error.message
                 break

@@ -22,7 +22,7 @@ from mdnum.audit.jumps import (
     scatter,
 )
 from mdnum.audit.probes import FARTHEST, Pair, pairs
-from mdnum.audit.subject import CalculatorError
+from mdnum.audit.subject import CalculatorError, only_trying
 
 STEP = 0.025
 """Spacing of a scan, in the unit of length. Two thresholds closer than this may be told as one."""
@@ -123,20 +123,34 @@ def walk_pairs(subject: Subject, progress: Progress | None = None) -> PairWalks:
             if progress:
                 progress(k, len(found), {"phase": f"walking {pair.name}"})
             try:
-                walks.append(walk(pair, pair.curve(subject), subject.kT))
+                walks.append(walk(subject, pair))
             except CalculatorError as error:
                 skipped.append((f"pair {pair.name}", error.message))
         _known[subject] = PairWalks(tuple(walks), tuple(skipped))
     return _known[subject]
 
 
-def walk(pair: Pair, curve: Curve, kT: float, step: float = STEP) -> PairWalk:
+def rough(subject: Subject, pair: Pair) -> tuple[float | None, float | None]:
+    """(where a pair stops interacting, where its energy is least), to within the coarse scan; None if never."""
+    curve = pair.curve(subject)
+    coarse, far = _coarse(subject, curve)
+    energies, forces = curve.many(coarse)
+    energies = energies - curve(far)[0]
+    felt = np.flatnonzero((np.abs(energies) > 1e-12) | (np.abs(forces) > 1e-12))
+    cutoff = None if len(felt) == 0 or felt[-1] >= len(coarse) - 2 else float(coarse[felt[-1] + 1])
+    lowest = int(np.argmin(energies[coarse > 0.8])) + int((coarse <= 0.8).sum())
+    least = float(coarse[lowest]) if energies[lowest] < -1e-9 and lowest > 0 else None
+    return cutoff, least
+
+
+def walk(subject: Subject, pair: Pair, step: float = STEP) -> PairWalk:
     """Walk one pair.
 
     Raises:
         CalculatorError: the calculator fails at distances at which it had answered before.
     """
-    coarse, far = _coarse(curve)
+    curve, kT = pair.curve(subject), subject.kT
+    coarse, far = _coarse(subject, curve)
     energy_far, force_far = curve(far)
     noise = 8 * scatter(curve, far, far, 1.0)[0]
 
@@ -167,13 +181,14 @@ def walk(pair: Pair, curve: Curve, kT: float, step: float = STEP) -> PairWalk:
     )  # fmt: skip
 
 
-def _coarse(curve: Curve) -> tuple[Float[np.ndarray, "points"], float]:
+def _coarse(subject: Subject, curve: Curve) -> tuple[Float[np.ndarray, "points"], float]:
     """Distances from where the calculator first answers to the farthest."""
     places = np.concatenate([np.arange(_NEAREST, 3.0, 0.1), np.arange(3.0, FARTHEST + 0.1, 0.25)])
     first = len(places)
     for k in range(len(places) - 1, -1, -1):
         try:
-            curve(float(places[k]))
+            with only_trying(subject):
+                curve(float(places[k]))
         except CalculatorError:
             break
         first = k

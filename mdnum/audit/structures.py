@@ -1,0 +1,204 @@
+"""The structure a calculator is asked about: a file's, or one built for the elements it knows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from ase import Atoms
+
+from mdnum.audit.load import Loaded
+from mdnum.audit.probes import Pair, pairs
+from mdnum.audit.subject import CalculatorError, CalculatorSubject, only_trying
+from mdnum.audit.thresholds import rough
+from mdnum.errors import InputError
+
+#: Tried in this order, and then every other element: argon where anything goes.
+_FIRST = ("Ar", "Cu", "Si", "C", "O", "Al", "Fe", "Na")
+_LAST_ELEMENT = 95
+
+_MOST_ATOMS = 500
+_FEWEST_ATOMS = 32
+_WATER_EDGES = (4, 5, 6, 8)
+"""Molecules along an edge: some calculators want a box of two cutoffs."""
+
+_RATTLE = 0.02
+"""Standard deviation, of the nearest distance: in a perfect crystal forces are zero and distances tie."""
+
+
+@dataclass(frozen=True)
+class Structure:
+    """Atoms, and in words where they come from."""
+
+    atoms: Atoms
+    says: str
+
+
+def read_structure(words: str | Path) -> Structure:
+    """A structure from any file that ASE reads; `file@5` is its sixth, otherwise the last is taken.
+
+    Raises:
+        InputError: no such file, ASE cannot read it, no atoms, numbers that are not finite.
+    """
+    import ase.io
+
+    text = str(words)
+    head, separator, index = text.rpartition("@")
+    path, which = (Path(head), index) if separator and not Path(text).exists() else (Path(text), "-1")
+    if not path.is_file():
+        raise InputError(
+            "no such structure file", where=str(path), remedy="Correct --structure, or leave it out"
+        )
+    try:
+        atoms = ase.io.read(path, index=int(which))
+    except Exception as error:
+        # ase's readers raise whatever their parsing meets; every one of them means the same to the reader
+        detail = " ".join(str(error).split()) or "no more detail"
+        raise InputError(
+            f"cannot be read as a structure ({type(error).__name__}: {detail})",
+            where=text,
+            remedy="Check that `ase.io.read` opens it; extxyz is the safest format",
+        ) from error
+    if not isinstance(atoms, Atoms) or len(atoms) == 0:
+        raise InputError("holds no atoms", where=text, remedy="Name another file, or another index: file@0")
+    bad = ~np.isfinite(atoms.positions).all(axis=1)
+    if bad.any() or not np.isfinite(np.asarray(atoms.cell)).all():
+        what = f"atom {int(np.argmax(bad))}" if bad.any() else "the cell"
+        raise InputError(
+            f"{what} has a number that is not finite", where=text, remedy="Correct the structure"
+        )
+    return Structure(atoms, f"{len(atoms)} atoms, {atoms.get_chemical_formula()}, from {text}")
+
+
+def default_structure(loaded: Loaded) -> Structure:
+    """A structure for a calculator: its own, or a crystal of an element it takes, or rigid water.
+
+    The crystal is the element's, with the lattice at the calculator's own least energy, repeated until two
+    cutoffs fit in (at most 500 atoms), its atoms displaced a little.
+
+    Raises:
+        InputError: the calculator answers for no element and not for water.
+    """
+    if loaded.atoms is not None:
+        return Structure(loaded.atoms, f"{len(loaded.atoms)} atoms of {loaded.name}")
+    calculator = loaded.make()
+    for symbol in _symbols(calculator):
+        subject = CalculatorSubject(loaded.name, lambda: calculator, Atoms(symbol, [(0, 0, 0)]), kT=1.0)
+        with only_trying(subject):
+            found, _ = pairs(subject)
+            if found:
+                return _crystal(subject, found[0], symbol)
+    why = ""
+    for edge in _WATER_EDGES:
+        subject = CalculatorSubject(loaded.name, lambda: calculator, water(edge), kT=1.0)
+        with only_trying(subject):
+            try:
+                subject.energy(subject.atoms)
+            except CalculatorError as error:
+                why = error.message
+            else:
+                return Structure(subject.atoms, f"{edge**3} molecules of water, on a grid, turned at random")
+    raise InputError(
+        f"the calculator answers neither for two atoms of any element nor for water ({why})",
+        where=loaded.name,
+        remedy="Give a structure that it is made for: --structure FILE",
+    )
+
+
+def water(edge: int = 4, spacing: float = 3.1) -> Atoms:
+    """Rigid water on a cubic grid in random orientations (always the same ones), in the order O, H, H.
+
+    Args:
+        edge: molecules along an edge.
+        spacing: between them, Å; 3.1 is the density of the liquid.
+    """
+    from ase.calculators.tip3p import angleHOH, rOH
+    from scipy.spatial.transform import Rotation
+
+    half = np.radians(angleHOH) / 2
+    flat = rOH * np.array([[0, 0, 0], [np.cos(half), np.sin(half), 0], [np.cos(half), -np.sin(half), 0]])
+    turns = Rotation.random(edge**3, rng=np.random.default_rng(0)).as_matrix()
+    corners = np.stack(np.meshgrid(*[np.arange(edge)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    positions = np.concatenate([flat @ turn.T for turn in turns])
+    positions += np.repeat((corners + 0.5) * spacing, 3, axis=0)
+    return Atoms("OH2" * edge**3, positions, cell=[edge * spacing] * 3, pbc=True)
+
+
+def _symbols(calculator: object) -> list[str]:
+    """Elements to try: those the calculator names, then the usual ones, then all."""
+    from ase.data import chemical_symbols
+
+    named: list[str] = []
+    for attribute in ("elements", "species", "symbols", "atom_types", "parameters"):
+        value = getattr(calculator, attribute, None)
+        if isinstance(value, dict | list | tuple | set):
+            words = [word for key in value for word in (key if isinstance(key, tuple) else (key,))]
+            named += [word for word in words if isinstance(word, str) and word in chemical_symbols[1:]]
+    return list(dict.fromkeys([*named, *_FIRST, *chemical_symbols[1:_LAST_ELEMENT]]))
+
+
+def _crystal(subject: CalculatorSubject, pair: Pair, symbol: str) -> Structure:
+    cutoff, least = rough(subject, pair)
+    cell, lattice = _unit_cell(symbol)
+    scale, relaxed = _least_energy(subject, cell, least)
+    cell.set_cell(np.asarray(cell.cell) * scale, scale_atoms=True)
+    wanted = 2.05 * cutoff if cutoff else 12.0
+    edge = float(np.asarray(cell.cell).diagonal().min())
+    repeat = max(int(np.ceil(wanted / edge)), int(np.ceil((_FEWEST_ATOMS / len(cell)) ** (1 / 3))))
+    repeat = max(min(repeat, int((_MOST_ATOMS / len(cell)) ** (1 / 3))), 1)
+    atoms = cell.repeat(repeat)
+    nearest = _nearest_distance(cell)
+    atoms.rattle(_RATTLE * nearest, seed=0)
+    at = "at the calculator's own least energy" if relaxed else "at its tabulated lattice constant"
+    return Structure(
+        atoms,
+        f"{len(atoms)} atoms of {symbol}, {lattice}, nearest distance {nearest:.4g} Å ({at}), "
+        f"displaced by {_RATTLE * nearest:.2g} Å",
+    )
+
+
+def _unit_cell(symbol: str) -> tuple[Atoms, str]:
+    """The element's crystal as a rectangular cell; fcc of its size where it has none of these."""
+    from ase.build import bulk
+    from ase.data import atomic_numbers, covalent_radii, reference_states
+
+    state = reference_states[atomic_numbers[symbol]]
+    if state is not None and state.get("symmetry") in ("fcc", "bcc", "diamond") and state.get("a"):
+        return bulk(symbol, cubic=True), state["symmetry"]
+    nearest = 2 * float(covalent_radii[atomic_numbers[symbol]])
+    return bulk(symbol, "fcc", a=nearest * np.sqrt(2), cubic=True), "fcc"
+
+
+def _nearest_distance(cell: Atoms) -> float:
+    """Smallest distance between two atoms of a crystal, images included."""
+    large = cell.repeat(2)
+    distances = large.get_all_distances(mic=True)
+    return float(distances[distances > 1e-6].min())
+
+
+def _least_energy(subject: CalculatorSubject, cell: Atoms, least: float | None) -> tuple[float, bool]:
+    """(factor on the lattice at which its energy is least, whether there was one)."""
+    small = cell.repeat(max(int(np.ceil((_FEWEST_ATOMS / len(cell)) ** (1 / 3))), 1))
+
+    def energy(scale: float) -> float:
+        scaled = small.copy()
+        scaled.set_cell(np.asarray(small.cell) * scale, scale_atoms=True)
+        try:
+            return subject.energy(scaled)
+        except CalculatorError:
+            return np.inf
+
+    scale, factor = 1.0, 1.03
+    if least is not None and abs(energy(1.01) - energy(1.0)) < 1e-9:
+        scale = least / _nearest_distance(cell)  # too far apart to feel one another: start at two atoms' own
+    here = energy(scale)
+    start = scale
+    for direction in (factor, 1 / factor):
+        for _ in range(60):
+            there = energy(scale * direction)
+            if not there < here:
+                break
+            scale, here = scale * direction, there
+    ended = np.isfinite(here) and 0.2 < scale / start < 5.0
+    return (scale, True) if ended and np.isfinite(here) else (start, False)
