@@ -48,7 +48,7 @@ def judge(name: str, parts: Sequence[Part]) -> Judgment:
         name: of the calculator.
         parts: as the checks gave them.
     """
-    answers = {question: _answer(question, parts) for question in ("run", "differentiate")}
+    answers: dict[str, Answer] = {question: _answer(question, parts) for question in ("run", "differentiate")}
     return Judgment(
         answers["run"],
         answers["differentiate"],
@@ -92,10 +92,8 @@ def _headline(name: str, answers: Mapping[str, Answer], parts: Sequence[Part]) -
         if finding["severity"] == severity
     ]
     if not titles:
-        asked = len(parts)
-        return (
-            f"{head}: {asked} checks found nothing." if head else f"{asked} checks of {name} found nothing."
-        )
+        found = f"{len(parts)} checks found nothing"
+        return f"{head}: {found}." if head else f"{name}: {found}."
     shown = list(dict.fromkeys(titles))
     more = f", and {len(shown) - 2} more findings" if len(shown) > 3 else ""
     reasons = "; ".join(shown if not more else shown[:2])

@@ -100,13 +100,7 @@ def _part(part: Mapping[str, Any]) -> dict[str, Any]:
 
 def _table(title: str, rows: list[Mapping[str, Any]]) -> dict[str, Any]:
     columns = list(dict.fromkeys(name for row in rows for name in row))
-    numeric = [
-        all(
-            isinstance(row.get(name), int | float | None) and not isinstance(row.get(name), bool)
-            for row in rows
-        )
-        for name in columns
-    ]
+    numeric = [all(_is_number(row.get(name)) for row in rows) for name in columns]
     cells = [[_cell(row.get(name)) for name in columns] for row in rows]
     # what went wrong is on top, where it is seen
     bad = [any(row.get(name) is False for name in columns) for row in rows]
@@ -118,6 +112,10 @@ def _table(title: str, rows: list[Mapping[str, Any]]) -> dict[str, Any]:
         "lines": lines[:_SHOWN],
         "more": lines[_SHOWN:],
     }
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float | None) and not isinstance(value, bool)
 
 
 def _cell(value: Any) -> str:
