@@ -1,0 +1,82 @@
+"""What differs between the neighbors at two frames, pair by pair and image by image."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from jaxtyping import Int
+
+from mdnum.trajectories.lattice import Lattice, image_square
+from mdnum.trajectories.pairs import Rows
+
+
+@numba.njit(cache=True, nogil=True)
+def _compared(first0, count0, other0, first1, count1, other1, i_out, j_out, rank_out, entered_out):
+    """Write (i, j, rank, entered) sorted by (i, j, rank); rows that do not fit are counted only.
+
+    seen[j] = (images before, images now) while the row of i is looked at.
+    """
+    atoms = first0.shape[0]
+    seen = np.zeros((atoms, 2), np.int32)
+    total, room = 0, i_out.shape[0]
+    for i in range(atoms):
+        for k in range(first0[i], first0[i] + count0[i]):
+            seen[other0[k], 0] += 1
+        for k in range(first1[i], first1[i] + count1[i]):
+            seen[other1[k], 1] += 1
+        begin = total
+        for side in range(2):
+            last = first0[i] + count0[i] if side == 0 else first1[i] + count1[i]
+            for k in range(first0[i] if side == 0 else first1[i], last):
+                j = other0[k] if side == 0 else other1[k]
+                before, now = seen[j, 0], seen[j, 1]
+                seen[j, 0], seen[j, 1] = 0, 0
+                for rank in range(min(before, now), max(before, now)):
+                    if total < room:
+                        # the flips of one atom are few: inserted where they belong
+                        at = total
+                        while at > begin and (
+                            j_out[at - 1] > j or (j_out[at - 1] == j and rank_out[at - 1] > rank)
+                        ):
+                            j_out[at], rank_out[at] = j_out[at - 1], rank_out[at - 1]
+                            entered_out[at] = entered_out[at - 1]
+                            at -= 1
+                        i_out[total] = i
+                        j_out[at], rank_out[at], entered_out[at] = j, rank, now > before
+                    total += 1
+    return total
+
+
+def compared(before: Rows, now: Rows, room: int = 4096):
+    """(i, j, rank, entered) of every decision that differs, sorted; indices are those of the rows."""
+    while True:
+        i, j, rank = (np.empty(room, np.int64) for _ in range(3))
+        entered = np.empty(room, np.bool_)
+        total = _compared(
+            before.first, before.count, before.other, now.first, now.count, now.other, i, j, rank, entered
+        )
+        if total <= room:
+            return i[:total], j[:total], rank[:total], entered[:total]
+        room = total
+
+
+@numba.njit(cache=True, nogil=True)
+def _image_distances(x, vectors, inverse, periodic, widths, i, j, rank, out):
+    for k in range(i.shape[0]):
+        a, b = min(i[k], j[k]), max(i[k], j[k])
+        out[k] = np.sqrt(image_square(x, a, b, rank[k], vectors, inverse, periodic, widths))
+
+
+def image_distances(
+    positions,
+    lattice: Lattice,
+    i: Int[np.ndarray, "pairs"],
+    j: Int[np.ndarray, "pairs"],
+    rank: Int[np.ndarray, "pairs"],
+):
+    """Distances to the images that have `rank` nearer ones, length; inf where there are not so many."""
+    out = np.empty(len(i))
+    _image_distances(
+        positions, lattice.vectors, lattice.inverse, lattice.periodic, lattice.widths, i, j, rank, out
+    )
+    return out

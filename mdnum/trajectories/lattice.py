@@ -1,0 +1,240 @@
+"""The lattice of one frame's box: reduced vectors, widths, and the distance to any image of an atom.
+
+Vectors are reduced first, so that a box that is skewed beyond need costs no more than the compact one that
+tiles space in the same way. A decision is always taken on the same number: the length of
+
+    (x_j - x_i) + s_0 a_0 + s_1 a_1 + s_2 a_2
+
+with the coordinates as they are stored, i < j, whole numbers s and the reduced vectors a, in this order of
+operations. So it does not depend on which search found the pair.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from mdnum.errors import InputError
+from mdnum.trajectories.frame import Box
+
+_UNIT_ROUNDOFF = 2.0**-53
+# sqrt(volume² / product of lengths²) under which vectors are called dependent
+_FLAT = 1e-10
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """What a search needs to know of a box.
+
+    Attributes:
+        vectors: reduced lattice vectors as rows, length; zero along directions that do not repeat.
+        periodic: which rows repeat.
+        inverse: of the vectors completed by unit vectors normal to them: x @ inverse are the coordinates.
+        widths: distance between opposite faces, length; inf along directions that do not repeat.
+        combination: vectors = combination @ matrix of the box.
+    """
+
+    vectors: Float[np.ndarray, "3 3"]
+    periodic: Bool[np.ndarray, "3"]
+    inverse: Float[np.ndarray, "3 3"]
+    widths: Float[np.ndarray, "3"]
+    combination: Int[np.ndarray, "3 3"]
+
+    @property
+    def narrowest(self) -> float:
+        """Smallest width, length: no lattice vector is shorter."""
+        return float(self.widths.min())
+
+    @property
+    def volume(self) -> float:
+        """Volume of the box; of a slice one length thick along directions that do not repeat."""
+        return float(1.0 / abs(np.linalg.det(self.inverse)))
+
+    def rounding(self, largest: float, radius: float) -> float:
+        """How far a computed distance near radius can be off, length.
+
+        Args:
+            largest: largest coordinate, absolute.
+            radius: the distance.
+        Source: Higham, Accuracy and Stability of Numerical Algorithms, 2nd ed., section 3.1.
+        """
+        combined = np.abs(self.combination).sum(axis=1).max()
+        size = largest + float(np.abs(self.vectors).sum()) * max(1.0, float(combined) - 1.0) + radius
+        return 16.0 * _UNIT_ROUNDOFF * size
+
+
+def lattice_of(box: Box) -> Lattice:
+    """The lattice of a box.
+
+    Raises:
+        InputError: a direction repeats, but its vector is zero, not finite, or in the plane of the others.
+    """
+    pbc = np.asarray(box.pbc, bool)
+    matrix = np.where(pbc[:, None], np.asarray(box.matrix, np.float64), 0.0)
+    for axis in np.flatnonzero(pbc):
+        if not np.isfinite(matrix[axis]).all() or not matrix[axis].any():
+            raise InputError(
+                f"the box repeats along direction {axis}, but its vector there is {matrix[axis].tolist()}",
+                remedy="Give the frame a box, or say that this direction does not repeat",
+                where="box",
+            )
+    rows = np.flatnonzero(pbc)
+    combination = np.eye(3, dtype=np.int64)
+    if len(rows):
+        lengths = np.linalg.norm(matrix[rows], axis=1)
+        scaled = matrix[rows] / lengths[:, None]
+        if not np.sqrt(max(np.linalg.det(scaled @ scaled.T), 0.0)) > _FLAT:
+            raise InputError(
+                f"the vectors of the box lie in one plane: {matrix[rows].tolist()}",
+                remedy="Give the frame the box it was run in",
+                where="box",
+            )
+        combination[np.ix_(rows, rows)] = _reduced(matrix[rows])
+    vectors = np.where(pbc[:, None], combination @ matrix, 0.0)
+    completed = _completed(vectors, pbc)
+    inverse = np.linalg.inv(completed)
+    widths = np.where(pbc, 1.0 / np.linalg.norm(inverse, axis=0), np.inf)
+    return Lattice(vectors, pbc, inverse, widths, combination)
+
+
+def _reduced(vectors):
+    """Whole-number combinations of at most three vectors that are Minkowski-reduced.
+
+    Each pass takes from a vector the combination of the shorter ones that leaves the least; a vector that
+    gets no shorter by any of these ends it (Nguyen and Stehlé 2009, greedy reduction, dimension <= 3).
+    """
+    count = len(vectors)
+    made = np.eye(count, dtype=np.int64)
+    tries = [np.array(one) for one in itertools.product((-1, 0, 1), repeat=count - 1)] if count > 1 else []
+    for _ in range(200):
+        current = made @ vectors
+        changed = False
+        for k in np.argsort(-np.einsum("ij,ij->i", current, current), kind="stable"):
+            current = made @ vectors
+            others = [m for m in range(count) if m != k]
+            if not others:
+                break
+            base = np.rint(np.linalg.lstsq(current[others].T, current[k], rcond=None)[0])
+            length = float(current[k] @ current[k])
+            best, taken = length * (1.0 - 1e-12), None
+            # around nothing as well: then the end of the passes is the definition of a reduced basis
+            for whole in itertools.chain((base + more for more in tries), tries):
+                whole = whole.astype(np.int64)
+                left = current[k] - whole @ current[others]
+                if float(left @ left) < best:
+                    best, taken = float(left @ left), whole
+            if taken is not None:
+                made[k] -= taken @ made[others]
+                changed = True
+        if not changed:
+            break
+    return made
+
+
+def _completed(vectors, pbc):
+    """The vectors with those that do not repeat replaced by unit vectors normal to all others."""
+    free = np.flatnonzero(~pbc)
+    if not len(free):
+        return vectors
+    completed = vectors.copy()
+    if len(free) == 3:
+        return np.eye(3)
+    if len(free) == 1:
+        normal = np.cross(vectors[(free[0] + 1) % 3], vectors[(free[0] + 2) % 3])
+        completed[free[0]] = normal / np.linalg.norm(normal)
+        return completed
+    along = vectors[pbc][0] / np.linalg.norm(vectors[pbc][0])
+    other = np.cross(along, np.eye(3)[np.argmin(np.abs(along))])
+    completed[free[0]] = other / np.linalg.norm(other)
+    completed[free[1]] = np.cross(along, completed[free[0]])
+    return completed
+
+
+def own_images(lattice: Lattice, radius: float) -> Float[np.ndarray, "images"]:
+    """Squared lengths of the lattice vectors no longer than radius, one of each ± pair, ascending."""
+    span = [range(-int(radius / w) - 1, int(radius / w) + 2) if p else range(1)
+            for w, p in zip(lattice.widths, lattice.periodic, strict=True)]  # fmt: skip
+    if not lattice.periodic.any() or radius < lattice.narrowest * (1 - 1e-9):
+        return np.zeros(0)
+    found = []
+    for s in itertools.product(*span):
+        if s > (0, 0, 0):
+            d = s[0] * lattice.vectors[0] + s[1] * lattice.vectors[1] + s[2] * lattice.vectors[2]
+            square = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
+            if square <= radius * radius:
+                found.append(float(square))
+    return np.sort(np.array(found, np.float64))
+
+
+@numba.njit(cache=True, nogil=True)
+def square_of(x, i, j, s0, s1, s2, vectors):
+    """Squared distance from atom i to an image of atom j, i < j: the number that decides."""
+    if s0 == 0 and s1 == 0 and s2 == 0:
+        d0, d1, d2 = x[j, 0] - x[i, 0], x[j, 1] - x[i, 1], x[j, 2] - x[i, 2]
+    else:
+        d0 = (x[j, 0] - x[i, 0]) + (s0 * vectors[0, 0] + s1 * vectors[1, 0] + s2 * vectors[2, 0])
+        d1 = (x[j, 1] - x[i, 1]) + (s0 * vectors[0, 1] + s1 * vectors[1, 1] + s2 * vectors[2, 1])
+        d2 = (x[j, 2] - x[i, 2]) + (s0 * vectors[0, 2] + s1 * vectors[1, 2] + s2 * vectors[2, 2])
+    return d0 * d0 + d1 * d1 + d2 * d2
+
+
+@numba.njit(cache=True, nogil=True)
+def image_square(x, i, j, rank, vectors, inverse, periodic, widths):
+    """Squared distance to the image of j that has `rank` nearer ones; inf where there are not so many.
+
+    i < j, or i == j for images of an atom itself, of which one of each ± pair counts.
+    """
+    f = np.zeros(3)
+    base = np.zeros(3, np.int64)
+    close = False
+    narrowest = np.inf
+    for k in range(3):
+        if periodic[k]:
+            narrowest = min(narrowest, widths[k])
+            for c in range(3):
+                f[k] += (x[j, c] - x[i, c]) * inverse[c, k]
+            base[k] = -np.int64(np.rint(f[k]))
+            close = close or abs(f[k] + base[k]) > 0.5 - 1e-6
+    if narrowest == np.inf:
+        if rank > 0 or i == j:
+            return np.inf
+        return square_of(x, i, j, 0, 0, 0, vectors)
+    if rank == 0 and i != j and not close:
+        here = square_of(x, i, j, base[0], base[1], base[2], vectors)
+        # any other image is a lattice vector away, and none is shorter than the narrowest width
+        if here < 0.2499 * narrowest * narrowest:
+            return here
+    best = np.empty(rank + 1)
+    span = np.zeros(3, np.int64)
+    for k in range(3):
+        span[k] = 1 if periodic[k] else 0
+    while True:
+        best[:] = np.inf
+        for s0 in range(base[0] - span[0], base[0] + span[0] + 1):
+            for s1 in range(base[1] - span[1], base[1] + span[1] + 1):
+                for s2 in range(base[2] - span[2], base[2] + span[2] + 1):
+                    if i == j and (s0 < 0 or (s0 == 0 and s1 < 0) or (s0 == 0 and s1 == 0 and s2 <= 0)):
+                        continue
+                    square = square_of(x, i, j, s0, s1, s2, vectors)
+                    place = rank
+                    if square < best[place]:
+                        while place > 0 and best[place - 1] > square:
+                            best[place] = best[place - 1]
+                            place -= 1
+                        best[place] = square
+        # an image not tried is at least (span + 1/2) widths away
+        grown = False
+        reach = np.sqrt(best[rank])
+        for k in range(3):
+            if periodic[k] and not reach <= (span[k] + 0.499999) * widths[k]:
+                # the vectors are reduced: the nearest of all is among the 27 around the rounded one
+                if rank == 0 and i != j and span[k] >= 1:
+                    continue
+                grown = True
+                span[k] = span[k] + 1 if reach == np.inf else np.int64(reach / widths[k] + 0.6)
+        if not grown:
+            return best[rank]

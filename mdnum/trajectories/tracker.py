@@ -1,0 +1,321 @@
+"""Which neighbors an atom gained and lost, frame after frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from mdnum.errors import InputError
+from mdnum.trajectories.changes import compared, image_distances
+from mdnum.trajectories.frame import Frame
+from mdnum.trajectories.lattice import Lattice, lattice_of, own_images
+from mdnum.trajectories.nearest import chosen
+from mdnum.trajectories.pairs import Rows, Sides, ordered, ranks, search
+from mdnum.trajectories.rules import Capped, Cutoff, Nearest, Rule, SpeciesCutoffs
+from mdnum.trajectories.table import Flips, Members
+
+#: `Tracker.min_margin` looks this share of the radius away from it
+HORIZON = 0.02
+
+
+@dataclass(frozen=True)
+class Moment:
+    """One frame as it was decided.
+
+    Attributes:
+        positions: of the atoms that take part, length.
+        lattice: of its box.
+        rounding: how far a distance can be off through float64, length.
+        rows: neighbors; None where they have not been listed.
+        own: images of an atom itself that are inside, by species.
+        last_in, first_out: thresholds of each atom, where the rule is directed.
+    """
+
+    positions: Float[np.ndarray, "atoms 3"]
+    lattice: Lattice
+    rounding: float
+    rows: Rows | None
+    own: Int[np.ndarray, "species"]
+    last_in: Float[np.ndarray, "limits"]
+    first_out: Float[np.ndarray, "limits"]
+
+
+class Tracker:
+    """Flips of a membership rule between consecutive frames.
+
+    Remembers one frame, so memory does not grow with the number of frames; can be pickled.
+
+    Args:
+        rule: who is a neighbor.
+        first: atoms of the file on one side; None for all. A directed rule looks for neighbors of these.
+        second: atoms on the other side; None for the same atoms as first. An atom may be on both.
+        species: of each atom of the file; needed by rules that ask for it.
+        bound: how far a margin can be off through the resolution of the file, length. What float64 rounds
+            is added to it.
+
+    Attributes:
+        pairs: inside at the last frame.
+        near: pairs at the last frame with a |margin| of at most the bound, inside or not.
+        min_margin: smallest |margin| at the last frame, length; inf where no pair is within `HORIZON` of its
+            radius. The nearest few of an atom without a radius have no such limit.
+
+    Raises:
+        InputError: indices that are not whole numbers from 0 or come twice; no species where they are needed.
+    """
+
+    def __init__(
+        self,
+        rule: Rule,
+        first: Int[np.ndarray, "first"] | Sequence[int] | None = None,
+        second: Int[np.ndarray, "second"] | Sequence[int] | None = None,
+        species: Sequence[str] | np.ndarray | None = None,
+        bound: float = 0.0,
+    ):
+        if first is None and second is not None:
+            first, second = second, None
+        self.rule = rule
+        self.bound = float(bound)
+        self._first, self._second = _indices(first, "first"), _indices(second, "second")
+        if rule.needs_species and species is None:
+            raise InputError(
+                f"{rule.name} needs to know which species the atoms are of",
+                remedy="Give a topology that names elements or types, or use one cutoff for all",
+                where="species",
+            )
+        self._species = None if species is None else np.asarray(species, str)
+        self._atoms = -1
+        self._last: Moment | None = None
+        self.frames = 0
+        self.pairs = 0
+        self.near = 0
+        self.min_margin = np.inf
+
+    def step(self, frame: Frame, bound: float | None = None) -> Flips:
+        """What changed since the frame before; nothing at the first.
+
+        Args:
+            frame: the next one; its own index is not looked at.
+            bound: of this frame and from here on, length; None for the one before.
+        Raises:
+            InputError: a position that is not finite; a direction that repeats without a vector; another
+                number of atoms than before.
+        """
+        if bound is not None:
+            self.bound = float(bound)
+        now = self._decided(frame)
+        before, self._last = self._last, now
+        self.frames += 1
+        if before is None:
+            return Flips.none()
+        return self._flips(before, now)
+
+    def members(self) -> Members:
+        """The pairs inside at the last frame."""
+        none = np.zeros(0, np.int64)
+        if self._last is None:
+            return Members(none, none, none, np.zeros(0))
+        now = self._last
+        i, j = ordered(self._listed(now))
+        own = self._own_members(now)
+        # images of an atom itself are its first neighbors in the order of indices, unless rows are directed
+        i, j = np.concatenate([i, own]), np.concatenate([j, own])
+        if not self.rule.directed:
+            i, j = np.minimum(i, j), np.maximum(i, j)
+        order = np.lexsort((j, i))
+        i, j = i[order], j[order]
+        rank = ranks(i, j)
+        distance = self._distances(now, i, j, rank)
+        return Members(self._labels[i], self._labels[j], rank, distance)
+
+    # ---- one frame
+
+    def _decided(self, frame: Frame) -> Moment:
+        positions, largest = self._checked(frame)
+        lattice = lattice_of(frame.box)
+        rule = self.rule
+        radius = self._radii.max(initial=0.0)
+        size = radius if np.isfinite(radius) else 4.0 * largest
+        rounding = lattice.rounding(largest, float(size))
+        if np.isfinite(radius) and rounding > 1e-3 * radius:
+            raise InputError(
+                f"coordinates up to {largest:.3g} with a cutoff of {radius:g}: float64 cannot tell distances",
+                remedy="Check the unit, and that the file's coordinates are not broken",
+                where=f"frame {frame.index}",
+            )
+        bound = self.bound + rounding
+        empty = np.zeros(0)
+        if isinstance(rule, Nearest | Capped):
+            made = chosen(
+                positions, lattice, self._sides, rule,
+                band=max(bound, HORIZON * rule.reach if np.isfinite(rule.reach) else 0.0, 4 * rounding),
+                bound=bound, guard=rounding,
+            )  # fmt: skip
+            self.pairs, self.near = len(made.rows.other), made.rows.close
+            horizon = HORIZON * rule.reach
+            self.min_margin = made.rows.smallest if made.rows.smallest <= horizon else np.inf
+            none = np.zeros(len(self._radii), np.int64)
+            return Moment(positions, lattice, rounding, made.rows, none, made.last_in, made.first_out)
+        horizon = HORIZON * radius
+        rows = search(
+            positions, lattice, self._sides, self._radii,
+            band=max(bound, horizon, 4 * rounding), bound=bound, guard=rounding,
+        )  # fmt: skip
+        own, close, smallest = self._own(lattice, bound)
+        smallest = min(rows.smallest, smallest)
+        self.pairs = len(rows.other) + int((own * self._both_count).sum())
+        self.near = rows.close + close
+        self.min_margin = smallest if smallest <= horizon else np.inf
+        return Moment(positions, lattice, rounding, rows, own, empty, empty)
+
+    def _listed(self, moment: Moment) -> Rows:
+        assert moment.rows is not None
+        return moment.rows
+
+    def _own(self, lattice: Lattice, bound: float) -> tuple[np.ndarray, int, float]:
+        """Images of an atom itself that are inside, by species; how many are close; the smallest |margin|."""
+        inside = np.zeros(len(self._radii), np.int64)
+        close, smallest = 0, np.inf
+        reach = float(self._radii.max(initial=0.0)) * (1.0 + HORIZON) + bound
+        squares = own_images(lattice, reach)
+        for kind, radius in enumerate(np.diag(self._radii)):
+            if radius < 0 or not self._both_count[kind]:
+                continue
+            inside[kind] = int((squares < radius * radius).sum())
+            margins = np.abs(radius - np.sqrt(squares))
+            close += int((margins <= bound).sum()) * int(self._both_count[kind])
+            smallest = min(smallest, float(margins.min(initial=np.inf)))
+        return inside, close, smallest
+
+    def _own_members(self, moment: Moment) -> np.ndarray:
+        """Each atom as often as images of its own are inside (not those of directed rules, which list them)."""
+        times = np.where(self._both, moment.own[self._kinds], 0)
+        return np.repeat(np.arange(len(times)), times)
+
+    # ---- two frames
+
+    def _flips(self, before: Moment, now: Moment) -> Flips:
+        i, j, rank, entered = compared(self._listed(before), self._listed(now))
+        if (before.own != now.own).any():
+            parts = [(i, j, rank, entered)]
+            for kind in np.flatnonzero(before.own != now.own):
+                atoms = np.flatnonzero(self._both & (self._kinds == kind))
+                low, high = sorted((int(before.own[kind]), int(now.own[kind])))
+                a = np.repeat(atoms, high - low)
+                yes = np.full(len(a), bool(now.own[kind] > before.own[kind]))
+                parts.append((a, a, np.tile(np.arange(low, high), len(atoms)), yes))
+            i, j, rank, entered = (np.concatenate([part[k] for part in parts]) for k in range(4))
+        return self._table(before, now, i, j, rank, entered)
+
+    def _table(self, before: Moment, now: Moment, i, j, rank, entered) -> Flips:
+        """The flips as columns, from indices among the atoms that take part."""
+        if not self.rule.directed:
+            i, j = np.minimum(i, j), np.maximum(i, j)
+        key = i * np.int64(len(self._labels)) + j
+        if (key[1:] < key[:-1]).any() or (rank[1:] < rank[:-1]).any():
+            order = np.lexsort((rank, key))
+            i, j, rank, entered = i[order], j[order], rank[order], entered[order]
+        distance, old = self._distances(now, i, j, rank), self._distances(before, i, j, rank)
+        if self.rule.directed:
+            margin = np.where(entered, now.last_in[i], now.first_out[i]) - distance
+            earlier = np.where(entered, before.first_out[i], before.last_in[i]) - old
+        else:
+            radius = self._radii[self._kinds[i], self._kinds[j]]
+            margin, earlier = radius - distance, radius - old
+        bound = self.bound + max(before.rounding, now.rounding)
+        return Flips(
+            np.full(len(i), self.frames - 1, np.int64), self._labels[i], self._labels[j], rank, entered,
+            distance, old, margin, earlier, np.full(len(i), bound),
+            (np.abs(margin) <= bound) | (np.abs(earlier) <= bound),
+        )  # fmt: skip
+
+    def _distances(self, moment: Moment, i, j, rank) -> np.ndarray:
+        if self.rule.directed:
+            # both of a ± pair are neighbors of an atom
+            rank = np.where(i == j, rank // 2, rank)
+        return image_distances(moment.positions, moment.lattice, i, j, rank)
+
+    # ---- input
+
+    def _checked(self, frame: Frame) -> tuple[np.ndarray, float]:
+        """Positions of the atoms that take part, and the largest coordinate."""
+        atoms = len(frame.positions)
+        if self._atoms < 0:
+            self._prepare(atoms)
+        if atoms != self._atoms:
+            raise InputError(
+                f"{atoms} atoms, {self._atoms} in the frames before",
+                remedy="Split the trajectory where the number of atoms changes",
+                where=f"frame {frame.index}",
+            )
+        positions = np.asarray(frame.positions, np.float64)
+        if not self._all:
+            positions = positions[self._labels]
+        positions = np.array(positions, order="C")
+        largest = float(np.abs(positions).max(initial=0.0))
+        if not np.isfinite(largest):
+            at = int(np.flatnonzero(~np.isfinite(positions).all(axis=1))[0])
+            raise InputError(
+                f"atom {int(self._labels[at])} is at {positions[at].tolist()}",
+                remedy="Stop before this frame (a slice of the file), and find out why the run broke",
+                where=f"frame {frame.index}",
+            )
+        return positions, largest
+
+    def _prepare(self, atoms: int) -> None:
+        """Number the atoms that take part, once their number is known."""
+        everyone = np.arange(atoms)
+        first = everyone if self._first is None else self._first
+        second = first if self._second is None else self._second
+        for name, chosen_atoms in (("first", first), ("second", second)):
+            if len(chosen_atoms) and chosen_atoms.max() >= atoms:
+                raise InputError(
+                    f"atom {int(chosen_atoms.max())} is selected, but frames have {atoms} atoms (from 0)",
+                    remedy="Select atoms of this trajectory",
+                    where=name,
+                )
+        if self._species is not None and len(self._species) != atoms:
+            raise InputError(
+                f"{len(self._species)} species for frames of {atoms} atoms",
+                remedy="Use the topology that belongs to the trajectory",
+                where="species",
+            )
+        self._atoms = atoms
+        self._labels = np.union1d(first, second).astype(np.int64)
+        self._all = len(self._labels) == atoms
+        centers, others = np.isin(self._labels, first), np.isin(self._labels, second)
+        if (centers == others).all():
+            others = centers
+        kinds, radii = self._kinds_and_radii()
+        self._kinds, self._radii, self._both = kinds, radii, centers & others
+        self._sides = Sides(centers, others, kinds)
+        self._both_count = np.bincount(kinds[self._both], minlength=len(radii))
+
+    def _kinds_and_radii(self) -> tuple[np.ndarray, np.ndarray]:
+        rule, none = self.rule, np.zeros(len(self._labels), np.int64)
+        if isinstance(rule, SpeciesCutoffs):
+            assert self._species is not None
+            # species of atoms that do not take part count too: a selection may hold none of one
+            kinds, radii = rule.table(list(self._species))
+            return kinds[self._labels], radii
+        if isinstance(rule, Cutoff):
+            return none, np.array([[float(rule.radius)]])
+        return none, np.array([[float(rule.reach)]])
+
+
+def _indices(chosen_atoms, where: str) -> np.ndarray | None:
+    """Sorted atom numbers, each once."""
+    if chosen_atoms is None:
+        return None
+    made = np.asarray(chosen_atoms)
+    if made.size == 0:
+        return np.zeros(0, np.int64)
+    if made.ndim != 1 or made.dtype.kind not in "iu" or made.min() < 0:
+        raise InputError(
+            f"expected whole numbers from 0, got {made.dtype} of shape {made.shape}",
+            remedy="Give the indices of the atoms in the trajectory, from 0",
+            where=where,
+        )
+    return np.unique(made.astype(np.int64))
