@@ -22,6 +22,7 @@ _HOMES = {
     "bounce": "mdnum.workflow:bounce",
     "build": "mdnum.systems:build",
     "diagnose": "mdnum.doctor:diagnose",
+    "flips": "mdnum.workflow:flips",
     "fork": "mdnum.workflow:fork",
     "fork_certify": "mdnum.workflow:fork_certify",
     "fork_folders": "mdnum.workflow:fork_folders",
@@ -46,6 +47,7 @@ if TYPE_CHECKING:
     from mdnum.systems import build as build
     from mdnum.systems import load as load
     from mdnum.workflow import bounce as bounce
+    from mdnum.workflow import flips as flips
     from mdnum.workflow import fork as fork
     from mdnum.workflow import fork_certify as fork_certify
     from mdnum.workflow import fork_folders as fork_folders
@@ -66,6 +68,7 @@ __all__ = [
     "bounce",
     "build",
     "diagnose",
+    "flips",
     "fork",
     "fork_certify",
     "fork_folders",

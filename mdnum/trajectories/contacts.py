@@ -1,4 +1,4 @@
-"""Every stay of a pair inside its threshold: when it began, when it ended, and which of the two was not seen."""
+"""Every stay of a pair inside its threshold: when it began and ended, and which of the two was not seen."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from mdnum.trajectories.history import History
 class Contacts:
     """Stays inside, sorted by (i, j, rank, begin).
 
-    The frames say no more than that a pair was inside at `begin`, ..., `end - 1`: it entered some time between
-    the frames `begin - 1` and `begin`, and it may have been outside for a while between two frames.
+    The frames say no more than that a pair was inside at `begin`, ..., `end - 1`: it entered some time
+    between the frames `begin - 1` and `begin`, and it may have been outside for a while between two frames.
 
     Attributes:
         i, j, rank: the pair; see `mdnum.trajectories.table.Members`.

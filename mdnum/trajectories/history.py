@@ -1,4 +1,4 @@
-"""What every pair did over the frames: flips by pair rather than by frame, for everything that asks how long."""
+"""What every pair did over the frames: flips by pair rather than by frame, for all that asks how long."""
 
 from __future__ import annotations
 

@@ -2,13 +2,13 @@
 
 Three different answers, each honest about what it is:
 
-- the **lifetime** of a contact that was seen to begin: the product-limit estimate (Kaplan and Meier, J. Am. Stat.
-  Assoc. 53, 457, 1958), which uses stays that go on after the last frame for as long as they were seen;
-- the **mean by rate**: time spent inside over the number of leaves, which uses every frame of every stay, whether
-  its ends were seen or not, and is the mean lifetime where pairs leave at a constant rate;
-- the **residence**: of pairs found inside at some frame, the share still inside (without a break) so much later
-  (Impey, Madden and McDonald, J. Phys. Chem. 87, 5071, 1983). Long stays are met more often: it is not the
-  lifetime.
+- the **lifetime** of a contact that was seen to begin: the product-limit estimate (Kaplan and Meier, J. Am.
+  Stat. Assoc. 53, 457, 1958), which uses stays that go on after the last frame for as long as they were seen;
+- the **mean by rate**: time spent inside over the number of leaves, which uses every frame of every stay,
+  whether its ends were seen or not, and is the mean lifetime where pairs leave at a constant rate;
+- the **residence**: of pairs found inside at some frame, the share still inside (without a break) so much
+  later (Impey, Madden and McDonald, J. Phys. Chem. 87, 5071, 1983). Long stays are met more often: it is not
+  the lifetime.
 
 All in frames; times come from the frames' own.
 """

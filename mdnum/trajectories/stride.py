@@ -1,11 +1,11 @@
-"""Flips that happened and reverted between two frames: the file cannot show them, but it can tell their number.
+"""Flips that happened and reverted between two frames: not in the file, but it can tell their number.
 
 Two estimates that know nothing of one another:
 
-- **from the frames themselves**: every second frame alone would have lost a share of the flips; how that share
-  grows with the stride is carried on to what lies between the frames that there are;
-- **from velocities**, where the file has them: atoms that fly on straight for a moment cross their thresholds at a
-  rate, the flux of pairs, which is what a run that looks at every instant would record.
+- **from the frames themselves**: every second frame alone would have lost a share of the flips; how that
+  share grows with the stride is carried on to what lies between the frames that there are;
+- **from velocities**, where the file has them: atoms that fly on straight for a moment cross their thresholds
+  at a rate, the flux of pairs, which is what a run that looks at every instant would record.
 """
 
 from __future__ import annotations
@@ -90,10 +90,10 @@ def doublings(frames: int) -> list[int]:
 def between_frames(found: Strides) -> Between | None:
     """What lies between the frames, from how the flips thin out when frames are left out.
 
-    Going from stride 2 to 1 brought some flips back, going from 4 to 2 some others. Where the first are fewer by
-    a factor q, halving the stride for ever brings back a geometric series of them. For straight flight through
-    the cutoff q is about 1/2; where it is not below 0.9 there is no sum to speak of (motion that looks Brownian
-    at this stride), and only what the next halving would bring is told.
+    Going from stride 2 to 1 brought some flips back, going from 4 to 2 some others. Where the first are fewer
+    by a factor q, halving the stride for ever brings back a geometric series of them. For straight flight
+    through the cutoff q is about 1/2; where it is not below 0.9 there is no sum to speak of (motion that
+    looks Brownian at this stride), and only what the next halving would bring is told.
 
     Returns:
         None with fewer than three strides, or no flips.
@@ -120,8 +120,8 @@ def crossings(frame: Frame, count: Callable[[Frame, Frame], int], move: float) -
     Args:
         frame: with velocities.
         count: flips between two frames, by the rule at hand.
-        move: root mean square displacement in that moment, length: small beside the distance over which a path
-            bends, large enough that many pairs cross.
+        move: root mean square displacement in that moment, length: small beside the distance over which a
+            path bends, large enough that many pairs cross.
 
     Returns:
         flips, and the moment in the unit of the velocities' time; None where no atom moves.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from mdnum.workflow.ball import BallResult, bounce
+from mdnum.workflow.flips import FlipsResult, flips
 from mdnum.workflow.fork import ForkResult, fork
 from mdnum.workflow.fork_certify import CertifyResult, fork_certify
 from mdnum.workflow.fork_forecast import ForecastResult, fork_forecast
@@ -16,11 +17,13 @@ __all__ = [
     "BallResult",
     "CertifyResult",
     "ForecastResult",
+    "FlipsResult",
     "ForkResult",
     "GradResult",
     "MapResult",
     "ProcessesResult",
     "bounce",
+    "flips",
     "fork",
     "fork_certify",
     "fork_folders",

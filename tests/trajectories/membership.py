@@ -8,7 +8,7 @@ from mdnum.trajectories.table import Flips, Members
 
 
 def ledger(inside: np.ndarray, names: list[tuple[int, int, int]]) -> tuple[Flips, Members]:
-    """Flips in the order of frames, and the pairs at the first frame, of a table (pairs, frames) of decisions.
+    """Flips in the order of frames, and the pairs at the first frame, of decisions by pair and frame.
 
     Args:
         names: (i, j, rank) of each row, sorted.
@@ -31,7 +31,7 @@ def ledger(inside: np.ndarray, names: list[tuple[int, int, int]]) -> tuple[Flips
 def random_membership(
     seed: int, pairs: int = 30, frames: int = 25, atoms: int = 8
 ) -> tuple[np.ndarray, list[tuple[int, int, int]]]:
-    """Decisions that stick for a while, some pairs never inside and some always; images and (i, i) included."""
+    """Decisions that stick for a while; one pair is never inside and one always; images and (i, i) too."""
     rng = np.random.default_rng(seed)
     inside = np.empty((pairs, frames), bool)
     inside[:, 0] = rng.random(pairs) < 0.5

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import fields
 from fractions import Fraction
 
@@ -69,7 +70,7 @@ def test_stays_with_short_gaps_between_count_as_one(seed: int, gap: int) -> None
     filled = inside.copy()
     for row in filled:
         at = np.flatnonzero(row)
-        for one, following in zip(at[:-1], at[1:], strict=True):
+        for one, following in itertools.pairwise(at):
             if following - one - 1 <= gap:
                 row[one:following] = True
     assert listed(mended(contacts(history), gap), names) == stays(filled)
@@ -132,7 +133,7 @@ def test_pairs_that_leave_at_a_constant_rate_are_given_that_rate_however_much_is
     mean, error = mean_by_rate(found)
     assert abs(mean - 20) < 4 * error and error < 0.6
     left = survival(found)
-    assert (np.abs(left.share - 0.95**left.frames) < 4 * left.error).all() and left.error.max() < 0.02
+    assert (np.abs(left.share - 0.95**left.frames) < 4 * left.error).all() and left.error.max() < 0.025
     # what a mean over finished stays would say is far off: that is why censoring has to be named
     finished = found.seen @ np.arange(31) / found.seen.sum()
     assert finished < 12

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 
 import numpy as np
@@ -47,7 +48,7 @@ def test_flips_taken_back_and_how_soon(seed: int, window: int) -> None:
     for row in inside:
         at = np.flatnonzero(np.diff(row.astype(int))) + 1
         total += len(at)
-        for one, following in zip(at[:-1], at[1:], strict=True):
+        for one, following in itertools.pairwise(at):
             (within if row[one] else beyond)[int(following - one)] += 1
     assert found.flips == total and found.window == window
     assert found.inside.tolist() == [within[n] for n in range(window + 1)]

@@ -1,0 +1,68 @@
+"""A folder of flips in the terminal: what was read, counts by rule, lifetimes, and what cannot be told."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from mdnum.cli import output
+
+
+def print_rows(summary: Mapping[str, Any]) -> None:
+    """What a folder of flips says below its headline."""
+    out = output.console()
+    out.print(f"  {_file(summary)}", markup=False)
+    out.print(f"  {summary['resolution']['words']}", markup=False)
+    columns = (
+        "rule",
+        "pairs",
+        "flips",
+        "per frame",
+        "undecidable",
+        "median life",
+        "mean life by rate",
+        "chatter",
+    )
+    rows = [
+        (
+            one["rule"], f"{one['pairs_first']:,} to {one['pairs_last']:,}", f"{one['flips']:,}",
+            one["flips_per_frame"], f"{one['ambiguous']:,}", _length(one["lifetime"]["median"], summary),
+            _length(one["lifetime"]["mean_by_rate"], summary), f"{100 * one['chatter']['share']:.1f} %",
+        )
+        for one in summary["rules"]
+    ]  # fmt: skip
+    output.print_table("", columns, rows)
+
+
+def print_comparison(summary: Mapping[str, Any]) -> None:
+    """What a comparison of two trajectories says below its headline."""
+    out = output.console()
+    out.print(f"  {summary['system']} and {summary['other']}, {summary['atoms']:,} atoms", markup=False)
+    for line in summary["concluded"]:
+        out.print(f"  {line}", markup=False)
+    rows = [
+        (f"{one['i']}-{one['j']}", one["inside"], one["distance_a"], one["distance_b"], one["margin_a"],
+         one["margin_b"])
+        for one in summary["first_pairs"]
+    ]  # fmt: skip
+    if rows:
+        unit = f" ({summary['length']})" if summary["length"] else ""
+        columns = ("pair", "inside in", f"r in A{unit}", "r in B", "margin in A", "margin in B")
+        output.print_table(f"first to differ, frame {summary['first']['frame']}", columns, rows)
+
+
+def _file(summary: Mapping[str, Any]) -> str:
+    frames = summary["frames"]
+    size = f"{summary['atoms']:,} atoms, {frames:,} frame{'' if frames == 1 else 's'}"
+    if summary["timed"] and frames > 1:
+        size += f" {summary['interval']:.6g} {summary['time']} apart"
+    return f"{summary['system']} ({summary['format']}, read by {summary['reader']}), {size}"
+
+
+def _length(frames: float | None, summary: Mapping[str, Any]) -> str:
+    """A stretch of frames as time, where the file has times."""
+    if frames is None:
+        return "longer than seen"
+    if summary["timed"] and summary["interval"] is not None:
+        return f"{frames * summary['interval']:.4g} {summary['time']}"
+    return f"{frames:.4g} frames"

@@ -1,0 +1,97 @@
+"""report.html of a trajectory: its flips, how long contacts last, who flips, what the file cannot tell."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from mdnum.errors import FolderError
+from mdnum.report.flips import figures as drawn
+from mdnum.report.flips import findings, sections
+from mdnum.report.flips.words import duration, per_time, rule_words, size
+from mdnum.report.fork.findings import Verdict
+from mdnum.report.fork.question import Question, declared, write_page
+from mdnum.report.words import count, number, percent
+from mdnum.store import RunFolder
+
+# the ledger and the contacts may be larger than memory, and what is told of them is in the summary
+_TABLES = ("frames", "lifetimes", "neighbors", "residues", "busiest")
+
+
+def write_report(folder: RunFolder | str | Path) -> Path:
+    """Writes report.html and figures/*.svg, and puts headline and findings into summary.json.
+
+    Returns:
+        the path of report.html.
+
+    Raises:
+        FolderError: no finished ledger in the folder, or it cannot be written.
+    """
+    folder, run = load(folder, "flips")
+    browsed = sections.pairs(run)
+    return write_page(
+        folder,
+        run,
+        findings.judge(run),
+        "flips/run.html.j2",
+        {name: declared(plot) for name, plot in drawn.plots(run).items()},
+        captions=drawn.captions(run),
+        figures=list(_key_figures(run)),
+        rules=[sections.rule(run, place) for place in range(len(run.summary["rules"]))],
+        size=size(run),
+        browsed=browsed,
+        scripted=browsed is not None,
+        what=list(_what(run)),
+    )
+
+
+def record(folder: RunFolder | str | Path) -> Verdict:
+    """Judges a trajectory and writes headline and findings into its summary.json."""
+    folder, run = load(folder, "flips")
+    judged = findings.judge(run)
+    judged.store(folder, run.summary)
+    return judged
+
+
+def load(
+    folder: RunFolder | str | Path, question: str, tables: tuple[str, ...] = _TABLES
+) -> tuple[RunFolder, Question]:
+    """A folder, with the tables that a page needs.
+
+    Raises:
+        FolderError: nothing in it was finished.
+    """
+    folder = folder if isinstance(folder, RunFolder) else RunFolder.open(folder)
+    summary = folder.summary
+    if summary.get("question") != question:
+        raise FolderError(
+            "holds no finished answer", remedy="Run `mdnum flips` again", where=str(folder.path)
+        )
+    read = {name: folder.read(name) for name in tables}
+    return folder, Question(folder.path, summary, "", folder.provenance, read)
+
+
+def _key_figures(run: Question) -> Iterator[tuple[str, str, str]]:
+    """(label, value, small print) of the strip below the verdict."""
+    one = run.summary["rules"][0]
+    yield "Pairs inside", number(one["pairs_mean"], 4), f"on average, {rule_words(run, one)}"
+    yield "Flips", count(one["flips"]), per_time(run, one["flips_per_frame"])
+    share = one["ambiguous"] / one["flips"] if one["flips"] else 0.0
+    yield "Undecidable", count(one["ambiguous"]), percent(share) if one["flips"] else ""
+    yield "Median contact", duration(run, one["lifetime"]["median"], beyond="–"), "of those seen to begin"
+    yield "Mean by rate", duration(run, one["lifetime"]["mean_by_rate"]), "all of them"
+
+
+def _what(run: Question) -> Iterator[tuple[str, str]]:
+    summary: Mapping[str, Any] = run.summary
+    frames = f", frames {summary['slice']}" if summary["slice"] else ""
+    yield "File", f"{summary['file']}{frames} ({summary['format']}, read by {summary['reader']})"
+    yield "Size", size(run)
+    if summary["between"]:
+        yield "Between", " and ".join(f"“{one}”" for one in summary["between"])
+    for one in summary["rules"]:
+        yield "Inside", rule_words(run, one)
+    yield "Resolution", summary["resolution"]["words"]
+    seconds = summary["seconds"]
+    yield "Took", f"{number(seconds['frames'] + seconds['statistics'], 2)} s"

@@ -1,0 +1,374 @@
+"""`mdnum flips` as a function: anybody's trajectory to a ledger of flips, what it says, and a report."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mdnum.errors import InputError
+from mdnum.store import RunFolder
+from mdnum.store.naming import default_folder
+from mdnum.workflow.flips_words import cutoff_of_run, rules
+from mdnum.workflow.fork_question import Log, Progress, finish
+
+if TYPE_CHECKING:
+    from mdnum.trajectories.resolution import Resolution
+    from mdnum.trajectories.rules import Rule
+    from mdnum.trajectories.source import Trajectory
+    from mdnum.workflow.flips_record import Followed, Groups, Pass
+
+#: Frames within which a flip that is taken back is chatter, unless another number is asked for.
+WINDOW = 5
+_SAMPLE = 8
+# files that hold positions and nothing on what the atoms are
+_BARE = frozenset({"xtc", "trr", "dcd", "nc", "ncdf", "netcdf", "trj", "mdcrd", "crdbox", "trz", "h5md"})
+# displacement between frames over what velocities say, above which they cannot belong to the positions
+_TOO_FAR = 1.1
+
+
+@dataclass(frozen=True)
+class FlipsResult:
+    """A finished look at a trajectory, or at two.
+
+    Attributes:
+        folder: with the ledger (flips.parquet) and everything else.
+        summary: what summary.json says, findings included.
+    """
+
+    folder: Path
+    summary: dict[str, Any]
+
+
+def flips(
+    trajectory: str | Path,
+    other: str | Path | None = None,
+    *,
+    topology: str | Path | None = None,
+    cutoffs: Sequence[float] = (),
+    pairs: Sequence[str | Mapping[tuple[str, str], float]] = (),
+    nearest: Sequence[int] = (),
+    most: int | None = None,
+    between: tuple[str, str] | None = None,
+    window: int = WINDOW,
+    format: str | None = None,
+    out: str | Path | None = None,
+    report: bool = True,
+    progress: Progress | None = None,
+) -> FlipsResult:
+    """Finds which pairs entered or left a threshold between the frames of a file, and what follows.
+
+    Args:
+        trajectory: a file that MDAnalysis or ASE reads, or the folder of an mdnum run; a slice of its frames
+            may stand behind an @ ("run.xtc@100:", "run.xtc@::10").
+        other: another one of the same atoms: where do the two part?
+        topology: what the atoms are, where the trajectory does not say.
+        cutoffs: lengths in the file's unit, a rule each; default the cutoff of the mdnum run that the file
+            belongs to.
+        pairs: cutoffs by pair of species, a rule each: "O-H=2.5,O-O=3.5".
+        nearest: numbers of neighbors, a rule each: the k nearest of every atom.
+        most: neighbors an atom can have inside a cutoff; the nearest are kept.
+        between: two selections in MDAnalysis's language; only pairs with an atom in each are looked at.
+        window: frames within which a flip that is taken back is chatter, and up to which a stay outside is
+            overlooked in an intermittent contact.
+        format: of the files, where their names do not tell.
+        out: the new folder; default runs/flips-<name>-<n>.
+        report: write report.html.
+        progress: called now and then with what is done, of how much, and a dictionary of figures.
+
+    Raises:
+        InputError: a file or an option cannot be used. A frame in the middle that cannot be read is no
+            exception: what came before is kept, and the summary names the frame.
+        FolderError: the folder cannot be used.
+    """
+    if window < 1:
+        raise InputError(f"window = {window}; expected at least 1 frame")
+    asked = rules(cutoffs, pairs, nearest, most)
+    if other is not None:
+        _topology_first(trajectory, other, topology)
+        from mdnum.workflow.flips_compare import compare
+
+        return compare(
+            (trajectory, other), topology, asked, between, format=format, out=out, report=report,
+            progress=progress,
+        )  # fmt: skip
+    opened = source(trajectory, topology, format)
+    asked = asked or default_rules(opened)
+    groups = selected(opened, between)
+    folder = new_folder(opened, "flips", out)
+    try:
+        return _look(folder, opened, asked, groups, between, window, report, progress)
+    except BaseException:
+        folder.close()
+        raise
+
+
+def source(path: str | Path, topology: str | Path | None, format: str | None) -> Trajectory:
+    """The trajectory at a path."""
+    from mdnum.trajectories.source import open_trajectory
+
+    return open_trajectory(path, topology, format=format)
+
+
+def default_rules(trajectory: Trajectory) -> tuple[Rule, ...]:
+    """The cutoff with which mdnum made the file.
+
+    Raises:
+        InputError: it did not.
+    """
+    radius = cutoff_of_run(trajectory.path)
+    if radius is None:
+        unit = f" in {trajectory.length}" if trajectory.length else ""
+        raise InputError(
+            "no rule says which pairs count",
+            remedy=f'Add --cutoff R{unit}, --pairs "O-H=2.5,O-O=3.5" or --nearest K',
+            where=str(trajectory.path),
+        )
+    return rules([radius])
+
+
+def selected(trajectory: Trajectory, between: tuple[str, str] | None) -> Groups:
+    """Indices of the atoms on either side."""
+    from mdnum.trajectories.selection import select
+
+    if between is None:
+        return None, None
+    return select(trajectory, between[0]), select(trajectory, between[1])
+
+
+def new_folder(trajectory: Trajectory, world: str, out: str | Path | None) -> RunFolder:
+    """An empty folder, with what was computed with."""
+    from mdnum.provenance import surroundings
+
+    stem = trajectory.path.name.split(".")[0]
+    if stem == "trajectory":
+        # the run folder says more than the name that all of its files have
+        stem = trajectory.path.resolve().parent.name
+    folder = RunFolder.create(default_folder(f"flips-{stem}") if out is None else out, world=world)
+    try:
+        folder.write_provenance(surroundings())
+    except BaseException:
+        folder.close()
+        raise
+    return folder
+
+
+def resolution_of(trajectory: Trajectory) -> Resolution:
+    """From the first frames; from fewer where one of them cannot be read.
+
+    Raises:
+        InputError: not even the first can be read.
+    """
+    from mdnum.trajectories.resolution import infer_from
+
+    sample = []
+    try:
+        for frame in trajectory.frames():
+            sample.append(frame)
+            if len(sample) == _SAMPLE:
+                break
+    except InputError:
+        if not sample:
+            raise
+    if not sample:
+        raise InputError(
+            "no frame is left of what was asked for", remedy="Ask for others", where=str(trajectory.path)
+        )
+    return infer_from(sample, trajectory.bits, trajectory.format)
+
+
+def _look(
+    folder: RunFolder,
+    trajectory: Trajectory,
+    asked: tuple[Rule, ...],
+    groups: Groups,
+    between: tuple[str, str] | None,
+    window: int,
+    report: bool,
+    progress: Progress | None,
+) -> FlipsResult:
+    from mdnum.workflow import flips_numbers, flips_record
+
+    log = Log(folder, progress)
+    resolution = resolution_of(trajectory)
+    found = flips_record.follow(folder, trajectory, asked, groups, resolution.bound, log)
+    began = time.perf_counter()
+    for rows in flips_record.neighbor_rows(found):
+        folder.append("neighbors", rows)
+    frames = _frames(folder)
+    steps = _steps(frames, trajectory.time != "frame")
+    labels = flips_numbers.labels(trajectory.table)
+    told = []
+    for number, one in enumerate(found.rules):
+        counted = flips_numbers.count(
+            folder, number, found.frames, labels, one.rule.directed, window, log
+        )  # fmt: skip
+        mine = frames["rule"] == number
+        pairs = frames["pairs"][mine]
+        columns = flips_numbers.curves(counted, pairs, steps["interval"])
+        folder.append("lifetimes", {"rule": np.full(len(pairs_of(columns)), number), **columns})
+        busiest = {name: getattr(counted.busiest, name) for name in counted.busiest.__dataclass_fields__}
+        folder.append("busiest", {"rule": np.full(len(counted.busiest.i), number), **busiest})
+        _append_residues(folder, number, counted, labels)
+        rows = {name: values[mine] for name, values in frames.items()}
+        told.append(_rule(one, rows, steps, found) | flips_numbers.told(counted))
+    folder.finalize()
+    (folder.path / "checkpoint.npz").unlink(missing_ok=True)
+    folder.write_summary(
+        {
+            **about(trajectory, "flips"),
+            "between": None if between is None else list(between),
+            "frames": found.frames,
+            **steps,
+            "window": window,
+            "resolution": told_resolution(resolution, trajectory),
+            "rules": told,
+            "stopped": None if found.stopped is None else str(found.stopped),
+            "seconds": {"frames": found.seconds, "statistics": time.perf_counter() - began},
+            "findings": [],
+            "status": "complete" if found.stopped is None else "stopped",
+        }
+    )
+    return FlipsResult(folder.path, finish(folder, report, progress))
+
+
+def pairs_of(columns: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Any column: they are equally long."""
+    return next(iter(columns.values()))
+
+
+def about(trajectory: Trajectory, question: str) -> dict[str, Any]:
+    """What summary.json says of a file."""
+    return {
+        "world": "flips",
+        "question": question,
+        "system": trajectory.name,
+        "file": str(trajectory.path),
+        "format": trajectory.format,
+        "reader": trajectory.reader,
+        "atoms": trajectory.atoms,
+        "length": trajectory.length,
+        "time": trajectory.time,
+        "slice": _slice_words(trajectory.slice),
+        "notes": list(trajectory.notes),
+    }
+
+
+def told_resolution(resolution: Resolution, trajectory: Trajectory) -> dict[str, Any]:
+    """What summary.json says of how finely positions are told."""
+    return {
+        "kind": resolution.kind,
+        "step": resolution.step,
+        "moved": resolution.moved,
+        "words": resolution.words(trajectory.length),
+    }
+
+
+def _frames(folder: RunFolder) -> dict[str, np.ndarray]:
+    names = ("rule", "time", "pairs", "near", "entered", "left", "ambiguous", "min_margin")
+    return folder.read("frames", [*names, "fewest", "neighbors", "most"])
+
+
+def _steps(frames: Mapping[str, np.ndarray], timed: bool) -> dict[str, Any]:
+    """Times of the frames: how far apart, evenly or not."""
+    times = frames["time"][frames["rule"] == 0]
+    steps = np.diff(times)
+    interval = float((times[-1] - times[0]) / len(steps)) if len(steps) else float("nan")
+    even = bool(np.all(np.abs(steps - interval) <= 1e-3 * abs(interval))) if len(steps) else True
+    return {
+        "timed": timed,
+        "first_time": float(times[0]),
+        "last_time": float(times[-1]),
+        "interval": interval,
+        "even": even,
+        "backward": int(np.count_nonzero(steps <= 0)),
+    }
+
+
+def _rule(
+    one: Followed, rows: Mapping[str, np.ndarray], steps: Mapping[str, Any], found: Pass
+) -> dict[str, Any]:
+    """Counts of one rule, and what velocities say about the frames' distance in time."""
+    entered, left = int(rows["entered"].sum()), int(rows["left"].sum())
+    frames = len(rows["pairs"])
+    margins = rows["min_margin"]
+    return {
+        "rule": one.rule.name,
+        "directed": one.rule.directed,
+        "pairs_first": int(rows["pairs"][0]),
+        "pairs_last": int(rows["pairs"][-1]),
+        "pairs_mean": float(rows["pairs"].mean()),
+        "entered": entered,
+        "left": left,
+        "flips": entered + left,
+        "flips_per_frame": (entered + left) / (frames - 1) if frames > 1 else 0.0,
+        "ambiguous": int(rows["ambiguous"].sum()),
+        "near_mean": float(rows["near"].mean()),
+        "min_margin": float(np.nanmin(np.abs(margins))) if np.isfinite(margins).any() else None,
+        "neighbors": {
+            "fewest": int(rows["fewest"].min()),
+            "mean": float(rows["neighbors"].mean()),
+            "most": int(rows["most"].max()),
+        },
+        "flux": _flux(one, entered + left, steps, found),
+    }
+
+
+def _flux(one: Followed, flips: int, steps: Mapping[str, Any], found: Pass) -> dict[str, Any] | None:
+    """Crossings by the velocities, which a run would show that looked at every instant, against the flips."""
+    duration = steps["last_time"] - steps["first_time"]
+    if not one.flux or not steps["timed"] or not duration > 0 or found.moved > _TOO_FAR:
+        return None
+    crossed, moments = sum(flips for flips, _ in one.flux), sum(moment for _, moment in one.flux)
+    rate = crossed / moments
+    seen = flips / duration
+    return {
+        "rate": rate,
+        "error": rate / max(crossed, 1) ** 0.5,
+        "seen": seen,
+        "crossed": crossed,
+        "frames": len(one.flux),
+        "moved": found.moved,
+        "lost": 1.0 - seen / rate if rate > 0 else None,
+    }
+
+
+def _append_residues(folder: RunFolder, number: int, counted: Any, labels: Any) -> None:
+    if counted.residues is None:
+        return
+    between, within = counted.residues
+    busy = np.flatnonzero(between + within)
+    busy = busy[np.argsort(-(between + within)[busy], kind="stable")]
+    words = [labels.residues[1][at] for at in busy]
+    folder.append(
+        "residues",
+        {
+            "rule": np.full(len(busy), number),
+            "residue": words,
+            "between": between[busy],
+            "within": within[busy],
+        },
+    )
+
+
+def _slice_words(frames: slice) -> str:
+    if frames == slice(None):
+        return ""
+    return ":".join("" if end is None else str(end) for end in (frames.start, frames.stop, frames.step))
+
+
+def _topology_first(first: str | Path, second: str | Path, topology: str | Path | None) -> None:
+    """Refuses "TOPOLOGY TRAJECTORY", the order that other programs have."""
+    suffixes = [str(one).rpartition("@")[0] or str(one) for one in (first, second)]
+    bare = [Path(one).suffix.lower().lstrip(".") in _BARE for one in suffixes]
+    if topology is None and not bare[0] and bare[1]:
+        raise InputError(
+            f"two paths are two trajectories to compare, and {Path(suffixes[0]).name} looks like the "
+            "topology of "
+            f"{Path(suffixes[1]).name}",
+            remedy=f"Write mdnum flips {second} -s {first}",
+        )
