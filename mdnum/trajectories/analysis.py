@@ -21,7 +21,7 @@ from mdnum.errors import InputError
 from mdnum.trajectories.checked import FrameError, check_frame
 from mdnum.trajectories.frame import Frame
 from mdnum.trajectories.joined import Part, RuleResult, joined
-from mdnum.trajectories.mdanalysis_source import READING_FAILS, first_line, frame_of, table_of
+from mdnum.trajectories.mdanalysis_source import READING_FAILS, Boxes, first_line, frame_of, table_of
 from mdnum.trajectories.resolution import SAMPLE, Resolution, infer_from
 from mdnum.trajectories.rules import Cutoff, Rule, SpeciesCutoffs
 from mdnum.trajectories.source import UnreadableFrame
@@ -109,6 +109,7 @@ class NeighborFlips(AnalysisBase):
         self._numbers = np.zeros(0, np.int64)
         self._at = 0
         self._trackers: list[Tracker] = []
+        self._boxes: Boxes | None = None
         self._done, self._reading = 0, True
 
     def run(self, *args: Any, **kwargs: Any) -> NeighborFlips:
@@ -145,6 +146,7 @@ class NeighborFlips(AnalysisBase):
         if sample:
             self._resolution = infer_from(sample, 32, _format(self._trajectory))
             self._pbc = sample[0].box.pbc
+        self._boxes = None
         return groups
 
     def _compute(self, indexed_frames: np.ndarray, verbose: Any = None, **kwargs: Any) -> NeighborFlips:
@@ -164,7 +166,7 @@ class NeighborFlips(AnalysisBase):
         for part, tracker in zip(self.results.parts[0], self._trackers, strict=True):
             part.last = tracker.members() if part.pairs else None
         # what a process sends back is what it found, not what it needed for that
-        self._trackers = []
+        self._trackers, self._boxes = [], None
         return self
 
     def _stopped(self, failure: _Failure) -> None:
@@ -224,7 +226,9 @@ class NeighborFlips(AnalysisBase):
         return frame
 
     def _frame(self, ts: Any) -> Frame:
-        return frame_of(ts, int(ts.frame))
+        # made where it is used: an open file does not go to another process
+        self._boxes = self._boxes or Boxes(self._trajectory)
+        return frame_of(ts, int(ts.frame), self._boxes)
 
     def _bound_at(self, frame: Frame) -> float:
         if self._bound is not None or self._resolution is None:

@@ -14,7 +14,7 @@ import numpy as np
 from mdnum.errors import InputError
 from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.slices import chosen, counts_from_end
-from mdnum.trajectories.source import AtomTable, Trajectory, UnreadableFrame
+from mdnum.trajectories.source import AtomTable, Trajectory, UnreadableFrame, table_of_topology
 from mdnum.units import METAL, Units
 from mdnum.units import get as units_named
 
@@ -51,7 +51,9 @@ class AseTrajectory(Trajectory):
         else:
             self._images = self._of_any
         first = self._first()
-        self.table = AtomTable.plain(first.get_chemical_symbols()) if topology is None else _named(topology)
+        self.table = (
+            AtomTable.plain(first.get_chemical_symbols()) if topology is None else table_of_topology(topology)
+        )
         if len(self.table) != len(first):
             raise InputError(
                 f"the topology {Path(str(topology)).name} has {len(self.table):,} atoms "
@@ -184,24 +186,6 @@ def _frames_of_traj(path: Path) -> int:
         raise InputError(
             f"ASE cannot open it ({error})", remedy="Check that it was written to its end", where=str(path)
         ) from error
-
-
-def _named(topology: str | Path) -> AtomTable:
-    """The atoms of a topology file: MDAnalysis's, or any structure that ASE reads."""
-    from mdnum.trajectories.mdanalysis_source import open_universe, table_of
-
-    try:
-        return table_of(open_universe(Path(topology), None)[0].atoms)
-    except InputError:
-        from ase import Atoms
-        from ase.io import read
-
-        try:
-            atoms = read(str(topology))
-        except _UNREADABLE as error:
-            raise InputError("neither MDAnalysis nor ASE reads this topology", where=str(topology)) from error
-        assert isinstance(atoms, Atoms)
-        return AtomTable.plain(atoms.get_chemical_symbols())
 
 
 def _units(path: Path) -> Units:

@@ -48,6 +48,7 @@ class MDAnalysisTrajectory(Trajectory):
 
     def frames(self) -> Iterator[Frame]:
         trajectory = self._universe.trajectory
+        boxes = Boxes(trajectory)
         at = None
         for number in chosen(self.slice, self.in_file):
             with warnings.catch_warnings():
@@ -56,7 +57,7 @@ class MDAnalysisTrajectory(Trajectory):
                     # some formats go forward only, so that the next frame is asked for as the next
                     step = at is not None and number == at + 1 and trajectory.ts.frame == at
                     ts = trajectory.next() if step else trajectory[number]
-                    frame = frame_of(ts, number, self.time == "frame")
+                    frame = frame_of(ts, number, boxes, self.time == "frame")
                 except READING_FAILS as error:
                     raise UnreadableFrame(
                         f"frame {number} cannot be read ({first_line(error)})",
@@ -67,13 +68,46 @@ class MDAnalysisTrajectory(Trajectory):
             yield frame
 
 
-def frame_of(ts: Any, number: int, untimed: bool = False) -> Frame:
+class Boxes:
+    """The boxes of an MDAnalysis trajectory, turned as its coordinates are.
+
+    MDAnalysis keeps lengths and angles, from which a box has its first vector along x. So have the boxes of
+    most programs, but CHARMM's are symmetric matrices (since version 22, and in dcd files), and lengths and
+    angles alone would put images into wrong places.
+
+    Args:
+        trajectory: MDAnalysis's reader.
+    """
+
+    def __init__(self, trajectory: Any):
+        self._dcd: Any = None
+        if "DCD" in trajectory.format and getattr(trajectory, "filename", None) is not None:
+            from MDAnalysis.lib.formats.libdcd import DCDFile
+
+            self._dcd = DCDFile(str(trajectory.filename))
+
+    def box(self, ts: Any, number: int) -> Box:
+        """The box of a timestep that is this frame of the file."""
+        box = box_of(ts.dimensions)
+        if self._dcd is None or not box.periodic or np.count_nonzero(box.matrix) == 3:
+            return box
+        self._dcd.seek(number)
+        xx, xy, yy, xz, yz, zz = np.asarray(self._dcd.read().unitcell, np.float64)
+        symmetric = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        # in these places stand cosines otherwise, or angles, which give other lengths
+        lengths = np.sqrt((symmetric**2).sum(axis=1))
+        cosines = max(abs(xy), abs(xz), abs(yz)) <= 1
+        known = not cosines and np.allclose(lengths, ts.dimensions[:3], rtol=1e-5)
+        return Box(symmetric, box.pbc) if known else box
+
+
+def frame_of(ts: Any, number: int, boxes: Boxes, untimed: bool = False) -> Frame:
     """A frame from an MDAnalysis timestep, copied."""
     return Frame(
         index=number,
         time=float(number) if untimed else float(ts.time),
         positions=np.array(ts.positions, np.float64),
-        box=box_of(ts.dimensions),
+        box=boxes.box(ts, number),
         velocities=np.array(ts.velocities, np.float64) if ts.has_velocities else None,
     )
 

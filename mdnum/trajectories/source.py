@@ -1,7 +1,8 @@
 """Trajectories of any code as frames in float64: the contract, and which reader a file gets.
 
 Positions are those of the file: nothing is wrapped, made whole or centered. Readers differ in what they keep:
-ASE's and mdnum's own keep every digit, MDAnalysis's narrow every coordinate to float32 (`Trajectory.bits`).
+ASE's and mdnum's own (gro, LAMMPS's text dumps) keep every digit, MDAnalysis's narrow every coordinate to
+float32 (`Trajectory.bits`).
 """
 
 from __future__ import annotations
@@ -172,22 +173,61 @@ def open_trajectory(
         from mdnum.trajectories.ase_source import AseTrajectory
 
         return AseTrajectory(file, topology, frames, format)
+    if reader == "lammps":
+        from mdnum.trajectories.lammps_dump import LammpsDump
+
+        return LammpsDump(file, topology, frames)
+    if reader == "gro":
+        from mdnum.trajectories.gro import GroTrajectory
+
+        return GroTrajectory(file, topology, frames)
     from mdnum.trajectories.mdanalysis_source import MDAnalysisTrajectory
 
     return MDAnalysisTrajectory(file, topology, frames, format)
+
+
+def table_of_topology(topology: str | Path) -> AtomTable:
+    """The atoms of a topology file: any that MDAnalysis takes for one, or any structure that ASE reads.
+
+    Raises:
+        InputError: neither reads it.
+    """
+    from mdnum.trajectories.mdanalysis_source import open_universe, table_of
+
+    try:
+        return table_of(open_universe(Path(topology), None)[0].atoms)
+    except InputError:
+        from ase import Atoms
+        from ase.io import read
+
+        try:
+            atoms = read(str(topology))
+        except Exception as error:
+            raise InputError("neither MDAnalysis nor ASE reads this topology", where=str(topology)) from error
+        assert isinstance(atoms, Atoms)
+        return AtomTable.plain(atoms.get_chemical_symbols())
 
 
 # MDAnalysis reads XYZ too, but neither boxes nor more than float32 of it; the others it does not know
 _ASE_SUFFIXES = frozenset({".traj", ".extxyz", ".json", ".db", ".bundle", ".castep", ".xsf", ".con"})
 
 
+_OWN = {"lammpsdump": "lammps", "lammpstrj": "lammps", "lammps-dump-text": "lammps", "gro": "gro"}
+
+
 def _reader_of(file: Path, format: str | None) -> str:
-    """Which reader a file gets: "ase" or "mdanalysis"."""
+    """Which reader a file gets: "ase", "mdanalysis", or one of mdnum's own, "lammps" and "gro"."""
     suffix = (file.with_suffix("") if file.suffix in (".gz", ".bz2") else file).suffix.lower()
+    if format is not None and format.lower() in _OWN:
+        return _OWN[format.lower()]
     if format is not None:
         return "mdanalysis" if format.upper() in _mdanalysis_formats() else "ase"
     if suffix in _ASE_SUFFIXES:
         return "ase"
+    if suffix == ".gro":
+        return "gro"
+    if suffix[1:].upper() not in _mdanalysis_formats() and _first_lines(file)[0].startswith("item:"):
+        return "lammps"
     if suffix == ".xyz" and _is_extended(file):
         return "ase"
     if suffix[1:].upper() in _mdanalysis_formats():
@@ -203,12 +243,16 @@ def _mdanalysis_formats() -> set[str]:
 
 def _is_extended(file: Path) -> bool:
     """Whether the comment line of an XYZ file says what its columns are, or its box."""
+    comment = _first_lines(file)[1]
+    return "lattice=" in comment or "properties=" in comment
+
+
+def _first_lines(file: Path) -> tuple[str, str]:
+    """The first two lines in small letters; empty for a file that is no text."""
     from ase.io.formats import open_with_compression
 
     try:
         with open_with_compression(str(file), "r") as lines:
-            lines.readline()
-            comment = lines.readline().lower()
-    except (OSError, UnicodeDecodeError):
-        return False
-    return "lattice=" in comment or "properties=" in comment
+            return lines.readline(1000).lower(), lines.readline(10_000).lower()
+    except (OSError, EOFError, UnicodeDecodeError):
+        return "", ""
