@@ -29,12 +29,12 @@ class UnreadableFrame(InputError):
     """
 
     def __init__(self, message: str, *, frame: int, where: str, remedy: str | None = None):
-        super().__init__(
-            message,
-            remedy=remedy
-            or f"The frames before it were read; to go without the rest add @:{frame} to the path",
-            where=where,
+        otherwise = (
+            f"The frames before it were read; to stop there add @:{frame} to the path"
+            if frame
+            else "Check that the file is whole and of the kind its name says"
         )
+        super().__init__(message, remedy=remedy or otherwise, where=where)
         self.frame = frame
 
 
