@@ -93,7 +93,9 @@ class Jump:
         return self.low if self.exact else 0.5 * (self.low + self.high)
 
 
-def find_jumps(curve: Curve, low: float, high: float, step: float, most: int = 24) -> tuple[list[Jump], int]:
+def find_jumps(
+    curve: Curve, low: float, high: float, step: float, most: int = 24, expected: Sequence[float] = ()
+) -> tuple[list[Jump], int]:
     """Every jump of energy, force or curvature that stands out of a scan.
 
     Args:
@@ -101,12 +103,17 @@ def find_jumps(curve: Curve, low: float, high: float, step: float, most: int = 2
         low, high: where to look.
         step: spacing of the scan. Two thresholds closer together than this may be told as one.
         most: how many places are looked at closely, those that stand out most.
+        expected: places that are known to stand out and not to be looked at.
 
     Returns:
         (jumps by coordinate, how many places that stood out were left out).
     """
     places = np.linspace(low, high, max(int(np.ceil((high - low) / step)), 12) + 1)
-    suspects = _outliers(curve, places)
+    suspects = [
+        one
+        for one in _outliers(curve, places)
+        if not any(one[1] - 2.5 * step < place < one[2] + 2.5 * step for place in expected)
+    ]
     found: list[Jump] = []
     for _, left, right in suspects[:most]:
         if any(jump.low >= left and jump.high <= right for jump in found):
@@ -267,7 +274,7 @@ def _zoom(curve: Curve, left: float, right: float) -> list[Jump]:
             jumped = abs(_level(curve, row, left)(right) - curve(left)[row])
             now = history[-1][channel]
             if clear[-1][channel] and falls[channel] > 0.5 and 0.7 * jumped < now < 1.4 * jumped:
-                low, high = _split(curve, row, left, right)
+                low, high = locate(curve, row, left, right)
                 jump = measure(curve, low, high, room, exact=True)
                 return [jump] if jump.order < SMOOTH else []
         if len(history) > 2 and (falls < _NARROWER**-2.5).all():
@@ -278,8 +285,14 @@ def _zoom(curve: Curve, left: float, right: float) -> list[Jump]:
     return _kink(curve, left, right, room)
 
 
-def _split(curve: Curve, row: int, left: float, right: float) -> tuple[float, float]:
-    """Neighboring doubles between which a value goes from that at left to that at right."""
+def locate(curve: Curve, row: int, left: float, right: float) -> tuple[float, float]:
+    """Neighboring doubles between which a value goes from that at left to that at right.
+
+    Args:
+        curve: what is looked at.
+        row: 0 for the energy (without the work done on the way), 1 for the force.
+        left, right: two sides of a jump, so near that the value changes by little else.
+    """
     level = _level(curve, row, left)
     middle = 0.5 * (level(left) + level(right))
     rising = level(right) > level(left)

@@ -131,7 +131,7 @@ def walk_pairs(subject: Subject, progress: Progress | None = None) -> PairWalks:
 
 
 def rough(subject: Subject, pair: Pair) -> tuple[float | None, float | None]:
-    """(where a pair stops interacting, where its energy is least), to within the coarse scan; None if never."""
+    """(where a pair stops interacting, where its energy is least), to within a coarse scan; None if never."""
     curve = pair.curve(subject)
     coarse, far = _coarse(subject, curve)
     energies, forces = curve.many(coarse)

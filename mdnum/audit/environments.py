@@ -1,0 +1,247 @@
+"""Thresholds among many: triples and whole surroundings walked through what two atoms alone have shown.
+
+What jumps for two atoms may jump otherwise among many (an embedding, an angle, a cap), and what is smooth
+for two may not be.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from ase import Atoms
+from ase.neighborlist import neighbor_list
+
+from mdnum.audit.base import Progress, Subject
+from mdnum.audit.jumps import SMOOTH, Jump, find_jumps, locate, measure
+from mdnum.audit.probes import molecules
+from mdnum.audit.routes import Crossing, Route
+from mdnum.audit.subject import CalculatorError
+from mdnum.audit.thresholds import STEP, Threshold, walk_pairs
+
+_SIDE = 1e-7
+"""Half the stretch around an expected crossing in which it is located, length."""
+
+_MOST_CROSSINGS = 3
+"""Crossings of one threshold that are measured, each by another atom."""
+
+_MOST_TRIPLES = 4
+_LENGTH = 0.6
+"""Of a route through the structure, length."""
+
+
+@dataclass(frozen=True)
+class Event:
+    """A place on a route at which something jumps.
+
+    Attributes:
+        route: its name.
+        at: place along it, length.
+        jump: what jumps there; the force is the one along the route.
+        force: largest change of the force on any atom, eV/Å.
+        threshold: the pair threshold that explains it, None if none does.
+        distance: at which the pair is then; nan without one.
+        ties: (atom, k) whose k-th and next neighbors are equally far there.
+    """
+
+    route: str
+    at: float
+    jump: Jump
+    force: float
+    threshold: Threshold | None
+    distance: float
+    ties: tuple[tuple[int, int], ...]
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What walks through surroundings told.
+
+    Attributes:
+        events: places at which something jumps.
+        measured: crossings of known thresholds that were measured.
+        routes: names of routes that were scanned for unknown ones.
+        expected: crossings of known thresholds on those routes.
+        skipped: (what, why).
+    """
+
+    events: tuple[Event, ...]
+    measured: int
+    routes: tuple[str, ...]
+    expected: int
+    skipped: tuple[tuple[str, str], ...]
+
+
+def walk_surroundings(
+    subject: Subject, progress: Progress | None = None, seconds: float = 8.0
+) -> Surroundings:
+    """Walk triples, and atoms of the structure, through the known thresholds and look for unknown ones.
+
+    Args:
+        subject: the calculator and its structure.
+        progress: called now and then.
+        seconds: about how long to look for unknown thresholds in the structure; one route is always walked.
+    """
+    walks = walk_pairs(subject).walks
+    thresholds = [one for walk in walks for one in walk.thresholds]
+    groups = _groups(subject, single=bool(walks) and len(walks[0].pair.second) == 1)
+    events: list[Event] = []
+    skipped: list[tuple[str, str]] = []
+    targeted = _targeted(subject, thresholds, groups)
+    triples = _triples(subject) if walks and len(walks[0].pair.second) == 1 else []
+    total = len(targeted) + len(triples) + 1
+    for k, (route, crossing) in enumerate(targeted):
+        if progress:
+            progress(k, total, {"phase": "walking through the structure"})
+        try:
+            events.append(_at_crossing(subject, route, crossing))
+        except CalculatorError as error:
+            skipped.append((route.name, error.message))
+    scanned: list[str] = []
+    expected = 0
+    for k, (route, low, high) in enumerate([*triples, *_random(subject, groups, seconds)]):
+        if progress:
+            progress(min(len(targeted) + k, total - 1), total, {"phase": route.name})
+        try:
+            found, known = _scanned(subject, route, thresholds, low, high)
+        except CalculatorError as error:
+            skipped.append((route.name, error.message))
+            continue
+        scanned.append(route.name)
+        events += found
+        expected += known
+    return Surroundings(tuple(events), len(targeted), tuple(scanned), expected, tuple(skipped))
+
+
+def _groups(subject: Subject, single: bool) -> list[np.ndarray]:
+    """What moves together: single atoms, or molecules where the calculator takes nothing less."""
+    if single:
+        return [np.array([k]) for k in range(len(subject.atoms))]
+    return molecules(subject.atoms)
+
+
+def _lead(atoms: Atoms, group: np.ndarray) -> int:
+    return int(group[np.argmax(atoms.get_masses()[group])])
+
+
+def _targeted(
+    subject: Subject, thresholds: Sequence[Threshold], groups: Sequence[np.ndarray]
+) -> list[tuple[Route, Crossing]]:
+    """For each threshold, a few pairs of the structure near it, moved through it along their line."""
+    atoms = subject.atoms
+    of_lead = {_lead(atoms, group): group for group in groups}
+    symbols = np.array(atoms.get_chemical_symbols())
+    found: list[tuple[Route, Crossing]] = []
+    for threshold in thresholds:
+        first, second, distance, vector = neighbor_list("ijdD", atoms, threshold.radius + 1.0)
+        one, other = threshold.species
+        fits = (symbols[first] == one) & (symbols[second] == other) & (first != second)
+        fits &= np.isin(first, list(of_lead)) & np.isin(second, list(of_lead))
+        used: set[int] = set()
+        for k in np.argsort(np.abs(distance - threshold.radius)):
+            if not fits[k] or int(first[k]) in used or abs(distance[k] - threshold.radius) > 1.0:
+                continue
+            used.add(int(first[k]))
+            direction = vector[k] / distance[k]
+            route = Route(
+                f"atom {first[k]} ({one}) toward atom {second[k]} ({other})",
+                atoms, of_lead[int(first[k])], int(first[k]), direction,
+            )  # fmt: skip
+            crossing = Crossing(float(distance[k] - threshold.radius), int(second[k]), threshold)
+            found.append((route, crossing))
+            if len(used) == _MOST_CROSSINGS:
+                break
+    return found
+
+
+def _at_crossing(subject: Subject, route: Route, crossing: Crossing) -> Event:
+    """What jumps where a known threshold is crossed, to the last representable place if a value does."""
+    curve = route.curve(subject)
+    low, high = crossing.at - _SIDE, crossing.at + _SIDE
+    exact = crossing.threshold.order < 2
+    if exact:
+        low, high = locate(curve, crossing.threshold.order, low, high)
+    jump = measure(curve, low, high, STEP, exact)
+    return _event(subject, route, jump, crossing)
+
+
+def _event(subject: Subject, route: Route, jump: Jump, crossing: Crossing | None) -> Event:
+    change = subject.forces(route.at(jump.high)) - subject.forces(route.at(jump.low))
+    return Event(
+        route.name, jump.at, jump, float(np.linalg.norm(change, axis=1).max()),
+        crossing.threshold if crossing else None,
+        crossing.threshold.radius if crossing else float("nan"),
+        () if crossing else tuple(route.ties(jump.at)),
+    )  # fmt: skip
+
+
+def _scanned(
+    subject: Subject, route: Route, thresholds: Sequence[Threshold], low: float, high: float
+) -> tuple[list[Event], int]:
+    """Unknown thresholds on a route, and how many known ones it crosses."""
+    curve = route.curve(subject)
+    crossings = route.crossings(thresholds, low - 1.0, high + 1.0)
+    inside = [one for one in crossings if low <= one.at <= high]
+    # crowded routes in finer steps, so that what lies between two crossings is seen
+    step = float(np.clip((high - low) / (10 * len(inside) + 1), STEP / 10, STEP))
+    jumps, _ = find_jumps(curve, low, high, step, most=6, expected=[one.at for one in crossings])
+    unknown = [jump for jump in jumps if not any(_explains(one, jump) for one in crossings)]
+    return [_event(subject, route, jump, None) for jump in unknown], len(inside)
+
+
+def _explains(crossing: Crossing, jump: Jump) -> bool:
+    near = max(1e-6, 10 * crossing.threshold.located, jump.high - jump.low)
+    return abs(jump.at - crossing.at) < near
+
+
+def _triples(subject: Subject) -> list[tuple[Route, float, float]]:
+    """A third atom brought toward one of a bonded pair, beside their line: (route, from, to)."""
+    found: list[tuple[Route, float, float]] = []
+    for walk in walk_pairs(subject).walks[:_MOST_TRIPLES]:
+        lowest = int(np.argmin(walk.energy))
+        bond = float(walk.distance[lowest])
+        end = min((walk.cutoff or 8.0) + bond, 12.0)
+        one, other = walk.pair.species
+        side = np.radians(110.0)
+        atoms = Atoms(
+            [one, other, other],
+            [(0, 0, 0), (bond * np.cos(side), bond * np.sin(side), 0), (0, 0, 0)],
+        )
+        if walk.pair.box:
+            atoms.set_cell([walk.pair.box] * 3)
+        atoms.pbc = walk.pair.periodic
+        route = Route(
+            f"a third atom ({other}) toward {one}-{other}", atoms, np.array([2]), 2, np.array([1.0, 0.0, 0.0])
+        )
+        low = max(float(walk.distance[0]), 0.8 * bond) + 6 * STEP
+        found.append((route, low, end))
+    return found
+
+
+def _random(
+    subject: Subject, groups: Sequence[np.ndarray], seconds: float
+) -> list[tuple[Route, float, float]]:
+    """Routes of some atoms in arbitrary directions, as many as the time allows."""
+    atoms = subject.atoms
+    subject.forces(atoms)  # whatever is made at the first question is made
+    begin = time.perf_counter()
+    subject.forces(Route("", atoms, groups[0], int(groups[0][0]), np.eye(3)[0]).at(1e-3))
+    cost = max(time.perf_counter() - begin, 1e-4)
+    calls = _LENGTH / STEP + 400
+    count = int(np.clip(seconds / (cost * calls), 1, 8))
+    rng = np.random.default_rng(0)
+    found: list[tuple[Route, float, float]] = []
+    for k in rng.permutation(len(groups))[:count]:
+        direction = rng.normal(size=3)
+        lead = _lead(atoms, groups[k])
+        name = f"atom {lead} ({atoms.get_chemical_symbols()[lead]}) in some direction"
+        route = Route(name, atoms, groups[k], lead, direction / np.linalg.norm(direction))
+        found.append((route, -_LENGTH / 2, _LENGTH / 2))
+    return found
+
+
+def unexplained(events: Sequence[Event]) -> list[Event]:
+    """Events that no pair threshold explains and that jump beyond doubt."""
+    return [one for one in events if one.threshold is None and one.jump.order < SMOOTH]

@@ -1,0 +1,237 @@
+"""Neighbors added until something drops: a cap on how many are kept, or a choice of the k nearest.
+
+A center is crowded, and one more atom is brought from outside to inside past all its neighbors. Where it is
+exactly as far as the k-th of them, a calculator that keeps k neighbors exchanges one for the other, and
+something jumps; where it keeps the first k in its own order, a permutation of the atoms does the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from ase import Atoms
+from jaxtyping import Float, Int
+
+from mdnum.audit.base import Progress, Subject
+from mdnum.audit.probes import Pair
+from mdnum.audit.subject import CalculatorError, only_trying
+from mdnum.audit.thresholds import walk_pairs
+
+_MOST = 160
+"""Neighbors of the crowded center; radius graphs are cut at 32 by habit, and at 50, 100 or 120 elsewhere."""
+
+_NEAR, _FAR = 0.5, 0.94
+"""The crowd is between these fractions of the cutoff."""
+
+_SIDES = (1e-9, 1e-6)
+"""How far to either side of a tie is looked, the second for calculators that compute in float32."""
+
+_SURE = 30.0
+_WITHOUT_CUTOFF = 6.0
+
+
+@dataclass(frozen=True)
+class Crowd:
+    """A center with many neighbors, none as far as another, and what came of crowding it.
+
+    Attributes:
+        species: of all atoms.
+        radius: cutoff that the crowd is inside of, length.
+        neighbors: how many neighbors the center got.
+        kept: how many of them the calculator keeps, None where no exchange showed.
+        energy: jump at the exchange, eV; 0 without one.
+        force: largest jump of a force there, eV/Å.
+        distance: from the center at which the exchange takes place; nan without one.
+        order_from: number of neighbors at which the order of atoms starts to matter, None if it never does.
+        order_energy: how much it changes the energy then, eV.
+        order_force: how much it changes a force, eV/Å.
+        jumps: (k, energy jump, force jump) for each tie with the k-th neighbor.
+        noise: (energy, force of the median atom) of places without a tie.
+    """
+
+    species: str
+    radius: float
+    neighbors: int
+    kept: int | None
+    energy: float
+    force: float
+    distance: float
+    order_from: int | None
+    order_energy: float
+    order_force: float
+    jumps: tuple[tuple[int, float, float], ...]
+    noise: tuple[float, float]
+
+
+def crowd(subject: Subject, progress: Progress | None = None, most: int = _MOST) -> list[Crowd]:
+    """Crowd an atom of each species that the calculator takes alone.
+
+    Args:
+        subject: the calculator.
+        progress: called now and then.
+        most: neighbors given to the center.
+
+    Returns:
+        one for each species of the structure; none for a calculator that takes no single atoms.
+    """
+    found: list[Crowd] = []
+    for walk in walk_pairs(subject).walks:
+        if walk.pair.species[0] != walk.pair.species[1] or len(walk.pair.first) > 1:
+            continue
+        if progress:
+            progress(
+                len(found), len(walk_pairs(subject).walks), {"phase": f"crowding {walk.pair.species[0]}"}
+            )
+        radius = walk.cutoff or _WITHOUT_CUTOFF
+        for count in (most, most // 2, most // 5):  # some refuse what is too dense for them
+            try:
+                with only_trying(subject):
+                    found.append(_crowded(subject, walk.pair, radius, count))
+                break
+            except CalculatorError:
+                continue
+    return found
+
+
+def cluster(pair: Pair, radius: float, count: int) -> tuple[Atoms, Float[np.ndarray, "neighbors"]]:
+    """A center at the origin and count atoms around it at different distances: (atoms, distances).
+
+    The neighbors fill the shell evenly (a golden spiral in angle, equal volumes in distance), so that no two
+    are as near to one another as chance would put them. Sorted by distance, the center first.
+    """
+    k = np.arange(count)
+    share = (k + 0.5) / count
+    distance = radius * (_NEAR**3 + (_FAR**3 - _NEAR**3) * share) ** (1 / 3)
+    # neighbors in distance are put far apart in angle
+    spread = np.argsort(np.random.default_rng(0).random(count))
+    height = 1 - 2 * (spread + 0.5) / count
+    angle = np.pi * (3 - np.sqrt(5)) * spread
+    flat = np.sqrt(1 - height**2)
+    directions = np.column_stack([flat * np.cos(angle), flat * np.sin(angle), height])
+    positions = np.vstack([np.zeros(3), distance[:, None] * directions])
+    atoms = Atoms([pair.species[0]] * (count + 1), positions)
+    if pair.box:
+        atoms.set_cell([pair.box] * 3)
+        atoms.positions += pair.box / 2
+    atoms.pbc = pair.periodic
+    return atoms, distance
+
+
+def _crowded(subject: Subject, pair: Pair, radius: float, count: int) -> Crowd:
+    atoms, distances = cluster(pair, radius, count)
+    direction = _gap(atoms)
+    side = next((one for one in _SIDES if _resolved(subject, atoms, direction, distances, one)), _SIDES[-1])
+    between = 0.5 * (distances[1:] + distances[:-1])
+    quiet = [_change(subject, atoms, direction, place, side) for place in between[:: max(count // 20, 1)]]
+    noise_energy = max(max(energy for energy, _ in quiet), 1e-14)
+    # an atom that its neighbors press hard has forces with more rounding in them than another
+    noise_force = np.maximum(np.max([force for _, force in quiet], axis=0), 1e-14)
+    jumps: list[tuple[int, float, float]] = []
+    over: list[tuple[int, float, float]] = []
+    for k, place in enumerate(distances):
+        energy, force = _change(subject, atoms, direction, place, side)
+        jumps.append((k + 1, energy, float(force.max())))
+        sure = force > _SURE * noise_force
+        if energy > _SURE * noise_energy or sure.any():
+            over.append((k + 1, energy, float(force[sure].max()) if sure.any() else 0.0))
+    kept, energy, force = max(over, key=lambda one: (one[2], one[1])) if over else (None, 0.0, 0.0)
+    order_from, order_energy, order_force = _order(subject, pair, radius, count)
+    return Crowd(
+        pair.species[0], radius, count, kept, energy, force,
+        float(distances[kept - 1]) if kept else float("nan"),
+        order_from, order_energy, order_force, tuple(jumps), (noise_energy, float(np.median(noise_force))),
+    )  # fmt: skip
+
+
+def _with_walker(atoms: Atoms, direction: Float[np.ndarray, "3"], distance: float) -> Atoms:
+    center = atoms.positions[0]
+    return atoms + Atoms([atoms.get_chemical_symbols()[0]], [center + distance * direction])
+
+
+def _change(
+    subject: Subject, atoms: Atoms, direction: Float[np.ndarray, "3"], place: float, side: float
+) -> tuple[float, Float[np.ndarray, "atoms"]]:
+    """Changes from place - side to place + side that a smooth function has not.
+
+    Returns:
+        (|change of the energy beyond the force's work|, for each atom |change of its force beyond the change
+        over the next stretch of that length|).
+    """
+    near, far, farther = (_with_walker(atoms, direction, place + times * side) for times in (-1, 1, 3))
+    before, after, later = subject.forces(near), subject.forces(far), subject.forces(farther)
+    work = float((before[-1] + after[-1]) @ direction) * side
+    energy = abs(subject.energy(far) - subject.energy(near) + work)
+    return energy, np.linalg.norm((after - before) - (later - after), axis=1)
+
+
+def _resolved(
+    subject: Subject,
+    atoms: Atoms,
+    direction: Float[np.ndarray, "3"],
+    distances: Float[np.ndarray, "neighbors"],
+    side: float,
+) -> bool:
+    """Whether the calculator tells two places this near apart."""
+    place = 0.5 * float(distances[0] + distances[1])
+    near, far = (subject.forces(_with_walker(atoms, direction, place + sign * side)) for sign in (-1, 1))
+    return bool((near != far).any())
+
+
+def _gap(atoms: Atoms) -> Float[np.ndarray, "3"]:
+    """The direction from the center that stays farthest from every neighbor."""
+    tried = np.random.default_rng(1).normal(size=(2000, 3))
+    tried /= np.linalg.norm(tried, axis=1)[:, None]
+    offsets = atoms.positions[1:] - atoms.positions[0]
+    units = offsets / np.linalg.norm(offsets, axis=1)[:, None]
+    return tried[np.argmin((tried @ units.T).max(axis=1))]
+
+
+def _order(subject: Subject, pair: Pair, radius: float, most: int) -> tuple[int | None, float, float]:
+    """(fewest neighbors at which permuting atoms changes anything, by how much energy, and force)."""
+
+    def differs(count: int) -> tuple[bool, float, float]:
+        atoms, _ = cluster(pair, radius, count)
+        return _permuted(subject, atoms)
+
+    counts = [count for count in (2, 4, 8, 16, 32, 64, 128) if count < most] + [most]
+    low = 1
+    for count in counts:
+        changed, energy, force = differs(count)
+        if not changed:
+            low = count
+            continue
+        high = count
+        while high - low > 1:
+            middle = (low + high) // 2
+            now, less, weaker = differs(middle)
+            if now:
+                high, energy, force = middle, less, weaker
+            else:
+                low = middle
+        return high, energy, force
+    return None, 0.0, 0.0
+
+
+def _permuted(subject: Subject, atoms: Atoms) -> tuple[bool, float, float]:
+    """Whether energy or forces change with the order of atoms by more than another order of summation can."""
+    energy, forces = subject.energy(atoms), subject.forces(atoms)
+    rng = np.random.default_rng(2)
+    orders: Sequence[Int[np.ndarray, "atoms"]] = [
+        np.arange(len(atoms))[::-1],
+        rng.permutation(len(atoms)),
+        rng.permutation(len(atoms)),
+    ]
+    worst = np.zeros(2)
+    for order in orders:
+        other = atoms.copy()[order]
+        assert isinstance(other, Atoms)
+        apart = np.abs(subject.forces(other) - forces[order]).max()
+        worst = np.maximum(worst, [abs(subject.energy(other) - energy), apart])
+    # terms are at most as large as their sum is where the crowd repels; rounding of float32 is allowed
+    scale = np.array(
+        [np.abs(forces).sum() * np.ptp(atoms.positions, axis=0).max() + abs(energy), np.abs(forces).sum()]
+    )
+    changed = bool((worst > 1e-6 * scale).any())
+    return changed, float(worst[0]), float(worst[1])
