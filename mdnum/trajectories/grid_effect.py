@@ -1,9 +1,9 @@
 """What the grid of a file does to flips: how many it hides, and how many it makes up.
 
 Rounding every coordinate moves a crossing to another frame, hides a short visit, or lets a pair that hovers
-at the cutoff hop across it. From one file nobody can tell which flips those are, but how many there must be can
-be estimated: pairs are drawn at random near the cutoff, move as atoms of the file do between two frames, and
-are decided with and without rounding.
+at the cutoff hop across it. From one file nobody can tell which flips those are, but how many there must be
+can be estimated: pairs are drawn at random near the cutoff, move as atoms of the file do between two frames,
+and are decided with and without rounding.
 """
 
 from __future__ import annotations
