@@ -16,7 +16,7 @@ from mdnum.audit.noise import FEW, Noise, displaced, settled
 from mdnum.references.findings import finding
 
 #: Å; the loop with the smaller error counts.
-_RADII = (0.03, 0.003)
+_RADII = (0.03, 0.003, 0.0003)
 #: Points on a loop: equally spaced ones integrate a smooth periodic function to all orders below this.
 _POINTS = 12
 #: Work over its error from which it is there.
@@ -78,8 +78,8 @@ class Curl:
         for what, u, v in wanted:
             if progress is not None:
                 progress(len(loops), len(wanted), {"phase": "curl", "unit": "loops"})
-            both = [around(worker, atoms, u, v, radius, noise, what) for radius in _RADII]
-            loops.append(min(both, key=lambda one: one.error))
+            tried = [around(worker, atoms, u, v, radius, noise, what) for radius in _RADII]
+            loops.append(min(tried, key=lambda one: one.error))
         wrong = [one for one in loops if not one.conservative]
         found = [_finding(wrong, len(loops))] if wrong else []
         return Part(
@@ -210,8 +210,10 @@ def _says(loops: list[Loop], wrong: list[Loop]) -> str:
             "their "
             f"derivative is up to {worst.share:.2g} of the symmetric one. No energy has these forces."
         )
+    limit = max(loops, key=lambda one: (abs(one.curl) + one.error) / max(one.stiffness, 1e-300))
     return (
         f"Around {len(loops)} small loops the forces do no work that could be told from rounding: their "
         "curl is "
-        f"below {max(abs(one.curl) + one.error for one in loops):.1g} eV/Å²."
+        f"below {abs(limit.curl) + limit.error:.1g} eV/Å², where the stiffness is {limit.stiffness:.2g} "
+        "eV/Å²."
     )

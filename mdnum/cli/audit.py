@@ -28,7 +28,7 @@ def audit(
         None, min=0.0, metavar="KELVIN", help="For kT and for the run; 300 K by default."
     ),
     timestep: float | None = typer.Option(
-        None, min=0.0, metavar="FS", help="Of the run, fs; from the fastest vibration by default."
+        None, min=0.0, metavar="FS", help="Of the run; from the fastest vibration by default."
     ),
     steps: int | None = typer.Option(None, min=16, help="Of the run; 400, or what takes half a minute."),
     out: Path | None = typer.Option(

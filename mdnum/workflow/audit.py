@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
     from mdnum.audit.base import Check, Part
     from mdnum.audit.load import Loaded
+    from mdnum.audit.structures import Structure
     from mdnum.audit.subject import CalculatorSubject
 
 #: Checks in the order in which they are made.
@@ -64,7 +65,8 @@ def audit(
             that is built for it.
         checks: words of `CHECKS`; default all.
         temperature: K, of kT and of the run; default the system's own, or 300.
-        timestep: fs, of the run; default a fraction of the fastest vibration.
+        timestep: of the run, fs (τ of a system in reduced units); default a fraction of the fastest
+            vibration.
         steps: of the run; default as many as take half a minute, 400 at most.
         out: the new audit folder; default runs/audit-<name>-<n>.
         report: write report.html.
@@ -83,16 +85,16 @@ def audit(
     began = time.perf_counter()
     wanted = _wanted(checks)
     loaded = _loaded(calculator)
-    atoms = _atoms(structure, loaded)
+    asked = _structure(structure, loaded)
     folder = RunFolder.create(default_folder(f"audit-{loaded.stem}") if out is None else out, world="audit")
     try:
-        subject = _subject(loaded, atoms, temperature, folder.path)
+        subject = _subject(loaded, asked.atoms, temperature, folder.path)
         folder.write_provenance(surroundings() | {"calculator": loaded.name})
         audit_record.write_structures(folder.path, {"structure": subject.atoms})
         told = Log(folder, progress)
         parts: list[Part] = []
         pairs: dict[str, Atoms] = {}
-        for check in _checks(wanted, parts, temperature, timestep, steps):
+        for check in _checks(wanted, subject, timestep, steps):
             told(0, 0, {"phase": check.name})
             parts.append(_ask(check, subject, told))
             pairs |= getattr(check, "structures", {})
@@ -111,8 +113,8 @@ def audit(
         summary = audit_record.summarize(
             loaded.name, subject.atoms, subject.kT, units, parts, judge(loaded.name, parts)
         )
-        summary["reproduce"] = bool(pairs)
-        folder.write_summary(summary | {"seconds": time.perf_counter() - began})
+        summary |= {"structure": asked.says, "seconds": time.perf_counter() - began}
+        folder.write_summary(summary)
     except BaseException:
         folder.close()
         raise
@@ -151,38 +153,22 @@ def _loaded(calculator: str | Callable[[], Any]) -> Loaded:
     return Loaded(name, name, calculator)
 
 
-def _atoms(structure: Atoms | str | Path | None, loaded: Loaded) -> Atoms:
+def _structure(structure: Atoms | str | Path | None, loaded: Loaded) -> Structure:
     from ase import Atoms
 
+    from mdnum.audit.structures import Structure, default_structure, read_structure
+
     if isinstance(structure, Atoms):
-        atoms = structure
+        found = Structure(structure, "given as atoms")
     elif structure is not None:
-        atoms = _read(Path(structure))
+        found = read_structure(structure)
     elif loaded.atoms is not None:
-        atoms = loaded.atoms
+        found = Structure(loaded.atoms, f"the structure of {loaded.name}")
     else:
-        from mdnum.audit.structures import default_structure
-
-        atoms = default_structure(loaded)
-    if not len(atoms):
+        found = default_structure(loaded)
+    if not len(found.atoms):
         raise InputError("a structure without atoms", remedy="Give one with atoms: -s FILE")
-    return atoms
-
-
-def _read(path: Path) -> Atoms:
-    from ase.io import read
-
-    if not path.is_file():
-        raise InputError("no such file", where=str(path), remedy="Give a structure file that ASE reads")
-    try:
-        found = read(path)
-    except Exception as error:  # whatever a reader raises
-        raise InputError(
-            f"ASE cannot read it: {type(error).__name__}: {error}",
-            where=str(path),
-            remedy="Give a structure file that ASE reads, extxyz or cif say",
-        ) from error
-    return found[-1] if isinstance(found, list) else found
+    return found
 
 
 def _subject(loaded: Loaded, atoms: Atoms, temperature: float | None, folder: Path) -> CalculatorSubject:
@@ -197,24 +183,36 @@ def _subject(loaded: Loaded, atoms: Atoms, temperature: float | None, folder: Pa
 
 
 def _checks(
-    wanted: Sequence[str],
-    parts: Sequence[Part],
-    temperature: float | None,
-    timestep: float | None,
-    steps: int | None,
-):
-    """The checks asked for, one after the other: a later one may use what an earlier one found."""
+    wanted: Sequence[str], subject: CalculatorSubject, timestep: float | None, steps: int | None
+) -> Iterator[Check]:
+    """The checks asked for, in their order."""
     from mdnum.audit.curl import Curl
+    from mdnum.audit.dynamics import Dynamics
     from mdnum.audit.forces import Forces
     from mdnum.audit.invariance import Invariance
     from mdnum.audit.state import State
+    from mdnum.audit.thresholds import find_thresholds
 
-    simple: dict[str, Callable[[], Check]] = {
-        "invariance": Invariance, "forces": Forces, "curl": Curl, "state": State,
-    }  # fmt: skip
+    made: dict[str, Callable[[], Check]] = {
+        "invariance": Invariance,
+        "forces": Forces,
+        "curl": Curl,
+        "state": State,
+        "dynamics": lambda: Dynamics(find_thresholds, _internal(timestep, subject), steps),
+    }
     for name in wanted:
-        if name in simple:
-            yield simple[name]()
+        if name in made:
+            yield made[name]()
+
+
+def _internal(timestep: float | None, subject: CalculatorSubject) -> float | None:
+    """A time step in length * sqrt(mass / energy), of one in fs, or in τ for reduced units."""
+    if timestep is None:
+        return None
+    if not timestep > 0:
+        raise InputError(f"a time step of {timestep:g}; expected one above 0", remedy="Correct --timestep")
+    units = subject.units
+    return timestep * units.time_factor / (1000.0 if units.time == "ps" else 1.0)
 
 
 def _ask(check: Check, subject: CalculatorSubject, told: Log) -> Part:

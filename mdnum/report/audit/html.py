@@ -163,6 +163,8 @@ def _what(run: Question) -> Iterator[tuple[str, str]]:
         f"{summary['formula']}, {count(summary['atoms'])} atoms, "
         + (f"periodic along {', '.join(axes)}" if axes else "not periodic"),
     )
+    if summary.get("structure"):
+        yield "Which is", summary["structure"]
     yield "kT", f"{number(summary['kT'], 4)} {summary['units']['energy']}"
     yield "Took", f"{number(summary.get('seconds'), 2)} s"
 

@@ -1,0 +1,228 @@
+"""Flips of a run at the thresholds that were found, and what each did to the energy."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Protocol
+
+import numpy as np
+from ase import Atoms
+from jaxtyping import Float
+
+from mdnum.audit.base import Subject
+from mdnum.audit.nve import Run, at
+from mdnum.trajectories.frame import Box, Frame
+from mdnum.trajectories.rules import SpeciesCutoffs
+from mdnum.trajectories.tracker import Tracker
+
+#: Å before and after a crossing at which the energy is asked for.
+_BESIDE = 1e-7
+#: Lowest derivative that jumps, from which the work over a step needs no care: Simpson's rule takes a kink in
+#: the force's slope as it takes the fourth power of the step.
+SMOOTH_ENOUGH = 2
+
+
+class Threshold(Protocol):
+    """What is asked of a threshold: see `mdnum.audit.thresholds`."""
+
+    @property
+    def radius(self) -> float: ...
+    @property
+    def species(self) -> tuple[str, str]: ...
+    @property
+    def order(self) -> int: ...
+    @property
+    def located(self) -> float: ...
+
+
+@dataclass(frozen=True)
+class Crossing:
+    """A pair that crossed a threshold between two steps.
+
+    Attributes:
+        step: after it; the step before is one less.
+        i, j, rank: the pair, as in `mdnum.trajectories.table.Flips`.
+        entered: whether it is inside afterwards.
+        threshold: its place among the thresholds.
+        distance: at `step`, Å.
+        margin: at `step`, Å.
+        share: of the step's straight way at which the distance is the threshold's.
+        slack: of the way to stay clear of it on either side.
+    """
+
+    step: int
+    i: int
+    j: int
+    rank: int
+    entered: bool
+    threshold: int
+    distance: float
+    margin: float
+    share: float
+    slack: float
+
+
+def crossings(run: Run, like: Atoms, thresholds: Sequence[Threshold]) -> list[Crossing]:
+    """All flips of a run, in the order of steps and of their places on the way.
+
+    Args:
+        run: with positions of every step.
+        like: species and cell.
+        thresholds: any number for each pair of species.
+    """
+    box = Box(np.asarray(like.cell.array, np.float64), np.asarray(like.pbc, bool))
+    species = like.get_chemical_symbols()
+    found = []
+    for level in _levels(thresholds, set(species)):
+        radii = {thresholds[at].species: thresholds[at].radius for at in level}
+        places = {frozenset(thresholds[at].species): at for at in level}
+        tracker = Tracker(SpeciesCutoffs(radii), species=species)
+        for step, positions in enumerate(run.positions):
+            flips = tracker.step(Frame(step, float(step), positions, box))
+            for row in range(len(flips)):
+                i, j = int(flips.i[row]), int(flips.j[row])
+                place = places[frozenset((species[i], species[j]))]
+                threshold = thresholds[place]
+                share, slack = _share(
+                    run.positions[step - 1], positions, i, j, float(flips.distance[row]), threshold, box
+                )
+                found.append(
+                    Crossing(
+                        step, i, j, int(flips.rank[row]), bool(flips.entered[row]), place,
+                        float(flips.distance[row]), float(flips.margin[row]), share, slack,
+                    )
+                )  # fmt: skip
+    return sorted(found, key=lambda one: (one.step, one.share))
+
+
+def _levels(thresholds: Sequence[Threshold], species: set[str]) -> list[list[int]]:
+    """Thresholds in groups that have one for a pair of species at most: a rule has no room for more."""
+    levels: list[list[int]] = []
+    for place, one in enumerate(thresholds):
+        if not set(one.species) <= species:
+            continue
+        key = frozenset(one.species)
+        for level in levels:
+            if all(frozenset(thresholds[other].species) != key for other in level):
+                level.append(place)
+                break
+        else:
+            levels.append([place])
+    return levels
+
+
+def _share(
+    before: Float[np.ndarray, "atoms 3"],
+    after: Float[np.ndarray, "atoms 3"],
+    i: int,
+    j: int,
+    distance: float,
+    threshold: Threshold,
+    box: Box,
+) -> tuple[float, float]:
+    """Where on the way of a step a pair has the threshold's distance, and how much of it to stay clear of."""
+    end = _image(after[j] - after[i], distance, box)
+    start = end - ((after[j] - after[i]) - (before[j] - before[i]))
+    way = end - start
+    a, b, c = way @ way, 2 * start @ way, start @ start - threshold.radius**2
+    length = float(np.sqrt(a))
+    inside = b * b - 4 * a * c
+    share = 0.5
+    if a > 0 and inside >= 0:
+        root = np.sqrt(inside)
+        # the form without cancellation; the root in the interval is the crossing
+        q = -0.5 * (b + np.copysign(root, b))
+        roots = [q / a, c / q if q else 0.0]
+        share = float(min(roots, key=lambda one: abs(one - 0.5)))
+    slack = max(_BESIDE, 3 * threshold.located) / length if length else 1e-3
+    return float(np.clip(share, 0.0, 1.0)), float(np.clip(slack, 1e-9, 1e-3))
+
+
+def _image(vector: Float[np.ndarray, "3"], distance: float, box: Box) -> Float[np.ndarray, "3"]:
+    """The periodic image of a vector whose length is a given one."""
+    if not box.periodic:
+        return vector
+    rows = box.matrix[box.pbc]
+    # nearest images first; how many there are within the distance follows from the cell
+    shares = np.rint(np.linalg.lstsq(rows.T, vector, rcond=None)[0])
+    base = vector - shares @ rows
+    # distance between the planes of the cell: one over the length of a reciprocal vector
+    widths = 1 / np.linalg.norm(np.linalg.pinv(rows), axis=0)
+    reach = [range(-int(distance / width) - 2, int(distance / width) + 3) for width in widths]
+    shifts = np.array(list(product(*reach)), np.float64) @ rows
+    candidates = base + shifts
+    return candidates[int(np.argmin(np.abs(np.linalg.norm(candidates, axis=1) - distance)))]
+
+
+@dataclass(frozen=True)
+class Account:
+    """What became of the energy in one step.
+
+    Attributes:
+        jumps: of the energy at each crossing, in their order, eV; 0 where the energy does not jump.
+        rest: change of the energy that neither a jump nor the work of the forces explains, eV.
+    """
+
+    jumps: tuple[float, ...]
+    rest: float
+
+
+def account(
+    subject: Subject,
+    run: Run,
+    like: Atoms,
+    step: int,
+    crossed: Sequence[Crossing],
+    thresholds: Sequence[Threshold],
+) -> Account:
+    """Work of the forces along the straight way of a step, in pieces between its crossings.
+
+    Args:
+        subject: another object than the run's; asked three times for each crossing and once more.
+        run: the run.
+        like: species and cell.
+        step: at its end.
+        crossed: those of this step, by their share.
+        thresholds: as `crossings` was given them.
+
+    Error:
+        Simpson's rule on the way of one step, fifth power of its length; the calculator's noise.
+    """
+    start, way = run.positions[step - 1], run.positions[step] - run.positions[step - 1]
+
+    def asked(share: float) -> tuple[float, float]:
+        """Energy, and force along the way."""
+        there = at(like, start + share * way)
+        return subject.energy(there), float(np.sum(subject.forces(there) * way))
+
+    left = 0.0, (float(run.potential[step - 1]), float(np.sum(run.forces[step - 1] * way)))
+    end = 1.0, (float(run.potential[step]), float(np.sum(run.forces[step] * way)))
+    jumps, rest = [], 0.0
+    for one in crossed:
+        order = thresholds[one.threshold].order
+        if order >= SMOOTH_ENOUGH:
+            jumps.append(0.0)
+            continue
+        below, above = max(one.share - one.slack, left[0]), min(one.share + one.slack, 1.0)
+        before = (below, asked(below)) if below > left[0] else left
+        after = (above, asked(above)) if above < 1.0 else end
+        rest += _piece(left, before, asked)
+        # what the smooth forces do between the two places is no jump
+        mean = 0.5 * (before[1][1] + after[1][1])
+        change = after[1][0] - before[1][0] + mean * (after[0] - before[0])
+        jumps.append(change if order == 0 else 0.0)
+        rest += 0.0 if order == 0 else change
+        left = after
+    return Account(tuple(jumps), rest + _piece(left, end, asked))
+
+
+def _piece(first, last, asked) -> float:
+    """Energy gained plus work done between two places, 0 where the forces have this energy."""
+    width = last[0] - first[0]
+    if width <= 0:
+        return 0.0
+    middle = asked(0.5 * (first[0] + last[0]))[1]
+    work = width * (first[1][1] + 4 * middle + last[1][1]) / 6
+    return last[1][0] - first[1][0] + work
