@@ -13,6 +13,7 @@ from numpy import ndarray
 from mdnum.errors import InputError
 
 _BLOCK = 2_000_000  # pairs looked at in one go: 48 MB of displacements
+_FEW = 100_000  # pairs and images that are quicker in one go than image by image
 
 
 @dataclass(frozen=True)
@@ -202,6 +203,9 @@ def _images(positions: ndarray, cell: ndarray, pbc: ndarray, reach: float):
     # atoms brought home differ by less than one cell, so one vector beyond reach / width is enough
     most = np.where(pbc, (reach / width).astype(int) + 1, 0)
     span = [range(-count, count + 1) for count in most]
+    vectors = np.array(list(product(*span)), dtype=float)
+    if len(vectors) * len(positions) * (len(positions) + 1) <= 2 * _FEW:
+        return [(vectors, home)]
     tries = []
     for vector in product(*span):
 
@@ -214,8 +218,11 @@ def _images(positions: ndarray, cell: ndarray, pbc: ndarray, reach: float):
 
 def _within(positions: ndarray, cell: ndarray, image, reach: float):
     """(i, j, shift, distance) of the pairs within reach for one choice of image, block by block."""
-    shift_of, own_image = image
     n = len(positions)
+    if isinstance(image[0], np.ndarray):
+        yield _at_once(positions, cell, *image, reach)
+        return
+    shift_of, own_image = image
     rows = max(1, _BLOCK // max(n, 1))
     yield np.empty(0, int), np.empty(0, int), np.empty((0, 3), int), np.empty(0)
     for start in range(0, n, rows):
@@ -230,3 +237,16 @@ def _within(positions: ndarray, cell: ndarray, image, reach: float):
         distance = np.sqrt(dx * dx + dy * dy + dz * dz)
         near = distance <= reach
         yield first[near], second[near], shift[near].astype(int), distance[near]
+
+
+def _at_once(positions: ndarray, cell: ndarray, vectors: ndarray, home: ndarray, reach: float):
+    """As `_within`, for all vectors at once: few atoms would wait for Python alone."""
+    first, second = np.triu_indices(len(positions))
+    shift = vectors[:, None, :] + (home[second] - home[first])[None]
+    displacement = (positions[second] - positions[first])[None] + shift @ cell
+    dx, dy, dz = np.moveaxis(displacement, -1, 0)
+    distance = np.sqrt(dx * dx + dy * dy + dz * dz)
+    leading = np.array([tuple(vector) > (0.0, 0.0, 0.0) for vector in vectors.tolist()], dtype=bool)
+    near = (distance <= reach) & ((first != second)[None] | leading[:, None])
+    which, pair = np.nonzero(near)
+    return first[pair], second[pair], shift[which, pair].astype(int), distance[which, pair]

@@ -1,0 +1,288 @@
+"""A neighbor list under test: how it is called, what it says it cannot do, and what became of a call."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from importlib import metadata
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from numpy import ndarray
+
+from mdnum.references.conformance.answer import Answer, Malformed, read
+from mdnum.references.conformance.case import Case
+from mdnum.references.oracle import widths
+
+
+@runtime_checkable
+class KeptList(Protocol):
+    """A list that is kept and brought up to date. Both calls return pairs as `answer.read` takes them.
+
+    `allocate` starts anew and may be called again on the same object; `update` is told where the atoms are
+    now. The pairs that are returned must hold every pair within r_cut of the positions of this call; pairs
+    somewhat further may be there, as the skin leaves them.
+    """
+
+    def allocate(self, positions: ndarray, cell: ndarray, pbc: ndarray, r_cut: float, skin: float) -> Any:
+        """The pairs of a new list."""
+        ...
+
+    def update(self, positions: ndarray, cell: ndarray) -> Any:
+        """The pairs of the list in use at these positions."""
+        ...
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a list does not claim to do; such cases are not asked, and are counted.
+
+    Attributes:
+        minimum_image: one image of a pair at most: no cell narrower than two cutoffs (and skins).
+        orthorhombic: no cell with other than right angles.
+        along_axes: no cell whose vectors point elsewhere than along x, y and z (lengths may be negative: no).
+        all_axes: no cell that repeats along some axes only.
+        periodic: no free atoms.
+        free: no periodic box.
+        wrapped: no atoms outside the box.
+        fixed_cell: no box that changes during the list's life.
+        fixed_atoms: a list in use cannot be given other atoms: `allocate` is called again.
+        right_handed: no left-handed cell.
+        lower: no cell that is not lower triangular.
+        atoms: no fewer atoms.
+        most_atoms: no more atoms.
+        roomy: no box of more cells of r_cut than this along all axes together.
+    """
+
+    minimum_image: bool = False
+    orthorhombic: bool = False
+    along_axes: bool = False
+    all_axes: bool = False
+    periodic: bool = False
+    free: bool = False
+    wrapped: bool = False
+    fixed_cell: bool = False
+    fixed_atoms: bool = True
+    right_handed: bool = False
+    lower: bool = False
+    atoms: int = 0
+    most_atoms: int | None = None
+    roomy: float | None = None
+
+    def refusal(self, case: Case) -> str | None:
+        """Why a case is not asked, or None when it is."""
+        pbc = np.array(case.pbc)
+        reach = case.r_cut + case.skin
+        least = min(len(still.positions) for still in case.stills)
+        if least < self.atoms:
+            return f"at least {self.atoms} atom{'s' * (self.atoms > 1)}"
+        if self.most_atoms is not None and case.atoms > self.most_atoms:
+            return f"at most {self.most_atoms} atoms"
+        if self.periodic and not pbc.any():
+            return "no free atoms"
+        if self.free and pbc.any():
+            return "free atoms only"
+        if not pbc.any():
+            return None
+        if self.all_axes and not pbc.all():
+            return "no periodicity axis by axis"
+        first = case.stills[0].cell
+        for still in case.stills if case.steps > 1 else case.stills[:1]:
+            if (why := self._box(still.cell, pbc, reach)) is not None:
+                return why
+            if self.fixed_cell and not still.fresh and not np.array_equal(still.cell, first):
+                return "no box that changes"
+            first = still.cell
+            if self.wrapped and not _inside(still.positions, still.cell, pbc):
+                return "atoms inside the box only"
+        return None
+
+    def _box(self, cell: ndarray, pbc: ndarray, reach: float) -> str | None:
+        used = cell[pbc]
+        products = used @ used.T
+        if self.orthorhombic and np.count_nonzero(products - np.diag(np.diag(products))):
+            return "right angles only"
+        if self.along_axes and np.count_nonzero(used - np.where(np.eye(3, dtype=bool), cell, 0.0)[pbc]):
+            return "cells along x, y and z only"
+        if self.along_axes and (np.diag(cell)[pbc] <= 0).any():
+            return "cells along x, y and z only"
+        if self.right_handed and pbc.all() and np.linalg.det(cell) < 0:
+            return "no left-handed cell"
+        if self.lower and np.count_nonzero(np.triu(cell, 1)):
+            return "lower triangular cells only"
+        width = widths(completed(cell, pbc))[pbc]
+        if self.minimum_image and reach >= 0.5 * width.min():
+            return "minimum image only"
+        if self.roomy is not None and np.prod(width / reach) > self.roomy:
+            return f"no box of more than {self.roomy:.0e} cells"
+        return None
+
+
+@dataclass(frozen=True)
+class PairList:
+    """A neighbor list under test.
+
+    Attributes:
+        name: as it was asked for.
+        make: gives a function of (positions, cell, pbc, r_cut), or a `KeptList`.
+        kept: whether it is a `KeptList`.
+        package: distribution whose version counts.
+        full: every pair from both atoms, or once; None to find out.
+        unit: roundoff of its arithmetic; None to find out.
+        superset: pairs somewhat beyond the cutoff may be there; None to find out, of a list that is kept.
+        limits: what it does not claim to do.
+        source: lines that define or import it, for a script without mdnum; the last expression is `call`.
+        call: what the script calls it by.
+        affords: how many of the random cases it is asked, as a share: slow ones take 0.01.
+        about: one line.
+        word: what `load` finds it by in another process; empty where it cannot.
+    """
+
+    name: str
+    make: Callable[[], Any]
+    kept: bool = False
+    package: str | None = None
+    full: bool | None = None
+    unit: float | None = None
+    superset: bool | None = None
+    limits: Limits = field(default_factory=Limits)
+    source: str = ""
+    call: str = "pairs"
+    affords: float = 1.0
+    about: str = ""
+    word: str = ""
+
+    @property
+    def version(self) -> str | None:
+        """Installed version of its package, or None."""
+        if self.package is None:
+            return None
+        try:
+            return metadata.version(self.package)
+        except metadata.PackageNotFoundError:
+            return None
+
+    def with_options(self, **options: Any) -> PairList:
+        """The same with other declarations; None leaves one as it is."""
+        return replace(self, **{name: value for name, value in options.items() if value is not None})
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one call.
+
+    Attributes:
+        answer: the pairs, or None.
+        raised: the exception in words, or None.
+        refused: the exception says on purpose that this cannot be done.
+        malformed: why the answer is none, or None.
+        changed: the input that the call wrote to, or None.
+        crashed: how the process ended that made the call, or that it did not end in time; or None.
+    """
+
+    answer: Answer | None = None
+    raised: str | None = None
+    refused: bool = False
+    malformed: str | None = None
+    changed: str | None = None
+    crashed: str | None = None
+
+
+class Session:
+    """Calls of one list, a kept one through its life.
+
+    Args:
+        tested: the list.
+        reuse: ask the same object in all cases, as a program that runs for long does.
+    """
+
+    def __init__(self, tested: PairList, reuse: bool = False):
+        self.tested, self.reuse = tested, reuse
+        self._made: Any = None
+
+    def ask(self, case: Case) -> list[Outcome]:
+        """The outcome at every still, as far as the list goes: it ends at the first that is no answer."""
+        if self._made is None or (self.tested.kept and not self.reuse):
+            try:
+                self._made = self.tested.make()
+            except Exception as error:
+                return [_failed(error, case)]
+        outcomes = []
+        atoms = None
+        for still in case.stills:
+            positions, cell = np.array(still.positions), np.array(still.cell)
+            pbc, count = np.array(case.pbc), len(positions)
+            fresh = atoms is None or still.fresh or (self.tested.limits.fixed_atoms and count != atoms)
+            atoms = count
+            outcomes.append(self._one(case, positions, cell, pbc, fresh))
+            if outcomes[-1].answer is None:
+                break
+        return outcomes
+
+    def close(self) -> None:
+        """Lets go of the list."""
+        self._made = None
+
+    def _one(self, case: Case, positions: ndarray, cell: ndarray, pbc: ndarray, fresh: bool) -> Outcome:
+        before = (positions.copy(), cell.copy(), pbc.copy())
+        try:
+            if not self.tested.kept:
+                given = self._made(positions, cell, pbc, case.r_cut)
+            elif fresh:
+                given = self._made.allocate(positions, cell, pbc, case.r_cut, case.skin)
+            else:
+                given = self._made.update(positions, cell)
+        except Exception as error:
+            return _failed(error, case)
+        try:
+            # a copy: a list may hand out the buffer that it fills next time
+            answer = read(given)
+        except Malformed as error:
+            return Outcome(malformed=str(error))
+        names = ("positions", "cell", "pbc")
+        changed = [
+            name
+            for name, old, new in zip(names, before, (positions, cell, pbc), strict=True)
+            if not np.array_equal(old, new)
+        ]
+        return Outcome(_copied(answer), changed=changed[0] if changed else None)
+
+
+def _failed(error: Exception, case: Case) -> Outcome:
+    # LinAlgError is a ValueError that nobody raises on purpose
+    meant = isinstance(error, ValueError | NotImplementedError) and not isinstance(error, np.linalg.LinAlgError)
+    words = " ".join(str(error).split())
+    refused = bool(words) and meant and case.atoms > 0
+    return Outcome(raised=f"{type(error).__name__}: {words[:300]}", refused=refused)
+
+
+def _copied(answer: Answer) -> Answer:
+    parts = (answer.i, answer.j, answer.shift, answer.distance, answer.vector)
+    return Answer(*(None if part is None else np.array(part) for part in parts))  # type: ignore[arg-type]
+
+
+def _inside(positions: ndarray, cell: ndarray, pbc: ndarray) -> bool:
+    fractional = np.linalg.solve(completed(cell, pbc).T, positions.T).T[:, pbc]
+    return bool(((fractional >= 0) & (fractional < 1)).all())
+
+
+def completed(cell: ndarray, pbc: ndarray) -> ndarray:
+    """The cell with unit normals in place of the vectors of axes that do not repeat."""
+    if pbc.all():
+        return cell
+    free = np.flatnonzero(~pbc)
+    basis = np.linalg.svd(np.vstack([cell[pbc], np.zeros((1, 3))]), full_matrices=True)[2]
+    made = np.array(cell, np.float64)
+    made[free] = basis[3 - len(free) :]
+    return made
+
+
+def source_of(made: Any) -> str:
+    """The lines that define a function or class, or nothing where they are not to be had."""
+    try:
+        return inspect.getsource(made)
+    except (OSError, TypeError):
+        return ""
+
+

@@ -1,0 +1,459 @@
+"""One list through all questions: which it answers as it should, and the first failure of each kind."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from mdnum.references.conformance.case import AREAS, KEPT, Case, one
+from mdnum.references.conformance.catalog import catalog
+from mdnum.references.conformance.crowds import LARGE_EDGE, SMALL_EDGE, crowds, lattice
+from mdnum.references.conformance.judge import CODES, Conventions, Failure, judge
+from mdnum.references.conformance.lists import Outcome, PairList, Session
+from mdnum.references.conformance.movers import movers, sequences
+from mdnum.references.conformance.remote import RemoteSession
+from mdnum.references.conformance.truth import DOUBLE, SINGLE, Truth, truth
+
+Progress = Callable[[int, int, dict[str, Any]], None]
+
+#: Random cases by default; a list that is asked for a share of them has fewer.
+CASES = 500
+#: Seconds that the 100,000 atoms may be expected to take.
+_PATIENCE = 30.0
+#: Failures of one code that are kept for shrinking; the rest are counted.
+_KEPT = 1
+
+
+@dataclass(frozen=True)
+class Failed:
+    """A case that a list failed.
+
+    Attributes:
+        case: as it was asked, up to the step that failed.
+        failures: what was wrong at that step.
+        asked: the case before it was shrunk; the same where it was not.
+    """
+
+    case: Case
+    failures: tuple[Failure, ...]
+    asked: Case
+
+    @property
+    def worst(self) -> Failure:
+        """The failure that is told."""
+        return min(self.failures, key=lambda one: CODES.index(one.code))
+
+    @property
+    def code(self) -> str:
+        """Its code."""
+        return self.worst.code
+
+
+@dataclass
+class Tally:
+    """What became of the questions of one area.
+
+    Attributes:
+        asked, failed, refused, skipped: cases; refused by the list itself, skipped because of its limits.
+        codes: cases by code of their worst failure.
+        why: reasons of refusing and skipping, with how often.
+    """
+
+    asked: int = 0
+    failed: int = 0
+    refused: int = 0
+    skipped: int = 0
+    codes: dict[str, int] = field(default_factory=dict)
+    why: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def passed(self) -> int:
+        """Cases answered as they should be."""
+        return self.asked - self.failed - self.refused
+
+
+@dataclass
+class Report:
+    """What the suite found out about a list.
+
+    Attributes:
+        tested: the list.
+        how: its conventions, as declared or found out.
+        found_out: which of them were found out rather than declared.
+        single: a case that it decides as float32 does and float64 would not, where that was found out.
+        ties: (counted, not counted) pairs at exactly r_cut.
+        keeps_order: whether the same question gives the same rows in the same order.
+        areas: tallies by area.
+        failed: the first failure of each kind and area, in the order in which they were met.
+        seconds: in all; asking: of the list itself.
+        large: (atoms, seconds) of its largest question.
+    """
+
+    tested: PairList
+    how: Conventions = field(default_factory=Conventions)
+    found_out: list[str] = field(default_factory=list)
+    single: Case | None = None
+    ties: list[int] = field(default_factory=lambda: [0, 0])
+    keeps_order: bool | None = None
+    areas: dict[str, Tally] = field(default_factory=dict)
+    failed: list[Failed] = field(default_factory=list)
+    seconds: float = 0.0
+    asking: float = 0.0
+    large: tuple[int, float] | None = None
+
+    @property
+    def asked(self) -> int:
+        """Cases that were asked."""
+        return sum(tally.asked for tally in self.areas.values())
+
+    @property
+    def wrong(self) -> int:
+        """Cases that failed."""
+        return sum(tally.failed for tally in self.areas.values())
+
+    @property
+    def conforms(self) -> bool:
+        """Whether it was asked and no case failed."""
+        return self.wrong == 0 and self.asked > sum(tally.refused for tally in self.areas.values())
+
+
+class Examiner:
+    """Asks a list and judges its answers; finds out its conventions first.
+
+    Args:
+        tested: the list.
+        reuse: ask one object in all cases.
+        apart: call it in a process of its own, which may crash.
+    """
+
+    def __init__(self, tested: PairList, reuse: bool = False, apart: bool = False):
+        self.tested = tested
+        self.session: Session | RemoteSession = (
+            RemoteSession(tested, reuse) if apart and tested.word else Session(tested, reuse)
+        )
+        self.report = Report(tested)
+        self._find_conventions()
+
+    def _find_conventions(self) -> None:
+        """Full or half, signs of shifts and vectors, from a question that nobody gets wrong otherwise."""
+        tested, report = self.tested, self.report
+        full, sign, toward = tested.full, 1, 1
+        triple = one("a triple through a face", "few", [[0.2, 2, 2], [3.8, 2.1, 2], [0.5, 2.4, 2.2]], 4.0)
+        free = one("a free triple", "few", [[0.2, 2, 2], [-0.2, 2.1, 2], [0.5, 2.4, 2.2]])
+        for case in (triple, free):
+            if tested.limits.refusal(case) is not None:
+                continue
+            case = replace(case, skin=0.3 if tested.kept else 0.0)
+            outcome = self.session.ask(case)[0]
+            answer = outcome.answer
+            if answer is None or len(answer) == 0:
+                continue
+            rows = set(zip(answer.i.tolist(), answer.j.tolist(), strict=True))
+            if full is None:
+                full = all((j, i) in rows for i, j in rows)
+                report.found_out.append("full" if full else "half")
+            right = truth(case, 0)
+            for convention in (Conventions(full, a, b) for a in (1, -1) for b in (1, -1)):
+                if not judge(answer, right, replace(convention, unit=SINGLE)):
+                    sign, toward = convention.sign, convention.toward
+                    break
+            break
+        report.how = Conventions(True if full is None else full, sign, toward, tested.unit or DOUBLE)
+        self.superset = self._has_more() if tested.superset is None and tested.kept else bool(tested.superset)
+
+    def _has_more(self) -> bool:
+        """Whether a list that is kept gives what its skin holds, rather than what is inside the cutoff."""
+        case = replace(one("a pair in the skin", "few", [[2.0, 2, 2], [3.15, 2, 2]], 5.0), skin=0.3)
+        if self.tested.limits.refusal(case) is not None:
+            case = replace(one("a free pair in the skin", "few", [[2.0, 2, 2], [3.15, 2, 2]]), skin=0.3)
+        answer = self.session.ask(case)[0].answer
+        more = answer is None or len(answer) > 0
+        self.report.found_out.append("with its skin" if more else "without its skin")
+        return more
+
+    def failures(self, case: Case) -> list[Failure]:
+        """What is wrong with the answers to a case, at the first step where anything is; empty if nothing.
+
+        A call that raises counts as a failure; one that refuses does not.
+        """
+        return self.outcome(case)[0]
+
+    def outcome(self, case: Case) -> tuple[list[Failure], Outcome | None]:
+        """(failures, the outcome that ended the case: a refusal, or None)."""
+        began = time.perf_counter()
+        outcomes = self.session.ask(case)
+        self.report.asking += time.perf_counter() - began
+        for step, outcome in enumerate(outcomes):
+            found = self._judged(case, step, outcome)
+            if found:
+                return [failure.at(step) for failure in found], None
+            if outcome.refused:
+                return [], outcome
+        return [], None
+
+    def _judged(self, case: Case, step: int, outcome: Outcome) -> list[Failure]:
+        if outcome.crashed is not None:
+            return [Failure("CRASHED", outcome.crashed)]
+        if outcome.raised is not None:
+            return [] if outcome.refused else [Failure("RAISED", outcome.raised)]
+        if outcome.malformed is not None:
+            return [Failure("MALFORMED", outcome.malformed)]
+        assert outcome.answer is not None
+        changed = (
+            [Failure("CHANGED_INPUT", f"the call wrote to its {outcome.changed}")] if outcome.changed else []
+        )
+        # what is listed may have come as far as the skin lets it, from either side
+        reach = case.r_cut + 2 * case.skin if self.superset else None
+        if self.superset and not case.skin:
+            reach = 1.5 * case.r_cut
+        how = self.report.how
+        right = truth(case, step, reach=reach, unit=how.unit)
+        found = judge(outcome.answer, right, how)
+        if found and step and self.superset and any(failure.code == "EXTRA" for failure in found):
+            # a box that grows takes listed pairs further apart than any skin: harmless, and no phantoms
+            found = judge(outcome.answer, _with_earlier(case, step, right), how)
+        if found and self.tested.unit is None and how.unit == DOUBLE and not case.known:
+            coarse = replace(how, unit=SINGLE)
+            if not judge(outcome.answer, truth(case, step, reach=reach, unit=SINGLE), coarse):
+                # right for float32: from here on it is taken for a list in float32, and told to be one
+                self.report.how, self.report.single = coarse, case.until(step + 1)
+                self.report.found_out.append("float32")
+                found = []
+        if not found and step == 0 and right.tie.any() and how.unit == DOUBLE:
+            self._count_ties(outcome, right)
+        return found + changed
+
+    def _count_ties(self, outcome: Outcome, right: Truth) -> None:
+        """Which pairs at exactly the cutoff are there, from cases in which no rounding can blur them."""
+        if self.superset or not _whole(right):
+            return
+        assert outcome.answer is not None
+        rows = set(zip(outcome.answer.i.tolist(), outcome.answer.j.tolist(), strict=True))
+        near = np.abs(right.distance - right.r_cut) > 1e-6
+        for i, j in zip(right.i[right.tie].tolist(), right.j[right.tie].tolist(), strict=True):
+            if near[(right.i == i) & (right.j == j)].any():
+                continue  # another image of the pair is inside
+            self.report.ties[0 if (i, j) in rows or (j, i) in rows else 1] += 1
+
+
+def _with_earlier(case: Case, step: int, right: Truth) -> Truth:
+    """The truth at a step, where pairs that were listed rightly earlier in the list's life may still be."""
+    rows = [(right.i, right.j, right.shift)]
+    for before in range(step - 1, -1, -1):
+        if len(case.stills[before].positions) != len(right.positions) or case.stills[before + 1].fresh:
+            break
+        then = truth(case, before, reach=case.r_cut + case.skin)
+        rows.append((then.i, then.j, then.shift))
+    i, j, shift = (np.concatenate([part[n] for part in rows]) for n in range(3))
+    table = np.unique(np.column_stack([i, j, shift]), axis=0)
+    i, j, shift = table[:, 0], table[:, 1], table[:, 2:]
+    distance = np.linalg.norm(right.positions[j] - right.positions[i] + shift @ right.cell, axis=1)
+    no = np.zeros(len(i), bool)
+    return replace(
+        right, i=i, j=j, shift=shift, distance=distance, tie=no, inside=distance < case.r_cut, reach=np.inf
+    )  # fmt: skip
+
+
+def _whole(right: Truth) -> bool:
+    """Whether all numbers are whole and small: then no arithmetic on them rounds."""
+    numbers = np.concatenate([right.positions.ravel(), right.cell.ravel(), [right.r_cut]])
+    return bool((numbers == np.rint(numbers)).all() and np.abs(numbers).max(initial=0.0) < 1e6)
+
+
+def questions(tested: PairList, count: int, seed: int, large: bool = True) -> Iterator[Case]:
+    """The cases that a list is asked, in order.
+
+    Args:
+        count: random cases.
+        seed: of the random cases.
+        large: the 5,000 and the 100,000 atoms, too.
+    """
+    yield from _as_kept(tested, catalog())
+    yield from movers() if tested.kept else sequences()
+    yield from _as_kept(tested, crowds())
+    yield from _as_kept(tested, drawn(max(1, round(count * tested.affords)), seed) if count else ())
+    if large:
+        yield lattice(SMALL_EDGE)
+        yield lattice(LARGE_EDGE)
+
+
+def _as_kept(tested: PairList, cases: Iterable[Case]) -> Iterator[Case]:
+    """Questions at one moment, with a skin for a list that is kept."""
+    for case in cases:
+        yield replace(case, skin=0.3 * case.r_cut) if tested.kept else case
+
+
+def drawn(count: int, seed: int) -> list[Case]:
+    """Cases that hypothesis draws, the same for the same seed."""
+    import hypothesis
+
+    from mdnum.references.conformance.strategies import cases
+
+    made: list[Case] = []
+
+    @hypothesis.seed(seed)
+    @hypothesis.settings(
+        max_examples=count, database=None, deadline=None, phases=[hypothesis.Phase.generate],
+        suppress_health_check=list(hypothesis.HealthCheck), derandomize=False,
+    )  # fmt: skip
+    @hypothesis.given(cases())
+    def draw(case: Case) -> None:
+        made.append(case)
+
+    draw()
+    return made[:count]
+
+
+def examine(
+    tested: PairList,
+    *,
+    cases: int = CASES,
+    seed: int = 0,
+    large: bool = True,
+    stop: bool = False,
+    shrink: bool = True,
+    apart: bool = False,
+    asked: Iterable[Case] | None = None,
+    progress: Progress | None = None,
+) -> Report:
+    """Put a list through the suite.
+
+    Args:
+        cases: random ones, beside those with a name.
+        seed: of the random ones.
+        large: ask about 5,000 and 100,000 atoms, too.
+        stop: at the first failure.
+        shrink: bring failures down to a few atoms.
+        apart: call it in a process of its own, so that a crash is told as one; needs a list from `load`.
+        asked: instead of all questions.
+        progress: called with (cases done, cases, words).
+
+    Returns:
+        what was asked and what came of it. A list may raise, return anything and write to its input: that is
+        told as a failure.
+    """
+    from mdnum.references.conformance.shrink import shrunk
+
+    began = time.perf_counter()
+    examiner = Examiner(tested, reuse=True, apart=apart)
+    report = examiner.report
+    every = list(questions(tested, cases, seed, False) if asked is None else asked)
+    total = len(every) + 2 * (large and asked is None)
+    seen: set[tuple[str, str]] = set()
+
+    def take(case: Case) -> bool:
+        """Asks one case; whether to go on."""
+        failures = _asked(examiner, case)
+        if failures:
+            failed = Failed(case.until(failures[0].step + 1), tuple(failures), case)
+            key = (failed.code, case.area)
+            if key not in seen:
+                seen.add(key)
+                report.failed.append(failed)
+        return not (stop and failures)
+
+    going = True
+    for number, case in enumerate(every):
+        if progress is not None:
+            progress(number, total, {"phase": "asking", "unit": "cases"})
+        going = take(case)
+        if not going:
+            break
+    if going:
+        _order(examiner)
+    if large and asked is None and going:
+        for edge in (SMALL_EDGE, LARGE_EDGE):
+            case = lattice(edge)
+            if _too_long(report, case):
+                continue
+            at = time.perf_counter()
+            going = take(case)
+            if tested.limits.refusal(case) is None:
+                report.large = (case.atoms, time.perf_counter() - at)
+            if not going:
+                break
+    if shrink:
+        examiner.session.reuse = False
+        for number, failed in enumerate(report.failed):
+            if progress is not None:
+                progress(number, len(report.failed), {"phase": "shrinking", "unit": "failures"})
+            report.failed[number] = shrunk(examiner, failed)
+        report.failed = _distinct(report.failed)
+    report.areas = {area: report.areas[area] for area in AREAS if area in report.areas}
+    examiner.session.close()
+    report.seconds = time.perf_counter() - began
+    return report
+
+
+def _asked(examiner: Examiner, case: Case) -> list[Failure]:
+    """The failures of a case, counted."""
+    report = examiner.report
+    tally = report.areas.setdefault(case.area, Tally())
+    why = examiner.tested.limits.refusal(case)
+    if why is not None:
+        tally.skipped += 1
+        tally.why[why] = tally.why.get(why, 0) + 1
+        return []
+    tally.asked += 1
+    failures, refused = examiner.outcome(case)
+    if failures:
+        tally.failed += 1
+        code = min((failure.code for failure in failures), key=CODES.index)
+        tally.codes[code] = tally.codes.get(code, 0) + 1
+    elif refused is not None:
+        tally.refused += 1
+        words = str(refused.raised)
+        tally.why[words] = tally.why.get(words, 0) + 1
+    return failures
+
+
+def _order(examiner: Examiner) -> None:
+    """Whether the same question has the same rows in the same order, twice in a row."""
+    from mdnum.references.conformance.catalog import gas
+
+    for case in (one("order", "reuse", gas(40, 6.0, 120), 6.0), one("order", "reuse", gas(40, 3.0, 120))):
+        case = replace(case, skin=0.3 if examiner.tested.kept else 0.0)
+        if examiner.tested.limits.refusal(case) is None:
+            answers = [examiner.session.ask(case)[0].answer for _ in range(3)]
+            first = answers[0]
+            if first is not None:
+                examiner.report.keeps_order = all(
+                    other is not None and first.same(other) for other in answers[1:]
+                )
+            return
+
+
+def _too_long(report: Report, case: Case) -> bool:
+    """Whether a large question would take longer than anybody wants to wait, by the one before it."""
+    if report.large is None:
+        return False
+    atoms, seconds = report.large
+    # lists that are not linear in the number of atoms are squared in it
+    expected = seconds * (case.atoms / atoms) ** (2 if seconds > 1.0 else 1)
+    if expected > _PATIENCE:
+        tally = report.areas.setdefault(case.area, Tally())
+        tally.skipped += 1
+        words = f"{case.atoms:,} atoms would take more than {_PATIENCE:.0f} s"
+        tally.why[words] = tally.why.get(words, 0) + 1
+        return True
+    return False
+
+
+def _distinct(failed: list[Failed]) -> list[Failed]:
+    """Failures without those that shrank to the same case as another."""
+    kept: dict[Any, Failed] = {}
+    for one_failed in failed:
+        case = one_failed.case
+        key = (
+            one_failed.code, case.pbc, case.r_cut, case.skin,
+            tuple((still.positions.tobytes(), still.cell.tobytes()) for still in case.stills),
+        )  # fmt: skip
+        kept.setdefault(key, one_failed)
+    return sorted(kept.values(), key=lambda one: (CODES.index(one.code), list(AREAS).index(one.case.area)))
+
+
+__all__ = ["CASES", "KEPT", "Examiner", "Failed", "Report", "Tally", "drawn", "examine", "questions"]
