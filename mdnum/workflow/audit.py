@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
     from mdnum.audit.base import Check, Part
     from mdnum.audit.load import Loaded
-    from mdnum.audit.structures import Structure
     from mdnum.audit.subject import CalculatorSubject
 
 #: Checks in the order in which they are made.
@@ -88,7 +87,7 @@ def audit(
     asked = _structure(structure, loaded)
     folder = RunFolder.create(default_folder(f"audit-{loaded.stem}") if out is None else out, world="audit")
     try:
-        subject = _subject(loaded, asked.atoms, temperature, folder.path)
+        subject = _subject(loaded, asked, temperature, folder.path)
         folder.write_provenance(surroundings() | {"calculator": loaded.name})
         audit_record.write_structures(folder.path, {"structure": subject.atoms})
         told = Log(folder, progress)
@@ -113,7 +112,7 @@ def audit(
         summary = audit_record.summarize(
             loaded.name, subject.atoms, subject.kT, units, parts, judge(loaded.name, parts)
         )
-        summary |= {"structure": asked.says, "seconds": time.perf_counter() - began}
+        summary |= {"structure": asked.info.get("origin"), "seconds": time.perf_counter() - began}
         folder.write_summary(summary)
     except BaseException:
         folder.close()
@@ -153,20 +152,17 @@ def _loaded(calculator: str | Callable[[], Any]) -> Loaded:
     return Loaded(name, name, calculator)
 
 
-def _structure(structure: Atoms | str | Path | None, loaded: Loaded) -> Structure:
+def _structure(structure: Atoms | str | Path | None, loaded: Loaded) -> Atoms:
+    """Atoms; what they are is in their info under "origin", where it is known."""
     from ase import Atoms
 
-    from mdnum.audit.structures import Structure, default_structure, read_structure
+    from mdnum.audit.structures import default_structure, read_structure
 
     if isinstance(structure, Atoms):
-        found = Structure(structure, "given as atoms")
-    elif structure is not None:
-        found = read_structure(structure)
-    elif loaded.atoms is not None:
-        found = Structure(loaded.atoms, f"the structure of {loaded.name}")
+        found = structure
     else:
-        found = default_structure(loaded)
-    if not len(found.atoms):
+        found = default_structure(loaded) if structure is None else read_structure(structure)
+    if not len(found):
         raise InputError("a structure without atoms", remedy="Give one with atoms: -s FILE")
     return found
 
