@@ -7,7 +7,7 @@ those of one process to the last bit. What two parts found at the frame that bot
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -27,6 +27,7 @@ from mdnum.trajectories.rules import Cutoff, Rule, SpeciesCutoffs
 from mdnum.trajectories.source import UnreadableFrame
 from mdnum.trajectories.table import Flips
 from mdnum.trajectories.tracker import Tracker
+from mdnum.trajectories.xtc_guard import XtcGuard, guard_of
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,21 @@ class _Failure:
     frame: int
     message: str
     read: bool
+
+
+@dataclass
+class _Looked:
+    """Frames of a trajectory one after the other, each looked at before the library reads it."""
+
+    analysis: NeighborFlips
+    numbers: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def __iter__(self) -> Iterator[Any]:
+        for number in self.numbers:
+            yield self.analysis.timestep(int(number))
 
 
 class NeighborFlips(AnalysisBase):
@@ -110,6 +126,8 @@ class NeighborFlips(AnalysisBase):
         self._at = 0
         self._trackers: list[Tracker] = []
         self._boxes: Boxes | None = None
+        self._guard: XtcGuard | None = None
+        self._opened = False
         self._done, self._reading = 0, True
 
     def run(self, *args: Any, **kwargs: Any) -> NeighborFlips:
@@ -139,15 +157,33 @@ class NeighborFlips(AnalysisBase):
         sample = []
         for number in self._numbers[:SAMPLE]:
             try:
-                sample.append(self._frame(self._trajectory[int(number)]))
+                sample.append(self._frame(self.timestep(int(number))))
             except READING_FAILS:
                 # met again in its turn, and told there
                 break
         if sample:
             self._resolution = infer_from(sample, 32, _format(self._trajectory))
             self._pbc = sample[0].box.pbc
-        self._boxes = None
+        self._let_go()
         return groups
+
+    def _prepare_sliced_trajectory(self, slicer: Any) -> None:
+        super()._prepare_sliced_trajectory(slicer)
+        if isinstance(slicer, np.ndarray):
+            self._sliced_trajectory = _Looked(self, slicer)
+
+    def timestep(self, number: int) -> Any:
+        """MDAnalysis's timestep of a frame, once it is known that reading it does not end the process."""
+        if not self._opened:
+            self._guard, self._boxes = guard_of(self._trajectory), Boxes(self._trajectory)
+            self._opened = True
+        if self._guard is not None:
+            self._guard.check(number)
+        return self._trajectory[number]
+
+    def _let_go(self) -> None:
+        """Leaves files that were opened: an open file does not go to another process."""
+        self._guard, self._boxes, self._opened = None, None, False
 
     def _compute(self, indexed_frames: np.ndarray, verbose: Any = None, **kwargs: Any) -> NeighborFlips:
         self._at = int(indexed_frames[0, 0]) if len(indexed_frames) else 0
@@ -166,7 +202,8 @@ class NeighborFlips(AnalysisBase):
         for part, tracker in zip(self.results.parts[0], self._trackers, strict=True):
             part.last = tracker.members() if part.pairs else None
         # what a process sends back is what it found, not what it needed for that
-        self._trackers, self._boxes = [], None
+        self._trackers = []
+        self._let_go()
         return self
 
     def _stopped(self, failure: _Failure) -> None:
@@ -182,7 +219,7 @@ class NeighborFlips(AnalysisBase):
         self.results.bounds = [[]]
         if self._at:
             self._done = -1
-            self._before(self._trajectory[int(self._numbers[self._at - 1])])
+            self._before(self.timestep(int(self._numbers[self._at - 1])))
             self._done = 0
 
     def _before(self, ts: Any) -> None:
@@ -226,8 +263,7 @@ class NeighborFlips(AnalysisBase):
         return frame
 
     def _frame(self, ts: Any) -> Frame:
-        # made where it is used: an open file does not go to another process
-        self._boxes = self._boxes or Boxes(self._trajectory)
+        assert self._boxes is not None
         return frame_of(ts, int(ts.frame), self._boxes)
 
     def _bound_at(self, frame: Frame) -> float:

@@ -14,6 +14,7 @@ from mdnum.errors import InputError
 from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.slices import chosen
 from mdnum.trajectories.source import AtomTable, Trajectory, UnreadableFrame
+from mdnum.trajectories.xtc_guard import guard_of
 
 #: what readers raise on files that end early or hold something else
 READING_FAILS = (OSError, EOFError, ValueError, RuntimeError, StopIteration, IndexError, KeyError, TypeError)
@@ -48,12 +49,14 @@ class MDAnalysisTrajectory(Trajectory):
 
     def frames(self) -> Iterator[Frame]:
         trajectory = self._universe.trajectory
-        boxes = Boxes(trajectory)
+        boxes, guard = Boxes(trajectory), guard_of(trajectory)
         at = None
         for number in chosen(self.slice, self.in_file):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 try:
+                    if guard is not None:
+                        guard.check(number)
                     # some formats go forward only, so that the next frame is asked for as the next
                     step = at is not None and number == at + 1 and trajectory.ts.frame == at
                     ts = trajectory.next() if step else trajectory[number]
@@ -66,6 +69,28 @@ class MDAnalysisTrajectory(Trajectory):
                     ) from error
             at = number
             yield frame
+        if self.slice.stop is None and (rest := bytes_left(trajectory)):
+            raise UnreadableFrame(
+                f"frame {trajectory.n_frames} cannot be read (the file ends after {rest:,} bytes of it)",
+                frame=int(trajectory.n_frames),
+                where=str(self.path),
+            )
+
+
+def bytes_left(trajectory: Any) -> int:
+    """Bytes of a dcd file behind its last whole frame, which MDAnalysis leaves out without a word."""
+    path = getattr(trajectory, "filename", None)
+    if "DCD" not in trajectory.format or not isinstance(path, str | Path):
+        return 0
+    from MDAnalysis.lib.formats.libdcd import DCDFile
+
+    with DCDFile(str(path)) as file:
+        sizes = [getattr(file, name, None) for name in ("_header_size", "_firstframesize", "_framesize")]
+    if None in sizes:
+        # another release of MDAnalysis keeps them elsewhere
+        return 0
+    head, first, other = (int(one) for one in sizes if one is not None)
+    return max(Path(path).stat().st_size - head - first - (int(trajectory.n_frames) - 1) * other, 0)
 
 
 class Boxes:
