@@ -41,8 +41,8 @@ def print_comparison(summary: Mapping[str, Any]) -> None:
     for line in summary["concluded"]:
         out.print(f"  {line}", markup=False)
     rows = [
-        (f"{one['i']}-{one['j']}", one["inside"], one["distance_a"], one["distance_b"], one["margin_a"],
-         one["margin_b"])
+        (f"{one['i']}-{one['j']}", f"{one['inside']} only", *(f"{one[name]:.10g}" for name in ("distance_a",
+         "distance_b")), one["margin_a"], one["margin_b"])
         for one in summary["first_pairs"]
     ]  # fmt: skip
     if rows:

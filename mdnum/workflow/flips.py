@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,11 +11,22 @@ import numpy as np
 
 from mdnum.errors import InputError
 from mdnum.store import RunFolder
-from mdnum.store.naming import default_folder
-from mdnum.workflow.flips_words import cutoff_of_run, rules
+from mdnum.workflow.flips_open import (
+    FlipsResult,
+    about,
+    default_rules,
+    new_folder,
+    refuse_topology_first,
+    sample_of,
+    selected,
+    source,
+    told_resolution,
+)
+from mdnum.workflow.flips_words import rules
 from mdnum.workflow.fork_question import Log, Progress, finish
 
 if TYPE_CHECKING:
+    from mdnum.trajectories.frame import Frame
     from mdnum.trajectories.resolution import Resolution
     from mdnum.trajectories.rules import Rule
     from mdnum.trajectories.source import Trajectory
@@ -24,24 +34,8 @@ if TYPE_CHECKING:
 
 #: Frames within which a flip that is taken back is chatter, unless another number is asked for.
 WINDOW = 5
-_SAMPLE = 8
-# files that hold positions and nothing on what the atoms are
-_BARE = frozenset({"xtc", "trr", "dcd", "nc", "ncdf", "netcdf", "trj", "mdcrd", "crdbox", "trz", "h5md"})
 # displacement between frames over what velocities say, above which they cannot belong to the positions
 _TOO_FAR = 1.1
-
-
-@dataclass(frozen=True)
-class FlipsResult:
-    """A finished look at a trajectory, or at two.
-
-    Attributes:
-        folder: with the ledger (flips.parquet) and everything else.
-        summary: what summary.json says, findings included.
-    """
-
-    folder: Path
-    summary: dict[str, Any]
 
 
 def flips(
@@ -89,7 +83,7 @@ def flips(
         raise InputError(f"window = {window}; expected at least 1 frame")
     asked = rules(cutoffs, pairs, nearest, most)
     if other is not None:
-        _topology_first(trajectory, other, topology)
+        refuse_topology_first(trajectory, other, topology)
         from mdnum.workflow.flips_compare import compare
 
         return compare(
@@ -107,80 +101,6 @@ def flips(
         raise
 
 
-def source(path: str | Path, topology: str | Path | None, format: str | None) -> Trajectory:
-    """The trajectory at a path."""
-    from mdnum.trajectories.source import open_trajectory
-
-    return open_trajectory(path, topology, format=format)
-
-
-def default_rules(trajectory: Trajectory) -> tuple[Rule, ...]:
-    """The cutoff with which mdnum made the file.
-
-    Raises:
-        InputError: it did not.
-    """
-    radius = cutoff_of_run(trajectory.path)
-    if radius is None:
-        unit = f" in {trajectory.length}" if trajectory.length else ""
-        raise InputError(
-            "no rule says which pairs count",
-            remedy=f'Add --cutoff R{unit}, --pairs "O-H=2.5,O-O=3.5" or --nearest K',
-            where=str(trajectory.path),
-        )
-    return rules([radius])
-
-
-def selected(trajectory: Trajectory, between: tuple[str, str] | None) -> Groups:
-    """Indices of the atoms on either side."""
-    from mdnum.trajectories.selection import select
-
-    if between is None:
-        return None, None
-    return select(trajectory, between[0]), select(trajectory, between[1])
-
-
-def new_folder(trajectory: Trajectory, world: str, out: str | Path | None) -> RunFolder:
-    """An empty folder, with what was computed with."""
-    from mdnum.provenance import surroundings
-
-    stem = trajectory.path.name.split(".")[0]
-    if stem == "trajectory":
-        # the run folder says more than the name that all of its files have
-        stem = trajectory.path.resolve().parent.name
-    folder = RunFolder.create(default_folder(f"flips-{stem}") if out is None else out, world=world)
-    try:
-        folder.write_provenance(surroundings())
-    except BaseException:
-        folder.close()
-        raise
-    return folder
-
-
-def resolution_of(trajectory: Trajectory) -> Resolution:
-    """From the first frames; from fewer where one of them cannot be read.
-
-    Raises:
-        InputError: not even the first can be read.
-    """
-    from mdnum.trajectories.resolution import infer_from
-
-    sample = []
-    try:
-        for frame in trajectory.frames():
-            sample.append(frame)
-            if len(sample) == _SAMPLE:
-                break
-    except InputError:
-        if not sample:
-            raise
-    if not sample:
-        raise InputError(
-            "no frame is left of what was asked for", remedy="Ask for others", where=str(trajectory.path)
-        )
-    return infer_from(sample, trajectory.bits, trajectory.format)
-
-
 def _look(
     folder: RunFolder,
     trajectory: Trajectory,
@@ -191,10 +111,12 @@ def _look(
     report: bool,
     progress: Progress | None,
 ) -> FlipsResult:
+    from mdnum.trajectories.resolution import infer_from
     from mdnum.workflow import flips_numbers, flips_record
 
     log = Log(folder, progress)
-    resolution = resolution_of(trajectory)
+    sample = sample_of(trajectory)
+    resolution = infer_from(sample, trajectory.bits, trajectory.format)
     found = flips_record.follow(folder, trajectory, asked, groups, resolution.bound, log)
     began = time.perf_counter()
     for rows in flips_record.neighbor_rows(found):
@@ -215,7 +137,11 @@ def _look(
         folder.append("busiest", {"rule": np.full(len(counted.busiest.i), number), **busiest})
         _append_residues(folder, number, counted, labels)
         rows = {name: values[mine] for name, values in frames.items()}
-        told.append(_rule(one, rows, steps, found) | flips_numbers.told(counted))
+        told.append(
+            _rule(one, rows, steps, found)
+            | {"grid": _grid(sample, resolution, one, groups)}
+            | flips_numbers.told(counted)
+        )
     folder.finalize()
     (folder.path / "checkpoint.npz").unlink(missing_ok=True)
     folder.write_summary(
@@ -227,6 +153,7 @@ def _look(
             "window": window,
             "resolution": told_resolution(resolution, trajectory),
             "rules": told,
+            "velocities_odd": bool(found.moved > _TOO_FAR),
             "stopped": None if found.stopped is None else str(found.stopped),
             "seconds": {"frames": found.seconds, "statistics": time.perf_counter() - began},
             "findings": [],
@@ -239,33 +166,6 @@ def _look(
 def pairs_of(columns: Mapping[str, np.ndarray]) -> np.ndarray:
     """Any column: they are equally long."""
     return next(iter(columns.values()))
-
-
-def about(trajectory: Trajectory, question: str) -> dict[str, Any]:
-    """What summary.json says of a file."""
-    return {
-        "world": "flips",
-        "question": question,
-        "system": trajectory.name,
-        "file": str(trajectory.path),
-        "format": trajectory.format,
-        "reader": trajectory.reader,
-        "atoms": trajectory.atoms,
-        "length": trajectory.length,
-        "time": trajectory.time,
-        "slice": _slice_words(trajectory.slice),
-        "notes": list(trajectory.notes),
-    }
-
-
-def told_resolution(resolution: Resolution, trajectory: Trajectory) -> dict[str, Any]:
-    """What summary.json says of how finely positions are told."""
-    return {
-        "kind": resolution.kind,
-        "step": resolution.step,
-        "moved": resolution.moved,
-        "words": resolution.words(trajectory.length),
-    }
 
 
 def _frames(folder: RunFolder) -> dict[str, np.ndarray]:
@@ -318,6 +218,26 @@ def _rule(
     }
 
 
+def _grid(
+    sample: Sequence[Frame], resolution: Resolution, one: Followed, groups: Groups
+) -> dict[str, Any] | None:
+    """What writing positions with so few digits did to the flips, estimated; None where it cannot be."""
+    from mdnum.trajectories.grid_effect import grid_effect
+
+    if not one.reach > 0:
+        return None
+    found = grid_effect(resolution, sample, one.reach, *groups)
+    if found is None:
+        return None
+    return {
+        "missed": found.missed,
+        "invented": found.invented,
+        "ratio": found.ratio,
+        "move": found.move,
+        "words": found.words(),
+    }
+
+
 def _flux(one: Followed, flips: int, steps: Mapping[str, Any], found: Pass) -> dict[str, Any] | None:
     """Crossings by the velocities, which a run would show that looked at every instant, against the flips."""
     duration = steps["last_time"] - steps["first_time"]
@@ -353,22 +273,3 @@ def _append_residues(folder: RunFolder, number: int, counted: Any, labels: Any) 
             "within": within[busy],
         },
     )
-
-
-def _slice_words(frames: slice) -> str:
-    if frames == slice(None):
-        return ""
-    return ":".join("" if end is None else str(end) for end in (frames.start, frames.stop, frames.step))
-
-
-def _topology_first(first: str | Path, second: str | Path, topology: str | Path | None) -> None:
-    """Refuses "TOPOLOGY TRAJECTORY", the order that other programs have."""
-    suffixes = [str(one).rpartition("@")[0] or str(one) for one in (first, second)]
-    bare = [Path(one).suffix.lower().lstrip(".") in _BARE for one in suffixes]
-    if topology is None and not bare[0] and bare[1]:
-        raise InputError(
-            f"two paths are two trajectories to compare, and {Path(suffixes[0]).name} looks like the "
-            "topology of "
-            f"{Path(suffixes[1]).name}",
-            remedy=f"Write mdnum flips {second} -s {first}",
-        )

@@ -240,6 +240,8 @@ def told(found: Counted) -> dict[str, Any]:
             "older": int(found.durations.older.sum()),
             "throughout": int(found.durations.throughout.sum()),
         },
+        # of the pairs inside at a frame that were looked at again, those still inside at the next
+        "stays_over": 1 - found.durations.leaves / max(found.durations.exposure, 1),
         "lifetime": _lifetime(found.durations),
         "intermittent": _lifetime(found.intermittent),
         "by_species": classes(found.species),

@@ -13,8 +13,9 @@ from jaxtyping import Int
 from mdnum.errors import InputError
 from mdnum.store import RunFolder
 from mdnum.trajectories.checked import checked
+from mdnum.trajectories.compare import displacements
 from mdnum.trajectories.frame import Box, Frame
-from mdnum.trajectories.lattice import lattice_of
+from mdnum.trajectories.rules import Capped, Cutoff, SpeciesCutoffs
 from mdnum.trajectories.stride import crossings
 from mdnum.trajectories.tracker import Tracker
 
@@ -90,12 +91,14 @@ class Followed:
         tracker: of it.
         neighbors: known from the first frame on.
         flux: (flips, moment) at frames whose velocities were looked at.
+        reach: the usual distance of a pair at the threshold, length; nan where there was none.
     """
 
     rule: Rule
     tracker: Tracker
     neighbors: Neighbors | None = None
     flux: list[tuple[int, float]] = field(default_factory=list)
+    reach: float = float("nan")
 
 
 @dataclass
@@ -184,7 +187,7 @@ def follow(
 
 
 def _sampled(count: int | None) -> set[int]:
-    """Frames whose velocities are looked at: spread over the file, or thinning out if its end is not known."""
+    """Frames whose velocities are looked at: spread over the file, or ever fewer if its end is not known."""
     if count is None:
         return {0, *(2**n for n in range(_FLUX_FRAMES - 1))}
     return set(np.linspace(0, count - 1, min(_FLUX_FRAMES, count)).astype(int).tolist())
@@ -203,6 +206,7 @@ def _write(
     if one.neighbors is None:
         members = one.tracker.members()
         one.neighbors = Neighbors.of(members, *size, one.rule.directed)
+        one.reach = _reach(one.rule, members)
         columns = {"i": members.i, "j": members.j, "rank": members.rank, "distance": members.distance}
         folder.append("members", {"rule": np.full(len(members), number), **columns})
     else:
@@ -219,6 +223,15 @@ def _write(
         "fewest": fewest, "neighbors": mean, "most": most,
     }  # fmt: skip
     folder.append("frames", {name: [value] for name, value in row.items()})
+
+
+def _reach(rule: Rule, members: Members) -> float:
+    """The radius of a rule, the largest of several; of one without a radius, the median distance inside."""
+    if isinstance(rule, Cutoff | Capped):
+        return rule.radius
+    if isinstance(rule, SpeciesCutoffs):
+        return max(rule.radii.values())
+    return float(np.median(members.distance)) if len(members) else float("nan")
 
 
 def _measure_flux(one: Followed, frame: Frame, groups: Groups, species: list[str]) -> None:
@@ -246,17 +259,9 @@ def _moved(start: Frame, end: Frame) -> float:
     if start.velocities is None or not end.time > start.time:
         return float("nan")
     expected = float(np.sqrt(np.mean(start.velocities**2))) * (end.time - start.time)
-    return float(np.sqrt(np.mean(displacement(start, end) ** 2))) / expected if expected > 0 else float("nan")
-
-
-def displacement(start: Frame, end: Frame) -> np.ndarray:
-    """Displacements, up to lattice vectors of the second frame's box, shape (atoms, 3)."""
-    apart = end.positions - start.positions
-    if end.box.periodic:
-        lattice = lattice_of(end.box)
-        whole = np.where(lattice.periodic, np.rint(apart @ lattice.inverse), 0.0)
-        apart = apart - whole @ lattice.vectors
-    return apart
+    return (
+        float(np.sqrt(np.mean(displacements(start, end) ** 2))) / expected if expected > 0 else float("nan")
+    )
 
 
 def _at_frame(error: InputError, frames: int) -> InputError:

@@ -79,7 +79,9 @@ def _key_figures(run: Question) -> Iterator[tuple[str, str, str]]:
     yield "Flips", count(one["flips"]), per_time(run, one["flips_per_frame"])
     share = one["ambiguous"] / one["flips"] if one["flips"] else 0.0
     yield "Undecidable", count(one["ambiguous"]), percent(share) if one["flips"] else ""
-    yield "Median contact", duration(run, one["lifetime"]["median"], beyond="–"), "of those seen to begin"
+    median = one["lifetime"]["median"]
+    at_most = "≤ " if median == 1 else ""
+    yield "Median contact", at_most + duration(run, median, beyond="–"), "of those seen to begin"
     yield "Mean by rate", duration(run, one["lifetime"]["mean_by_rate"]), "all of them"
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from mdnum.report.browse import Browse, Column, plain_rows
 from mdnum.report.flips.words import duration, length, per_time, rule_words
+from mdnum.report.flips.words import life as life_of
 from mdnum.report.fork.question import Question
 from mdnum.report.words import count, number, percent
 
@@ -74,7 +75,7 @@ def _lifetimes(run: Question, one: Mapping[str, Any]) -> Iterator[tuple[str, str
     )
     if not life["followed"]:
         return
-    yield "Median life", duration(run, life["median"])
+    yield "Median life", life_of(run, life)
     if life["quarter_gone"] is not None:
         yield (
             "Quartiles",
@@ -92,7 +93,7 @@ def _lifetimes(run: Question, one: Mapping[str, Any]) -> Iterator[tuple[str, str
         )
     yield (
         "Intermittent contacts",
-        f"gaps up to {one['chatter']['window']} frames overlooked: median {duration(run, loose['median'])}"
+        f"gaps up to {one['chatter']['window']} frames overlooked: median {life_of(run, loose)}"
         + (f", by rate {duration(run, loose['mean_by_rate'])}" if loose["leaves"] else ""),
     )
 
@@ -112,7 +113,7 @@ def _between(run: Question, one: Mapping[str, Any]) -> Iterator[tuple[str, str]]
         yield (
             "Lost between frames, by velocities",
             f"{number(flux['rate'])} ± {number(flux['error'], 2)} crossings per {unit}, "
-            "{number(flux['seen'])} in "
+            f"{number(flux['seen'])} in "
             f"the file: {told}",
         )
 

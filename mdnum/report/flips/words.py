@@ -9,14 +9,27 @@ from mdnum.report.fork.question import Question
 from mdnum.report.words import count, many, number, plain
 
 
+def timed(run: Question) -> bool:
+    """Whether the frames have times that go forward."""
+    summary = run.summary
+    return bool(summary["timed"] and not summary["backward"] and summary["interval"])
+
+
 def duration(run: Question, frames: float | None, digits: int = 3, beyond: str = "longer than seen") -> str:
     """A stretch of frames as time where the file has times, else in frames."""
     if frames is None:
         return beyond
-    interval = run.summary["interval"]
-    if run.summary["timed"] and interval:
-        return f"{number(frames * interval, digits)} {run.summary['time']}"
+    if timed(run):
+        return f"{number(frames * run.summary['interval'], digits)} {run.summary['time']}"
     return f"{number(frames, digits)} frame{'' if frames == 1 else 's'}"
+
+
+def life(run: Question, found: Mapping[str, Any]) -> str:
+    """The median of a lifetime; no shorter than the distance of two frames."""
+    median = found["median"]
+    if median is None:
+        return "longer than the file can tell"
+    return f"{'at most ' if median == 1 else ''}{duration(run, median)}"
 
 
 def length(run: Question, value: float | None, digits: int = 3) -> str:
@@ -28,9 +41,8 @@ def per_time(run: Question, per_frame: float | None, digits: int = 3) -> str:
     """A rate per frame as one per time, where the file has times."""
     if per_frame is None:
         return "–"
-    interval = run.summary["interval"]
-    if run.summary["timed"] and interval:
-        return f"{number(per_frame / interval, digits)} per {run.summary['time']}"
+    if timed(run):
+        return f"{number(per_frame / run.summary['interval'], digits)} per {run.summary['time']}"
     return f"{number(per_frame, digits)} per frame"
 
 
@@ -38,7 +50,7 @@ def size(run: Question) -> str:
     """Atoms, frames, and how far apart."""
     summary = run.summary
     text = f"{many(summary['atoms'], 'atom')}, {many(summary['frames'], 'frame')}"
-    if summary["timed"] and summary["frames"] > 1:
+    if timed(run):
         text += f" {plain(summary['interval'])} {summary['time']} apart"
     return text
 
@@ -53,15 +65,14 @@ def rule_words(run: Question, one: Mapping[str, Any]) -> str:
 
 def axis(run: Question) -> tuple[str, float]:
     """(label, factor) of an axis of lags in frames."""
-    summary = run.summary
-    if summary["timed"] and summary["interval"]:
-        return f"time ({summary['time']})", float(summary["interval"])
+    if timed(run):
+        return f"time ({run.summary['time']})", float(run.summary["interval"])
     return "frames", 1.0
 
 
 def moment(run: Question, table: Mapping[str, Any]) -> tuple[str, Any]:
     """(label, values) of an axis along the trajectory."""
-    if run.summary["timed"] and not run.summary["backward"]:
+    if timed(run):
         return f"time ({run.summary['time']})", table["time"]
     return "frame", table["frame"]
 

@@ -1,0 +1,311 @@
+"""`mdnum flips A B`: two trajectories of the same atoms, frame by frame, until their neighbor sets differ."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mdnum.errors import InputError
+from mdnum.store import RunFolder
+from mdnum.trajectories.checked import checked
+from mdnum.trajectories.compare import Apart, Difference, Pair, apart, distances, growth
+from mdnum.trajectories.resolution import infer_from
+from mdnum.trajectories.rules import Cutoff, SpeciesCutoffs
+from mdnum.trajectories.tracker import Tracker
+from mdnum.workflow.flips_open import (
+    FlipsResult,
+    about,
+    default_rules,
+    name_of,
+    new_folder,
+    sample_of,
+    selected,
+    source,
+    told_resolution,
+)
+from mdnum.workflow.fork_question import Log, Progress, finish
+
+if TYPE_CHECKING:
+    from mdnum.trajectories.frame import Frame
+    from mdnum.trajectories.resolution import Resolution
+    from mdnum.trajectories.rules import Rule
+    from mdnum.trajectories.source import Trajectory
+    from mdnum.trajectories.table import Flips
+    from mdnum.workflow.flips_record import Groups
+
+#: Rows of the table of pairs that come to differ.
+ROWS = 1_000
+_FIRST = 8
+# times that differ by less than this, relative, are the same
+_SAME_TIME = 1e-6
+
+
+@dataclass
+class _Side:
+    """One of the two trajectories."""
+
+    trajectory: Trajectory
+    tracker: Tracker
+    resolution: Resolution
+    bound: float = 0.0
+
+    def step(self, frame: Frame) -> Flips:
+        self.bound = self.resolution.bound(frame)
+        return self.tracker.step(frame, bound=self.bound)
+
+
+@dataclass
+class _Found:
+    """What the frames showed, position by position.
+
+    Attributes:
+        seed: first frame whose positions differ at all.
+        first: what was seen at the first frame whose sets differ.
+        certain: first frame at which a pair differs that no resolution could have moved.
+    """
+
+    frames: int = 0
+    seed: int | None = None
+    first: dict[str, Any] | None = None
+    certain: int | None = None
+    rows: int = 0
+    times_differ: int = 0
+    last: Apart = field(default_factory=lambda: Apart(0.0, 0.0, 0))
+    stopped: InputError | None = None
+
+
+def compare(
+    paths: tuple[str | Path, str | Path],
+    topology: str | Path | None,
+    asked: tuple[Rule, ...],
+    between: tuple[str, str] | None,
+    *,
+    format: str | None = None,
+    out: str | Path | None = None,
+    report: bool = True,
+    progress: Progress | None = None,
+) -> FlipsResult:
+    """Where two trajectories part; see `mdnum.workflow.flips.flips`.
+
+    Raises:
+        InputError: they are not of the same atoms, or there is more than one rule.
+    """
+    a, b = (source(path, topology, format) for path in paths)
+    if a.atoms != b.atoms:
+        raise InputError(
+            f"{a.name} has {a.atoms:,} atoms and {b.name} {b.atoms:,}",
+            remedy="Compare trajectories of the same atoms",
+        )
+    rule, *more = asked or default_rules(a)
+    if more:
+        raise InputError(
+            f"{len(asked)} rules; two trajectories are compared by one",
+            remedy="Keep one of them, and ask again for the others",
+        )
+    groups = selected(a, between)
+    folder = new_folder(a, "flips-compare", out)
+    try:
+        return _look(folder, (a, b), rule, groups, between, report, progress)
+    except BaseException:
+        folder.close()
+        raise
+
+
+def _look(
+    folder: RunFolder,
+    both: tuple[Trajectory, Trajectory],
+    rule: Rule,
+    groups: Groups,
+    between: tuple[str, str] | None,
+    report: bool,
+    progress: Progress | None,
+) -> FlipsResult:
+    began = time.perf_counter()
+    sides = [
+        _Side(
+            one,
+            Tracker(rule, groups[0], groups[1], [str(word) for word in one.species], 0.0),
+            infer_from(sample_of(one), one.bits, one.format),
+        )
+        for one in both
+    ]
+    found = _follow(folder, sides, rule, groups, Log(folder, progress))
+    folder.finalize()
+    (folder.path / "checkpoint.npz").unlink(missing_ok=True)
+    a, b = both
+    table = folder.read("apart", ["time", "furthest", "typical"])
+    differing = folder.read("differing", rows=_FIRST)
+    folder.write_summary(
+        {
+            **about(a, "flips-compare"),
+            "other": name_of(b),
+            "other_file": str(b.path),
+            "other_format": b.format,
+            "same_species": bool(np.array_equal(a.species.astype(str), b.species.astype(str))),
+            "between": None if between is None else list(between),
+            "rule": rule.name,
+            "frames": found.frames,
+            "in_file": [one.count for one in both],
+            "times_differ": found.times_differ,
+            "timed": a.time != "frame",
+            "resolution": told_resolution(sides[0].resolution, a),
+            "other_resolution": told_resolution(sides[1].resolution, b),
+            "seed": found.seed,
+            "first": found.first,
+            "certain": found.certain,
+            "first_pairs": _first_pairs(found, differing),
+            "growth": _growth(found, table, rule),
+            "last": {"furthest": found.last.furthest, "typical": found.last.typical},
+            "stopped": None if found.stopped is None else str(found.stopped),
+            "seconds": time.perf_counter() - began,
+            "findings": [],
+            "status": "complete" if found.stopped is None else "stopped",
+        }
+    )
+    return FlipsResult(folder.path, finish(folder, report, progress))
+
+
+def _follow(folder: RunFolder, sides: list[_Side], rule: Rule, groups: Groups, progress: Log) -> _Found:
+    """Reads both once, in step."""
+    atoms = None
+    if groups[0] is not None:
+        atoms = np.unique(np.concatenate([one for one in groups if one is not None]))
+    found, difference = _Found(), Difference()
+    before = Apart(0.0, 0.0, 0)
+    counts = [one.trajectory.count for one in sides]
+    total = min((one for one in counts if one is not None), default=0)
+    first, second = (checked(one.trajectory.frames(), atoms, str(one.trajectory.path)) for one in sides)
+    pairs_of_frames = zip(first, second, strict=False)
+    while True:
+        try:
+            frames = next(pairs_of_frames, None)
+            if frames is None:
+                break
+            flips = [side.step(frame) for side, frame in zip(sides, frames, strict=True)]
+        except InputError as error:
+            if not found.frames:
+                raise
+            found.stopped = error
+            break
+        if found.frames:
+            difference.step(*flips)
+        else:
+            difference = Difference.of(*(side.tracker.members() for side in sides))
+        now = apart(frames[0], frames[1], atoms)
+        if found.seed is None and now.furthest > 0:
+            found.seed = found.frames
+        scale = max(abs(frames[0].time), abs(frames[1].time))
+        found.times_differ += abs(frames[0].time - frames[1].time) > _SAME_TIME * scale
+        rows = _rows(difference.new[: max(ROWS - found.rows, 1)], difference, sides, frames, flips, rule)
+        if len(difference.new) and found.first is None:
+            found.first = {
+                "frame": found.frames, "number": frames[0].index, "time": frames[0].time,
+                "pairs": len(difference), "furthest": now.furthest, "typical": now.typical,
+                "furthest_before": before.furthest if found.frames else None,
+                "typical_before": before.typical if found.frames else None,
+                "ambiguous": int(np.count_nonzero(rows["ambiguous"])),
+            }  # fmt: skip
+        if found.certain is None and len(rows["i"]) and not rows["ambiguous"].all():
+            found.certain = found.frames
+        if found.rows < ROWS and len(rows["i"]):
+            folder.append("differing", {"frame": np.full(len(rows["i"]), found.frames), **rows})
+            found.rows += len(rows["i"])
+        _append(folder, found.frames, frames, now, difference, sides)
+        before, found.last = now, now
+        found.frames += 1
+        folder.checkpoint({"frames": found.frames})
+        progress(found.frames, total, {"phase": "run", "unit": "frames"})
+    if not found.frames:
+        raise InputError("no frame is left of what was asked for", remedy="Ask for others")
+    folder.checkpoint({"frames": found.frames}, force=True)
+    return found
+
+
+def _append(
+    folder: RunFolder,
+    at: int,
+    frames: tuple[Frame, ...],
+    now: Apart,
+    difference: Difference,
+    sides: list[_Side],
+) -> None:
+    row = {
+        "frame": at, "time": frames[0].time, "time_b": frames[1].time, "furthest": now.furthest,
+        "typical": now.typical, "atom": now.atom, "pairs_a": sides[0].tracker.pairs,
+        "pairs_b": sides[1].tracker.pairs, "only_a": len(difference.only_a),
+        "only_b": len(difference.only_b),
+    }  # fmt: skip
+    folder.append("apart", {name: [value] for name, value in row.items()})
+
+
+def _rows(
+    pairs: list[Pair],
+    difference: Difference,
+    sides: list[_Side],
+    frames: tuple[Frame, ...],
+    flips: list[Flips],
+    rule: Rule,
+) -> dict[str, np.ndarray]:
+    """Columns on pairs that differ: where each is inside, and by how much."""
+    i, j, rank = (np.array([pair[k] for pair in pairs], np.int64) for k in range(3))
+    apart = [distances(frame, pairs, rule.directed) for frame in frames]
+    margins = [
+        np.array(list(_margins(pairs, distance, flipped, rule, side)))
+        for distance, flipped, side in zip(apart, flips, sides, strict=True)
+    ]
+    bounds = [side.bound for side in sides]
+    close = [np.abs(margin) <= bound for margin, bound in zip(margins, bounds, strict=True)]
+    return {
+        "rule": np.zeros(len(pairs), np.int64),
+        "i": i, "j": j, "rank": rank,
+        "inside": np.array(["A" if pair in difference.only_a else "B" for pair in pairs], dtype=object),
+        "distance_a": apart[0], "distance_b": apart[1], "margin_a": margins[0], "margin_b": margins[1],
+        "bound": np.full(len(pairs), max(bounds)), "ambiguous": np.asarray(close[0] | close[1], bool),
+    }  # fmt: skip
+
+
+def _margins(
+    pairs: list[Pair], distance: np.ndarray, flips: Flips, rule: Rule, side: _Side
+) -> Iterator[float]:
+    """Signed distances to the threshold; nan where a rule without a radius did not flip the pair here."""
+    species = side.trajectory.species
+    told = {
+        pair: margin
+        for *pair_, margin in zip(
+            flips.i.tolist(), flips.j.tolist(), flips.rank.tolist(), flips.margin.tolist(), strict=True
+        )
+        if (pair := (pair_[0], pair_[1], pair_[2])) in set(pairs)
+    } if rule.directed else {}  # fmt: skip
+    for pair, r in zip(pairs, distance.tolist(), strict=True):
+        if isinstance(rule, Cutoff):
+            yield rule.radius - r
+        elif isinstance(rule, SpeciesCutoffs):
+            first, second = str(species[pair[0]]), str(species[pair[1]])
+            yield rule.radii.get((first, second), rule.radii.get((second, first), float("nan"))) - r
+        else:
+            yield told.get(pair, float("nan"))
+
+
+def _first_pairs(found: _Found, rows: dict[str, np.ndarray]) -> list[dict[str, Any]]:
+    """The pairs of the first frame whose sets differ, as plain values."""
+    if found.first is None:
+        return []
+    mine = np.flatnonzero(rows["frame"] == found.first["frame"])
+    return [{name: values[at].item() if hasattr(values[at], "item") else values[at]
+             for name, values in rows.items()} for at in mine]  # fmt: skip
+
+
+def _growth(found: _Found, table: dict[str, np.ndarray], rule: Rule) -> dict[str, Any]:
+    """Rates at which the separation grows before the sets differ, and from then on."""
+    limit = 0.1 * (rule.radius if isinstance(rule, Cutoff) else float(table["furthest"].max(initial=0.0)))
+    cut = found.frames if found.first is None else found.first["frame"]
+    parts = {}
+    for name, part in (("before", slice(None, cut + 1)), ("after", slice(cut, None))):
+        line = growth(table["time"][part], table["furthest"][part], limit)
+        parts[name] = None if line is None else {"rate": line[0], "r2": line[1], "frames": line[2]}
+    return parts
