@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -190,21 +191,28 @@ def open_universe(
 
 
 def _opened(file: Path, act: Any, trajectory: Path) -> Any:
+    hook = sys.unraisablehook
+    # readers that could not open complain once more when they are thrown away
+    sys.unraisablehook = lambda _: None
     try:
-        return act()
-    except ImportError as error:
+        try:
+            return act()
+        except READING_FAILS as error:
+            said, package = first_line(error), "install" in str(error)
+        except ImportError as error:
+            said, package = first_line(error), True
+    finally:
+        sys.unraisablehook = hook
+    if package:
         raise InputError(
-            f"reading it needs a package that is not installed ({first_line(error)})",
+            f"reading it needs a package that is not installed ({said})",
             remedy="Install the package, or convert the file to xtc or extxyz",
             where=str(file),
-        ) from error
-    except READING_FAILS as error:
-        hint = "Check that the file is whole and of the kind its name says"
-        if file == trajectory:
-            hint += "; a trajectory without names of atoms needs its topology (-s TOPOLOGY)"
-        raise InputError(
-            f"MDAnalysis cannot open it ({first_line(error)})", remedy=hint, where=str(file)
-        ) from error
+        )
+    hint = "Check that the file is whole and of the kind its name says"
+    if file == trajectory:
+        hint += "; a trajectory without names of atoms needs its topology (-s TOPOLOGY)"
+    raise InputError(f"MDAnalysis cannot open it ({said})", remedy=hint, where=str(file))
 
 
 def atoms_in(path: Path, topology: int, format: str | None = None) -> int | None:

@@ -1,0 +1,287 @@
+"""Frames as the files have them: against MDAnalysis, ASE and the text itself."""
+
+from __future__ import annotations
+
+import tracemalloc
+import warnings
+
+import ase.io
+import MDAnalysis
+import numpy as np
+import pytest
+from ase import Atoms, units
+from MDAnalysis.lib.formats.libdcd import DCDFile
+from MDAnalysisTests import datafiles
+
+from mdnum.errors import InputError
+from mdnum.trajectories.selection import select
+from mdnum.trajectories.slices import chosen, parse_slice, split_path
+from mdnum.trajectories.source import open_trajectory
+
+warnings.filterwarnings("ignore", module="MDAnalysis")
+
+REAL = {
+    "xtc, triclinic": (datafiles.XTC, datafiles.GRO),
+    "trr": (datafiles.TRR, datafiles.GRO),
+    "dcd, no box": (datafiles.DCD, datafiles.PSF),
+    "netcdf": (datafiles.NCDF, datafiles.PRMncdf),
+    "pdb": (datafiles.PDB_multiframe if hasattr(datafiles, "PDB_multiframe") else datafiles.PDB_small, None),
+    "trz": (datafiles.TRZ, datafiles.TRZ_psf),
+    "lammps dcd": (datafiles.LAMMPSdcd2, datafiles.LAMMPSdata2),
+    "xyz": (datafiles.XYZ_mini, None),
+}
+
+
+def argon(frames=6, atoms=5, seed=0):
+    random = np.random.default_rng(seed)
+    images = []
+    for k in range(frames):
+        one = Atoms(
+            "Ar" * atoms, random.normal(size=(atoms, 3)), cell=[[7, 0, 0], [1, 8, 0], [2, -1, 9]], pbc=True
+        )
+        one.set_velocities(random.normal(size=(atoms, 3)))
+        one.info["time"] = 0.5 * k
+        images.append(one)
+    return images
+
+
+@pytest.mark.parametrize("kind", REAL)
+def test_a_real_file_is_what_mdanalysis_makes_of_it(kind):
+    path, topology = REAL[kind]
+    trajectory = open_trajectory(path, topology, slice="::2")
+    universe = MDAnalysis.Universe(*(one for one in (topology, path) if one is not None))
+    frames = list(trajectory.frames())
+    assert len(frames) == trajectory.count == len(universe.trajectory[::2])
+    assert trajectory.atoms == len(universe.atoms) == len(trajectory.species)
+    for frame in (frames[0], frames[-1]):
+        ts = universe.trajectory[frame.index]
+        assert frame.positions.dtype == np.float64
+        np.testing.assert_array_equal(frame.positions, ts.positions.astype(np.float64))
+        if trajectory.time != "frame":
+            assert frame.time == ts.time
+        if ts.dimensions is None:
+            assert not frame.box.pbc.any()
+        else:
+            # float32 there
+            np.testing.assert_allclose(frame.box.matrix, ts.triclinic_dimensions, rtol=1e-6, atol=1e-5)
+            assert frame.box.pbc.all()
+        assert (frame.velocities is not None) == ts.has_velocities
+
+
+def test_elements_are_told_or_guessed_and_types_stay_where_there_are_no_names():
+    water = open_trajectory(datafiles.XTC, datafiles.GRO)
+    assert water.species[list(water.table.names).index("OW")] == "O"
+    assert water.table.guessed and any("guessed" in note for note in water.notes)
+    # alpha carbons are no calcium, in a protein
+    assert water.species[list(water.table.names).index("CA")] == "C"
+    assert set(open_trajectory(datafiles.LAMMPSdcd2, datafiles.LAMMPSdata2).species) >= {"4", "29"}
+
+
+def test_atoms_nobody_names_can_be_looked_at_all_the_same():
+    trajectory = open_trajectory(datafiles.XTC)
+    assert trajectory.atoms == 47681 and not trajectory.table.named
+    assert any("topology" in note for note in trajectory.notes)
+    with pytest.raises(InputError, match="-s TOPOLOGY"):
+        select(trajectory, "name OW")
+    np.testing.assert_array_equal(select(trajectory, "index 3:5"), [3, 4, 5])
+
+
+def test_a_charmm_box_is_turned_as_its_coordinates_are():
+    trajectory = open_trajectory(datafiles.DCD_TRICLINIC, datafiles.PSF_TRICLINIC, slice="::5")
+    with DCDFile(datafiles.DCD_TRICLINIC) as file:
+        cells = [frame.unitcell.copy() for frame in file]
+    for frame in trajectory.frames():
+        xx, xy, yy, xz, yz, zz = cells[frame.index]
+        np.testing.assert_array_equal(frame.box.matrix, [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    # lengths and cosines stand in the same places of another program's file
+    other = next(open_trajectory(datafiles.DCD_NAMD_TRICLINIC, datafiles.PSF_NAMD_TRICLINIC).frames())
+    assert other.box.matrix[0, 1] == 0 and abs(other.box.matrix[1, 0]) > 1
+
+
+@pytest.mark.parametrize("name", ["GRO", "GRO_velocity", "two_water_gro"])
+def test_gro_keeps_the_digits_of_the_text(name):
+    path = getattr(datafiles, name)
+    frame = next(open_trajectory(path).frames())
+    ts = MDAnalysis.Universe(path).trajectory.ts
+    np.testing.assert_allclose(frame.positions, ts.positions, atol=2e-5)
+    np.testing.assert_allclose(frame.box.matrix, ts.triclinic_dimensions, atol=2e-5)
+    np.testing.assert_allclose(frame.positions, np.round(frame.positions, 2), atol=1e-12)
+    if ts.has_velocities:
+        np.testing.assert_allclose(frame.velocities, ts.velocities, atol=1e-4)
+
+
+def test_gro_of_many_frames_has_all_of_them():
+    path = datafiles.two_water_gro_multiframe
+    frames = list(open_trajectory(path).frames())
+    assert len(frames) == 2
+    with open(path) as lines:
+        text = lines.read().splitlines()
+    expected = [10 * float(text[11][20 + 8 * k : 28 + 8 * k]) for k in range(3)]
+    np.testing.assert_array_equal(frames[1].positions[0], expected)
+
+
+DUMP = """ITEM: UNITS
+metal
+ITEM: TIME
+{time}
+ITEM: TIMESTEP
+{step}
+ITEM: NUMBER OF ATOMS
+3
+ITEM: BOX BOUNDS xy xz yz pp pp ff
+-1.0 9.5 1.5
+2.0 10.0 -1.0
+0.0 8.0 0.25
+ITEM: ATOMS id element {columns}
+{rows}
+"""
+
+
+def test_a_lammps_dump_has_its_tilt_its_free_sides_and_the_order_of_ids(tmp_path):
+    # lo = bound - min(0, xy, xz, xy + xz): x from 0 to 8, y from 2 to 9.75, z from 0 to 8
+    matrix = np.array([[8.0, 0, 0], [1.5, 7.75, 0], [-1.0, 0.25, 8.0]])
+    scaled = np.array([[0.1, 0.2, 0.3], [0.5, -0.25, 1.5], [0.0, 0.0, 0.0]])
+    text = ""
+    for step, order in ((0, (0, 1, 2)), (5, (2, 0, 1))):
+        rows = "\n".join(f"{k + 1} {'OHH'[k]} {' '.join(map(repr, scaled[k].tolist()))} 1 2 3" for k in order)
+        text += DUMP.format(time=0.5 * step, step=step, columns="xs ys zs vx vy vz", rows=rows)
+    (tmp_path / "run.lammpstrj").write_text(text)
+    trajectory = open_trajectory(tmp_path / "run.lammpstrj")
+    frames = list(trajectory.frames())
+    assert (trajectory.length, trajectory.time, trajectory.bits) == ("Å", "ps", 64)
+    assert trajectory.species.tolist() == ["O", "H", "H"]
+    assert [frame.time for frame in frames] == [0.0, 2.5]
+    for frame in frames:
+        np.testing.assert_allclose(frame.box.matrix, matrix, atol=1e-15)
+        assert frame.box.pbc.tolist() == [True, True, False]
+        np.testing.assert_allclose(frame.positions, scaled @ matrix + [0.0, 2.0, 0.0], atol=1e-15)
+        np.testing.assert_array_equal(frame.velocities, [[1, 2, 3]] * 3)
+
+
+def test_a_lammps_dump_agrees_with_ase():
+    trajectory = open_trajectory(datafiles.LAMMPSDUMP_image_vf)
+    images = ase.io.read(datafiles.LAMMPSDUMP_image_vf, index=":", format="lammps-dump-text")
+    frames = list(trajectory.frames())
+    assert len(frames) == len(images) and trajectory.time == "step"
+    for frame, image in zip(frames, images, strict=True):
+        np.testing.assert_array_equal(frame.positions, image.positions)
+        np.testing.assert_array_equal(frame.box.matrix, image.cell.array)
+
+
+def test_lammps_atoms_without_ids_are_refused(tmp_path):
+    text = DUMP.format(time=0, step=0, columns="x y z", rows="O 1 2 3\nH 1 2 3\nH 2 2 2").replace("id ", "")
+    (tmp_path / "run.dump").write_text(text)
+    with pytest.raises(InputError, match="no ids"):
+        open_trajectory(tmp_path / "run.dump")
+
+
+@pytest.mark.parametrize("name", ["run.extxyz", "run.traj", "run.json", "run.extxyz.gz"])
+def test_ase_files_keep_every_digit(tmp_path, name):
+    images = argon()
+    ase.io.write(tmp_path / name, images)
+    trajectory = open_trajectory(tmp_path / name)
+    frames, kept = list(trajectory.frames()), ase.io.read(tmp_path / name, index=":")
+    assert len(frames) == 6 and trajectory.bits == 64 and trajectory.species.tolist() == ["Ar"] * 5
+    for k, (frame, image) in enumerate(zip(frames, kept, strict=True)):
+        assert frame.index == k
+        np.testing.assert_array_equal(frame.positions, image.positions)
+        np.testing.assert_array_equal(frame.box.matrix, image.cell.array)
+        if "json" not in name:
+            assert frame.time == 0.5 * k
+            # Å per ps
+            np.testing.assert_allclose(frame.velocities, image.get_velocities() * 1e3 * units.fs, rtol=1e-12)
+
+
+def test_a_run_of_mdnum_has_its_units(tmp_path):
+    ase.io.write(tmp_path / "trajectory.traj", argon())
+    (tmp_path / "system.toml").write_text('units = "lj"\n')
+    trajectory = open_trajectory(tmp_path)
+    assert (trajectory.length, trajectory.time) == ("σ", "τ")
+    np.testing.assert_allclose(next(trajectory.frames()).velocities, argon()[0].get_velocities())
+    with pytest.raises(InputError, match="--save-every"):
+        (tmp_path / "trajectory.traj").unlink()
+        (tmp_path / "summary.json").write_text("{}")
+        open_trajectory(tmp_path)
+
+
+def test_a_topology_names_the_atoms_of_an_ase_file(tmp_path):
+    water = MDAnalysis.Universe(datafiles.two_water_gro)
+    ase.io.write(tmp_path / "run.extxyz", Atoms("OHHOHH", water.atoms.positions))
+    trajectory = open_trajectory(tmp_path / "run.extxyz", datafiles.two_water_gro)
+    np.testing.assert_array_equal(select(trajectory, "name OW and resid 2"), [3])
+    assert trajectory.table.residues.tolist() == [0, 0, 0, 1, 1, 1]
+
+
+@pytest.mark.parametrize("name", ["run.extxyz", "run.traj", "run.json", "run.lammpstrj"])
+@pytest.mark.parametrize("words", ["", "2:", ":3", "::2", "1:5:3", "-2:", ":-4", "3", "-1", "9:", "0:0"])
+def test_slices_are_those_of_python(tmp_path, name, words):
+    ase.io.write(tmp_path / "run.extxyz", argon())
+    if name.endswith("lammpstrj"):
+        rows = "1 O 1 2 3\n2 H 1 2 3\n3 H 2 2 2"
+        text = "".join(DUMP.format(time=k, step=k, columns="x y z", rows=rows) for k in range(6))
+        (tmp_path / name).write_text(text)
+    else:
+        ase.io.write(tmp_path / name, argon())
+    trajectory = open_trajectory(f"{tmp_path / name}@{words}" if words else tmp_path / name)
+    expected = (
+        list(range(6))[parse_slice(words)] if words not in ("3", "-1") else [list(range(6))[int(words)]]
+    )
+    assert [frame.index for frame in trajectory.frames()] == expected
+    # as often as wanted
+    assert [frame.index for frame in trajectory.frames()] == expected
+    assert trajectory.count in (None, len(expected))
+
+
+def test_slices_in_words(tmp_path):
+    assert split_path("a/b.xtc@100:") == (type(tmp_path)("a/b.xtc"), "100:")
+    assert split_path("a@home/b.xtc")[1] == ""
+    (tmp_path / "run@5").write_text("")
+    assert split_path(str(tmp_path / "run@5")) == (tmp_path / "run@5", "")
+    assert list(chosen(slice(1, 9, 3), None)) == [1, 4, 7]
+    for words in ("::-1", "::0", "a:b", "1:2:3:4"):
+        with pytest.raises(InputError):
+            parse_slice(words)
+
+
+def test_memory_does_not_grow_with_frames(tmp_path):
+    peaks = []
+    for frames in (5, 40):
+        ase.io.write(tmp_path / "run.extxyz", argon(frames, atoms=400))
+        trajectory = open_trajectory(tmp_path / "run.extxyz")
+        tracemalloc.start()
+        assert sum(1 for _ in trajectory.frames()) == frames
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    # positions and velocities of one frame
+    one = 400 * 6 * 8
+    assert peaks[1] < peaks[0] + 5 * one
+
+
+def test_selections_are_one_language(tmp_path):
+    trajectory = open_trajectory(datafiles.XTC, datafiles.GRO)
+    universe = MDAnalysis.Universe(datafiles.GRO, datafiles.XTC)
+    for words in ("name OW", "protein", "resname SOL and around 4 protein"):
+        np.testing.assert_array_equal(select(trajectory, words), universe.select_atoms(words).indices)
+    assert len(select(trajectory, "element O")) == (trajectory.species == "O").sum()
+    images = [Atoms("NaCl", [[0.2, 0, 0], [2.0, 0, 0]], cell=[5, 5, 5], pbc=True)]
+    ase.io.write(tmp_path / "salt.traj", images)
+    salt = open_trajectory(tmp_path / "salt.traj")
+    np.testing.assert_array_equal(select(salt, "element Na or name Cl"), [0, 1])
+    np.testing.assert_array_equal(select(salt, "around 2 element Na"), [1])
+    for words, said in (("element O", "names Cl, Na"), ("nam O", "no selection")):
+        with pytest.raises(InputError, match=said):
+            select(salt, words)
+
+
+@pytest.mark.parametrize(("kind", "package"), [("GSD", "gsd"), ("H5MD_xvf", "h5py")])
+def test_a_format_whose_package_is_missing_names_it(kind, package):
+    try:
+        __import__(package)
+    except ImportError:
+        with pytest.raises(InputError, match=package):
+            open_trajectory(getattr(datafiles, kind), datafiles.TPR_xvf if kind == "H5MD_xvf" else None)
+    else:
+        topology = datafiles.TPR_xvf if kind == "H5MD_xvf" else None
+        trajectory = open_trajectory(getattr(datafiles, kind), topology)
+        universe = MDAnalysis.Universe(*(one for one in (topology, getattr(datafiles, kind)) if one))
+        np.testing.assert_array_equal(next(trajectory.frames()).positions, universe.trajectory[0].positions)
