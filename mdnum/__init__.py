@@ -21,6 +21,7 @@ _HOMES = {
     "NumericalError": "mdnum.errors:NumericalError",
     "bounce": "mdnum.workflow:bounce",
     "build": "mdnum.systems:build",
+    "conform": "mdnum.workflow:conform",
     "diagnose": "mdnum.doctor:diagnose",
     "flips": "mdnum.workflow:flips",
     "fork": "mdnum.workflow:fork",
@@ -47,6 +48,7 @@ if TYPE_CHECKING:
     from mdnum.systems import build as build
     from mdnum.systems import load as load
     from mdnum.workflow import bounce as bounce
+    from mdnum.workflow import conform as conform
     from mdnum.workflow import flips as flips
     from mdnum.workflow import fork as fork
     from mdnum.workflow import fork_certify as fork_certify
@@ -67,6 +69,7 @@ __all__ = [
     "__version__",
     "bounce",
     "build",
+    "conform",
     "diagnose",
     "flips",
     "fork",

@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 
 import typer
 
-from mdnum.cli import audit, ball, check, doctor, flips, fork, grad, report, run, systems
+from mdnum.cli import audit, ball, check, conform, doctor, flips, fork, grad, report, run, systems
 from mdnum.cli.output import EXIT_STOPPED, EXIT_USAGE, print_error
 from mdnum.errors import InputError, MdnumError
 
@@ -32,6 +32,7 @@ app.command("fork")(fork.fork)
 app.command("grad")(grad.grad)
 app.command("flips")(flips.flips)
 app.command("audit")(audit.audit)
+app.command("conform")(conform.conform)
 app.add_typer(_systems, name="systems")
 app.add_typer(_check, name="check")
 app.command("report")(report.report)

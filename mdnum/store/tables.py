@@ -140,6 +140,12 @@ COLUMNS: Mapping[str, Mapping[str, pa.DataType]] = MappingProxyType(
             rule=_SHORT, frame=_INT, i=_SHORT, j=_SHORT, rank=_SHORT, inside=_TEXT, distance_a=_FLOAT,
             distance_b=_FLOAT, margin_a=_FLOAT, margin_b=_FLOAT, bound=_FLOAT, ambiguous=_BOOL,
         ),
+        "areas": _columns(
+            area=_TEXT, asked=_INT, passed=_INT, failed=_INT, refused=_INT, skipped=_INT,
+        ),
+        "failures": _columns(
+            code=_TEXT, area=_TEXT, case=_TEXT, atoms=_INT, steps=_INT, step=_INT, text=_TEXT, script=_TEXT,
+        ),
     }
 )  # fmt: skip
 
@@ -178,6 +184,7 @@ TABLES: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "grad": ("growth", "flip_contributions", "trust", "scaling"),
         "flips": ("flips", "frames", "members", "contacts", "lifetimes", "neighbors", "residues", "busiest"),
         "flips-compare": ("apart", "differing"),
+        "conform": ("areas", "failures"),
     }
 )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from mdnum.workflow.ball import BallResult, bounce
+from mdnum.workflow.conform import ConformResult, conform
 from mdnum.workflow.flips import FlipsResult, flips
 from mdnum.workflow.fork import ForkResult, fork
 from mdnum.workflow.fork_certify import CertifyResult, fork_certify
@@ -16,6 +17,7 @@ from mdnum.workflow.md import run
 __all__ = [
     "BallResult",
     "CertifyResult",
+    "ConformResult",
     "ForecastResult",
     "FlipsResult",
     "ForkResult",
@@ -23,6 +25,7 @@ __all__ = [
     "MapResult",
     "ProcessesResult",
     "bounce",
+    "conform",
     "flips",
     "fork",
     "fork_certify",

@@ -142,7 +142,7 @@ def _kept(name: str, package: str, made: type, about: str, **declared: Any) -> P
 KEPT_PEERS: tuple[PairList, ...] = (
     _kept(
         "ase-skin", "ase", AseSkinList, "ase.neighborlist.NeighborList with a skin, updated", affords=0.1,
-        limits=Limits(most_atoms=20_000, roomy=1e5),
+        limits=Limits(most_atoms=20_000, roomy=1e5, least_cutoff=0.5),
     ),
     _kept(
         "jax-md-kept", "jax-md", JaxMdList, "jax-md's partition.neighbor_list, allocated and updated",

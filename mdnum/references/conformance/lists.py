@@ -52,6 +52,7 @@ class Limits:
         lower: no cell that is not lower triangular.
         atoms: no fewer atoms.
         most_atoms: no more atoms.
+        least_cutoff: no shorter cutoff: a library for one unit of length.
         roomy: no box of more cells of r_cut than this along all axes together.
     """
 
@@ -68,6 +69,7 @@ class Limits:
     lower: bool = False
     atoms: int = 0
     most_atoms: int | None = None
+    least_cutoff: float = 0.0
     roomy: float | None = None
 
     def refusal(self, case: Case) -> str | None:
@@ -79,6 +81,8 @@ class Limits:
             return f"at least {self.atoms} atom{'s' * (self.atoms > 1)}"
         if self.most_atoms is not None and case.atoms > self.most_atoms:
             return f"at most {self.most_atoms} atoms"
+        if case.r_cut < self.least_cutoff:
+            return f"no cutoff below {self.least_cutoff:g}"
         if self.periodic and not pbc.any():
             return "no free atoms"
         if self.free and pbc.any():

@@ -194,7 +194,8 @@ def _peer(name, package, function, about, **declared) -> PairList:
 
 
 PEERS: tuple[PairList, ...] = (
-    _peer("ase", "ase", ase_neighbor_list, "ase.neighborlist.neighbor_list", affords=0.3),
+    _peer("ase", "ase", ase_neighbor_list, "ase.neighborlist.neighbor_list", affords=0.3,
+        limits=Limits(least_cutoff=0.5)),
     _peer(
         "ase-primitive", "ase", ase_primitive_list, "the list under ASE's LennardJones, EAM and Tersoff",
         affords=0.3, limits=Limits(atoms=1, most_atoms=20_000),
@@ -202,7 +203,8 @@ PEERS: tuple[PairList, ...] = (
     _peer("vesin", "vesin", vesin_cells, "vesin's cell list, every pair from both atoms"),
     _peer("vesin-half", "vesin", vesin_half, "vesin, every pair once"),
     _peer("matscipy", "matscipy", matscipy_list, "matscipy.neighbours.neighbour_list"),
-    _peer("pymatgen", "pymatgen", pymatgen_points, "pymatgen's find_points_in_spheres"),
+    _peer("pymatgen", "pymatgen", pymatgen_points, "pymatgen's find_points_in_spheres",
+        limits=Limits(least_cutoff=0.01)),
     _peer(
         "mdanalysis", "MDAnalysis", mdanalysis_nsgrid, "MDAnalysis self_capped_distance, nsgrid",
         full=False, unit=_SINGLE, affords=0.3,

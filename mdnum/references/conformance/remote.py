@@ -15,8 +15,8 @@ from mdnum.errors import MdnumError
 from mdnum.references.conformance.case import Case
 from mdnum.references.conformance.lists import Outcome, PairList, Session
 
-#: Seconds that a call may take, and those that a process may take to import a library.
-CALL, START = 60.0, 120.0
+#: Seconds that an answer may take, for so many atoms at most and for more; and those to import a library.
+FEW, CALL, LONG, START = 1000, 20.0, 120.0, 120.0
 _SIZE = struct.Struct("<Q")
 
 
@@ -37,7 +37,7 @@ class RemoteSession:
         try:
             if self._process is None:
                 self._process = self._started()
-            return self._exchanged((case, self.reuse, self.tested.limits), CALL)
+            return self._exchanged((case, self.reuse, self.tested.limits), CALL if case.atoms <= FEW else LONG)
         except _Ended as ended:
             self.close()
             return [Outcome(crashed=str(ended))]

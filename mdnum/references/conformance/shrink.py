@@ -49,7 +49,7 @@ def shrunk(examiner: Examiner, failed: Failed) -> Failed:
     case = failed.case
     if not still_fails(case):
         # what it kept from earlier questions was part of it: told as it is
-        return failed
+        return replace(failed, alone=False)
     changed = True
     while changed and not spent():
         changed = False

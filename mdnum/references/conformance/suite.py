@@ -36,11 +36,13 @@ class Failed:
         case: as it was asked, up to the step that failed.
         failures: what was wrong at that step.
         asked: the case before it was shrunk; the same where it was not.
+        alone: it fails when it is the first that a new process asks; else what was asked before matters.
     """
 
     case: Case
     failures: tuple[Failure, ...]
     asked: Case
+    alone: bool = True
 
     @property
     def worst(self) -> Failure:
@@ -87,6 +89,8 @@ class Report:
         single: a case that it decides as float32 does and float64 would not, where that was found out.
         ties: (counted, not counted) pairs at exactly r_cut.
         keeps_order: whether the same question gives the same rows in the same order.
+        superset: pairs beyond the cutoff are part of what it gives.
+        shifts: whether it gives the images that pairs are through.
         areas: tallies by area.
         failed: the first failure of each kind and area, in the order in which they were met.
         seconds: in all; asking: of the list itself.
@@ -99,6 +103,8 @@ class Report:
     single: Case | None = None
     ties: list[int] = field(default_factory=lambda: [0, 0])
     keeps_order: bool | None = None
+    superset: bool = False
+    shifts: bool = False
     areas: dict[str, Tally] = field(default_factory=dict)
     failed: list[Failed] = field(default_factory=list)
     seconds: float = 0.0
@@ -156,7 +162,8 @@ class Examiner:
             if full is None:
                 full = all((j, i) in rows for i, j in rows)
                 report.found_out.append("full" if full else "half")
-            right = truth(case, 0)
+            report.shifts = answer.shift is not None
+            right = truth(case, 0, reach=case.r_cut + 2 * case.skin)
             for convention in (Conventions(full, a, b) for a in (1, -1) for b in (1, -1)):
                 if not judge(answer, right, replace(convention, unit=SINGLE)):
                     sign, toward = convention.sign, convention.toward
@@ -164,6 +171,7 @@ class Examiner:
             break
         report.how = Conventions(True if full is None else full, sign, toward, tested.unit or DOUBLE)
         self.superset = self._has_more() if tested.superset is None and tested.kept else bool(tested.superset)
+        report.superset = self.superset
 
     def _has_more(self) -> bool:
         """Whether a list that is kept gives what its skin holds, rather than what is inside the cutoff."""
@@ -381,6 +389,8 @@ def examine(
         for number, failed in enumerate(report.failed):
             if progress is not None:
                 progress(number, len(report.failed), {"phase": "shrinking", "unit": "failures"})
+            # a new process: what the list kept from other questions must not be part of it
+            examiner.session.close()
             report.failed[number] = shrunk(examiner, failed)
         report.failed = _distinct(report.failed)
     report.areas = {area: report.areas[area] for area in AREAS if area in report.areas}

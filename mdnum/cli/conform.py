@@ -1,0 +1,113 @@
+"""`mdnum conform`: does a neighbor list list the right pairs?"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from mdnum.cli import output
+from mdnum.cli.progress import watched
+
+
+def conform(
+    pairs: str | None = typer.Argument(
+        None,
+        metavar="[LIST]",
+        help="A name, package.module:function, or file.py:function; without one, the names are listed.",
+    ),
+    cases: int | None = typer.Option(
+        None, min=0, metavar="N", help="Random cases beside those with a name; 500 by default."
+    ),
+    seed: int = typer.Option(0, metavar="N", help="Of the random cases."),
+    full: bool | None = typer.Option(
+        None, "--full/--half", help="Every pair from both of its atoms, or once; found out by default."
+    ),
+    precision: str | None = typer.Option(
+        None, metavar="WORD", help="Of its arithmetic: float64 or float32; found out by default."
+    ),
+    superset: bool = typer.Option(False, "--superset", help="Pairs beyond the cutoff may be listed."),
+    limits: list[str] | None = typer.Option(
+        None,
+        metavar="WORD,WORD",
+        help="What it does not claim to do: minimum-image, orthorhombic, along-axes, all-axes, periodic, "
+        "free, wrapped, fixed-cell, right-handed, lower-triangular.",
+    ),
+    no_large: bool = typer.Option(False, "--no-large", help="Leave out 5,000 and 100,000 atoms."),
+    out: Path | None = typer.Option(
+        None, "-o", "--out", metavar="DIR", help="The folder; runs/conform-NAME-N by default."
+    ),
+    no_report: bool = typer.Option(False, "--no-report", help="Do not write report.html."),
+    as_json: bool = output.JSON_OPTION,
+) -> int:
+    """Put a neighbor list through a conformance suite: pairs, shifts, distances, and lists that go stale."""
+    if pairs is None:
+        return _names(as_json)
+    from mdnum.workflow.conform import conform as examine
+
+    words = tuple(word.strip() for one in limits or () for word in one.split(",") if word.strip())
+    with watched() as progress:
+        result = examine(
+            pairs,
+            cases=cases,
+            seed=seed,
+            large=not no_large,
+            full=full,
+            precision=precision,
+            superset=superset or None,
+            limits=words,
+            out=out,
+            report=not no_report,
+            progress=progress,
+        )
+    return output.answer(result.folder, result.summary, _print, as_json=as_json)
+
+
+def _names(as_json: bool) -> int:
+    """The lists that have a name."""
+    from mdnum.references.conformance.load import known
+
+    rows = [
+        {"list": one.name, "version": one.version, "kept": one.kept, "what": one.about} for one in known()
+    ]
+    if as_json:
+        output.print_json({"lists": rows})
+        return output.EXIT_FINE
+    output.print_table(
+        "neighbor lists that have a name here",
+        ("list", "version", "what"),
+        [(row["list"], row["version"] or "not installed", row["what"]) for row in rows],
+    )
+    typer.echo("\nYour own: mdnum conform package.module:function, or file.py:function.")
+    typer.echo("It takes (positions, cell, pbc, r_cut) and returns (i, j), (i, j, shift), ... or a mapping;")
+    typer.echo("a class with allocate(positions, cell, pbc, r_cut, skin) and update(positions, cell) is a")
+    typer.echo("list that is kept.")
+    return output.EXIT_FINE
+
+
+def _print(summary: Mapping[str, Any]) -> None:
+    """A row for each area, and the scripts."""
+    output.print_table(
+        "",
+        ("area", "asked", "right", "wrong", "refused", "not asked", "about"),
+        [
+            (
+                row["area"],
+                row["asked"],
+                row["passed"],
+                row["failed"] or None,
+                row["refused"] or None,
+                row["skipped"] or None,
+                row["about"],
+            )
+            for row in summary["areas"]
+        ],
+    )
+    if summary["failures"]:
+        output.print_table(
+            "reproduced without mdnum by",
+            ("script", "atoms", "steps", "what is wrong"),
+            [(row["script"], row["atoms"], row["steps"], row["text"]) for row in summary["failures"]],
+        )

@@ -1,0 +1,193 @@
+"""A failing case as a Python script that reproduces it without mdnum: the list, the numbers, brute force."""
+
+from __future__ import annotations
+
+import base64
+import io
+import textwrap
+import zlib
+from pprint import pformat
+
+import numpy as np
+
+from mdnum.references.conformance.judge import Conventions
+from mdnum.references.conformance.lists import PairList
+from mdnum.references.conformance.suite import Failed
+
+_PRINTED = 60  # atoms whose coordinates are written out
+
+_BRUTE_FORCE = '''
+def right_pairs(x, cell, reach):
+    """Every pair within reach, each once: {(i, j, shift): distance}, x[j] - x[i] + shift @ cell."""
+    box = np.where(PBC[:, None], cell, 0.0)
+    if PBC.any():
+        # fractions along the axes that repeat; normals stand in for the others
+        full = np.array(box)
+        if not PBC.all():
+            full[~PBC] = np.linalg.svd(np.vstack([box[PBC], np.zeros((1, 3))]))[2][PBC.sum():]
+        home = np.where(PBC, -np.floor(np.linalg.solve(full.T, x.T).T), 0).astype(int)
+        width = 1 / np.linalg.norm(np.linalg.inv(full), axis=0)
+        most = np.where(PBC, (reach / width).astype(int) + 1, 0)
+    else:
+        home, most = np.zeros(x.shape, int), np.zeros(3, int)
+    found = {}
+    for vector in itertools.product(*(range(-m, m + 1) for m in most)):
+        for i in range(len(x)):
+            shift = np.array(vector) + home[i:] - home[i]
+            apart = np.sqrt(((x[i:] - x[i] + shift @ box) ** 2).sum(axis=1))
+            for k in np.flatnonzero(apart <= reach):
+                if k or vector > (0, 0, 0):
+                    found[i, i + int(k), tuple(int(s) for s in shift[k])] = float(apart[k])
+    return found
+
+
+def check(step, x, cell, given):
+    """Compares what the list gave with brute force; returns whether it is right."""
+    scale = np.abs(x).max(initial=0.0) + np.abs(np.where(PBC[:, None], cell, 0.0)).sum() + R_CUT
+    close = TOLERANCE * scale
+    right = right_pairs(x, cell, REACH + close)
+    i, j = (np.asarray(given[name]).astype(int).ravel() for name in ("i", "j"))
+    bad = [f"row {n}: ({a}, {b}) with {len(x)} atoms" for n, (a, b) in enumerate(zip(i, j))
+           if not (0 <= a < len(x) and 0 <= b < len(x))]
+    shift = given.get("shift")
+    listed, named = collections.Counter(), collections.Counter()
+    for n, (a, b) in enumerate(zip(i.tolist(), j.tolist()) if not bad else ()):
+        s = (0, 0, 0) if shift is None else tuple(int(v) for v in SIGN * np.asarray(shift)[n])
+        turned = a > b or (a == b and s < (0, 0, 0))
+        key = (b, a, tuple(-v for v in s)) if turned else (a, b, s)
+        listed[key if shift is not None else key[:2]] += 1
+        if given.get("distance") is not None and shift is not None and key in right:
+            off = abs(float(np.asarray(given["distance"])[n]) - right[key])
+            if not off <= 2 * close:
+                bad.append(f"{a}-{b}: distance off by {off:.3g}")
+    times = 2 if FULL else 1
+    needed, allowed = collections.Counter(), collections.Counter()
+    for key, apart in right.items():
+        name = key if shift is not None else key[:2]
+        allowed[name] += times
+        needed[name] += times if apart < R_CUT - close else 0
+    for key in sorted(set(listed) | set(needed)):
+        if listed[key] < needed[key]:
+            nearest = min(d for k, d in right.items() if k[:len(key)] == key)
+            bad.append(f"pair {key}: listed {listed[key]} times, should be {needed[key]}; distance {nearest:.9g}")
+        elif listed[key] > allowed[key]:
+            bad.append(f"pair {key}: listed {listed[key]} times, should be at most {allowed[key]}")
+        elif FULL and listed[key] % 2:
+            bad.append(f"pair {key}: listed from one of its atoms only")
+    for line in bad[:10]:
+        print(f"step {step}: {line}")
+    return not bad
+'''
+
+_ONCE = '''
+fine = True
+for step, (x, cell, _) in enumerate(STEPS):
+    before = x.copy(), cell.copy()
+    given = as_mapping({call}(x, cell, PBC, R_CUT))
+    if not (np.array_equal(x, before[0]) and np.array_equal(cell, before[1])):
+        print(f"step {{step}}: the call wrote to its input")
+        fine = False
+    fine = check(step, *before, given) and fine
+'''
+
+_KEPT = '''
+fine, kept = True, {call}()
+for step, (x, cell, fresh) in enumerate(STEPS):
+    before = x.copy(), cell.copy()
+    given = as_mapping(kept.allocate(x, cell, PBC, R_CUT, SKIN) if fresh else kept.update(x, cell))
+    fine = check(step, *before, given) and fine
+'''
+
+_MAPPING = '''
+def as_mapping(given):
+    """The parts of an answer by name: i, j, shift, distance."""
+    if isinstance(given, dict):
+        return given
+    if hasattr(given, "i") and hasattr(given, "j"):
+        return {name: getattr(given, name, None) for name in ("i", "j", "shift", "distance")}
+    if not isinstance(given, (tuple, list)):
+        table = np.asarray(given)
+        return dict(zip("ij", table.T if table.shape[1:] == (2,) else table))
+    parts = [np.asarray(part) for part in given]
+    if len(parts) == 2 and parts[0].ndim == 2:
+        parts = [*parts[0], parts[1]]
+    named = {"i": parts[0], "j": parts[1]}
+    for part in parts[2:]:
+        whole = part.ndim == 2 and "shift" not in named and np.array_equal(np.rint(part), part)
+        named["distance" if part.ndim < 2 else "shift" if whole else "vector"] = part
+    return named
+'''
+
+
+def script(tested: PairList, failed: Failed, how: Conventions, superset: bool = False) -> str:
+    """Lines that call the list with the numbers of a failing case and compare it with brute force.
+
+    It needs numpy and the list; it prints what is wrong and exits with 1, or with 0 once the list is right. An
+    exception of the list is left to be seen.
+
+    Args:
+        how: conventions of the list.
+        superset: pairs beyond the cutoff may be listed.
+    """
+    case, worst = failed.case, failed.worst
+    reach = case.r_cut + (2 * case.skin if case.skin else 0.5 * case.r_cut) if superset else case.r_cut
+    title = f"{tested.name}{f' {tested.version}' if tested.version else ''}: {worst.text}"
+    case_words = f"Found by: {failed.asked.name}, at its step {worst.step}."
+    parts = [
+        '"""' + "\n".join(textwrap.wrap(title.replace("\\", "/"), 100)) + f'\n\n{case_words}\n"""',
+        "import collections\nimport itertools\n\nimport numpy as np",
+        tested.source.strip() or f"# import {tested.call} here: its lines could not be found",
+        _numbers(failed, how, reach),
+        _MAPPING.strip(),
+        _BRUTE_FORCE.strip(),
+        (_KEPT if tested.kept else _ONCE).strip().format(call=tested.call),
+        'print("the list is right" if fine else "the list is wrong")\nraise SystemExit(not fine)',
+    ]
+    return "\n\n\n".join(parts) + "\n"
+
+
+def _numbers(failed: Failed, how: Conventions, reach: float) -> str:
+    """The case as constants."""
+    case = failed.case
+    stills, atoms = [], None
+    for still in case.stills:
+        count = len(still.positions)
+        fresh = atoms is None or still.fresh or count != atoms
+        atoms = count
+        place = _array(still.positions)
+        stills.append(f"    ({place},\n     {_array(still.cell)}, {fresh}),")
+    lines = [
+        f"R_CUT, SKIN, REACH = {case.r_cut!r}, {case.skin!r}, {reach!r}",
+        f"PBC = np.array({list(case.pbc)})",
+        f"FULL = {how.full}  # every pair from both of its atoms",
+        f"SIGN = {how.sign}  # +1: shifts are added to atom j",
+        f"TOLERANCE = {16 * how.unit!r}  # a decision this close to the cutoff is rounding",
+        "STEPS = [  # positions, cell (vectors as rows), whether the list starts anew",
+        *stills,
+        "]",
+    ]
+    if any(len(still.positions) > _PRINTED for still in case.stills):
+        lines.insert(0, "import base64\nimport io\nimport zlib\n\n" + _UNPACK)
+    return "\n".join(lines)
+
+
+_UNPACK = '''
+def unpacked(text):
+    """An array that would fill pages."""
+    return np.load(io.BytesIO(zlib.decompress(base64.b85decode(text))))
+
+'''.lstrip()
+
+
+def _array(values: np.ndarray) -> str:
+    """An array as an expression that gives the same bits."""
+    if len(values) > _PRINTED:
+        sink = io.BytesIO()
+        np.save(sink, np.ascontiguousarray(values))
+        return f"unpacked({base64.b85encode(zlib.compress(sink.getvalue(), 9)).decode()!r})"
+    if not len(values):
+        return "np.zeros((0, 3))"
+    if not np.any(values):
+        return f"np.zeros({values.shape})"
+    text = pformat([[float(number) for number in row] for row in values], width=96)
+    return f"np.array({text.replace(chr(10), chr(10) + '              ')})"

@@ -1,0 +1,1 @@
+"""The page of a neighbor list that went through the conformance suite."""

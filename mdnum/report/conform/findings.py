@@ -1,0 +1,192 @@
+"""Verdict and findings on a neighbor list, from its folder alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from mdnum.report.fork.findings import Verdict
+from mdnum.report.fork.question import Question, verdict
+from mdnum.report.verdict import Finding
+from mdnum.report.words import count, listed, many, typeset
+
+#: (severity, title, remedy) by the code of a failure; {list} is the list's name.
+_CODES: Mapping[str, tuple[str, str, str]] = {
+    "CRASHED": (
+        "error", "{list} ends the process, or never answers",
+        "Check what it divides by and allocates before it starts; a program that calls it loses its run.",
+    ),
+    "MISSING": (
+        "error", "{list} misses pairs inside the cutoff",
+        "Do not run with it on such input: energies are wrong without a word.",
+    ),
+    "EXTRA": (
+        "error", "{list} lists pairs that are beyond the cutoff",
+        "Test the distance in whatever sums over it, or do not use it on such input.",
+    ),
+    "DUPLICATE": (
+        "error", "{list} lists pairs more than once", "Do not sum over it on such input: a pair counts twice.",
+    ),
+    "SELF": ("error", "{list} lists atoms as their own neighbors", "Leave out i = j where there is no shift."),
+    "RANGE": (
+        "error", "{list} names atoms that do not exist",
+        "Cut padding off before the list is handed on; what reads it reads other memory.",
+    ),
+    "ONE_SIDED": (
+        "error", "{list} lists pairs from one of their atoms only",
+        "Decide each pair once and list it both ways: forces on the two atoms differ else.",
+    ),
+    "SHIFTS": (
+        "error", "{list} gives the wrong images",
+        "Say whether shifts are for positions as given or wrapped, and return those for positions as given.",
+    ),
+    "DISTANCES": ("error", "{list} gives wrong distances", "Compute x_j - x_i + shift @ cell and its length."),
+    "VECTORS": ("error", "{list} gives wrong vectors", "Compute x_j - x_i + shift @ cell."),
+    "MALFORMED": (
+        "error", "{list} returns what is no list of pairs",
+        "Return (i, j), (i, j, shift), ... or a mapping with i and j, whole numbers of equal length.",
+    ),
+    "CHANGED_INPUT": ("warning", "{list} writes to its input", "Copy before wrapping in place."),
+    "UNSTABLE": ("warning", "{list} gives other pairs when asked again", "Find what it keeps between calls."),
+    "RAISED": (
+        "warning", "{list} raises on input that has an answer",
+        "Answer it, or say in a ValueError what cannot be done.",
+    ),
+}  # fmt: skip
+
+
+def judge(run: Question) -> Verdict:
+    """Headline, evidence and findings of an examination."""
+    found = list(_findings(run))
+    summary = run.summary
+    answered = summary["asked"] - sum(row["refused"] for row in summary["areas"])
+    if not answered:
+        headline = f"{run.name} answered no question."
+    elif not summary["wrong"]:
+        headline = f"{run.name} gave the right pairs in all of {many(answered, 'case')}."
+    else:
+        headline = f"{run.name} failed {count(summary['wrong'])} of {many(summary['asked'], 'case')}."
+    return verdict(headline, _evidence(run), found, plain_tone="good")
+
+
+def _evidence(run: Question) -> Iterator[str]:
+    summary = run.summary
+    wrong = [row for row in summary["areas"] if row["failed"]]
+    if wrong:
+        worst = sorted(wrong, key=lambda row: -row["failed"])[:4]
+        parts = [f"{row['area']} ({count(row['failed'])} of {count(row['asked'])})" for row in worst]
+        yield f"It fails about {listed(parts)}."
+    scripts = len(summary["failures"])
+    if scripts:
+        least = min(row["atoms"] for row in summary["failures"])
+        yield (
+            f"{many(scripts, 'script')} beside this page reproduce{'s' * (scripts == 1)} the failures without "
+            f"mdnum, the smallest with {many(least, 'atom')}."
+        )
+    refused = sum(row["refused"] for row in summary["areas"])
+    skipped = sum(row["skipped"] for row in summary["areas"])
+    if refused or skipped:
+        yield (
+            f"It refused {many(refused, 'case')}; {many(skipped, 'case')} "
+            f"{'was' if skipped == 1 else 'were'} not asked, because it does not claim to do them."
+        )
+
+
+def conventions(run: Question) -> Iterator[tuple[str, str]]:
+    """What kind of list it is: (what, words)."""
+    summary = run.summary
+    more = ", with pairs of its skin" if summary["superset"] and summary["kept"] else ""
+    more = more or (", with pairs beyond the cutoff" if summary["superset"] else "")
+    both = "every pair from both of its atoms" if summary["full"] else "every pair once"
+    yield "Lists", f"{both}{more}"
+    if summary["shifts"]:
+        yield "Shifts", "added to atom j" if summary["shift_sign"] > 0 else "added to atom i"
+    else:
+        yield "Shifts", "none given: images are counted, and not told apart"
+    yield "Decides in", summary["precision"]
+    ties = summary["ties"]
+    if ties["counted"] or ties["not_counted"]:
+        yield "At exactly the cutoff", _ties(ties)
+    if summary["keeps_order"] is not None:
+        yield "Asked again", "same rows, same order" if summary["keeps_order"] else "other order of rows"
+
+
+def _ties(ties: Mapping[str, int]) -> str:
+    if not ties["not_counted"]:
+        return "counts as inside (r ≤ r_cut)"
+    if not ties["counted"]:
+        return "does not count (r < r_cut)"
+    return f"{count(ties['counted'])} pairs count, {count(ties['not_counted'])} do not"
+
+
+def _findings(run: Question) -> Iterator[Finding]:
+    summary = run.summary
+    by_code: dict[str, list[Mapping[str, Any]]] = {}
+    for row in summary["failures"]:
+        by_code.setdefault(row["code"], []).append(row)
+    for code, rows in by_code.items():
+        severity, title, remedy = _CODES[code]
+        first = min(rows, key=lambda row: (row["atoms"], row["steps"]))
+        total = sum(row["codes"].get(code, 0) for row in summary["areas"])
+        areas = listed(sorted({row["area"] for row in rows}))
+        text = f"In {many(total, 'case')}, about {areas}. {_sentence(first)} Reproduced by {first['script']}."
+        if not first["alone"]:
+            text += " It fails only after other questions, so the script alone may not show it."
+        yield Finding(code, severity, title.format(list=run.name), text, remedy)  # type: ignore[arg-type]
+    yield from _conduct(run)
+
+
+def _sentence(row: Mapping[str, Any]) -> str:
+    where = f"{many(row['atoms'], 'atom')}" + (f", step {row['step']}" if row["steps"] > 1 else "")
+    return f"{where[:1].upper()}{where[1:]} ({row['case']}): {typeset(row['text'])}."
+
+
+def _conduct(run: Question) -> Iterator[Finding]:
+    """What is nobody's mistake and good to know."""
+    summary = run.summary
+    ties = summary["ties"]
+    if ties["counted"] and ties["not_counted"]:
+        yield Finding(
+            "TIES",
+            "info",
+            "pairs at exactly the cutoff are decided one way and the other",
+            f"Whole numbers, whose distances no arithmetic rounds: {_ties(ties)}.",
+            "Compare squares of distances, or distances, in one place.",
+        )
+    if "float32" in summary["found_out"]:
+        yield Finding(
+            "SINGLE_PRECISION",
+            "info",
+            f"{run.name} decides in single precision",
+            f"Its decisions are those of float32 and not those of float64, first seen in: {summary['single']}. "
+            "It was judged by the rounding of float32 from there on.",
+            "Expect other pairs near the cutoff than in a code that works in float64.",
+        )
+    if summary["keeps_order"] is False:
+        yield Finding(
+            "ORDER",
+            "info",
+            "the same question has its rows in another order each time",
+            "Sums over the list then differ in their last bits from call to call.",
+            "Sort the rows where runs have to repeat bit for bit.",
+        )
+    refused = [(row, one) for row in summary["areas"] for one in row["why"] if row["refused"]]
+    refused = [(row, one) for row, one in refused if ": " in one["why"]]
+    if refused:
+        row, one = max(refused, key=lambda each: each[1]["cases"])
+        total = sum(area["refused"] for area in summary["areas"])
+        yield Finding(
+            "REFUSES",
+            "info",
+            f"{run.name} refuses {many(total, 'case')}",
+            f"It says so, which is safe. Most often: {one['why']}, about {row['area']}.",
+        )
+    answered = summary["asked"] - sum(row["refused"] for row in summary["areas"])
+    if not answered:
+        yield Finding(
+            "NOTHING_ANSWERED",
+            "error",
+            f"{run.name} answered no question",
+            "Nothing is known about it.",
+            "Ask it about fewer things with --limits, or look at what it raises.",
+        )
