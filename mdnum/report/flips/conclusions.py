@@ -5,11 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
+
 from mdnum.report.flips.words import length, rule_words
 from mdnum.report.fork.question import Question
 from mdnum.report.verdict import Finding
 from mdnum.report.words import count, many, number
 
+# frames after a flip in which a leap of the separation shows, and how much larger than any before it must be
+_WINDOW, _LEAP = 10, 5.0
 # rates that differ by less than this factor are alike
 _ALIKE = 1.5
 # r² from which on a line through the logarithm is one exponential
@@ -49,6 +53,7 @@ def concluded(run: Question) -> Iterator[str]:
             )
         return
     yield _order(run, first, seed)
+    yield from _leap(run, first, seed)
     before, after = (summary["growth"][name] for name in ("before", "after"))
     if before is not None and before["r2"] >= _FITS and before["rate"] > 0:
         yield f"Before the sets differ the separation grows {_rate(run, before)}."
@@ -70,6 +75,28 @@ def _order(run: Question, first: Any, seed: int | None) -> str:
         f"At the frame before, no set differed and atoms were already up to {before} apart: the difference "
         "of the two did not begin with a flip that these frames show."
     )
+
+
+def _leap(run: Question, first: Any, seed: int | None) -> Iterator[str]:
+    """Whether the separation leaps when the sets come to differ, as it does nowhere before."""
+    furthest, at = run.tables["apart"]["furthest"], int(first["frame"])
+    # a difference that has just begun grows fast, whatever began it
+    start = max((seed or 0) + _WINDOW, at // 2)
+    if at + _WINDOW >= len(furthest) or start + _WINDOW > at or not furthest[start:].all():
+        return
+    grown = furthest[_WINDOW:] / np.maximum(furthest[:-_WINDOW], np.finfo(float).tiny)
+    after, before = float(grown[at]), float(grown[start : at - _WINDOW + 1].max())
+    if after > _LEAP * max(before, 1.0):
+        yield (
+            f"In the {_WINDOW} frames from there the separation grows {number(after, 2)}-fold, and in no "
+            f"{_WINDOW} frames before by more than {number(before, 2)}: a leap such as a flip causes, where "
+            "nothing else happened then."
+        )
+    elif after > 0:
+        yield (
+            f"In the {_WINDOW} frames from there the separation grows by a factor {number(after, 2)}, and in "
+            f"some {_WINDOW} frames before by {number(before, 2)}: no leap that would speak for a cause."
+        )
 
 
 def _rate(run: Question, found: Any) -> str:

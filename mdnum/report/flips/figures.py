@@ -118,7 +118,7 @@ def _distribution(table: dict[str, np.ndarray]) -> Plot | None:
 def _stride(run: Question, number: int) -> Plot | None:
     found = run.summary["rules"][number]["stride"]
     of = np.array(found["of"], float)
-    if len(of) < 2 or not of.all():
+    if len(of) < 3 or not of.all():
         return None
     stride, left = np.array(found["stride"]), np.array(found["flips"]) / of
     return Plot(

@@ -1,0 +1,79 @@
+"""Two trajectories against sets compared anew at every frame, and separations worked out by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from trajectories.membership import ledger, random_membership
+
+from mdnum.trajectories.compare import Difference, apart, displacements, distances, growth
+from mdnum.trajectories.frame import Box, Frame
+from mdnum.trajectories.table import Flips, Members
+
+
+def of_frame(flips: Flips, frame: int) -> Flips:
+    rows = flips.frame == frame
+    return Flips(**{name: getattr(flips, name)[rows] for name in Flips.__dataclass_fields__})
+
+
+@given(st.integers(0, 10**6), st.integers(1, 30))
+@settings(max_examples=30)
+def test_the_difference_carried_along_is_that_of_the_sets(seed: int, differing: int) -> None:
+    a, names = random_membership(seed)
+    b = a.copy()
+    b[:differing, 3:] = random_membership(seed + 1)[0][:differing, 3:]
+    (flips_a, first_a), (flips_b, first_b) = ledger(a, names), ledger(b, names)
+    found = Difference.of(first_a, first_b)
+    assert not len(found) and found.new == []
+    before: set[tuple[int, int, int]] = set()
+    for frame in range(1, a.shape[1]):
+        found.step(of_frame(flips_a, frame), of_frame(flips_b, frame))
+        in_a, in_b = ({names[p] for p in np.flatnonzero(one[:, frame])} for one in (a, b))
+        assert found.only_a == in_a - in_b and found.only_b == in_b - in_a
+        assert set(found.new) == (in_a ^ in_b) - before and found.new == sorted(found.new)
+        before = in_a ^ in_b
+
+
+def test_sets_that_differ_from_the_start() -> None:
+    one, other = (
+        Members(*np.array([[0, 1, 0], [0, 2, 0]]).T, np.ones(2)),
+        Members(*np.array([[0, 2, 0], [1, 1, 3]]).T, np.ones(2)),
+    )
+    found = Difference.of(one, other)
+    assert found.only_a == {(0, 1, 0)} and found.only_b == {(1, 1, 3)} and len(found) == 2
+    assert found.new == [(0, 1, 0), (1, 1, 3)]
+
+
+def test_displacements_go_through_the_boundary_of_any_box() -> None:
+    matrix = np.array([[10.0, 0, 0], [17.0, 9.0, 0], [-24.0, 31.0, 8.0]])
+    rng = np.random.default_rng(1)
+    start = rng.uniform(-30, 30, (200, 3))
+    moved = rng.uniform(-1.5, 1.5, (200, 3))
+    whole = rng.integers(-4, 5, (200, 3)).astype(float)
+    whole[:, 2] = 0
+    box = Box(matrix, np.array([True, True, False]))
+    end = Frame(0, 0.0, start + moved + whole @ matrix, box)
+    np.testing.assert_allclose(displacements(Frame(0, 0.0, start, box), end), moved, atol=1e-12)
+    free = Frame(0, 0.0, start + 100.0, Box())
+    np.testing.assert_allclose(displacements(Frame(0, 0.0, start, Box()), free), 100.0, atol=1e-12)
+    found = apart(Frame(0, 0.0, start, box), end, np.array([3, 8]))
+    sizes = np.linalg.norm(moved[[3, 8]], axis=1)
+    assert found.furthest == pytest.approx(sizes.max()) and found.atom == (3, 8)[int(sizes.argmax())]
+    assert found.typical == pytest.approx(np.sqrt((sizes**2).mean()))
+
+
+def test_distances_through_the_image_that_a_rank_names() -> None:
+    frame = Frame(
+        0, 0.0, np.array([[0.5, 0, 0], [9.0, 0, 0]]), Box(np.diag([10.0, 40, 40]), np.ones(3, bool))
+    )
+    np.testing.assert_allclose(distances(frame, [(0, 1, 0), (0, 1, 1), (1, 1, 0)]), [1.5, 8.5, 10.0])
+    assert distances(frame, []).shape == (0,)
+
+
+def test_growth_is_the_rate_of_an_exponential() -> None:
+    time = np.linspace(0, 10, 50)
+    rate, fit, frames = growth(time, 1e-9 * np.exp(1.7 * time), limit=1e-4) or (0, 0, 0)
+    assert rate == pytest.approx(1.7) and fit == pytest.approx(1.0) and frames < 50
+    assert growth(time[:4], time[:4], 1.0) is None and growth(time, np.zeros(50), 1.0) is None
