@@ -77,6 +77,11 @@ _MEANING: Mapping[str, tuple[str, str]] = {
 }
 
 
+#: Of other ways to write a structure down, those that a calculator for any cell has to take: it may know
+#: rectangular cells alone, or molecules by the order of their atoms.
+_MUST_ANSWER = ("TRANSLATION", "IMAGES", "FACES", "CELL_ULP", "EXTENSIVE")
+
+
 @dataclass(frozen=True)
 class _Difference:
     """What two ways of writing down one structure differ by, and may differ by."""
@@ -126,7 +131,7 @@ class Invariance:
         worker = subject.fresh()
         atoms, noise = settled(worker, rng)
         differences: list[_Difference] = []
-        refused: list[tuple[str, str]] = []
+        refused: list[tuple[Same, CalculatorError]] = []
         ways = list(transformations.all_of(atoms, subject.atoms, rng))
         judged = _Judge(subject, worker, atoms, noise, rng)
         for done, same in enumerate(ways):
@@ -135,8 +140,8 @@ class Invariance:
             try:
                 differences.append(judged(same))
             except CalculatorError as error:
-                refused.append((same.what, error.message))
-        found = list(self._findings(differences, judged, refused))
+                refused.append((same, error))
+        found = [*_refusals(refused), *self._findings(differences, judged, refused)]
         wrong = [one for one in differences if not one.agrees]
         return Part(
             name=self.name,
@@ -153,12 +158,12 @@ class Invariance:
                 "largest": max((one.energy for one in differences), default=0.0),
                 "largest_force": max((one.force for one in differences), default=0.0),
             },
-            skipped=refused,
+            skipped=[(same.what, error.message) for same, error in refused],
             seconds=time.perf_counter() - began,
         )
 
     def _findings(
-        self, differences: list[_Difference], judged: _Judge, refused: list[tuple[str, str]]
+        self, differences: list[_Difference], judged: _Judge, refused: list[tuple[Same, CalculatorError]]
     ) -> Iterator[dict[str, str]]:
         wrong: dict[str, list[_Difference]] = {}
         for one in differences:
@@ -190,10 +195,10 @@ class Invariance:
             )
 
     def _explained(
-        self, wrong: dict[str, list[_Difference]], judged: _Judge, refused: list[tuple[str, str]]
+        self, wrong: dict[str, list[_Difference]], judged: _Judge, refused: list[tuple[Same, CalculatorError]]
     ) -> dict[str, list[_Difference]]:
         """Differences without those that belong to what the calculator is: a topology made from the order."""
-        no_order = "ORDER" in wrong or any("order" in what for what, _ in refused)
+        no_order = "ORDER" in wrong or any(same.code == "ORDER" for same, _ in refused)
         if not no_order:
             return wrong
         rng = np.random.default_rng(self.seed + 1)
@@ -293,6 +298,29 @@ class _Judge:
                 allowed = Noise(_ALLOWED * noise.energy, _ALLOWED * noise.force)
             self._known[key] = worker.energy(base), worker.forces(base), allowed
         return self._known[key]
+
+
+def _refusals(refused: list[tuple[Same, CalculatorError]]) -> Iterator[dict[str, str]]:
+    """Ways of writing the structure down that nobody may fail on, and answers that are not numbers."""
+    groups: dict[str, list[tuple[Same, CalculatorError]]] = {}
+    for same, error in refused:
+        if error.cause is None:
+            groups.setdefault("NOT_FINITE", []).append((same, error))
+        elif same.code in _MUST_ANSWER:
+            groups.setdefault("FAILS", []).append((same, error))
+    for code, group in groups.items():
+        same, error = group[0]
+        saved = f" The structure is saved as {error.structure.name}." if error.structure else ""
+        yield finding(
+            code,
+            "error",
+            "an answer is not a number"
+            if code == "NOT_FINITE"
+            else "the calculator fails on the structure when it is written down otherwise",
+            f"With {same.what} it {error.message}. {len(group)} ways of writing the structure down end "
+            f"so.{saved}",
+            "Look at coordinates outside the cell and at its faces, and at distances of 0.",
+        )
 
 
 def _power(size: float) -> int:

@@ -10,17 +10,16 @@ from typing import Any
 import numpy as np
 from ase import Atoms
 
+from mdnum.audit.alone import alone
+from mdnum.audit.answer import Answer, Refusal, ask
 from mdnum.audit.base import Part, Progress, Subject
-from mdnum.audit.noise import FEW, Noise, displaced, roomy, settled
-from mdnum.audit.subject import CalculatorError
+from mdnum.audit.noise import FEW, Noise, displaced, settled
 from mdnum.references.findings import finding
 
 #: How many times the noise one object may differ from another by: a list that was built elsewhere sums its
 #: terms in another order.
 _ALLOWED = 40.0
 _REPEATS = 3
-#: Å between two parts that cannot feel one another.
-_FAR = 60.0
 
 
 @dataclass(frozen=True)
@@ -69,18 +68,24 @@ class State:
                 if progress is not None:
                     progress(done, total, {"phase": "state", "unit": "structures"})
         repeats = _repeated(subject, atoms)
-        alone, skipped = _alone(subject, atoms, noise)
+        lonely = alone(subject, atoms, noise)
+        self.structures |= lonely.structures
         stale = [row for row in rows if row["remembers"]]
-        skipped += [(row["structure"], row["refused"]) for row in rows if row["refused"]]
+        refused = [row for row in rows if row["refused"] and not row["remembers"]]
         return Part(
             name=self.name,
             title="Memory",
             says=_says(rows, stale, repeats),
-            findings=[*self._stale(stale), *_unsteady(repeats), *_of_alone(alone)],
+            findings=[
+                *self._stale(stale),
+                *self._not_finite(refused),
+                *_unsteady(repeats),
+                *lonely.findings(),
+            ],
             tables={
                 "One object, asked again and again, beside new ones": [_row(row) for row in rows],
                 "The same question again": [repeats],
-                "Atoms alone": alone,
+                "Atoms alone": lonely.rows,
             },
             numbers={
                 "structures": len(rows),
@@ -89,7 +94,7 @@ class State:
                 "bit_identical": repeats["bit-identical"],
                 "bit_identical_objects": repeats["bit-identical between objects"],
             },
-            skipped=skipped,
+            skipped=[*((row["structure"], row["refused"].why) for row in refused), *lonely.skipped],
             seconds=time.perf_counter() - began,
         )
 
@@ -97,19 +102,42 @@ class State:
         if not stale:
             return
         worst = max(stale, key=lambda row: row["energy"])
-        self.structures["stale-before"], self.structures["stale-after"] = worst["before"], worst["atoms"]
+        self.structures |= {"stale-before": worst["before"], "stale-after": worst["atoms"]}
         where = sorted({row["sequence"] for row in stale})
+        if worst["refused"] is None:
+            differs = (
+                f"differs from a new one by {worst['energy']:.3g} eV and {worst['force']:.3g} eV/Å, where "
+                "rounding "
+                f"explains {worst['allowed']:.1g} eV"
+            )
+        else:
+            differs = f"{worst['refused'].why}, while a new one answers"
         yield finding(
             "STALE_STATE",
             "error",
             "the answer depends on what the calculator was asked before",
-            f"After {worst['structure']}, an object that had been in use differs from a new one by "
-            f"{worst['energy']:.3g} eV and {worst['force']:.3g} eV/Å, where rounding explains "
-            f"{worst['allowed']:.1g} eV. {len(stale)} questions were answered so ({', '.join(where)}). The "
-            "structures are saved as stale-before and stale-after.",
+            f"After the step “{worst['structure']}”, an object that had been in use {differs}. "
+            f"{len(stale)} questions were answered so ({', '.join(where)}). The structures before and after "
+            "are "
+            "saved as stale-before and stale-after.",
             "Look for a neighbor list that is not rebuilt when the cell, the order or the number of atoms "
-            "changes or when atoms have used up half the skin, and for a buffer whose tail keeps old "
-            "entries.",
+            "changes "
+            "or when atoms have used up half the skin, and for a buffer whose tail keeps old entries.",
+        )
+
+    def _not_finite(self, refused: list[dict[str, Any]]) -> Iterator[dict[str, str]]:
+        empty = [row for row in refused if row["refused"].not_finite]
+        if not empty:
+            return
+        self.structures["not-finite"] = empty[0]["atoms"]
+        yield finding(
+            "NOT_FINITE",
+            "error",
+            "an answer is not a number",
+            f"After the step “{empty[0]['structure']}” a new object {empty[0]['refused'].why}. The "
+            "structure is "
+            "saved as not-finite.",
+            "Look for a division by a distance or a number of neighbors that can be 0.",
         )
 
 
@@ -218,46 +246,38 @@ def _scaled(atoms: Atoms, factor: float) -> Atoms:
 def _through(subject: Subject, sequence: list[Asked], noise: Noise, word: str) -> Iterator[dict[str, Any]]:
     """One object through a sequence; each answer beside that of an object that has seen nothing."""
     used = subject.fresh()
-    before = None
-    known: dict[int, tuple[float, np.ndarray] | str] = {}
+    before: Atoms | None = None
+    known: dict[int, Answer | Refusal] = {}
+    size = 0.0
     for asked in sequence:
-        new = known.get(id(asked.atoms))
-        if new is None:
-            new = known[id(asked.atoms)] = _answer(subject.fresh(), asked.atoms)
-        old = _answer(used, asked.atoms)
+        # structures come again within a sequence, which keeps them, so their ids are theirs
+        if id(asked.atoms) not in known:
+            known[id(asked.atoms)] = ask(subject.fresh(), asked.atoms)
+        new, old = known[id(asked.atoms)], ask(used, asked.atoms)
         row: dict[str, Any] = {
             "sequence": word, "structure": asked.what, "before": before or asked.atoms, "atoms": asked.atoms,
-            "energy": 0.0, "force": 0.0, "allowed": 0.0, "remembers": False, "refused": "",
+            "energy": 0.0, "force": 0.0, "allowed": 0.0, "remembers": False, "refused": None,
         }  # fmt: skip
         before = asked.atoms
-        if isinstance(new, str):
+        if isinstance(new, Refusal):
             # what nobody can answer says nothing about memory
             yield row | {"refused": new}
-            continue
-        if isinstance(old, str):
-            yield row | {"remembers": True, "energy": float("inf"), "force": float("inf")}
-            continue
-        share = max(1.0, abs(new[0]) / max(abs(known_energy(known)), 1e-300))
-        allowed = _ALLOWED * noise.energy * share
-        force = float(np.max(np.abs(old[1] - new[1]), initial=0.0))
-        scale = max(1.0, float(np.max(np.abs(new[1]), initial=0.0)))
-        change = abs(old[0] - new[0])
-        remembers = (
-            change > allowed or force > _ALLOWED * max(noise.force, np.finfo(float).eps * scale) * share
-        )
-        yield row | {"energy": change, "force": force, "allowed": allowed, "remembers": remembers}
+        elif isinstance(old, Refusal):
+            yield row | {"remembers": True, "energy": float("inf"), "force": float("inf"), "refused": old}
+        else:
+            size = size or abs(new.energy)
+            share = max(1.0, abs(new.energy) / size) if size else 1.0
+            yield row | _apart(old, new, noise, share)
 
 
-def known_energy(known: Mapping[int, tuple[float, np.ndarray] | str]) -> float:
-    """The first energy of a sequence."""
-    return next((one[0] for one in known.values() if not isinstance(one, str)), 0.0)
-
-
-def _answer(subject: Subject, atoms: Atoms) -> tuple[float, np.ndarray] | str:
-    try:
-        return subject.energy(atoms), subject.forces(atoms)
-    except CalculatorError as error:
-        return error.message
+def _apart(old: Answer, new: Answer, noise: Noise, share: float) -> dict[str, Any]:
+    """What an object in use and a new one differ by, where the noise is `share` times what was measured."""
+    allowed = _ALLOWED * noise.energy * share
+    force = float(np.max(np.abs(old.forces - new.forces), initial=0.0))
+    rounding = np.finfo(float).eps * max(1.0, float(np.max(np.abs(new.forces), initial=0.0)))
+    change = abs(old.energy - new.energy)
+    remembers = change > allowed or force > _ALLOWED * share * max(noise.force, rounding)
+    return {"energy": change, "force": force, "allowed": allowed, "remembers": remembers}
 
 
 def _repeated(subject: Subject, atoms: Atoms) -> dict[str, Any]:
@@ -286,73 +306,6 @@ def _identical(answers: list[tuple[float, np.ndarray]]) -> bool:
     return all(energy == first[0] and force.tobytes() == first[1].tobytes() for energy, force in answers)
 
 
-def _alone(
-    subject: Subject, atoms: Atoms, noise: Noise
-) -> tuple[list[dict[str, Any]], list[tuple[str, str]]]:
-    """Atoms without a neighbor: no force, and energies that add up."""
-    rows: list[dict[str, Any]] = []
-    skipped: list[tuple[str, str]] = []
-    species = list(dict.fromkeys(atoms.symbols))
-    single: dict[str, float] = {}
-    for symbol in species:
-        for periodic in (False, True):
-            one = Atoms(symbol, positions=[[1.0, 2.0, 3.0]], cell=[2 * _FAR] * 3, pbc=periodic)
-            what = f"one {symbol} atom{' in a large periodic cell' if periodic else ''}"
-            found = _answer(subject.fresh(), one)
-            if isinstance(found, str):
-                skipped.append((what, found))
-                continue
-            single.setdefault(symbol, found[0])
-            rows.append(_lonely(what, found, single[symbol], noise))
-    pair = Atoms([species[0], species[-1]], positions=[[1.0, 2.0, 3.0], [1.0 + _FAR, 2.0, 3.0]])
-    pair.set_cell([4 * _FAR] * 3)
-    expected = [single.get(one) for one in (species[0], species[-1])]
-    found = _answer(subject.fresh(), pair)
-    what = f"{species[0]} and {species[-1]} {_FAR:g} Å apart"
-    if isinstance(found, str):
-        skipped.append((what, found))
-    elif expected[0] is not None and expected[1] is not None:
-        rows.append(_lonely(what, found, expected[0] + expected[1], noise))
-    _beside_cluster(subject, atoms, single, noise, rows, skipped)
-    return rows, skipped
-
-
-def _beside_cluster(
-    subject: Subject,
-    atoms: Atoms,
-    single: Mapping[str, float],
-    noise: Noise,
-    rows: list[dict[str, Any]],
-    skipped: list[tuple[str, str]],
-) -> None:
-    """A cluster, and the same with an atom far away: it alone has no neighbors."""
-    cluster = roomy(atoms, 1)[: min(len(atoms), 12)]
-    cluster.pbc = False
-    cluster.set_cell([6 * _FAR] * 3)
-    symbol = str(atoms.symbols[0])
-    what = f"a {symbol} atom {_FAR:g} Å from a cluster"
-    far = cluster.copy()
-    far += Atoms(symbol, positions=[cluster.positions.max(axis=0) + _FAR])
-    both = _answer(subject.fresh(), cluster), _answer(subject.fresh(), far)
-    if isinstance(both[0], str) or isinstance(both[1], str):
-        skipped.append((what, next(one for one in both if isinstance(one, str))))
-    elif symbol in single:
-        rows.append(_lonely(what, (both[1][0], both[1][1][-1:]), both[0][0] + single[symbol], noise))
-
-
-def _lonely(what: str, found: tuple[float, np.ndarray], expected: float, noise: Noise) -> dict[str, Any]:
-    force = float(np.max(np.abs(found[1]), initial=0.0))
-    eps = np.finfo(float).eps
-    return {
-        "atoms": what,
-        "energy (eV)": found[0],
-        "expected": expected,
-        "force (eV/Å)": force,
-        "adds up": abs(found[0] - expected) <= _ALLOWED * max(noise.energy, eps * abs(expected)),
-        "no force": force <= _ALLOWED * max(noise.force, eps),
-    }
-
-
 def _unsteady(repeats: Mapping[str, Any]) -> Iterator[dict[str, str]]:
     if repeats["bit-identical"] and repeats["bit-identical between objects"]:
         return
@@ -369,31 +322,6 @@ def _unsteady(repeats: Mapping[str, Any]) -> Iterator[dict[str, str]]:
         "Look for sums in the order of threads or of atomic additions, and for a list kept from the call "
         "before.",
     )
-
-
-def _of_alone(rows: list[dict[str, Any]]) -> Iterator[dict[str, str]]:
-    pushed = [row for row in rows if not row["no force"]]
-    if pushed:
-        worst = max(pushed, key=lambda row: row["force (eV/Å)"])
-        yield finding(
-            "LONELY_FORCE",
-            "error",
-            "an atom without neighbors feels a force",
-            f"On {worst['atoms']} acts a force of {worst['force (eV/Å)']:.3g} eV/Å.",
-            "Look at empty neighborhoods: a sum over no neighbors, or a normalization by their number.",
-        )
-    apart = [row for row in rows if not row["adds up"]]
-    if apart:
-        worst = max(apart, key=lambda row: abs(row["energy (eV)"] - row["expected"]))
-        yield finding(
-            "LONELY_ENERGY",
-            "warning",
-            "energies of parts that cannot feel one another do not add up",
-            f"{worst['atoms'][0].upper()}{worst['atoms'][1:]}: {worst['energy (eV)']:.10g} eV, expected "
-            f"{worst['expected']:.10g}.",
-            "Look for terms of the whole structure (a mean over atoms, a background charge), or for a cutoff "
-            f"beyond {_FAR:g} Å.",
-        )
 
 
 def _row(row: Mapping[str, Any]) -> dict[str, Any]:

@@ -15,13 +15,12 @@ _NEEDED = {
     "run": ("invariance", "forces", "state", "dynamics"),
     "differentiate": ("smoothness", "forces", "curl"),
 }
-#: Codes that do not bear on a question, whatever their severity: what is smooth only to first order runs
-#: well, and what drifts may still have the right derivative.
+#: Codes that do not bear on a question, whatever their severity: where only the force jumps a run keeps its
+#: energy, and what a run loses to its time step takes nothing from a derivative.
 _APART = {
-    "run": ("KINK", "CURVATURE", "SECOND_DERIVATIVE", "NOT_REPEATABLE_DERIVATIVE"),
+    "run": ("FORCE_JUMP", "CURVATURE_JUMP", "CURVATURE_JUMP_AMONG_MANY"),
     "differentiate": ("DRIFT", "TIMESTEP"),
 }
-_WORDS = {"yes": "safe", "with care": "to be used with care", "no": "not safe", "not asked": "not asked"}
 
 
 @dataclass(frozen=True)
@@ -59,10 +58,7 @@ def judge(name: str, parts: Sequence[Part]) -> Judgment:
 
 def _answer(question: str, parts: Sequence[Part]) -> Answer:
     bearing = [
-        finding
-        for part in parts
-        for finding in part.findings
-        if not any(word in finding["code"] for word in _APART[question])
+        finding for part in parts for finding in part.findings if finding["code"] not in _APART[question]
     ]
     severities = {finding["severity"] for finding in bearing}
     if "error" in severities:
@@ -74,16 +70,7 @@ def _answer(question: str, parts: Sequence[Part]) -> Answer:
 
 
 def _headline(name: str, answers: Mapping[str, Answer], parts: Sequence[Part]) -> str:
-    run, differentiate = _WORDS[answers["run"]], _WORDS[answers["differentiate"]]
-    if run == differentiate:
-        head = f"{name} is {run} to run and to differentiate" if run != "not asked" else ""
-    else:
-        said = [
-            f"{words} to {verb}"
-            for words, verb in ((run, "run"), (differentiate, "differentiate"))
-            if words != "not asked"
-        ]
-        head = f"{name} is {' and '.join(said)}"
+    head = _said(name, answers["run"], answers["differentiate"])
     titles = [
         finding["title"]
         for severity in ("error", "warning")
@@ -92,9 +79,32 @@ def _headline(name: str, answers: Mapping[str, Answer], parts: Sequence[Part]) -
         if finding["severity"] == severity
     ]
     if not titles:
-        found = f"{len(parts)} checks found nothing"
-        return f"{head}: {found}." if head else f"{name}: {found}."
+        return f"{head or name}: {_counted(len(parts), 'check')} found nothing."
     shown = list(dict.fromkeys(titles))
-    more = f", and {len(shown) - 2} more findings" if len(shown) > 3 else ""
-    reasons = "; ".join(shown if not more else shown[:2])
-    return f"{head or name}: {reasons}{more}."
+    if len(shown) > 3:
+        shown[2:] = [f"and {len(shown) - 2} more findings"]
+    return f"{head or name}: {'; '.join(shown)}."
+
+
+def _said(name: str, run: Answer, differentiate: Answer) -> str:
+    """Both answers as a clause; empty where neither was asked for."""
+    if run == differentiate:
+        return {
+            "yes": f"{name} is safe to run and to differentiate",
+            "with care": f"Use {name} with care, to run and to differentiate",
+            "no": f"Neither run nor differentiate {name} as it is",
+            "not asked": "",
+        }[run]
+    words = {
+        "yes": "safe to {verb}", "with care": "to be {done} with care", "no": "not safe to {verb}",
+    }  # fmt: skip
+    said = [
+        words[answer].format(verb=verb, done=done)
+        for answer, verb, done in ((run, "run", "run"), (differentiate, "differentiate", "differentiated"))
+        if answer != "not asked"
+    ]
+    return f"{name} is {', and '.join(said)}"
+
+
+def _counted(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"

@@ -186,10 +186,12 @@ def _checks(
     from mdnum.audit.dynamics import Dynamics
     from mdnum.audit.forces import Forces
     from mdnum.audit.invariance import Invariance
+    from mdnum.audit.smoothness import Smoothness
     from mdnum.audit.state import State
     from mdnum.audit.thresholds import find_thresholds
 
     made: dict[str, Callable[[], Check]] = {
+        "smoothness": Smoothness,
         "invariance": Invariance,
         "forces": Forces,
         "curl": Curl,
