@@ -170,7 +170,8 @@ def own_images(lattice: Lattice, radius: float) -> Float[np.ndarray, "images"]:
     return np.sort(np.array(found, np.float64))
 
 
-@numba.njit(cache=True, nogil=True)
+# inlined: a call that takes arrays costs more than what is done here
+@numba.njit(cache=True, nogil=True, inline="always")
 def square_of(x, i, j, s0, s1, s2, vectors):
     """Squared distance from atom i to an image of atom j, i < j: the number that decides."""
     if s0 == 0 and s1 == 0 and s2 == 0:
@@ -182,32 +183,31 @@ def square_of(x, i, j, s0, s1, s2, vectors):
     return d0 * d0 + d1 * d1 + d2 * d2
 
 
+@numba.njit(cache=True, nogil=True, inline="always")
+def rounded_image(x, i, j, inverse, periodic):
+    """Lattice vector to add to j that brings it near i, by rounding: the nearest where that is near enough."""
+    y0, y1, y2 = x[j, 0] - x[i, 0], x[j, 1] - x[i, 1], x[j, 2] - x[i, 2]
+    n0, n1, n2 = 0, 0, 0
+    if periodic[0]:
+        n0 = -np.int64(np.rint(y0 * inverse[0, 0] + y1 * inverse[1, 0] + y2 * inverse[2, 0]))
+    if periodic[1]:
+        n1 = -np.int64(np.rint(y0 * inverse[0, 1] + y1 * inverse[1, 1] + y2 * inverse[2, 1]))
+    if periodic[2]:
+        n2 = -np.int64(np.rint(y0 * inverse[0, 2] + y1 * inverse[1, 2] + y2 * inverse[2, 2]))
+    return n0, n1, n2
+
+
 @numba.njit(cache=True, nogil=True)
 def image_square(x, i, j, rank, vectors, inverse, periodic, widths):
     """Squared distance to the image of j that has `rank` nearer ones; inf where there are not so many.
 
     i < j, or i == j for images of an atom itself, of which one of each ± pair counts.
     """
-    f = np.zeros(3)
-    base = np.zeros(3, np.int64)
-    close = False
-    narrowest = np.inf
-    for k in range(3):
-        if periodic[k]:
-            narrowest = min(narrowest, widths[k])
-            for c in range(3):
-                f[k] += (x[j, c] - x[i, c]) * inverse[c, k]
-            base[k] = -np.int64(np.rint(f[k]))
-            close = close or abs(f[k] + base[k]) > 0.5 - 1e-6
+    n0, n1, n2 = rounded_image(x, i, j, inverse, periodic)
+    narrowest = min(widths[0], widths[1], widths[2])
     if narrowest == np.inf:
-        if rank > 0 or i == j:
-            return np.inf
-        return square_of(x, i, j, 0, 0, 0, vectors)
-    if rank == 0 and i != j and not close:
-        here = square_of(x, i, j, base[0], base[1], base[2], vectors)
-        # any other image is a lattice vector away, and none is shorter than the narrowest width
-        if here < 0.2499 * narrowest * narrowest:
-            return here
+        return np.inf if rank > 0 or i == j else square_of(x, i, j, 0, 0, 0, vectors)
+    base = np.array([n0, n1, n2])
     best = np.empty(rank + 1)
     span = np.zeros(3, np.int64)
     for k in range(3):

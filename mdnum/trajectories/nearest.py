@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mdnum.trajectories.lattice import Lattice, own_images
-from mdnum.trajectories.pairs import Rows, Sides, search
+from mdnum.trajectories.pairs import DIRECTED, Rows, Sides, rows_of, search
 from mdnum.trajectories.rules import Capped, Nearest
 
 
@@ -100,10 +100,11 @@ def chosen(
     offset, close, smallest = 0, 0, np.inf
     one = np.zeros(atoms, np.int64)
     while True:
-        rows = search(
-            positions, lattice, Sides(centers, sides.others, one), np.array([[radius]]),
-            band=band, bound=bound, guard=guard, directed=True,
+        found = search(
+            positions, lattice, Sides(centers, sides.others, one), np.array([[radius]]), DIRECTED,
+            band=band, bound=bound, guard=guard,
         )  # fmt: skip
+        rows = rows_of(found, atoms)
         own = own_images(lattice, radius + band)
         room = int(centers.sum()) * rule.most
         room = min(room, len(rows.other) + 2 * len(own) * int(centers.sum()))

@@ -13,7 +13,7 @@ from mdnum.trajectories.changes import compared, image_distances
 from mdnum.trajectories.frame import Frame
 from mdnum.trajectories.lattice import Lattice, lattice_of, own_images
 from mdnum.trajectories.nearest import chosen
-from mdnum.trajectories.pairs import Rows, Sides, ordered, ranks, search
+from mdnum.trajectories.pairs import INSIDE, Rows, Sides, ordered, ranks, rows_of, search
 from mdnum.trajectories.rules import Capped, Cutoff, Nearest, Rule, SpeciesCutoffs
 from mdnum.trajectories.table import Flips, Members
 
@@ -87,6 +87,7 @@ class Tracker:
             )
         self._species = None if species is None else np.asarray(species, str)
         self._atoms = -1
+        self._open = 0
         self._last: Moment | None = None
         self.frames = 0
         self.pairs = 0
@@ -159,10 +160,13 @@ class Tracker:
             none = np.zeros(len(self._radii), np.int64)
             return Moment(positions, lattice, rounding, made.rows, none, made.last_in, made.first_out)
         horizon = HORIZON * radius
-        rows = search(
-            positions, lattice, self._sides, self._radii,
+        found = search(
+            positions, lattice, self._sides, self._radii, INSIDE,
             band=max(bound, horizon, 4 * rounding), bound=bound, guard=rounding,
+            room=int(1.1 * (self.pairs + self._open)), open_room=int(1.2 * self._open),
         )  # fmt: skip
+        self._open = found.open
+        rows = rows_of(found, len(positions))
         own, close, smallest = self._own(lattice, bound)
         smallest = min(rows.smallest, smallest)
         self.pairs = len(rows.other) + int((own * self._both_count).sum())
