@@ -24,9 +24,10 @@ from mdnum.audit.thresholds import STEP, Threshold, walk_pairs
 _SIDE = 1e-7
 """Half the stretch around an expected crossing in which it is located, length."""
 
-_MOST_CROSSINGS = 3
+_MOST_CROSSINGS = 2
 """Crossings of one threshold that are measured, each by another atom."""
 
+_CALLS_AT_CROSSING = 170
 _MOST_TRIPLES = 4
 _LENGTH = 0.6
 """Of a route through the structure, length."""
@@ -75,7 +76,7 @@ class Surroundings:
 
 
 def walk_surroundings(
-    subject: Subject, progress: Progress | None = None, seconds: float = 8.0
+    subject: Subject, progress: Progress | None = None, seconds: float = 6.0
 ) -> Surroundings:
     """Walk triples, and atoms of the structure, through the known thresholds and look for unknown ones.
 
@@ -87,9 +88,11 @@ def walk_surroundings(
     walks = walk_pairs(subject).walks
     thresholds = [one for walk in walks for one in walk.thresholds]
     groups = _groups(subject, single=bool(walks) and len(walks[0].pair.second) == 1)
+    cost = _cost(subject, groups[0])
     events: list[Event] = []
     skipped: list[tuple[str, str]] = []
-    targeted = _targeted(subject, thresholds, groups)
+    affordable = max(int(seconds / (cost * _CALLS_AT_CROSSING)), len(thresholds))
+    targeted = _targeted(subject, thresholds, groups)[:affordable]
     triples = _triples(subject) if walks and len(walks[0].pair.second) == 1 else []
     total = len(targeted) + len(triples) + 1
     for k, (route, crossing) in enumerate(targeted):
@@ -101,7 +104,7 @@ def walk_surroundings(
             skipped.append((route.name, error.message))
     scanned: list[str] = []
     expected = 0
-    for k, (route, low, high) in enumerate([*triples, *_random(subject, groups, seconds)]):
+    for k, (route, low, high) in enumerate([*triples, *_random(subject, groups, seconds / cost)]):
         if progress:
             progress(min(len(targeted) + k, total - 1), total, {"phase": route.name})
         try:
@@ -133,7 +136,7 @@ def _targeted(
     atoms = subject.atoms
     of_lead = {_lead(atoms, group): group for group in groups}
     symbols = np.array(atoms.get_chemical_symbols())
-    found: list[tuple[Route, Crossing]] = []
+    ranked: list[tuple[int, Route, Crossing]] = []
     for threshold in thresholds:
         first, second, distance, vector = neighbor_list("ijdD", atoms, threshold.radius + 1.0)
         one, other = threshold.species
@@ -150,10 +153,11 @@ def _targeted(
                 atoms, of_lead[int(first[k])], int(first[k]), direction,
             )  # fmt: skip
             crossing = Crossing(float(distance[k] - threshold.radius), int(second[k]), threshold)
-            found.append((route, crossing))
+            ranked.append((len(used), route, crossing))
             if len(used) == _MOST_CROSSINGS:
                 break
-    return found
+    # the first of every threshold before the second of any
+    return [(route, crossing) for _, route, crossing in sorted(ranked, key=lambda one: one[0])]
 
 
 def _at_crossing(subject: Subject, route: Route, crossing: Crossing) -> Event:
@@ -163,7 +167,7 @@ def _at_crossing(subject: Subject, route: Route, crossing: Crossing) -> Event:
     exact = crossing.threshold.order < 2
     if exact:
         low, high = locate(curve, crossing.threshold.order, low, high)
-    jump = measure(curve, low, high, STEP, exact)
+    jump = measure(curve, low, high, STEP, exact, bend=not exact)
     return _event(subject, route, jump, crossing)
 
 
@@ -220,17 +224,21 @@ def _triples(subject: Subject) -> list[tuple[Route, float, float]]:
     return found
 
 
-def _random(
-    subject: Subject, groups: Sequence[np.ndarray], seconds: float
-) -> list[tuple[Route, float, float]]:
-    """Routes of some atoms in arbitrary directions, as many as the time allows."""
-    atoms = subject.atoms
-    subject.forces(atoms)  # whatever is made at the first question is made
+def _cost(subject: Subject, group: np.ndarray) -> float:
+    """Seconds of a calculation after the first."""
+    subject.forces(subject.atoms)  # whatever is made at the first question is made
     begin = time.perf_counter()
-    subject.forces(Route("", atoms, groups[0], int(groups[0][0]), np.eye(3)[0]).at(1e-3))
-    cost = max(time.perf_counter() - begin, 1e-4)
-    calls = _LENGTH / STEP + 400
-    count = int(np.clip(seconds / (cost * calls), 1, 8))
+    for k in (1, 2, 3):
+        subject.forces(Route("", subject.atoms, group, int(group[0]), np.eye(3)[0]).at(k * 1e-3))
+    return max((time.perf_counter() - begin) / 3, 1e-5)
+
+
+def _random(
+    subject: Subject, groups: Sequence[np.ndarray], affordable: float
+) -> list[tuple[Route, float, float]]:
+    """Routes of some atoms in arbitrary directions, as many as so many calculations allow."""
+    atoms = subject.atoms
+    count = int(np.clip(affordable / (_LENGTH / STEP + 400), 1, 8))
     rng = np.random.default_rng(0)
     found: list[tuple[Route, float, float]] = []
     for k in rng.permutation(len(groups))[:count]:

@@ -142,7 +142,7 @@ def bisect(told: Callable[[float], bool], low: float, high: float) -> tuple[floa
             high = middle
 
 
-def measure(curve: Curve, low: float, high: float, room: float, exact: bool) -> Jump:
+def measure(curve: Curve, low: float, high: float, room: float, exact: bool, bend: bool = True) -> Jump:
     """The jumps between low and high, and how large they could look where there are none.
 
     Energy and force are taken at the last representable coordinates on either side (medians of four, so that
@@ -153,6 +153,7 @@ def measure(curve: Curve, low: float, high: float, room: float, exact: bool) -> 
         low, high: the two sides.
         room: how far to either side the curve can be used, coordinate.
         exact: whether low and high are neighboring doubles.
+        bend: whether the curvature is asked for too; nan if not.
     """
     left, right = _close(curve, low, -np.inf), _close(curve, high, np.inf)
     values = np.median(right, axis=1) - np.median(left, axis=1)
@@ -164,9 +165,11 @@ def measure(curve: Curve, low: float, high: float, room: float, exact: bool) -> 
         slope_right, _ = _slope(curve, high, 1, room, floor[1])
         steepest = max(abs(slope_left), abs(slope_right))
         spread = spread + (high - low) * np.array([force, steepest])
-    before, doubt_before = _slope(curve, low, -1, room, floor[1])
-    after, doubt_after = _slope(curve, high, 1, room, floor[1])
-    curvature, doubt = before - after, doubt_before + doubt_after  # E'' is -F'
+    curvature, doubt = np.nan, np.inf
+    if bend:
+        before, doubt_before = _slope(curve, low, -1, room, floor[1])
+        after, doubt_after = _slope(curve, high, 1, room, floor[1])
+        curvature, doubt = before - after, doubt_before + doubt_after  # E'' is -F'
     jumps, doubts = (*values, curvature), (*spread, doubt)
     order = SMOOTH
     for k in (2, 1, 0):

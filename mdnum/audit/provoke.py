@@ -7,6 +7,7 @@ something jumps; where it keeps the first k in its own order, a permutation of t
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -31,6 +32,9 @@ _SIDES = (1e-9, 1e-6)
 _SURE = 30.0
 _WITHOUT_CUTOFF = 6.0
 
+_HABITUAL = (12, 16, 20, 24, 30, 32, 40, 48, 50, 60, 64, 80, 96, 100, 120, 128, 150, 200, 250, 256)
+"""Ties that are looked at in any case; the others as the time allows, from the first on."""
+
 
 @dataclass(frozen=True)
 class Crowd:
@@ -47,7 +51,7 @@ class Crowd:
         order_from: number of neighbors at which the order of atoms starts to matter, None if it never does.
         order_energy: how much it changes the energy then, eV.
         order_force: how much it changes a force, eV/Å.
-        jumps: (k, energy jump, force jump) for each tie with the k-th neighbor.
+        jumps: (k, energy jump, force jump) for each tie with the k-th neighbor that was looked at.
         noise: (energy, force of the median atom) of places without a tie.
     """
 
@@ -65,30 +69,34 @@ class Crowd:
     noise: tuple[float, float]
 
 
-def crowd(subject: Subject, progress: Progress | None = None, most: int = _MOST) -> list[Crowd]:
+def crowd(
+    subject: Subject, progress: Progress | None = None, most: int = _MOST, seconds: float = 10.0
+) -> list[Crowd]:
     """Crowd an atom of each species that the calculator takes alone.
 
     Args:
         subject: the calculator.
         progress: called now and then.
         most: neighbors given to the center.
+        seconds: about how long to look, for all species together.
 
     Returns:
         one for each species of the structure; none for a calculator that takes no single atoms.
     """
     found: list[Crowd] = []
-    for walk in walk_pairs(subject).walks:
-        if walk.pair.species[0] != walk.pair.species[1] or len(walk.pair.first) > 1:
-            continue
+    alike = [
+        walk
+        for walk in walk_pairs(subject).walks
+        if walk.pair.species[0] == walk.pair.species[1] and len(walk.pair.first) == 1
+    ]
+    for k, walk in enumerate(alike):
         if progress:
-            progress(
-                len(found), len(walk_pairs(subject).walks), {"phase": f"crowding {walk.pair.species[0]}"}
-            )
+            progress(k, len(alike), {"phase": f"crowding {walk.pair.species[0]}"})
         radius = walk.cutoff or _WITHOUT_CUTOFF
         for count in (most, most // 2, most // 5):  # some refuse what is too dense for them
             try:
                 with only_trying(subject):
-                    found.append(_crowded(subject, walk.pair, radius, count))
+                    found.append(_crowded(subject, walk.pair, radius, count, seconds / len(alike)))
                 break
             except CalculatorError:
                 continue
@@ -119,18 +127,26 @@ def cluster(pair: Pair, radius: float, count: int) -> tuple[Atoms, Float[np.ndar
     return atoms, distance
 
 
-def _crowded(subject: Subject, pair: Pair, radius: float, count: int) -> Crowd:
+def _crowded(subject: Subject, pair: Pair, radius: float, count: int, seconds: float) -> Crowd:
+    began = time.perf_counter()
     atoms, distances = cluster(pair, radius, count)
     direction = _gap(atoms)
     side = next((one for one in _SIDES if _resolved(subject, atoms, direction, distances, one)), _SIDES[-1])
     between = 0.5 * (distances[1:] + distances[:-1])
-    quiet = [_change(subject, atoms, direction, place, side) for place in between[:: max(count // 20, 1)]]
+    quiet = [_change(subject, atoms, direction, place, side) for place in between[:: max(count // 10, 1)]]
+    cost = (time.perf_counter() - began) / (3 * len(quiet) + 4)
     noise_energy = max(max(energy for energy, _ in quiet), 1e-14)
     # an atom that its neighbors press hard has forces with more rounding in them than another
-    noise_force = np.maximum(np.max([force for _, force in quiet], axis=0), 1e-14)
+    forces = np.linalg.norm(subject.forces(_with_walker(atoms, direction, float(between[0]))), axis=1)
+    rounding = 2.0**-50 if side == _SIDES[0] else 2.0**-21
+    floor = np.maximum(rounding * np.maximum(forces, np.median(forces)), 1e-14)
+    noise_force = np.maximum(np.max([force for _, force in quiet], axis=0), floor)
     jumps: list[tuple[int, float, float]] = []
     over: list[tuple[int, float, float]] = []
+    every = int((seconds - (time.perf_counter() - began)) / (3 * cost))
     for k, place in enumerate(distances):
+        if k >= every and k + 1 not in _HABITUAL:
+            continue
         energy, force = _change(subject, atoms, direction, place, side)
         jumps.append((k + 1, energy, float(force.max())))
         sure = force > _SURE * noise_force
@@ -173,10 +189,12 @@ def _resolved(
     distances: Float[np.ndarray, "neighbors"],
     side: float,
 ) -> bool:
-    """Whether the calculator tells two places this near apart."""
-    place = 0.5 * float(distances[0] + distances[1])
-    near, far = (subject.forces(_with_walker(atoms, direction, place + sign * side)) for sign in (-1, 1))
-    return bool((near != far).any())
+    """Whether the calculator tells two places this near apart, wherever they are."""
+    for place in 0.5 * (distances[1:] + distances[:-1])[:: max(len(distances) // 6, 1)]:
+        near, far = (subject.forces(_with_walker(atoms, direction, place + sign * side)) for sign in (-1, 1))
+        if (near == far).all():
+            return False
+    return True
 
 
 def _gap(atoms: Atoms) -> Float[np.ndarray, "3"]:

@@ -89,7 +89,7 @@ class Route:
         return sorted(found, key=lambda one: one.at)
 
     def _others(self, reach: float) -> list[tuple[int, Float[np.ndarray, "3"]]]:
-        """(atom, vector from the lead to it or an image of it) within reach, without those that move along."""
+        """(atom, vector from the lead to it or an image) within reach, without those that move along."""
         atoms = self.atoms
         cell = np.asarray(atoms.cell)
         counts = [0, 0, 0]

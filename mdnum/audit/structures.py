@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -27,15 +26,7 @@ _RATTLE = 0.02
 """Standard deviation, of the nearest distance: in a perfect crystal forces are zero and distances tie."""
 
 
-@dataclass(frozen=True)
-class Structure:
-    """Atoms, and in words where they come from."""
-
-    atoms: Atoms
-    says: str
-
-
-def read_structure(words: str | Path) -> Structure:
+def read_structure(words: str | Path) -> Atoms:
     """A structure from any file that ASE reads; `file@5` is its sixth, otherwise the last is taken.
 
     Raises:
@@ -68,20 +59,20 @@ def read_structure(words: str | Path) -> Structure:
         raise InputError(
             f"{what} has a number that is not finite", where=text, remedy="Correct the structure"
         )
-    return Structure(atoms, f"{len(atoms)} atoms, {atoms.get_chemical_formula()}, from {text}")
+    return _told(atoms, f"{len(atoms)} atoms, {atoms.get_chemical_formula()}, from {text}")
 
 
-def default_structure(loaded: Loaded) -> Structure:
+def default_structure(loaded: Loaded) -> Atoms:
     """A structure for a calculator: its own, or a crystal of an element it takes, or rigid water.
 
     The crystal is the element's, with the lattice at the calculator's own least energy, repeated until two
-    cutoffs fit in (at most 500 atoms), its atoms displaced a little.
+    cutoffs fit in (at most 500 atoms), its atoms displaced a little. `info["origin"]` says so in words.
 
     Raises:
         InputError: the calculator answers for no element and not for water.
     """
     if loaded.atoms is not None:
-        return Structure(loaded.atoms, f"{len(loaded.atoms)} atoms of {loaded.name}")
+        return _told(loaded.atoms, f"{len(loaded.atoms)} atoms of {loaded.name}")
     calculator = loaded.make()
     for symbol in _symbols(calculator):
         subject = CalculatorSubject(loaded.name, lambda: calculator, Atoms(symbol, [(0, 0, 0)]), kT=1.0)
@@ -98,12 +89,18 @@ def default_structure(loaded: Loaded) -> Structure:
             except CalculatorError as error:
                 why = error.message
             else:
-                return Structure(subject.atoms, f"{edge**3} molecules of water, on a grid, turned at random")
+                return _told(subject.atoms, f"{edge**3} molecules of water, on a grid, turned at random")
     raise InputError(
         f"the calculator answers neither for two atoms of any element nor for water ({why})",
         where=loaded.name,
         remedy="Give a structure that it is made for: --structure FILE",
     )
+
+
+def _told(atoms: Atoms, says: str) -> Atoms:
+    copy = atoms.copy()
+    copy.info["origin"] = says
+    return copy
 
 
 def water(edge: int = 4, spacing: float = 3.1) -> Atoms:
@@ -138,7 +135,7 @@ def _symbols(calculator: object) -> list[str]:
     return list(dict.fromkeys([*named, *_FIRST, *chemical_symbols[1:_LAST_ELEMENT]]))
 
 
-def _crystal(subject: CalculatorSubject, pair: Pair, symbol: str) -> Structure:
+def _crystal(subject: CalculatorSubject, pair: Pair, symbol: str) -> Atoms:
     cutoff, least = rough(subject, pair)
     cell, lattice = _unit_cell(symbol)
     scale, relaxed = _least_energy(subject, cell, least)
@@ -151,7 +148,7 @@ def _crystal(subject: CalculatorSubject, pair: Pair, symbol: str) -> Structure:
     nearest = _nearest_distance(cell)
     atoms.rattle(_RATTLE * nearest, seed=0)
     at = "at the calculator's own least energy" if relaxed else "at its tabulated lattice constant"
-    return Structure(
+    return _told(
         atoms,
         f"{len(atoms)} atoms of {symbol}, {lattice}, nearest distance {nearest:.4g} Å ({at}), "
         f"displaced by {_RATTLE * nearest:.2g} Å",
