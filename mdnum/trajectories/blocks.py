@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterator
+from io import TextIOBase
 from pathlib import Path
-from typing import TextIO, cast
+from typing import cast
 
 from mdnum.errors import InputError
 from mdnum.trajectories.frame import Frame
@@ -63,7 +64,7 @@ class TextTrajectory(Trajectory):
             yield frame
 
     @abstractmethod
-    def _block(self, lines: TextIO) -> list[str] | None:
+    def _block(self, lines: TextIOBase) -> list[str] | None:
         """The lines of the next frame; None at the end of the file.
 
         Raises:
@@ -86,7 +87,7 @@ class TextTrajectory(Trajectory):
             number = 0
             while wanted is not None:
                 try:
-                    block = self._block(cast(TextIO, lines))
+                    block = self._block(cast(TextIOBase, lines))
                 except (ValueError, IndexError, OSError, EOFError) as error:
                     raise self._unreadable(number, error) from error
                 if block is None:

@@ -136,11 +136,9 @@ def grid_effect(
 
 def _steps(resolution: Resolution, frame: Frame) -> Float[np.ndarray, "3 3"]:
     """Vectors of the grid that positions lie on, as rows, length."""
-    if resolution.kind == "fractions":
+    if resolution.kind == "fractions" and not resolution.digits:
         return resolution.step * frame.box.matrix
-    # a float's grid is that of the coordinates at hand: twice the standard deviation times √3
-    size = resolution.step or float(np.sqrt(6.0)) * resolution.typical(frame)
-    return size * np.eye(3)
+    return resolution.usual_step(frame) * np.eye(3)
 
 
 def _moves(sample: Sequence[Frame], size: float) -> tuple[Float[np.ndarray, "atoms 3"], int]:

@@ -7,8 +7,8 @@ between two points.
 from __future__ import annotations
 
 import re
+from io import TextIOBase
 from itertools import islice
-from typing import TextIO
 
 import numpy as np
 from jaxtyping import Float
@@ -51,7 +51,7 @@ class GroTrajectory(TextTrajectory):
         time = float(found[1]) if found and self.time == "ps" else float(number)
         return Frame(number, time, values * _NANOMETER, _box(block[-1]), velocities)
 
-    def _block(self, lines: TextIO) -> list[str] | None:
+    def _block(self, lines: TextIOBase) -> list[str] | None:
         title = lines.readline()
         if not title:
             return None

@@ -5,11 +5,11 @@ Of `dump custom` and `dump atom`, with columns x, xu, xs or xsu (docs.lammps.org
 
 from __future__ import annotations
 
+from io import TextIOBase
 from itertools import islice
-from typing import TextIO
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from mdnum.errors import InputError
 from mdnum.trajectories.blocks import TextTrajectory, end_of, whole_number
@@ -56,13 +56,14 @@ class LammpsDump(TextTrajectory):
         items = _items(block)
         columns, rows = _atoms(items)
         rows = rows[self._order(number, columns, rows)]
-        matrix, origin, pbc = _box(items)
+        matrix, pbc = _box(items)
         positions = velocities = None
         for names in _COLUMNS:
             if set(names) <= set(columns):
                 positions = _numbers(rows, columns, names)
                 if names[0].startswith("xs"):
-                    positions = positions @ matrix + origin
+                    # from the box's corner: it moves as the box breathes, and would hide the digits
+                    positions = positions @ matrix
                 break
         if positions is None:
             raise InputError(
@@ -97,7 +98,7 @@ class LammpsDump(TextTrajectory):
             )
         return order
 
-    def _block(self, lines: TextIO) -> list[str] | None:
+    def _block(self, lines: TextIOBase) -> list[str] | None:
         block: list[str] = []
         atoms = None
         for line in lines:
@@ -159,21 +160,19 @@ def _numbers(rows: np.ndarray, columns: list[str], names: tuple[str, ...]) -> Fl
     return rows[:, [columns.index(one) for one in names]].astype(np.float64)
 
 
-def _box(
-    items: dict[str, list[str]],
-) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"], np.ndarray]:
-    """Lattice vectors, the box's corner, and which directions repeat."""
+def _box(items: dict[str, list[str]]) -> tuple[Float[np.ndarray, "3 3"], Bool[np.ndarray, "3"]]:
+    """Lattice vectors, and which directions repeat."""
     head, *rows = items["BOX BOUNDS"]
     words = head.split()
     pbc = np.array([word == "pp" for word in words[-3:]], bool)
     values = np.array([row.split() for row in rows[:3]], np.float64)
     if "abc" in words:
-        # vectors in any direction, and the corner as a fourth column
-        return values[:, :3], values[:, 3], pbc
+        # vectors in any direction; the corner is the fourth column
+        return values[:, :3], pbc
     low, high = values[:, 0], values[:, 1]
     xy, xz, yz = values[:, 2] if values.shape[1] > 2 else np.zeros(3)
     # the bounds of a tilted box are those of the box around it
     low = low - [min(0.0, xy, xz, xy + xz), min(0.0, yz), 0.0]
     high = high - [max(0.0, xy, xz, xy + xz), max(0.0, yz), 0.0]
     size = high - low
-    return np.array([[size[0], 0, 0], [xy, size[1], 0], [xz, yz, size[2]]]), low, pbc
+    return np.array([[size[0], 0, 0], [xy, size[1], 0], [xz, yz, size[2]]]), pbc

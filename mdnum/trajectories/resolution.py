@@ -14,17 +14,14 @@ from itertools import islice
 import numpy as np
 from jaxtyping import Float
 
-from mdnum.trajectories.frame import Box, Frame
+from mdnum.trajectories.frame import Frame
+from mdnum.trajectories.grids import decimal_grid, steps_of
 from mdnum.trajectories.source import Trajectory
 
 #: Frames looked at by `infer`.
 SAMPLE = 8
 # Coordinates looked at: chance hits decide nothing long before.
 _ENOUGH = 6000
-# Decimal steps tried, in Å or in fractions of the box: from 1 down.
-_STEPS = tuple(one * 10.0**-k for k in range(13) for one in (1.0, 0.5, 0.2))
-# A grid counts as found where chance would put all coordinates on it with no more than this probability.
-_CHANCE = 1e-6
 # Roundings that a number in the file may have seen beside those to its grid (a product in the writer,
 # reading, nm to Å), for finding the grid; and those that a coordinate in float32 has seen, nm to Å included.
 _SLACK, _ROUNDINGS = 3.0, 2.0
@@ -40,7 +37,9 @@ class Resolution:
     Attributes:
         kind: "grid" (decimals of a length), "fractions" (decimals of the box's vectors), "float32" or
             "float64".
-        step: of the grid: length for "grid", a pure number for "fractions"; 0 for floats.
+        step: of the grid: length for "grid", a pure number for "fractions"; 0 for floats. Where digits are
+            counted, that of the largest coordinate it was found from.
+        digits: significant digits of every number, where it is these that are fixed; else 0.
         bits: width of a coordinate as the reader hands it over, 32 or 64.
         frames: frames it was found from.
         moved: whether atoms moved between them. Where none did, the grid may be the structure's and not the
@@ -54,6 +53,7 @@ class Resolution:
     frames: int
     moved: bool = True
     box: tuple[float, float] = (0.0, 0.0)
+    digits: int = 0
 
     def bound(self, frame: Frame) -> float:
         """How far a distance in this frame can be from that of the positions before they were written.
@@ -64,7 +64,7 @@ class Resolution:
         Error: for a pair through one period of the box; further images add as much of the box's part again.
         """
         largest, lattice = _extent(frame)
-        coordinate, box = self._half(frame.box), 0.0
+        coordinate, box = self._half(frame), 0.0
         if self._narrow:
             # the box comes through the same reader
             coordinate += _ROUNDINGS * _UNIT[32] * largest
@@ -79,12 +79,21 @@ class Resolution:
 
     def typical(self, frame: Frame) -> float:
         """Standard deviation of a distance's error: rounding errors spread evenly within a step, length."""
-        largest, _ = _extent(frame)
-        half = self._half(frame.box)
-        if half == 0:
-            half = _UNIT[32 if self._narrow else 64] * largest
         # two atoms, each with variance step²/12 along the line between them
-        return float(np.sqrt(2 / 12) * 2 * half)
+        return float(np.sqrt(2 / 12)) * self.usual_step(frame)
+
+    def usual_step(self, frame: Frame) -> float:
+        """Root mean square of what the last digit of a coordinate is worth, length."""
+        if not len(frame.positions):
+            return 0.0
+        if not self.step:
+            # of a float, twice the unit roundoff; its mantissas are spread from 1/2 to 1
+            return 2 * _UNIT[32 if self._narrow else 64] * float(np.sqrt((frame.positions**2).mean()))
+        if self.kind == "fractions":
+            steps = steps_of(_fractions_of(frame), self.step, self.digits)
+            # a step along each lattice vector, and the mean over the axes
+            return float(np.sqrt((((steps**2).mean(axis=0)[:, None]) * frame.box.matrix**2).sum() / 3))
+        return float(np.sqrt((steps_of(frame.positions, self.step, self.digits) ** 2).mean()))
 
     def words(self, length: str = "Å") -> str:
         """A sentence on the resolution, for people."""
@@ -99,12 +108,14 @@ class Resolution:
             if self.moved
             else " No atom moved between the frames looked at, so this may be the structure's."
         )
-        if self.kind == "grid":
-            return f"Every coordinate is a multiple of {self.step:g}{unit}: the file keeps no more.{unsure}"
-        if self.kind == "fractions":
+        of = " of the box" if self.kind == "fractions" else unit
+        if self.digits:
             return (
-                f"Every coordinate is a multiple of {self.step:g} of the box: the file keeps no more.{unsure}"
+                f"Every coordinate has at most {self.digits} digits, the last worth {self.step:g}{of} in the "
+                f"largest: the file keeps no more.{unsure}"
             )
+        if self.step:
+            return f"Every coordinate is a multiple of {self.step:g}{of}: the file keeps no more.{unsure}"
         digits = {"float32": "about 7", "float64": "about 16"}[self.kind]
         return f"Coordinates have the resolution of {self.kind}, {digits} digits.{through}"
 
@@ -112,11 +123,16 @@ class Resolution:
     def _narrow(self) -> bool:
         return self.kind == "float32" or self.bits == 32
 
-    def _half(self, box: Box) -> float:
+    def _half(self, frame: Frame) -> float:
         """Half a step along an axis at worst, length."""
+        if not self.step or not len(frame.positions):
+            return 0.0
         if self.kind == "fractions":
-            return self.step / 2 * float(np.abs(box.matrix).sum(axis=0).max())
-        return self.step / 2
+            largest = np.abs(_fractions_of(frame)).max(axis=0) if self.digits else np.ones(3)
+            steps = steps_of(largest, self.step, self.digits)
+            return float((steps[:, None] * np.abs(frame.box.matrix)).sum(axis=0).max()) / 2
+        largest = np.abs(frame.positions).max(keepdims=True)
+        return float(steps_of(largest, self.step, self.digits).max()) / 2
 
 
 def infer(trajectory: Trajectory, frames: int = SAMPLE) -> Resolution:
@@ -142,37 +158,18 @@ def infer_from(sample: Sequence[Frame], bits: int = 64, format: str = "") -> Res
     values, fractions = _values(sample, moved), _fractions(sample, moved)
     box = _BOX_STEPS.get(format, (0.0, 0.0))
     unit = _SLACK * _UNIT[bits]
-    step, part, size = _grid(values, unit * np.abs(values)), 0.0, 0.0
+    step, digits = decimal_grid(values, unit * np.abs(values))
+    kind = "float32" if bits == 32 or bool((values == values.astype(np.float32)).all()) else "float64"
+    kind = "grid" if step else kind
     if fractions is not None:
         size = max(float(np.abs(frame.box.matrix).max()) for frame in sample)
         # a product of three and a solution of three equations lie between
-        part = _grid(fractions, 8 * unit * (np.abs(fractions) + np.abs(values).max() / size))
-    narrow = bits == 32 or bool((values == values.astype(np.float32)).all())
-    kind = "float32" if narrow else "float64"
-    if step or part:
+        slack = 8 * unit * (np.abs(fractions) + np.abs(values).max() / size)
+        part, part_digits = decimal_grid(fractions, slack)
         # decimals of a box with few decimals are decimals too, of a finer grid
-        kind, step = ("fractions", part) if part * size > 2 * step else ("grid", step)
-    return Resolution(kind, step, bits, len(sample), bool(moved.any()), box)
-
-
-def _grid(values: Float[np.ndarray, "values"], slack: Float[np.ndarray, "values"]) -> float:
-    """The coarsest decimal step that all values are multiples of; 0.0 where there is none."""
-    values, index = np.unique(values, return_index=True)
-    slack = slack[index]
-    worth = values != 0
-    values, slack = values[worth], slack[worth]
-    if not len(values):
-        return 0.0
-    for step in _STEPS:
-        # the part of a step that would pass by chance, of every value
-        chance = np.minimum(2 * slack / step, 1.0)
-        if np.log(np.maximum(chance, 1e-300)).sum() > np.log(_CHANCE):
-            # finer steps are told from chance less well still
-            return 0.0
-        ratio = values / step
-        if (np.abs(ratio - np.round(ratio)) * step <= slack).all():
-            return step
-    return 0.0
+        if part * size > 2 * step:
+            kind, step, digits = "fractions", part, part_digits
+    return Resolution(kind, step, bits, len(sample), bool(moved.any()), box, digits)
 
 
 def _moved(sample: Sequence[Frame]) -> np.ndarray:
@@ -199,13 +196,16 @@ def _fractions(sample: Sequence[Frame], moved: np.ndarray) -> Float[np.ndarray, 
     """As `_values`, in fractions of the box; None without a box of three vectors."""
     frames = sample[1:] if moved.any() and len(sample) > 1 else sample
     rows = moved if moved.any() else np.ones(len(moved), bool)
-    parts = []
-    for frame in frames:
-        matrix = frame.box.matrix
-        if not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) == 0:
-            return None
-        parts.append(np.linalg.solve(matrix.T, frame.positions[rows].T).T.ravel())
-    return _thinned(np.concatenate(parts))
+    if any(
+        not np.isfinite(frame.box.matrix).all() or np.linalg.det(frame.box.matrix) == 0 for frame in frames
+    ):
+        return None
+    return _thinned(np.concatenate([_fractions_of(frame)[rows].ravel() for frame in frames]))
+
+
+def _fractions_of(frame: Frame) -> Float[np.ndarray, "atoms 3"]:
+    """Positions in fractions of the box."""
+    return np.linalg.solve(frame.box.matrix.T, frame.positions.T).T
 
 
 def _thinned(values: Float[np.ndarray, "values"]) -> Float[np.ndarray, "fewer"]:

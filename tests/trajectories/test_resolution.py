@@ -1,0 +1,200 @@
+"""The resolution of a file against what was done to its numbers; its effect on flips against the truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from MDAnalysisTests import datafiles
+from trajectories.liquid import CUTOFF, liquid, memberships, missed_and_invented
+
+from mdnum.trajectories.frame import Box, Frame
+from mdnum.trajectories.grid_effect import effect_on, grid_effect
+from mdnum.trajectories.resolution import infer, infer_from
+from mdnum.trajectories.source import open_trajectory
+
+TILTED = np.array([[9.0, 0, 0], [2.3, 8.1, 0], [-1.7, 3.3, 10.9]])
+
+
+def frames_of(positions, matrix=TILTED):
+    box = Box(np.asarray(matrix, float), np.ones(3, bool))
+    return [Frame(k, float(k), np.asarray(x, np.float64), box) for k, x in enumerate(positions)]
+
+
+def moving(atoms=40, frames=4, seed=0):
+    random = np.random.default_rng(seed)
+    start = random.uniform(-20, 20, (atoms, 3))
+    return start + np.cumsum(random.normal(scale=0.05, size=(frames, atoms, 3)), axis=0)
+
+
+@pytest.mark.parametrize(
+    ("path", "topology", "kind", "step"),
+    [
+        (datafiles.XTC, datafiles.GRO, "grid", 0.01),
+        (datafiles.TRR, datafiles.GRO, "float32", 0.0),
+        (datafiles.DCD, datafiles.PSF, "float32", 0.0),
+        (datafiles.GRO, None, "grid", 0.01),
+        (datafiles.PDB_small, None, "grid", 0.001),
+        # this one was made from text with three decimals, which its floats still show
+        (datafiles.NCDF, datafiles.PRMncdf, "grid", 0.001),
+        # six digits, LAMMPS's own format: 0.0963968 and 1.03170
+        (datafiles.LAMMPSDUMP, None, "fractions", 1e-5),
+        (datafiles.LAMMPSDUMP_image_vf, None, "grid", 1e-4),
+    ],
+)
+def test_of_real_files(path, topology, kind, step):
+    resolution = infer(open_trajectory(path, topology))
+    assert (resolution.kind, resolution.step) == (kind, pytest.approx(step))
+
+
+@settings(max_examples=60)
+@given(
+    st.sampled_from([0.05, 0.02, 0.01, 0.005, 1e-3, 2e-4, 1e-4, 1e-6, 1e-9]),
+    st.integers(0, 10**6),
+    st.sampled_from([12, 200]),
+)
+def test_a_decimal_grid_is_found_whatever_its_step(step, seed, atoms):
+    positions = np.round(moving(atoms, seed=seed) / step) * step
+    found = infer_from(frames_of(positions))
+    assert (found.kind, found.step) == ("grid", pytest.approx(step))
+    if step >= 1e-4:
+        # and through float32, as nm
+        narrow = (positions / 10).astype(np.float32) * np.float32(10)
+        found = infer_from(frames_of(narrow), bits=32)
+        assert (found.kind, found.step) == ("grid", pytest.approx(step))
+
+
+@settings(max_examples=40)
+@given(st.sampled_from([1e-3, 1e-5, 1e-6, 1e-8]), st.integers(0, 10**6))
+def test_decimals_of_the_box_are_found(step, seed):
+    fractions = np.linalg.solve(TILTED.T, moving(seed=seed).reshape(-1, 3).T).T
+    positions = ((np.round(fractions / step) * step) @ TILTED).reshape(4, -1, 3)
+    found = infer_from(frames_of(positions))
+    assert (found.kind, found.step) == ("fractions", pytest.approx(step))
+
+
+@settings(max_examples=40)
+@given(st.integers(5, 9), st.integers(0, 10**6))
+def test_a_number_of_digits_is_told_from_a_number_of_decimals(digits, seed):
+    positions = moving(60, seed=seed)
+    written = np.vectorize(lambda x: float(f"{x:.{digits}g}"))(positions)
+    found = infer_from(frames_of(written))
+    # numbers from 10 to 99 have two digits before the point
+    assert (found.kind, found.digits, found.step) == ("grid", digits, pytest.approx(10.0 ** (2 - digits)))
+    off = np.abs(written - positions).max()
+    assert off <= found.step / 2 and found.bound(frames_of(written)[0]) > 2 * off
+    fixed = infer_from(frames_of(np.round(positions, digits - 2)))
+    assert (fixed.digits, fixed.step) == (0, pytest.approx(10.0 ** (2 - digits)))
+
+
+@given(st.integers(0, 10**6), st.sampled_from([1, 2, 40]))
+def test_floats_are_no_grid_however_few_there_are(seed, atoms):
+    positions = moving(atoms, seed=seed)
+    assert infer_from(frames_of(positions)).kind == "float64"
+    narrow = positions.astype(np.float32)
+    assert infer_from(frames_of(narrow)).kind == "float32"
+    assert infer_from(frames_of(narrow), bits=32).kind == "float32"
+
+
+def test_the_sites_of_a_crystal_are_no_resolution():
+    sites = 2.5 * np.stack(np.meshgrid(*[np.arange(4.0)] * 3), -1).reshape(-1, 3)
+    random = np.random.default_rng(0)
+    frames = [sites, *(sites + random.normal(scale=0.1, size=sites.shape) for _ in range(3))]
+    # the first frame and the frozen wall would look like steps of 0.5
+    for frame in frames:
+        frame[:16] = sites[:16]
+    found = infer_from(frames_of(frames, 10 * np.eye(3)))
+    assert found.kind == "float64" and found.moved
+    still = infer_from(frames_of(frames[:1], 10 * np.eye(3)))
+    assert still.kind == "grid" and "may be the structure's" in still.words()
+
+
+@settings(max_examples=100)
+@given(st.integers(0, 10**6), st.sampled_from(["grid", "fractions", "float32"]), st.floats(1e-5, 0.1))
+def test_no_distance_is_further_off_than_the_bound(seed, kind, step):
+    true = moving(60, 4, seed)
+    if kind == "grid":
+        step = 10.0 ** round(np.log10(step))
+        kept = np.round(true / step) * step
+    elif kind == "fractions":
+        step = 10.0 ** round(np.log10(step))
+        fractions = np.linalg.solve(TILTED.T, true.reshape(-1, 3).T).T
+        kept = ((np.round(fractions / step) * step) @ TILTED).reshape(true.shape)
+    else:
+        kept = (true / 10).astype(np.float32) * np.float32(10)
+    frames = frames_of(kept)
+    resolution = infer_from(frames, bits=32 if kind == "float32" else 64)
+    assert resolution.kind == kind
+    first, second = np.triu_indices(60, 1)
+    for frame, x in zip(frames, true, strict=True):
+        off = np.linalg.norm(x[first] - x[second], axis=1) - np.linalg.norm(
+            frame.positions[first] - frame.positions[second], axis=1
+        )
+        bound = resolution.bound(frame)
+        assert np.abs(off).max() <= bound
+        # and no wider than it has to be: the worst of 1,770 distances comes within a factor of 4 (float: 12)
+        assert np.abs(off).max() > bound / (12 if kind == "float32" else 4)
+        if kind == "grid":
+            assert off.std() == pytest.approx(resolution.typical(frame), rel=0.25)
+
+
+def test_the_worst_case_is_met():
+    # two atoms on the diagonal, half a step off in opposite directions
+    frames = frames_of(np.round(moving(30), 2))
+    resolution = infer_from(frames)
+    assert resolution.bound(frames[0]) == pytest.approx(2 * np.sqrt(3) * 0.005, rel=1e-9)
+
+
+def quantized(positions, step):
+    return np.round(positions / step) * step
+
+
+@pytest.mark.parametrize(("stride", "timestep"), [(1, 0.005), (4, 0.005)])
+def test_what_the_grid_of_an_xtc_does_to_flips(stride, timestep):
+    # sigma = 1 Å and 0.001 nm: 43 % hidden and 57 % of those in the file made up, at every step
+    positions, length = liquid(60 if stride == 1 else 20, timestep, stride)
+    kept = quantized(positions, 0.01)
+    missed, invented = missed_and_invented(memberships(positions, length), memberships(kept, length))
+    frames = frames_of(kept[:8], length * np.eye(3))
+    resolution = infer_from(frames)
+    assert resolution.step == 0.01
+    effect = grid_effect(resolution, frames, CUTOFF)
+    assert effect is not None
+    if stride == 1:
+        assert missed > 0.35 and invented > 0.5
+    assert effect.missed == pytest.approx(missed, abs=0.04)
+    assert effect.invented == pytest.approx(invented, abs=0.04)
+    assert f"{100 * effect.missed:.2g} %" in effect.words()
+
+
+def test_doubles_hide_nothing():
+    positions, length = liquid(60, 0.005, 1)
+    frames = frames_of(positions[:8], length * np.eye(3))
+    resolution = infer_from(frames)
+    effect = grid_effect(resolution, frames, CUTOFF)
+    assert resolution.kind == "float64" and effect is not None
+    assert effect.missed < 1e-6 and "fewer than 1 flip in 1,000" in effect.words()
+    move = np.sqrt(((positions[1:8] - positions[:7]) ** 2).mean())
+    assert effect.move == pytest.approx(move, rel=0.05)
+
+
+def test_wrapping_is_no_motion():
+    positions, length = liquid(60, 0.005, 1)
+    kept = quantized(positions % length, 0.01)
+    frames = frames_of(kept[:8], length * np.eye(3))
+    plain = frames_of(quantized(positions, 0.01)[:8], length * np.eye(3))
+    one, other = (grid_effect(infer_from(some), some, CUTOFF) for some in (frames, plain))
+    assert one is not None and other is not None
+    assert one.move == pytest.approx(other.move, rel=0.01)
+    assert one.missed == pytest.approx(other.missed, abs=0.02)
+
+
+def test_of_a_real_xtc():
+    trajectory = open_trajectory(datafiles.XTC, datafiles.GRO)
+    oxygens = np.flatnonzero(trajectory.species == "O")
+    effect = effect_on(trajectory, infer(trajectory), 3.5, oxygens)
+    # 100 ps between two frames: everything has moved far
+    assert effect is not None and effect.missed < 0.02 and effect.move > 1.0
+    single = open_trajectory(datafiles.XTC, datafiles.GRO, slice="3")
+    assert effect_on(single, infer(single), 3.5, oxygens) is None
