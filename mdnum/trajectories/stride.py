@@ -20,6 +20,8 @@ from jaxtyping import Float, Int
 from mdnum.trajectories.frame import Frame
 from mdnum.trajectories.history import History
 
+# share of the flips below which those that a stride of 2 loses are too few to see a trend in
+_FEW = 5e-3
 # ratio of successive losses, from one doubling of the stride to the next, above which they do not die out
 # when the stride is halved again and again: Brownian motion crosses a threshold infinitely often
 _DIES_OUT = 0.9
@@ -66,16 +68,19 @@ class Strides:
 
 @dataclass(frozen=True)
 class Between:
-    """An estimate of what is missing between the frames.
+    """An estimate of what is missing between the frames, as shares of all flips that happened.
 
     Attributes:
-        lost: share of the flips that happened but are not in the file; None where the numbers do not tell.
-        at_least: a share that is missing in any case.
+        lost: the estimate; None where the numbers do not tell.
+        low, high: what two ways of carrying the losses on give; None where `lost` is.
+        doubled: share that every second frame alone would lose.
         says: where it comes from, in words.
     """
 
     lost: float | None
-    at_least: float
+    low: float | None
+    high: float | None
+    doubled: float
     says: str
 
 
@@ -91,27 +96,59 @@ def between_frames(found: Strides) -> Between | None:
     """What lies between the frames, from how the flips thin out when frames are left out.
 
     Going from stride 2 to 1 brought some flips back, going from 4 to 2 some others. Where the first are fewer
-    by a factor q, halving the stride for ever brings back a geometric series of them. For straight flight
-    through the cutoff q is about 1/2; where it is not below 0.9 there is no sum to speak of (motion that
-    looks Brownian at this stride), and only what the next halving would bring is told.
+    by a factor q, halving the stride for ever brings back a geometric series of them. In a liquid q itself
+    falls with the stride, from about 1 where motion looks Brownian to 1/4 where atoms fly straight, so that q
+    held fixed says too much (high), and q that falls on as from one doubling to the next too little (low).
 
     Returns:
         None with fewer than three strides, or no flips.
+
+    Error: in a Lennard-Jones liquid, and in sums of a few oscillations, the truth is between the two, and
+        the estimate is within a factor of 3 of it (tests/trajectories/test_stride.py); neither is a bound.
     """
     if len(found.stride) < 3 or tuple(found.stride[:3]) != (1, 2, 4) or not found.of.all():
         return None
-    once, twice, four = (float(share) for share in found.share[:3])
-    near, far = once - twice, twice - four
+    shares = found.share[:4]
+    losses = -np.diff(shares)
+    near, far = float(losses[0]), float(losses[1])
     if near <= 0:
-        return Between(0.0, 0.0, "looking at every second frame alone loses no flip")
+        return Between(0.0, 0.0, 0.0, 0.0, "looking at every second frame alone loses no flip")
+    said = (
+        f"looking at every second frame alone loses {_percent(1 - shares[1])} of the flips, at every fourth "
+        f"{_percent(1 - shares[2])}"
+    )
+    if near < _FEW:
+        # straight flight, and too few to see a trend in: in proportion to the stride, or to its square
+        return Between(_share(near), _share(near / 3), _share(2 * near), near, said)
     q = near / far if far > 0 else math.inf
-    seen = f"every second frame alone has {1 - twice:.2g} of the flips fewer, every fourth {1 - four:.2g}"
-    # the next halving brings back q times what the last one did; the share is of all that happened
-    step = near * min(q, 1.0)
-    if q >= _DIES_OUT:
-        return Between(None, step / (1 + step), f"{seen}: the loss does not die out as the stride is halved")
-    missing = near * q / (1 - q)
-    return Between(missing / (1 + missing), step / (1 + step), f"{seen}: carried on as a geometric series")
+    trend = min(q / (far / float(losses[2])), 1.0) if len(losses) > 2 and losses[2] > 0 and far > 0 else 1.0
+    low = _series(near, q * trend, trend)
+    if q >= _DIES_OUT or low is None:
+        return Between(None, None, None, near, f"{said}: that does not die out as the stride is halved")
+    high = near * q / (1 - q)
+    said = f"{said}, carried on to ever shorter strides"
+    return Between(_share(math.sqrt(low * high)), _share(low), _share(high), near, said)
+
+
+def _series(first: float, q: float, trend: float) -> float | None:
+    """first (q + q q' + q q' q'' + ...), with q' = trend q and so on; None where it does not converge."""
+    total, term = 0.0, first
+    for _ in range(200):
+        term *= q
+        total += term
+        q *= trend
+        if term < 1e-6 * total:
+            return total
+    return None
+
+
+def _share(missing: float) -> float:
+    """Of all flips, those missing, from those missing for each flip in the file."""
+    return missing / (1 + missing)
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.2g} %"
 
 
 def crossings(frame: Frame, count: Callable[[Frame, Frame], int], move: float) -> tuple[int, float] | None:

@@ -6,6 +6,7 @@ flips of some of the pairs, and everything counted here adds up over parts.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -295,5 +296,5 @@ def classes(tally: Tally) -> list[dict[str, Any]]:
 def _between(found: Strides) -> dict[str, Any]:
     said = between_frames(found)
     if said is None:
-        return {"lost": None, "at_least": None, "says": ""}
-    return {"lost": said.lost, "at_least": said.at_least, "says": said.says}
+        return {"lost": None, "low": None, "high": None, "doubled": None, "says": ""}
+    return dataclasses.asdict(said)

@@ -92,10 +92,10 @@ def _between(run: Question, one: Mapping[str, Any]) -> Iterator[Finding]:
     elif one["flips"] >= FEW and found["says"] and found["lost"] is None:
         yield Finding(
             "BETWEEN_FRAMES",
-            "warning" if found["at_least"] > HIDDEN else "info",
+            "warning" if found["doubled"] > HIDDEN else "info",
             "how many flips happened between the frames cannot be told",
-            f"{rule_words(run, one)}: {found['says']}. Frames half as far apart would bring "
-            f"{percent(found['at_least'])} of all flips to light, and those between them more.",
+            f"{rule_words(run, one)}: {found['says']}, as where motion looks Brownian at this stride. Frames "
+            "half as far apart would bring a share of that order to light, and more between them.",
             _BOUND,
         )
     elif one["flips"] >= FEW and found["lost"] is not None and found["lost"] > HIDDEN:
@@ -103,7 +103,8 @@ def _between(run: Question, one: Mapping[str, Any]) -> Iterator[Finding]:
             "BETWEEN_FRAMES",
             "warning",
             f"about {percent(found['lost'])} of the flips happened and reverted between frames",
-            f"{rule_words(run, one)}: {found['says']}.",
+            f"{rule_words(run, one)}: {found['says']}. Two ways of doing that give {percent(found['low'])} "
+            f"and {percent(found['high'])}.",
             _BOUND,
         )
 

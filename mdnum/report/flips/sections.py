@@ -102,9 +102,9 @@ def _between(run: Question, one: Mapping[str, Any]) -> Iterator[tuple[str, str]]
     found, flux = one["stride"], one["flux"]
     if found["says"]:
         if found["lost"] is None:
-            told = f"no number; the next halving alone would add {percent(found['at_least'])}"
+            told = "no number can be given"
         else:
-            told = f"about {percent(found['lost'])} of all flips"
+            told = f"about {percent(found['lost'])} of all flips" if found["lost"] else "none"
         yield "Lost between frames, by leaving frames out", f"{told} ({found['says']})"
     if flux is not None and flux["crossed"]:
         unit = run.summary["time"]
