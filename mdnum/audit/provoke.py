@@ -32,6 +32,9 @@ _SIDES = (1e-9, 1e-6)
 _SURE = 30.0
 _WITHOUT_CUTOFF = 6.0
 
+_CALLS = 150
+"""Calculations that crowding one atom takes at least."""
+
 _HABITUAL = (12, 16, 20, 24, 30, 32, 40, 48, 50, 60, 64, 80, 96, 100, 120, 128, 150, 200, 250, 256)
 """Ties that are looked at in any case; the others as the time allows, from the first on."""
 
@@ -93,14 +96,28 @@ def crowd(
         if progress:
             progress(k, len(alike), {"phase": f"crowding {walk.pair.species[0]}"})
         radius = walk.cutoff or _WITHOUT_CUTOFF
-        for count in (most, most // 2, most // 5):  # some refuse what is too dense for them
+        share = seconds / len(alike)
+        for count in (most, most // 2, most // 4, most // 8):
+            # some refuse what is too dense for them, and for some it takes too long
             try:
                 with only_trying(subject):
-                    found.append(_crowded(subject, walk.pair, radius, count, seconds / len(alike)))
+                    if count > most // 8 and _CALLS * _cost(subject, walk.pair, radius, count) > share:
+                        continue
+                    found.append(_crowded(subject, walk.pair, radius, count, share))
                 break
             except CalculatorError:
                 continue
     return found
+
+
+def _cost(subject: Subject, pair: Pair, radius: float, count: int) -> float:
+    """Seconds of a calculation of a crowd, after the first."""
+    atoms, _ = cluster(pair, radius, count)
+    subject.forces(atoms)
+    atoms.positions[0, 0] += 1e-6
+    began = time.perf_counter()
+    subject.forces(atoms)
+    return time.perf_counter() - began
 
 
 def cluster(pair: Pair, radius: float, count: int) -> tuple[Atoms, Float[np.ndarray, "neighbors"]]:
@@ -213,7 +230,7 @@ def _order(subject: Subject, pair: Pair, radius: float, most: int) -> tuple[int 
         atoms, _ = cluster(pair, radius, count)
         return _permuted(subject, atoms)
 
-    counts = [count for count in (2, 4, 8, 16, 32, 64, 128) if count < most] + [most]
+    counts = [count for count in (4, 16, 64) if count < most] + [most]
     low = 1
     for count in counts:
         changed, energy, force = differs(count)
