@@ -3,36 +3,29 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from ase import Atoms
 
+from mdnum.audit import probes
 from mdnum.audit.alone import alone
 from mdnum.audit.answer import Answer, Refusal, ask
+from mdnum.audit.approaches import Asked, approaches
 from mdnum.audit.base import Part, Progress, Subject
+from mdnum.audit.crossings import Threshold
 from mdnum.audit.noise import FEW, Noise, displaced, settled
+from mdnum.audit.subject import CalculatorError, only_trying
 from mdnum.references.findings import finding
 
 #: How many times the noise one object may differ from another by: a list that was built elsewhere sums its
 #: terms in another order.
 _ALLOWED = 40.0
 _REPEATS = 3
-
-
-@dataclass(frozen=True)
-class Asked:
-    """A structure in a sequence that one calculator object is asked about.
-
-    Attributes:
-        what: how it differs from the one before, in words.
-        atoms: the structure.
-    """
-
-    what: str
-    atoms: Atoms
+#: Seconds that a new object and its first answer may take before only the ends of sequences are compared.
+_SLOW = 0.3
 
 
 @dataclass
@@ -40,9 +33,12 @@ class State:
     """Repeated calls, and one object through structures that grow, shrink, move and strain, beside new ones.
 
     Args:
+        thresholds: finds the cutoff, at which two atoms are brought together; see
+            `mdnum.audit.thresholds.find_thresholds`.
         seed: of structures.
     """
 
+    thresholds: Callable[[Subject], Sequence[Threshold]] | None = None
     name: str = "state"
     seed: int = 0
     structures: dict[str, Atoms] = field(default_factory=dict)
@@ -59,6 +55,8 @@ class State:
             "strain": list(strain(atoms)),
             "wrapping": list(wrapping(atoms, rng)),
         }
+        nothing = self._approached(subject, sequences)
+        sequences = {word: sequence for word, sequence in sequences.items() if sequence}
         total = sum(map(len, sequences.values()))
         done, rows = 0, []
         for word, sequence in sequences.items():
@@ -94,9 +92,27 @@ class State:
                 "bit_identical": repeats["bit-identical"],
                 "bit_identical_objects": repeats["bit-identical between objects"],
             },
-            skipped=[*((row["structure"], row["refused"].why) for row in refused), *lonely.skipped],
+            skipped=[*nothing, *((row["structure"], row["refused"].why) for row in refused), *lonely.skipped],
             seconds=time.perf_counter() - began,
         )
+
+    def _approached(self, subject: Subject, sequences: dict[str, list[Asked]]) -> list[tuple[str, str]]:
+        """Adds sequences of two atoms at the cutoff; what could not be, and why."""
+        what = "two atoms at the cutoff"
+        if self.thresholds is None:
+            return [(what, "no cutoff was looked for")]
+        try:
+            found = list(self.thresholds(subject))
+            with only_trying(subject):
+                pairs = probes.pairs(subject)[0]
+        except CalculatorError as error:
+            return [(what, error.message)]
+        for pair in pairs[:1]:
+            radii = [one.radius for one in found if set(one.species) == set(pair.species)]
+            if radii:
+                sequences |= dict(approaches(pair, max(radii)))
+                return []
+        return [(what, "no cutoff was found")]
 
     def _stale(self, stale: list[dict[str, Any]]) -> Iterator[dict[str, str]]:
         if not stale:
@@ -245,20 +261,26 @@ def _scaled(atoms: Atoms, factor: float) -> Atoms:
 
 def _through(subject: Subject, sequence: list[Asked], noise: Noise, word: str) -> Iterator[dict[str, Any]]:
     """One object through a sequence; each answer beside that of an object that has seen nothing."""
+    began = time.perf_counter()
     used = subject.fresh()
+    ask(used, sequence[0].atoms)
+    slow = time.perf_counter() - began > _SLOW
     before: Atoms | None = None
     known: dict[int, Answer | Refusal] = {}
     size = 0.0
-    for asked in sequence:
+    for place, asked in enumerate(sequence):
+        old = ask(used, asked.atoms)
+        previous, before = before or asked.atoms, asked.atoms
+        if not asked.compared or (slow and place < len(sequence) - 2):
+            continue
         # structures come again within a sequence, which keeps them, so their ids are theirs
         if id(asked.atoms) not in known:
             known[id(asked.atoms)] = ask(subject.fresh(), asked.atoms)
-        new, old = known[id(asked.atoms)], ask(used, asked.atoms)
+        new = known[id(asked.atoms)]
         row: dict[str, Any] = {
-            "sequence": word, "structure": asked.what, "before": before or asked.atoms, "atoms": asked.atoms,
+            "sequence": word, "structure": asked.what, "before": previous, "atoms": asked.atoms,
             "energy": 0.0, "force": 0.0, "allowed": 0.0, "remembers": False, "refused": None,
         }  # fmt: skip
-        before = asked.atoms
         if isinstance(new, Refusal):
             # what nobody can answer says nothing about memory
             yield row | {"refused": new}
@@ -338,10 +360,11 @@ def _row(row: Mapping[str, Any]) -> dict[str, Any]:
 def _says(rows: list[dict[str, Any]], stale: list[dict[str, Any]], repeats: Mapping[str, Any]) -> str:
     bits = "are" if repeats["bit-identical"] else "are not"
     tail = f"Repeated calls {bits} bit-identical."
+    words = f"{len({row['sequence'] for row in rows})} sequences"
     if stale:
         return (
             f"{len(stale)} of {len(rows)} answers of an object in use differ from those of a new one, by up "
             "to "
             f"{max(row['energy'] for row in stale):.3g} eV: the calculator remembers. {tail}"
         )
-    return f"An object asked {len(rows)} times in five sequences answered as new ones do. {tail}"
+    return f"Objects in use answered {len(rows)} questions of {words} as new ones do. {tail}"

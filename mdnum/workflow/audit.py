@@ -195,7 +195,7 @@ def _checks(
         "invariance": Invariance,
         "forces": Forces,
         "curl": Curl,
-        "state": State,
+        "state": lambda: State(find_thresholds),
         "dynamics": lambda: Dynamics(find_thresholds, _internal(timestep, subject), steps),
     }
     for name in wanted:

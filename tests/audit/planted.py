@@ -1,0 +1,351 @@
+"""A small correct calculator, and the same with one mistake each that the audit is there to find."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from ase import Atoms
+from ase.build import bulk
+from ase.calculators.calculator import Calculator, all_changes
+
+from mdnum.audit.subject import CalculatorSubject
+
+R_CUT = 3.4
+KT = 0.01
+
+
+def crystal() -> Atoms:
+    """Eight atoms in a cell of little more than one cutoff: images of all kinds are needed."""
+    return bulk("Ar", "fcc", a=3.9, cubic=True).repeat((2, 1, 1))
+
+
+def chain() -> Atoms:
+    """Six atoms of two species, with nothing periodic and nothing symmetric."""
+    rng = np.random.default_rng(3)
+    positions = np.cumsum(np.full((6, 3), 1.4), axis=0) + rng.uniform(-0.3, 0.3, (6, 3))
+    return Atoms("ArKrArArKrAr", positions=positions)
+
+
+def subject(make: Callable[[], Calculator], atoms: Atoms | None = None) -> CalculatorSubject:
+    """The subject of an audit."""
+    return CalculatorSubject(make.__name__, make, crystal() if atoms is None else atoms, kT=KT)
+
+
+class Good(Calculator):
+    """A smooth pair potential, by brute force over images: (1 - x²)⁴ (a - b x²), x = r / r_cut.
+
+    Overridden one by one below; every step of it is right here.
+    """
+
+    implemented_properties = ["energy", "free_energy", "forces"]  # noqa: RUF012
+
+    def calculate(self, atoms=None, properties=None, system_changes=all_changes):
+        super().calculate(atoms, properties, system_changes)
+        there = self.atoms
+        assert isinstance(there, Atoms)
+        energy, forces = self.answer(there)
+        self.results = {"energy": energy, "free_energy": energy, "forces": forces}
+
+    def answer(self, atoms: Atoms) -> tuple[float, np.ndarray]:
+        positions, shifts = self.positions(atoms), self.shifts(atoms)
+        i, _, vectors = self.pairs(positions, shifts, atoms)
+        distances = np.linalg.norm(vectors, axis=1)
+        u, slope = self.pair(distances)
+        energy = 0.5 * float(np.sum(u))
+        along = (slope / distances)[:, None] * vectors
+        forces = np.zeros((len(atoms), 3))
+        # each directed pair once: j's half of the force on i
+        np.add.at(forces, i, along)
+        return self.extra(atoms, energy, forces)
+
+    def positions(self, atoms: Atoms) -> np.ndarray:
+        """As the search wants them: wrapped along periodic axes."""
+        found = atoms.positions.copy()
+        if atoms.pbc.any():
+            rows = atoms.cell.array[atoms.pbc]
+            found -= np.floor(found @ np.linalg.pinv(rows)) @ rows
+        return found
+
+    def shifts(self, atoms: Atoms) -> np.ndarray:
+        """All lattice vectors that can matter to wrapped positions."""
+        if not atoms.pbc.any():
+            return np.zeros((1, 3))
+        rows = atoms.cell.array[atoms.pbc]
+        widths = 1 / np.linalg.norm(np.linalg.pinv(rows), axis=0)
+        counts = [range(-int(R_CUT / width) - 1, int(R_CUT / width) + 2) for width in widths]
+        return np.array(list(itertools.product(*counts))) @ rows
+
+    def pairs(self, positions, shifts, atoms) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        vectors = positions[None, :, None] + shifts[None, None] - positions[:, None, None]
+        squares = np.sum(vectors**2, axis=3)
+        i, j, image = np.nonzero((squares < R_CUT**2) & (squares > 1e-12))
+        return i, j, vectors[i, j, image]
+
+    def pair(self, distances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Energy of a pair, and its derivative by the distance."""
+        x2 = (distances / R_CUT) ** 2
+        window, well = (1 - x2) ** 4, 0.9 - 1.6 * x2
+        slope = (-8 * (1 - x2) ** 3 * well - 3.2 * window) * distances / R_CUT**2
+        return window * well, slope
+
+    def extra(self, atoms: Atoms, energy: float, forces: np.ndarray) -> tuple[float, np.ndarray]:
+        return energy, forces
+
+
+class OneImage(Good):
+    """Looks for neighbors one cell away and does not wrap: unwrapped coordinates lose theirs."""
+
+    def positions(self, atoms):
+        return atoms.positions
+
+
+class FaceDropped(Good):
+    """Puts atoms into cells of a grid by their wrapped fraction; one that rounds to 1 is in none."""
+
+    def pairs(self, positions, shifts, atoms):
+        i, j, vectors = super().pairs(positions, shifts, atoms)
+        # the same wrap in two steps, as codes do that work with fractions: -tiny becomes exactly 1
+        shares = atoms.cell.scaled_positions(atoms.positions)
+        lost = np.any(shares - np.floor(shares) >= 1.0, axis=1)
+        keep = ~lost[i] & ~lost[j]
+        return i[keep], j[keep], vectors[keep]
+
+
+class FirstSix(Good):
+    """Keeps six neighbors of each atom, those that come first."""
+
+    def pairs(self, positions, shifts, atoms):
+        i, j, vectors = super().pairs(positions, shifts, atoms)
+        rank = np.arange(len(i)) - np.searchsorted(i, i)
+        keep = rank < 6
+        return i[keep], j[keep], vectors[keep]
+
+
+class NearestImage(Good):
+    """One image of each pair, whatever the cell."""
+
+    def pairs(self, positions, shifts, atoms):
+        vectors = positions[None] - positions[:, None]
+        vectors -= np.rint(vectors @ np.linalg.inv(atoms.cell.array)) @ atoms.cell.array
+        squares = np.sum(vectors**2, axis=2)
+        i, j = np.nonzero((squares < R_CUT**2) & (squares > 1e-12))
+        return i, j, vectors[i, j]
+
+
+class ByLengths(Good):
+    """Counts images by the lengths of lattice vectors, which skewed cells exceed."""
+
+    def shifts(self, atoms):
+        rows = atoms.cell.array[atoms.pbc]
+        counts = [int(np.ceil(R_CUT / np.linalg.norm(row))) for row in rows]
+        return np.array(list(itertools.product(*(range(-n, n + 1) for n in counts)))) @ rows
+
+
+class HardEdge(Good):
+    """A cutoff that cuts."""
+
+    def pair(self, distances):
+        u, slope = super().pair(distances)
+        return u + 0.01, slope
+
+
+class Tilted(Good):
+    """Knows where up is."""
+
+    def extra(self, atoms, energy, forces):
+        lean = np.ones(len(atoms))
+        vectors = atoms.positions - atoms.positions.mean(axis=0)
+        forces = forces.copy()
+        if atoms.pbc.any():
+            return energy * (1 + 1e-3 * atoms.cell.array[0, 2] ** 2), forces
+        return energy + 1e-3 * float(np.sum(lean * vectors[:, 2] ** 2)), forces
+
+
+class Handed(Good):
+    """Tells left from right: the triple product of the first four atoms."""
+
+    def extra(self, atoms, energy, forces):
+        first = atoms.positions[1:4] - atoms.positions[0]
+        return energy + 1e-3 * float(np.linalg.det(first)) * (not atoms.pbc.any()), forces
+
+
+class WrapsAlways(Good):
+    """Wraps along axes that do not repeat."""
+
+    def positions(self, atoms):
+        if atoms.pbc.any() or not atoms.cell.array.any():
+            return super().positions(atoms)
+        rows = atoms.cell.array
+        return atoms.positions - np.floor(atoms.positions @ np.linalg.inv(rows)) @ rows
+
+
+class NoSwitchInForce(Good):
+    """The derivative of the window is left out of the force."""
+
+    def pair(self, distances):
+        u, _ = super().pair(distances)
+        x2 = (distances / R_CUT) ** 2
+        return u, (1 - x2) ** 4 * -3.2 * distances / R_CUT**2
+
+
+class OneSided(Good):
+    """Only the first of two atoms feels a pair."""
+
+    def pairs(self, positions, shifts, atoms):
+        i, j, vectors = super().pairs(positions, shifts, atoms)
+        keep = (i < j) | ((i == j) & (vectors[:, 0] > 0))
+        return i[keep], j[keep], vectors[keep]
+
+
+class Whirl(Good):
+    """Adds a force that goes round the center of the structure."""
+
+    def extra(self, atoms, energy, forces):
+        arms = atoms.positions - atoms.positions.mean(axis=0)
+        return energy, forces + 1e-3 * np.cross([0.0, 0.0, 1.0], arms)
+
+
+class OldPairs(Good):
+    """Keeps the list of pairs while the number of atoms stays the same."""
+
+    kept: Any = None
+
+    def pairs(self, positions, shifts, atoms):
+        if self.kept is None or self.kept[0] != len(atoms):
+            vectors = positions[None, :, None] + shifts[None, None] - positions[:, None, None]
+            squares = np.sum(vectors**2, axis=3)
+            self.kept = (
+                len(atoms),
+                np.nonzero((squares < (1.1 * R_CUT) ** 2) & (squares > 1e-12)),
+                len(shifts),
+            )
+        i, j, image = self.kept[1]
+        if self.kept[2] != len(shifts):
+            image = np.zeros_like(image)
+        vectors = positions[j] + shifts[image] - positions[i]
+        squares = np.sum(vectors**2, axis=1)
+        keep = (squares < R_CUT**2) & (squares > 1e-12)
+        return i[keep], j[keep], vectors[keep]
+
+
+class FullSkin(Good):
+    """A skin list without images of its own, rebuilt when an atom has moved by all of the skin, not half."""
+
+    skin = 0.4
+    kept: Any = None
+
+    def positions(self, atoms):
+        return atoms.positions
+
+    def pairs(self, positions, shifts, atoms):
+        key = (len(atoms), atoms.cell.array.tobytes(), atoms.pbc.tobytes(), atoms.numbers.tobytes())
+        if self.kept is None or self.kept[0] != key or (
+            np.max(np.linalg.norm(positions - self.kept[1], axis=1)) > self.skin
+        ):  # fmt: skip
+            # images are counted from the wrapped atoms, and belong to them as they are
+            wrapped = Good.positions(self, atoms)
+            offset, shifts = wrapped - positions, _far(atoms)
+            vectors = wrapped[None, :, None] + shifts[None, None] - wrapped[:, None, None]
+            squares = np.sum(vectors**2, axis=3)
+            i, j, image = np.nonzero((squares < (R_CUT + self.skin) ** 2) & (squares > 1e-12))
+            self.kept = key, positions.copy(), i, j, shifts[image] + offset[j] - offset[i]
+        i, j, moved = self.kept[2:]
+        vectors = positions[j] + moved - positions[i]
+        squares = np.sum(vectors**2, axis=1)
+        keep = squares < R_CUT**2
+        return i[keep], j[keep], vectors[keep]
+
+
+def _far(atoms: Atoms) -> np.ndarray:
+    """Lattice vectors up to three cells away."""
+    if not atoms.pbc.any():
+        return np.zeros((1, 3))
+    rows = atoms.cell.array[atoms.pbc]
+    return np.array(list(itertools.product(*[range(-3, 4)] * len(rows)))) @ rows
+
+
+class HalfSkin(FullSkin):
+    """The same with the criterion as it should be."""
+
+    skin = 0.4
+
+    def pairs(self, positions, shifts, atoms):
+        if self.kept is not None and len(self.kept[1]) == len(positions):
+            moved = np.max(np.linalg.norm(positions - self.kept[1], axis=1))
+            if 2 * moved > self.skin:
+                self.kept = None
+        return super().pairs(positions, shifts, atoms)
+
+
+class OldTail(Good):
+    """Writes its pairs into a buffer that only grows, and reads as many rows as the fullest atom ever had."""
+
+    buffer: Any = None
+
+    def pairs(self, positions, shifts, atoms):
+        i, j, vectors = super().pairs(positions, shifts, atoms)
+        if self.buffer is None or len(self.buffer[0]) < len(i):
+            self.buffer = i.copy(), vectors.copy()
+            return i, j, vectors
+        old_i, old_vectors = self.buffer
+        old_i[: len(i)], old_vectors[: len(i)] = i, vectors
+        keep = old_i < len(positions)
+        return old_i[keep].copy(), old_i[keep].copy(), old_vectors[keep].copy()
+
+
+class Restless(Good):
+    """Sums in another order each time."""
+
+    rng = np.random.default_rng(11)
+
+    def pairs(self, positions, shifts, atoms):
+        i, j, vectors = super().pairs(positions, shifts, atoms)
+        order = self.rng.permutation(len(i))
+        return i[order], j[order], vectors[order]
+
+
+class MeanNeighbor(Good):
+    """Divides by the number of neighbors."""
+
+    def extra(self, atoms, energy, forces):
+        i, _, _ = self.pairs(self.positions(atoms), self.shifts(atoms), atoms)
+        count = np.bincount(i, minlength=len(atoms))
+        with np.errstate(all="ignore"):
+            return energy + float(np.sum(np.where(count == 0, np.nan, 0.0))), forces
+
+
+class EmptyList(Good):
+    """Takes the nearest of no neighbors."""
+
+    def extra(self, atoms, energy, forces):
+        i, _, _ = self.pairs(self.positions(atoms), self.shifts(atoms), atoms)
+        for who in range(len(atoms)):
+            min(np.flatnonzero(i == who))
+        return energy, forces
+
+
+class Background(Good):
+    """A term of the whole: the energy of parts is not the sum."""
+
+    def extra(self, atoms, energy, forces):
+        return energy + 0.1 * len(atoms) ** 2 * (not atoms.pbc.any()), forces
+
+
+class Single(Good):
+    """Works in single precision."""
+
+    def answer(self, atoms):
+        energy, forces = super().answer(atoms)
+        return float(np.float32(energy)), forces.astype(np.float32).astype(float)
+
+
+class OnlyRectangles(Good):
+    """Refuses what it cannot do, which is no mistake."""
+
+    def answer(self, atoms):
+        if atoms.pbc.any() and np.abs(atoms.cell.array - np.diag(np.diag(atoms.cell.array))).max() > 1e-9:
+            raise NotImplementedError("rectangular cells only")
+        return super().answer(atoms)

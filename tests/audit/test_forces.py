@@ -1,0 +1,120 @@
+"""Forces, curl: their errors are honest, and what is wrong is told from what is only imprecise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from ase import Atoms
+from ase.calculators.emt import EMT
+from audit import planted
+from audit.planted import chain, crystal, subject
+from audit.test_invariance import codes
+
+from mdnum.audit.curl import Curl, around
+from mdnum.audit.forces import Forces, slope
+from mdnum.audit.noise import Noise, along_a_line
+
+
+@pytest.mark.parametrize("check", [Forces, Curl])
+@pytest.mark.parametrize("atoms", [crystal(), chain()], ids=["crystal", "chain"])
+@pytest.mark.parametrize("make", [planted.Good, planted.Single])
+def test_what_is_right_passes(check, make, atoms: Atoms):
+    assert not check()(subject(make, atoms)).findings
+
+
+@pytest.mark.parametrize("check", [Forces, Curl])
+def test_ases_emt_passes(check):
+    from ase.build import bulk
+
+    assert not check()(subject(EMT, bulk("Cu"))).findings
+
+
+def test_a_derivative_left_out_of_the_force_is_found_and_does_no_work():
+    """It is the derivative of another energy: conservative, and wrong."""
+    asked = subject(planted.NoSwitchInForce)
+    assert codes(Forces()(asked))["FORCES_NOT_GRADIENT"] == "error"
+    # a force along the line between two atoms that depends on their distance alone has an energy
+    assert not Curl()(asked).findings
+
+
+def test_pairs_that_one_atom_counts_push_the_structure():
+    found = codes(Forces()(subject(planted.OneSided)))
+    assert found["NET_FORCE"] == "error"
+
+
+def test_a_whirl_is_found_by_all_three():
+    asked = subject(planted.Whirl, chain())
+    found = codes(Forces()(asked))
+    assert found["FORCES_NOT_GRADIENT"] == found["NET_TORQUE"] == "error"
+    part = Curl()(asked)
+    assert codes(part)["CURL"] == "error"
+    # an atom that turns in the plane of the whirl: curl is twice its rate, times the share that moves
+    rows = part.tables["Work around closed loops"]
+    planar = [row["curl (eV/Å²)"] for row in rows if row["plane"].endswith("in xy")]
+    # the center of six atoms moves along by a sixth
+    np.testing.assert_allclose(planar, 2e-3 * 5 / 6, rtol=1e-6)
+
+
+def test_a_step_at_the_structure_is_told_from_a_wrong_force():
+    atoms = Atoms("Ar2", positions=[[0, 0, 0], [planted.R_CUT, 0, 0]])
+    asked = subject(planted.HardEdge, atoms)
+    line = np.array([[0.0, 0, 0], [1.0, 0, 0]])
+    found = slope(asked, atoms, line, asked.forces(atoms), Noise(1e-17, 1e-17))
+    # two directed pairs of half a hundredth each
+    assert abs(found.jump) == pytest.approx(0.01, rel=1e-3)
+    part = Forces()
+    asked.atoms = atoms
+    smooth = slope(
+        asked, Atoms("Ar2", positions=[[0, 0, 0], [3.0, 0, 0]]), line, asked.forces(atoms), Noise(0, 0)
+    )
+    assert smooth.jump == 0.0
+    assert part.name == "forces"
+
+
+@pytest.mark.parametrize("make", [planted.Good, planted.Single])
+def test_the_error_of_a_difference_covers_its_error(make):
+    """Against the force of the exact calculator, in forty directions: within the error that was told."""
+    atoms = chain()
+    asked, exact = subject(make, atoms), subject(planted.Good, atoms)
+    rng = np.random.default_rng(4)
+    noise = along_a_line(asked, atoms, rng)
+    forces = exact.forces(atoms)
+    covered, sizes = 0, []
+    for _ in range(40):
+        line = rng.standard_normal((len(atoms), 3))
+        line /= np.max(np.linalg.norm(line, axis=1))
+        found = slope(asked, atoms, line, forces, noise)
+        covered += abs(found.difference - found.force) <= 3 * found.error
+        sizes.append(found.error)
+    assert covered >= 38
+    # and it is not covered by being large
+    assert max(sizes) < (1e-4 if make is planted.Single else 1e-9)
+
+
+@pytest.mark.parametrize("size", [1e-15, 1e-9, 1e-5])
+def test_noise_is_measured_within_a_factor(size: float):
+    """What is planted is found, whatever the smooth part does."""
+    rng = np.random.default_rng(2)
+
+    class Shaken(planted.Good):
+        def extra(self, atoms, energy, forces):
+            return energy + size * rng.standard_normal(), forces
+
+    found = [along_a_line(subject(Shaken, chain()), chain(), rng).energy for _ in range(12)]
+    assert size / 2 < np.median(found) < 2 * size
+
+
+def test_curl_of_a_known_field():
+    """A linear force with a matrix that is not symmetric: work is its antisymmetric part times the area."""
+    matrix = np.array([[-1.0, 0.3, 0.0], [-0.2, -2.0, 0.1], [0.0, 0.1, -3.0]])
+
+    class Linear(planted.Good):
+        def answer(self, atoms):
+            return 0.0, atoms.positions @ matrix.T
+
+    atoms = Atoms("Ar", positions=[[0.3, 0.1, -0.2]])
+    u, v = np.array([[1.0, 0, 0]]), np.array([[0, 1.0, 0]])
+    found = around(subject(Linear, atoms), atoms, u, v, 0.02, Noise(0.0, 1e-17))
+    assert found.curl == pytest.approx(matrix[1, 0] - matrix[0, 1], rel=1e-12)
+    assert found.work == pytest.approx(np.pi * 0.02**2 * (matrix[1, 0] - matrix[0, 1]), rel=1e-12)
+    assert found.error < 1e-11 and not found.conservative
