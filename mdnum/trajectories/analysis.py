@@ -8,12 +8,13 @@ those of one process to the last bit. What two parts found at the frame that bot
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 from MDAnalysis.analysis.base import AnalysisBase
-from MDAnalysis.analysis.results import ResultsGroup
+from MDAnalysis.analysis.results import Results, ResultsGroup
 from MDAnalysis.core.groups import AtomGroup, UpdatingAtomGroup
 from MDAnalysis.core.universe import Universe
 
@@ -188,7 +189,7 @@ class NeighborFlips(AnalysisBase):
     def _compute(self, indexed_frames: np.ndarray, verbose: Any = None, **kwargs: Any) -> NeighborFlips:
         self._at = int(indexed_frames[0, 0]) if len(indexed_frames) else 0
         self._done, self._reading = 0, True
-        self.results.failures = [None]
+        self.results = Results(failures=[None])
         try:
             super()._compute(indexed_frames, verbose, **kwargs)
         except FrameError as error:
@@ -204,7 +205,8 @@ class NeighborFlips(AnalysisBase):
         # what a process sends back is what it found, not what it needed for that
         self._trackers = []
         self._let_go()
-        return self
+        # where one process computes several parts, each has to be an object of its own
+        return copy(self)
 
     def _stopped(self, failure: _Failure) -> None:
         self.results.failures = [failure]
@@ -269,7 +271,7 @@ class NeighborFlips(AnalysisBase):
     def _bound_at(self, frame: Frame) -> float:
         if self._bound is not None or self._resolution is None:
             return self._bound or 0.0
-        return self._resolution.bound(frame)
+        return self._resolution.bound(frame, self._seen)
 
     def _get_aggregator(self) -> ResultsGroup:
         flat = ResultsGroup.flatten_sequence

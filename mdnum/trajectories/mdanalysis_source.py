@@ -154,7 +154,8 @@ def box_of(dimensions: Float[np.ndarray, "6"] | None) -> Box:
     lengths, angles = np.asarray(dimensions[:3], np.float64), np.asarray(dimensions[3:], np.float64)
     if (lengths == 0).any() and (angles == 90).all():
         return Box(np.diag(lengths), lengths > 0)
-    matrix = np.asarray(triclinic_vectors(dimensions, dtype=np.float64), np.float64)
+    with np.errstate(invalid="ignore"):
+        matrix = np.asarray(triclinic_vectors(dimensions, dtype=np.float64), np.float64)
     if not matrix.any():
         # lengths and angles that no box has: left for whoever needs the box to refuse
         matrix = np.full((3, 3), np.nan)

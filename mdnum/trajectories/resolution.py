@@ -8,11 +8,11 @@ looks for the decimal grid that all coordinates lie on, so that a precision nobo
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from mdnum.trajectories.frame import Frame
 from mdnum.trajectories.grids import decimal_grid, steps_of
@@ -55,14 +55,19 @@ class Resolution:
     box: tuple[float, float] = (0.0, 0.0)
     digits: int = 0
 
-    def bound(self, frame: Frame) -> float:
+    def bound(self, frame: Frame, atoms: Int[np.ndarray, "chosen"] | None = None) -> float:
         """How far a distance in this frame can be from that of the positions before they were written.
 
         The worst case, length: both atoms moved by half a step along every axis, in opposite directions, and
         a pair across the boundary by what rounding did to the box. For float64 it is the distance's rounding.
 
+        Args:
+            frame: of the file.
+            atoms: those whose distances are meant; None for all.
+
         Error: for a pair through one period of the box; further images add as much of the box's part again.
         """
+        frame = _of(frame, atoms)
         largest, lattice = _extent(frame)
         coordinate, box = self._half(frame), 0.0
         if self._narrow:
@@ -79,6 +84,7 @@ class Resolution:
 
     def typical(self, frame: Frame) -> float:
         """Standard deviation of a distance's error: rounding errors spread evenly within a step, length."""
+        frame = _of(frame, None)
         # two atoms, each with variance step²/12 along the line between them
         return float(np.sqrt(2 / 12)) * self.usual_step(frame)
 
@@ -211,6 +217,14 @@ def _fractions_of(frame: Frame) -> Float[np.ndarray, "atoms 3"]:
 def _thinned(values: Float[np.ndarray, "values"]) -> Float[np.ndarray, "fewer"]:
     values = values[np.isfinite(values)]
     return values[:: max(len(values) // _ENOUGH, 1)]
+
+
+def _of(frame: Frame, atoms: Int[np.ndarray, "chosen"] | None) -> Frame:
+    """The frame of these atoms, without those that are nowhere: they have no distances."""
+    x = frame.positions if atoms is None else frame.positions[atoms]
+    if not np.isfinite(x.sum()):
+        x = x[np.isfinite(x).all(axis=1)]
+    return frame if x is frame.positions else replace(frame, positions=x, velocities=None)
 
 
 def _extent(frame: Frame) -> tuple[float, float]:

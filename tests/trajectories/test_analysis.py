@@ -1,0 +1,276 @@
+"""NeighborFlips on files nobody here made, against brute force; the same bits on any number of processes."""
+
+from __future__ import annotations
+
+import itertools
+import warnings
+
+import MDAnalysis
+import numpy as np
+import pytest
+from MDAnalysisTests import datafiles
+
+from mdnum.errors import InputError
+from mdnum.trajectories import NeighborFlips
+from mdnum.trajectories.checked import FrameError
+from mdnum.trajectories.rules import Capped, Cutoff, Nearest
+
+warnings.filterwarnings("ignore", module="MDAnalysis")
+
+
+@pytest.fixture(scope="module")
+def water():
+    """AdK in water: xtc, rhombic dodecahedron."""
+    return MDAnalysis.Universe(datafiles.GRO, datafiles.XTC)
+
+
+def images(matrix):
+    """Lattice vectors up to two boxes away: of boxes as skewed as these no more can matter."""
+    return np.array(list(itertools.product(range(-2, 3), repeat=3))) @ matrix
+
+
+def brute(universe, first, second, radius, frames, matrix_of):
+    """Rows (frame, i, j, rank, entered, distance) by trying every pair and every image."""
+    rows, before = [], None
+    for count, number in enumerate(frames):
+        ts = universe.trajectory[number]
+        x, matrix, now = ts.positions.astype(np.float64), matrix_of(ts), {}
+        shifts = np.zeros((1, 3)) if matrix is None else images(matrix)
+        for i in first:
+            d = x[second][:, None] - x[i] + shifts
+            ordered = np.sort(np.sqrt((d**2).sum(axis=-1)), axis=1)
+            for j, r in zip(second.tolist(), ordered, strict=True):
+                if i != j:
+                    now[min(i, j), max(i, j)] = r
+        if before is not None:
+            for i, j in sorted(now):
+                was, many = ((one[i, j] < radius).sum() for one in (before, now))
+                for rank in range(min(was, many), max(was, many)):
+                    rows.append((count, i, j, rank, many > was, now[i, j][rank]))
+        before = now
+    return rows, [pair for pair in sorted(before) for _ in range((before[pair] < radius).sum())]
+
+
+def same_rows(flips, rows):
+    found = list(zip(flips.frame, flips.i, flips.j, flips.rank, flips.entered, strict=True))
+    assert found == [row[:5] for row in rows]
+    np.testing.assert_allclose(flips.distance, [row[5] for row in rows], rtol=1e-12, atol=1e-12)
+
+
+def triclinic(ts):
+    from MDAnalysis.lib.mdamath import triclinic_vectors
+
+    return None if ts.dimensions is None else triclinic_vectors(ts.dimensions, dtype=np.float64)
+
+
+CASES = {
+    "xtc": (datafiles.GRO, datafiles.XTC, "name OW", 60, 5.0),
+    "trr": (datafiles.GRO, datafiles.TRR, "name OW", 50, 8.0),
+    "netcdf": (datafiles.PRMncdf, datafiles.NCDF, "name O", 80, 6.5),
+    "dcd without a box": (datafiles.PSF, datafiles.DCD, "name CA", 100, 7.0),
+}
+
+
+@pytest.mark.parametrize("kind", CASES)
+def test_every_flip_is_one_and_every_one_is_a_flip(kind):
+    topology, path, words, most, radius = CASES[kind]
+    universe = MDAnalysis.Universe(topology, path)
+    group = universe.select_atoms(words)[:most]
+    frames = range(0, min(len(universe.trajectory), 30), 3)
+    found = NeighborFlips(group, r_cut=radius).run(stop=30, step=3)
+    rows, last = brute(universe, group.indices, group.indices, radius, frames, triclinic)
+    assert len(rows) > 10
+    same_rows(found.results.flips, rows)
+    np.testing.assert_array_equal(found.frames, list(frames))
+    assert list(zip(found.results.last.i, found.results.last.j, strict=True)) == last
+    steps = found.results.rules[0].entered() - found.results.rules[0].left()
+    np.testing.assert_array_equal(np.diff(found.results.pairs), steps[1:])
+    assert len(found.results.initial) == found.results.pairs[0]
+    np.testing.assert_array_equal(found.times, [universe.trajectory[k].time for k in frames])
+
+
+def test_a_charmm_box_is_not_turned_away_from_its_atoms():
+    universe = MDAnalysis.Universe(datafiles.PSF_TRICLINIC, datafiles.DCD_TRICLINIC)
+    group = universe.select_atoms("name OH2")
+    from MDAnalysis.lib.formats.libdcd import DCDFile
+
+    with DCDFile(datafiles.DCD_TRICLINIC) as file:
+        cells = [frame.unitcell.copy() for frame in file]
+
+    def symmetric(ts):
+        xx, xy, yy, xz, yz, zz = cells[ts.frame]
+        return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+    # far enough for pairs across the boundary, some of them by two ways
+    found = NeighborFlips(group, r_cut=12.0).run(stop=6)
+    rows, _ = brute(universe, group.indices, group.indices, 12.0, range(6), symmetric)
+    same_rows(found.results.flips, rows)
+    other, _ = brute(universe, group.indices, group.indices, 12.0, range(6), triclinic)
+    assert [row[:5] for row in rows] != [row[:5] for row in other]
+
+
+def test_two_groups_may_overlap(water):
+    first, second = water.atoms[:300], water.select_atoms("name CA")[:40]
+    found = NeighborFlips(first, 4.5, other=second).run(frames=[0, 4, 5, 9])
+    rows, _ = brute(water, first.indices, second.indices, 4.5, [0, 4, 5, 9], triclinic)
+    assert len(np.intersect1d(first.indices, second.indices)) > 5 and len(rows) > 10
+    same_rows(found.results.flips, rows)
+    np.testing.assert_array_equal(found.frames, [0, 4, 5, 9])
+
+
+def test_several_rules_at_once_are_each_what_they_are_alone(water):
+    group = water.select_atoms("name OW")[:400]
+    rules = [Nearest(4), Capped(6.0, 3)]
+    found = NeighborFlips(group, [5.0, {("O", "O"): 4.0}], rule=rules).run(stop=4)
+    assert [one.rule.name for one in found.results.rules][2:] == [rule.name for rule in rules]
+    alone = NeighborFlips(group, rule=Nearest(4)).run(stop=4)
+    equal(found.results.rules[2], alone.results.rules[0])
+    assert (found.results.rules[2].pairs == 4 * 400).all()
+    by_species = NeighborFlips(group, 4.0).run(stop=4)
+    equal(found.results.rules[1], by_species.results.rules[0])
+    assert "flips" not in found.results and alone.results.flips is alone.results.rules[0].flips
+
+
+def equal(one, other):
+    """To the last bit."""
+    for name in ("flips", "initial", "last"):
+        for column, values in vars(getattr(one, name)).items():
+            np.testing.assert_array_equal(values, getattr(getattr(other, name), column), err_msg=column)
+    for name in ("pairs", "near", "min_margin"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
+
+
+@pytest.mark.parametrize("parts", [2, 3, 7, 10])
+def test_a_split_between_two_frames_loses_nothing(water, parts):
+    group = water.select_atoms("name OW")[:1500]
+    whole = NeighborFlips(group, [4.0], rule=Nearest(3)).run()
+    split = NeighborFlips(group, [4.0], rule=Nearest(3)).run(n_parts=parts)
+    for one, other in zip(whole.results.rules, split.results.rules, strict=True):
+        assert len(one.flips) > 100
+        equal(one, other)
+    np.testing.assert_array_equal(whole.results.bound, split.results.bound)
+    np.testing.assert_array_equal(whole.times, split.times)
+
+
+@pytest.mark.parametrize("backend", ["multiprocessing", pytest.param("dask", marks=pytest.mark.slow)])
+def test_other_processes_find_the_same_to_the_last_bit(water, backend):
+    group = water.select_atoms("name OW")[:3000]
+    assert backend in NeighborFlips.get_supported_backends()
+    asked = {"start": 1, "stop": 10, "step": 2}
+    serial = NeighborFlips(group, 3.5).run(**asked)
+    spread = NeighborFlips(group, 3.5).run(backend=backend, n_workers=2, **asked)
+    equal(serial.results.rules[0], spread.results.rules[0])
+    np.testing.assert_array_equal(serial.frames, spread.frames)
+    assert serial.frames.tolist() == [1, 3, 5, 7, 9]
+
+
+def test_what_the_file_cannot_tell_is_marked(water):
+    group = water.select_atoms("name OW")[:2000]
+    found = NeighborFlips(group, 3.5).run()
+    results = found.results
+    assert (results.resolution.kind, results.resolution.step) == ("grid", pytest.approx(0.01))
+    assert results.bound == pytest.approx(np.sqrt(3) * 0.01, rel=0.01)
+    flips = results.flips
+    near = (np.abs(flips.margin) <= flips.bound) | (np.abs(flips.margin_before) <= flips.bound)
+    np.testing.assert_array_equal(flips.ambiguous, near)
+    assert 0 < results.rules[0].ambiguous < 0.1
+    wide = NeighborFlips(group, 3.5, bound=0.5).run(stop=3)
+    assert (wide.results.bound == 0.5).all() and wide.results.rules[0].ambiguous > 0.3
+
+
+def test_no_frame_and_one_frame(water):
+    group = water.select_atoms("name OW")[:100]
+    none = NeighborFlips(group, 5.0).run(stop=0)
+    assert len(none.results.flips) == len(none.results.pairs) == len(none.frames) == 0
+    assert len(none.results.initial) == 0 and np.isnan(none.results.rules[0].ambiguous)
+    one = NeighborFlips(group, 5.0).run(frames=[7])
+    assert len(one.results.flips) == 0 and one.results.pairs.tolist() == [len(one.results.last)]
+    assert one.frames.tolist() == [7]
+
+
+def moving(frames=6, atoms=20, box=30.0):
+    """A Universe in memory whose frames may be spoiled."""
+    random = np.random.default_rng(0)
+    x = random.uniform(0, box, (atoms, 3)) + np.cumsum(random.normal(size=(frames, atoms, 3)), axis=0)
+    universe = MDAnalysis.Universe.empty(atoms, trajectory=True)
+    boxes = np.array([[box, box, box, 90, 90, 90]] * frames)
+    universe.load_new(x.astype(np.float32), order="fac", dimensions=boxes)
+    return universe
+
+
+@pytest.mark.parametrize("parts", [1, 2, 3])
+@pytest.mark.parametrize("value", [np.nan, np.inf, 0.0])
+def test_a_spoiled_frame_is_named_and_what_was_before_is_kept(parts, value):
+    universe = moving()
+    universe.trajectory.get_array()[4, 3:9] = value
+    analysis = NeighborFlips(universe, 8.0)
+    with pytest.raises(FrameError, match=r"frame 4: atom 3") as caught:
+        analysis.run(n_parts=parts)
+    assert caught.value.frame == 4 and "5 others" in str(caught.value)
+    good = NeighborFlips(moving(), 8.0).run(stop=4)
+    equal(analysis.results.rules[0], good.results.rules[0])
+    assert analysis.frames.tolist() == [0, 1, 2, 3] == good.frames.tolist()
+    # an atom that is not looked at spoils nothing
+    NeighborFlips(universe.atoms[10:], 8.0).run()
+
+
+def test_a_frame_of_zeros_is_named():
+    universe = moving()
+    universe.trajectory.get_array()[2] = 0.0
+    with pytest.raises(FrameError, match="frame 2: all coordinates are 0"):
+        NeighborFlips(universe, 8.0).run()
+
+
+@pytest.mark.parametrize("parts", [1, 3])
+def test_a_frame_without_its_box_is_named(parts):
+    universe = moving()
+    universe.trajectory.dimensions_array[3] = 0
+    with pytest.raises(FrameError, match="frame 3 has no box, and the first one looked at has a box"):
+        NeighborFlips(universe, 8.0).run(n_parts=parts)
+
+
+def test_a_box_that_is_none_is_named():
+    universe = moving()
+    universe.trajectory.dimensions_array[3, 3:] = [10, 10, 150]
+    with pytest.raises(FrameError, match="frame 3"):
+        NeighborFlips(universe, 8.0).run()
+
+
+def test_groups_that_cannot_be_looked_at(water):
+    nobody = water.select_atoms("name NOBODY")
+    changing = water.select_atoms("around 3 protein", updating=True)
+    for group, other, said in (
+        (nobody, None, "atoms is empty"),
+        (water.atoms[:3], nobody, "other is empty"),
+        (changing, None, "changes from frame to frame"),
+        (water.atoms[:3], moving().atoms, "two universes"),
+        (water.trajectory, None, "Universe or an AtomGroup"),
+    ):
+        with pytest.raises(InputError, match=said):
+            NeighborFlips(group, 5.0, other=other)
+    with pytest.raises(InputError, match="no cutoff"):
+        NeighborFlips(water)
+    with pytest.raises(InputError, match="'Xx'"):
+        NeighborFlips(water.atoms[:9], {("Xx", "O"): 2.0}).run(stop=1)
+
+
+def test_a_cutoff_wider_than_half_the_box_finds_every_image():
+    universe = moving(atoms=4, box=6.0)
+    found = NeighborFlips(universe, rule=Cutoff(7.0)).run()
+    shifts, rows, before = images(6.0 * np.eye(3)), [], None
+    for count, ts in enumerate(universe.trajectory):
+        x, now = ts.positions.astype(np.float64), {}
+        for i in range(4):
+            for j in range(i, 4):
+                d = np.linalg.norm(x[j] - x[i] + shifts, axis=1)
+                inside = int((d < 7.0).sum())
+                # an image of an atom itself and the opposite one are one pair
+                now[i, j] = inside if i != j else (inside - 1) // 2
+        if before is not None:
+            for (i, j), many in now.items():
+                for rank in range(min(many, before[i, j]), max(many, before[i, j])):
+                    rows.append((count, i, j, rank, many > before[i, j]))
+        before = now
+    flips = found.results.flips
+    assert list(zip(flips.frame, flips.i, flips.j, flips.rank, flips.entered, strict=True)) == rows
+    assert len(rows) > 20
