@@ -174,7 +174,7 @@ def _most(bins, reach, start):
 
 @numba.njit(cache=True, nogil=True)
 def _half(sorted_x, vectors, free, bins, reach, start, order, kind, species, low, high, largest,
-          tally, i_out, j_out, i_open, j_open, code_open):  # fmt: skip
+          tally, i_out, j_out, i_open, j_open, code_open, value_open):  # fmt: skip
     """All pairs of one set of atoms, each met once: from a bin, half of the bins around are looked at."""
     written, left = 0, 0
     room, runs = _most(bins, reach, start)
@@ -238,13 +238,14 @@ def _half(sorted_x, vectors, free, bins, reach, start, order, kind, species, low
                         else:
                             if left < i_open.shape[0]:
                                 i_open[left], j_open[left], code_open[left] = i, j, codes[run[k]]
+                                value_open[left] = squares[k]
                             left += 1
     tally[0], tally[1] = written, left
 
 
 @numba.njit(cache=True, nogil=True)
 def _between(wrapped, sorted_x, vectors, free, bins, reach, center_start, center_order, start, order,
-             both, kind, species, low, high, largest, tally, i_out, j_out, i_open, j_open, code_open):  # fmt: skip
+             both, kind, species, low, high, largest, tally, i_out, j_out, i_open, j_open, code_open, value_open):  # fmt: skip
     """Everything around each center; two atoms that are on both sides are met twice and count once."""
     written, left = 0, 0
     room, runs = _most(bins, reach, start)
@@ -304,18 +305,33 @@ def _between(wrapped, sorted_x, vectors, free, bins, reach, center_start, center
                         else:
                             if left < i_open.shape[0]:
                                 i_open[left], j_open[left], code_open[left] = i, j, codes[run[k]]
+                                value_open[left] = squares[k]
                             left += 1
     tally[0], tally[1] = written, left
 
 
 @numba.njit(cache=True, nogil=True)
 def _settle(
-    x, home, vectors, kind, species, square, radius, bound, i_in, j_in, code, tally, i_out, j_out, value
-):
-    """Decide on the candidates that wrapped coordinates left open; returns the smallest |margin|."""
+    x, home, vectors, kind, species, square, radius, bound, narrow, guard, i_in, j_in, code, tally, i_out, j_out, value
+):  # fmt: skip
+    """Decide on the candidates that wrapped coordinates left open; returns the smallest |margin|.
+
+    value holds the squares of wrapped coordinates, and then what `Found.value` says. A margin beyond `narrow`
+    is lessened by the guard rather than computed again.
+    """
     smallest = np.inf
     for k in range(i_in.shape[0]):
         i, j = i_in[k], j_in[k]
+        si, sj = species[i], species[j]
+        if kind == BAND:
+            margin = radius[si, sj] - np.sqrt(value[k])
+            if abs(margin) > narrow:
+                if i > j:
+                    n0, n1, n2 = lattice_vector(code[k])
+                    i_in[k], j_in[k], code[k] = j, i, lattice_code(-n0, -n1, -n2)
+                value[k] = margin - guard if margin > 0 else margin + guard
+                tally[0] += int(margin > 0)
+                continue
         n0, n1, n2 = lattice_vector(code[k])
         if i < j:
             real = exact_square(x, home, i, j, n0, n1, n2, vectors)
@@ -324,20 +340,18 @@ def _settle(
         if kind == DIRECTED:
             value[k] = real
             continue
-        if i > j:
-            i, j = j, i
-            if kind == BAND:
-                i_in[k], j_in[k], code[k] = i, j, lattice_code(-n0, -n1, -n2)
-        margin = radius[species[i], species[j]] - np.sqrt(real)
-        inside = real < square[species[i], species[j]]
+        margin = radius[si, sj] - np.sqrt(real)
+        inside = real < square[si, sj]
         smallest = min(smallest, abs(margin))
         tally[2] += int(abs(margin) <= bound)
         if kind == BAND:
+            if i > j:
+                i_in[k], j_in[k], code[k] = j, i, lattice_code(-n0, -n1, -n2)
             tally[0] += int(inside)
             # with the sign of the decision, whatever the root rounds to
-            value[k] = max(margin, 0.0) if inside else min(margin, -0.0)
+            value[k] = abs(margin) if inside else -abs(margin)
         elif inside:
-            i_out[tally[0]], j_out[tally[0]] = i, j
+            i_out[tally[0]], j_out[tally[0]] = min(i, j), max(i, j)
             tally[0] += 1
     return smallest
 
@@ -383,12 +397,12 @@ class Found:
     Attributes:
         i, j: atoms; i < j unless directed. A pair appears once for each of its images.
         code: `BAND` only: the lattice vector added to wrapped j, see `lattice_vector`.
-        value: `BAND`: margin, length, with the sign of the decision; `DIRECTED`: squared distance.
+        value: `BAND`: margin, length, with the sign of the decision, at most the real one; `DIRECTED`: squared distance.
         home: lattice vectors that wrapping took off each atom.
         inside: pairs inside, written down or not.
         open: candidates that were decided from the coordinates as stored.
         close: pairs within the bound of their threshold.
-        smallest: smallest |margin| among the pairs within the band of their threshold; inf without one.
+        smallest: smallest |margin| among the pairs that were decided so; inf without one.
     """
 
     i: Int[np.ndarray, "pairs"]
@@ -433,6 +447,7 @@ def search(
     band: float,
     bound: float,
     guard: float,
+    narrow: float = 0.0,
     room: int = 0,
     open_room: int = 0,
 ) -> Found:
@@ -447,6 +462,7 @@ def search(
         band: pairs this close to their radius are decided from the coordinates as stored, length.
         bound: pairs this close are counted as close, length; at most the band.
         guard: how far the wrapped distance of a pair can be off, length; at most the band.
+        narrow: `BAND`: margins up to here are exact; others may be too small by the guard, length.
         room, open_room: pairs inside and pairs in the band to make room for, where it is known.
     Raises:
         InputError: more pairs than fit into memory.
@@ -486,8 +502,9 @@ def search(
     while True:
         i, j = np.empty(sure, np.int32), np.empty(sure, np.int32)
         i_open, j_open, code = (np.empty(doubtful, np.int32) for _ in range(3))
+        value = np.empty(doubtful)
         tally = np.zeros(3, np.int64)
-        written = (kind, sides.species, low, high, largest**2, tally, i, j, i_open, j_open, code)
+        written = (kind, sides.species, low, high, largest**2, tally, i, j, i_open, j_open, code, value)
         if half:
             _half(sorted_x, lattice.vectors, *everything, start, order, *written)
         else:
@@ -500,15 +517,14 @@ def search(
         if left <= doubtful and (kind != INSIDE or count + left <= sure):
             break
         sure, doubtful = (int(1.05 * (count + left)) if kind == INSIDE else 0), int(1.05 * left) + 1
-    i_open, j_open, code = i_open[:left], j_open[:left], code[:left]
-    value = np.empty(0 if kind == INSIDE else left)
+    i_open, j_open, code, value = i_open[:left], j_open[:left], code[:left], value[:left]
     smallest = _settle(
         positions, home, lattice.vectors, kind, sides.species, np.where(allowed, radii * radii, -1.0), radii,
-        bound, i_open, j_open, code, tally, i, j, value,
+        bound, narrow + guard, guard, i_open, j_open, code, tally, i, j, value,
     )  # fmt: skip
     inside, close = int(tally[0]), int(tally[2])
     if kind == INSIDE:
-        return Found(i[:inside], j[:inside], code[:0], value, home, inside, left, close, float(smallest))
+        return Found(i[:inside], j[:inside], code[:0], value[:0], home, inside, left, close, float(smallest))
     return Found(i_open, j_open, code, value, home, inside, left, close, float(smallest))
 
 

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from mdnum.errors import InputError
 from mdnum.trajectories.changes import compared, image_distances
-from mdnum.trajectories.frame import Frame
+from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.lattice import Lattice, lattice_of, own_images
 from mdnum.trajectories.nearest import chosen
 from mdnum.trajectories.pairs import INSIDE, Rows, Sides, ordered, ranks, rows_of, search
 from mdnum.trajectories.rules import Capped, Cutoff, Nearest, Rule, SpeciesCutoffs
+from mdnum.trajectories.superset import Superset, displaced, listed, look, skin_for
 from mdnum.trajectories.table import Flips, Members
 
 #: `Tracker.min_margin` looks this share of the radius away from it
@@ -87,7 +88,9 @@ class Tracker:
             )
         self._species = None if species is None else np.asarray(species, str)
         self._atoms = -1
-        self._open = 0
+        self._open, self._room = 0, 0
+        self._list: Superset | None = None
+        self._box: Box | None = None
         self._last: Moment | None = None
         self.frames = 0
         self.pairs = 0
@@ -106,12 +109,17 @@ class Tracker:
         """
         if bound is not None:
             self.bound = float(bound)
-        now = self._decided(frame)
-        before, self._last = self._last, now
+        before, now = self._last, self._moment(frame)
+        flips = self._from_list(before, now) if before is not None and self._list is not None else None
+        if flips is None:
+            self._list = None
+            now = self._decided(now)
+            flips = Flips.none() if before is None else self._flips(before, now)
+        self._last = now
         self.frames += 1
-        if before is None:
-            return Flips.none()
-        return self._flips(before, now)
+        if before is not None and not self.rule.directed:
+            self._keep_list(before, now)
+        return flips
 
     def members(self) -> Members:
         """The pairs inside at the last frame."""
@@ -119,7 +127,7 @@ class Tracker:
         if self._last is None:
             return Members(none, none, none, np.zeros(0))
         now = self._last
-        i, j = ordered(self._listed(now))
+        i, j = ordered(self._rows(now))
         own = self._own_members(now)
         # images of an atom itself are its first neighbors in the order of indices, unless rows are directed
         i, j = np.concatenate([i, own]), np.concatenate([j, own])
@@ -133,21 +141,35 @@ class Tracker:
 
     # ---- one frame
 
-    def _decided(self, frame: Frame) -> Moment:
+    def _moment(self, frame: Frame) -> Moment:
+        """A frame that can be decided on."""
         positions, largest = self._checked(frame)
-        lattice = lattice_of(frame.box)
-        rule = self.rule
-        radius = self._radii.max(initial=0.0)
-        size = radius if np.isfinite(radius) else 4.0 * largest
-        rounding = lattice.rounding(largest, float(size))
+        lattice = self._lattice_of(frame)
+        radius = self._radius
+        rounding = lattice.rounding(largest, radius if np.isfinite(radius) else 4.0 * largest)
         if np.isfinite(radius) and rounding > 1e-3 * radius:
             raise InputError(
                 f"coordinates up to {largest:.3g} with a cutoff of {radius:g}: float64 cannot tell distances",
                 remedy="Check the unit, and that the file's coordinates are not broken",
                 where=f"frame {frame.index}",
             )
-        bound = self.bound + rounding
-        empty = np.zeros(0)
+        none = np.zeros(0)
+        return Moment(positions, lattice, rounding, None, np.zeros(len(self._radii), np.int64), none, none)
+
+    def _lattice_of(self, frame: Frame) -> Lattice:
+        box, last = frame.box, self._box
+        if last is None or not (
+            np.array_equal(box.matrix, last.matrix) and np.array_equal(box.pbc, last.pbc)
+        ):
+            # a copy: readers reuse their arrays
+            self._box = Box(np.array(box.matrix, np.float64), np.array(box.pbc, bool))
+            self._lattice = lattice_of(self._box)
+        return self._lattice
+
+    def _decided(self, now: Moment) -> Moment:
+        """The same with its neighbors searched for, and their numbers noted."""
+        positions, lattice, rounding = now.positions, now.lattice, now.rounding
+        rule, bound = self.rule, self.bound + now.rounding
         if isinstance(rule, Nearest | Capped):
             made = chosen(
                 positions, lattice, self._sides, rule,
@@ -157,26 +179,28 @@ class Tracker:
             self.pairs, self.near = len(made.rows.other), made.rows.close
             horizon = HORIZON * rule.reach
             self.min_margin = made.rows.smallest if made.rows.smallest <= horizon else np.inf
-            none = np.zeros(len(self._radii), np.int64)
-            return Moment(positions, lattice, rounding, made.rows, none, made.last_in, made.first_out)
-        horizon = HORIZON * radius
-        found = search(
-            positions, lattice, self._sides, self._radii, INSIDE,
-            band=max(bound, horizon, 4 * rounding), bound=bound, guard=rounding,
-            room=int(1.1 * (self.pairs + self._open)), open_room=int(1.2 * self._open),
-        )  # fmt: skip
-        self._open = found.open
-        rows = rows_of(found, len(positions))
+            return replace(now, rows=made.rows, last_in=made.last_in, first_out=made.first_out)
+        horizon = HORIZON * self._radius
+        rows = self._rows(now)
         own, close, smallest = self._own(lattice, bound)
         smallest = min(rows.smallest, smallest)
         self.pairs = len(rows.other) + int((own * self._both_count).sum())
         self.near = rows.close + close
         self.min_margin = smallest if smallest <= horizon else np.inf
-        return Moment(positions, lattice, rounding, rows, own, empty, empty)
+        return replace(now, rows=rows, own=own)
 
-    def _listed(self, moment: Moment) -> Rows:
-        assert moment.rows is not None
-        return moment.rows
+    def _rows(self, moment: Moment) -> Rows:
+        """The neighbors at a moment; searched for where they have not been listed."""
+        if moment.rows is not None:
+            return moment.rows
+        bound = self.bound + moment.rounding
+        found = search(
+            moment.positions, moment.lattice, self._sides, self._radii, INSIDE,
+            band=max(bound, HORIZON * self._radius, 4 * moment.rounding), bound=bound, guard=moment.rounding,
+            room=int(1.1 * (self.pairs + self._open)), open_room=int(1.2 * self._open),
+        )  # fmt: skip
+        self._open = found.open
+        return rows_of(found, len(moment.positions))
 
     def _own(self, lattice: Lattice, bound: float) -> tuple[np.ndarray, int, float]:
         """Images of an atom itself that are inside, by species; how many are close; the smallest |margin|."""
@@ -200,8 +224,54 @@ class Tracker:
 
     # ---- two frames
 
+    def _from_list(self, before: Moment, now: Moment) -> Flips | None:
+        """The flips as the list in use tells them; None where it cannot."""
+        held = self._list
+        assert held is not None
+        clear = max(self.bound + now.rounding, HORIZON * self._radius)
+        if not held.serves(held.gone, now.lattice, self._radius, clear):
+            return None
+        came = displaced(
+            before.positions, before.lattice, now.positions, now.lattice, held.found.home,
+            self._radius + 2.0 * held.skin,
+        )  # fmt: skip
+        held.gone += came + 8.0 * max(before.rounding, now.rounding)
+        held.last = came
+        if not held.serves(held.gone, now.lattice, self._radius, clear):
+            return None
+        horizon = HORIZON * self._radius
+        seen = look(
+            held, now.positions, now.lattice, self._sides, self._radii,
+            bound=self.bound + now.rounding, horizon=horizon,
+        )  # fmt: skip
+        self.pairs += 2 * int(seen.entered.sum()) - len(seen.entered)
+        self.near, self.min_margin = seen.close, seen.smallest if seen.smallest <= horizon else np.inf
+        return self._table(before, now, seen.i, seen.j, np.zeros(len(seen.i), np.int64), seen.entered)
+
+    def _keep_list(self, before: Moment, now: Moment) -> None:
+        """Make a list at this frame where the one in use will not last another, or there is none yet."""
+        held, bound = self._list, self.bound + now.rounding
+        clear = max(bound, HORIZON * self._radius)
+        if held is not None:
+            came = held.last
+            if held.serves(held.gone + 1.5 * came, now.lattice, self._radius, clear):
+                return
+        else:
+            home = np.zeros((len(now.positions), 3), np.int64)
+            came = displaced(
+                before.positions, before.lattice, now.positions, now.lattice, home, 1.5 * self._radius
+            )  # fmt: skip
+        self._list = None
+        skin = skin_for(came, self._radius, clear, now.lattice)
+        if skin > 0:
+            self._list = listed(
+                now.positions, now.lattice, self._sides, self._radii, skin,
+                bound=bound, guard=now.rounding, clear=clear, room=int(1.1 * self._room),
+            )  # fmt: skip
+            self._room = len(self._list.due)
+
     def _flips(self, before: Moment, now: Moment) -> Flips:
-        i, j, rank, entered = compared(self._listed(before), self._listed(now))
+        i, j, rank, entered = compared(self._rows(before), self._rows(now))
         if (before.own != now.own).any():
             parts = [(i, j, rank, entered)]
             for kind in np.flatnonzero(before.own != now.own):
@@ -293,6 +363,7 @@ class Tracker:
         if (centers == others).all():
             others = centers
         kinds, radii = self._kinds_and_radii()
+        self._radius = float(radii.max(initial=0.0))
         self._kinds, self._radii, self._both = kinds, radii, centers & others
         self._sides = Sides(centers, others, kinds)
         self._both_count = np.bincount(kinds[self._both], minlength=len(radii))
