@@ -81,16 +81,20 @@ def crossings(run: Run, like: Atoms, thresholds: Sequence[Threshold]) -> list[Cr
         tracker = Tracker(SpeciesCutoffs(radii), species=species)
         for step, positions in enumerate(run.positions):
             flips = tracker.step(Frame(step, float(step), positions, box))
+            # the flips of one pair one way, by place on the way: which image a rank means does not matter
+            taken: dict[tuple[int, int, bool], list[tuple[float, float]]] = {}
             for row in range(len(flips)):
-                i, j = int(flips.i[row]), int(flips.j[row])
+                i, j, entered = int(flips.i[row]), int(flips.j[row]), bool(flips.entered[row])
                 place = places[frozenset((species[i], species[j]))]
-                threshold = thresholds[place]
-                share, slack = _share(
-                    run.positions[step - 1], positions, i, j, float(flips.distance[row]), threshold, box
-                )
+                if (i, j, entered) not in taken:
+                    taken[i, j, entered] = _ways(
+                        run.positions[step - 1], positions, i, j, entered, thresholds[place], box
+                    )
+                ways = taken[i, j, entered]
+                share, slack = ways.pop(0) if ways else (0.5, 1e-3)
                 found.append(
                     Crossing(
-                        step, i, j, int(flips.rank[row]), bool(flips.entered[row]), place,
+                        step, i, j, int(flips.rank[row]), entered, place,
                         float(flips.distance[row]), float(flips.margin[row]), share, slack,
                     )
                 )  # fmt: skip
@@ -113,47 +117,53 @@ def _levels(thresholds: Sequence[Threshold], species: set[str]) -> list[list[int
     return levels
 
 
-def _share(
+def _ways(
     before: Float[np.ndarray, "atoms 3"],
     after: Float[np.ndarray, "atoms 3"],
     i: int,
     j: int,
-    distance: float,
+    entered: bool,
     threshold: Threshold,
     box: Box,
-) -> tuple[float, float]:
-    """Where on the way of a step a pair has the threshold's distance, and how much of it to stay clear of."""
-    end = _image(after[j] - after[i], distance, box)
-    start = end - ((after[j] - after[i]) - (before[j] - before[i]))
-    way = end - start
-    a, b, c = way @ way, 2 * start @ way, start @ start - threshold.radius**2
-    length = float(np.sqrt(a))
+) -> list[tuple[float, float]]:
+    """Where on the way of a step images of a pair cross a threshold one way, and what to stay clear of there.
+
+    Ranks name images by their distance: which image a flip belongs to is not told, those that cross are.
+    """
+    end = _images(after[j] - after[i], threshold.radius, box)
+    way = (after[j] - after[i]) - (before[j] - before[i])
+    start = end - way
+    square = threshold.radius**2
+    inside = np.sum(start**2, axis=1) < square, np.sum(end**2, axis=1) < square
+    crossing = (inside[1] & ~inside[0]) if entered else (inside[0] & ~inside[1])
+    length = float(np.linalg.norm(way))
+    slack = float(np.clip(max(_BESIDE, 3 * threshold.located) / length if length else 1.0, 1e-9, 1e-3))
+    return sorted((_root(one, way, square), slack) for one in start[crossing])
+
+
+def _root(start: Float[np.ndarray, "3"], way: Float[np.ndarray, "3"], square: float) -> float:
+    """The share s in [0, 1] at which |start + s way|² passes a value."""
+    a, b, c = float(way @ way), 2 * float(start @ way), float(start @ start) - square
     inside = b * b - 4 * a * c
-    share = 0.5
-    if a > 0 and inside >= 0:
-        root = np.sqrt(inside)
-        # the form without cancellation; the root in the interval is the crossing
-        q = -0.5 * (b + np.copysign(root, b))
-        roots = [q / a, c / q if q else 0.0]
-        share = float(min(roots, key=lambda one: abs(one - 0.5)))
-    slack = max(_BESIDE, 3 * threshold.located) / length if length else 1e-3
-    return float(np.clip(share, 0.0, 1.0)), float(np.clip(slack, 1e-9, 1e-3))
+    if a == 0 or inside < 0:
+        return 0.5
+    # the form without cancellation
+    q = -0.5 * (b + np.copysign(np.sqrt(inside), b))
+    roots = [q / a, c / q if q else 0.0]
+    return float(np.clip(min(roots, key=lambda one: abs(one - 0.5)), 0.0, 1.0))
 
 
-def _image(vector: Float[np.ndarray, "3"], distance: float, box: Box) -> Float[np.ndarray, "3"]:
-    """The periodic image of a vector whose length is a given one."""
+def _images(vector: Float[np.ndarray, "3"], radius: float, box: Box) -> Float[np.ndarray, "images 3"]:
+    """The periodic images of a vector that may be as long as a radius, and some more."""
     if not box.periodic:
-        return vector
+        return vector[None]
     rows = box.matrix[box.pbc]
-    # nearest images first; how many there are within the distance follows from the cell
     shares = np.rint(np.linalg.lstsq(rows.T, vector, rcond=None)[0])
     base = vector - shares @ rows
     # distance between the planes of the cell: one over the length of a reciprocal vector
     widths = 1 / np.linalg.norm(np.linalg.pinv(rows), axis=0)
-    reach = [range(-int(distance / width) - 2, int(distance / width) + 3) for width in widths]
-    shifts = np.array(list(product(*reach)), np.float64) @ rows
-    candidates = base + shifts
-    return candidates[int(np.argmin(np.abs(np.linalg.norm(candidates, axis=1) - distance)))]
+    reach = [range(-int(radius / width) - 2, int(radius / width) + 3) for width in widths]
+    return base + np.array(list(product(*reach)), np.float64) @ rows
 
 
 @dataclass(frozen=True)

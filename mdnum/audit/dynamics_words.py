@@ -16,6 +16,8 @@ from mdnum.references.findings import finding
 #: Share of the thermal energy of an atom that may drift away in a ps before a run is not one at constant
 #: energy: within 100 ps all of it.
 _MUCH = 1e-2
+#: Of kT: energy of an atom that may come and go without a flip or the integrator.
+_SWING = 1e-2
 
 
 def part(result: Result, name: str, period: float, seconds: float, unknown: str) -> Part:
@@ -79,6 +81,7 @@ class _Words:
             "crossings": len(ledger.crossed),
             "jumps_measured": len(ledger.measured),
             "largest_jump": max((abs(jump) for jump in ledger.measured.values()), default=0.0),
+            "rest_swing": float(np.ptp(np.cumsum(np.nan_to_num(ledger.rest)))) / self.atoms,
             "stale": self.result.stale[0],
             "mean_kinetic": float(np.mean(one.kinetic)) / self.atoms,
         }
@@ -112,14 +115,19 @@ class _Words:
                 "strain of the cell must fit into the skin.",
             )
         rest = shares["rest"]
-        if rest.there and abs(rest.slope) > 1e-2 * max(abs(shares["total"].slope), 1e-2 * much):
+        swing = numbers["rest_swing"] / result.subject.kT
+        drifts = rest.there and abs(rest.slope) > 1e-2 * max(abs(shares["total"].slope), 1e-2 * much)
+        if drifts or swing > _SWING:
+            large = (drifts and abs(rest.slope) > 0.1 * much) or swing > 10 * _SWING
             yield finding(
                 "NOT_CONSERVED",
-                "error" if abs(rest.slope) > 0.1 * much or differs > allowed else "warning",
+                "error" if large or differs > allowed else "warning",
                 "the forces do work that the energy does not know of",
-                f"{rest.slope:+.3g} ± {rest.error:.1g} {self.unit} of the drift are neither from flips nor "
-                "from the "
-                "integrator: along the run, energy gained and work done do not add up.",
+                f"{rest.slope:+.3g} ± {rest.error:.1g} {self.unit} of the drift, and changes of the energy "
+                "by up "
+                f"to {swing:.2g} kT an atom on the way, are neither from flips nor from the integrator: "
+                "along the "
+                "run, energy gained and work done do not add up.",
                 "See forces and curl: a force that is not the derivative of the energy"
                 + (", and a list that is out of date." if differs > allowed else "."),
             )

@@ -11,7 +11,7 @@ from ase import Atoms
 from jaxtyping import Float
 
 from mdnum.audit.base import Subject
-from mdnum.audit.crossings import SMOOTH_ENOUGH, Crossing, Threshold, account
+from mdnum.audit.crossings import SMOOTH_ENOUGH, Crossing, Threshold, account, crossings
 from mdnum.audit.drift import Drift, drift, wandering
 from mdnum.audit.noise import Noise
 from mdnum.audit.nve import Run

@@ -1,0 +1,192 @@
+"""A run's energy is accounted for: flips, integrator and the rest, each against what is known exactly."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from ase import Atoms
+from ase.build import bulk
+from ase.calculators.lj import LennardJones
+from audit import planted
+from audit.planted import subject
+from audit.test_invariance import codes
+
+from mdnum.audit.crossings import account, crossings
+from mdnum.audit.drift import Drift, drift, ratio, wandering
+from mdnum.audit.dynamics import Dynamics
+from mdnum.audit.nve import fitting_timestep, prepared, rigid_bonds, run
+from mdnum.audit.thresholds import Threshold
+
+STEPS = 160
+
+
+def hard(_=None, order: int = 0) -> list[Threshold]:
+    """The cutoff of the planted calculators."""
+    r = planted.R_CUT
+    return [Threshold(r, ("Ar", "Ar"), order, (0, 0, 0), (0, 0, 0), r, r, True, 0.0)]
+
+
+def smooth(_=None) -> list[Threshold]:
+    """The same where nothing jumps."""
+    return hard(order=4)
+
+
+def liquid() -> Atoms:
+    """Eight atoms, warm enough to cross the cutoff many times."""
+    atoms = bulk("Ar", "sc", a=2.6).repeat((2, 2, 2))
+    atoms.positions += np.random.default_rng(1).uniform(-0.15, 0.15, (8, 3))
+    return atoms
+
+
+@pytest.fixture(scope="module")
+def hard_run():
+    """A run over a hard cutoff, and its crossings."""
+    asked = subject(planted.HardEdge, liquid())
+    start = prepared(asked, liquid(), np.zeros((0, 2), int), 1.0, np.random.default_rng(2))
+    found, _ = run(asked, start, 1.0, STEPS)
+    return asked, found, start, crossings(found, start, hard())
+
+
+def test_every_crossing_is_in_the_ledger(hard_run):
+    """Their number is what ASE's own neighbor lists change by, at every step."""
+    from ase.neighborlist import neighbor_list
+
+    _, found, start, crossed = hard_run
+    inside = []
+    for positions in found.positions:
+        there = start.copy()
+        there.positions = positions
+        inside.append(len(neighbor_list("i", there, planted.R_CUT)) // 2)
+    balance = np.zeros(len(inside), int)
+    for one in crossed:
+        balance[one.step] += 1 if one.entered else -1
+    assert len(crossed) > 30
+    np.testing.assert_array_equal(np.diff(inside), balance[1:])
+
+
+def test_jumps_are_those_of_the_potential(hard_run):
+    """A pair that enters brings 0.01 eV; the rest of the step is work, to the tenth digit."""
+    asked, found, start, crossed = hard_run
+    for step in sorted({one.step for one in crossed})[:12]:
+        here = [one for one in crossed if one.step == step]
+        balance = account(asked.fresh(), found, start, step, here, hard())
+        expected = [0.01 if one.entered else -0.01 for one in here]
+        np.testing.assert_allclose(balance.jumps, expected, rtol=0, atol=1e-9)
+        assert abs(balance.rest) < 1e-8
+
+
+def test_a_run_without_its_jumps_is_that_of_the_smooth_potential(hard_run):
+    """Energy minus jumps is the energy of the same positions without the step, up to a constant."""
+    _, found, start, crossed = hard_run
+    brought = np.zeros(len(found.potential))
+    for one in crossed:
+        brought[one.step] += 0.01 if one.entered else -0.01
+    good = subject(planted.Good, liquid())
+    without = []
+    for positions in found.positions[::20]:
+        there = start.copy()
+        there.positions = positions
+        without.append(good.energy(there))
+    difference = (found.potential - np.cumsum(brought))[::20] - without
+    np.testing.assert_allclose(difference, difference[0], rtol=0, atol=1e-12)
+
+
+def test_what_is_right_passes():
+    part = Dynamics(smooth, steps=STEPS)(subject(planted.Good, liquid()))
+    assert not [one for one in part.findings if one["severity"] != "info"]
+    numbers = part.numbers
+    assert numbers["crossings"] > 30 and numbers["flips"] == 0.0
+    assert abs(numbers["rest"]) < 1e-3 * max(abs(numbers["drift"]), numbers["drift_error"])
+
+
+def test_shares_add_up_and_flips_are_blamed():
+    part = Dynamics(hard, steps=STEPS)(subject(planted.HardEdge, liquid()))
+    numbers = part.numbers
+    total = numbers["integrator"] + numbers["flips"] + numbers["rest"]
+    assert total == pytest.approx(numbers["drift"], rel=1e-9)
+    assert numbers["largest_jump"] == pytest.approx(0.01, rel=1e-6)
+    assert "FLIPS_CHANGE_ENERGY" in codes(part) and "NOT_CONSERVED" not in codes(part)
+    assert numbers["flips_error"] > 100 * abs(numbers["rest"])
+
+
+def test_a_force_without_an_energy_is_blamed():
+    part = Dynamics(smooth, steps=STEPS)(subject(planted.NoSwitchInForce, liquid()))
+    assert codes(part)["NOT_CONSERVED"] in ("error", "warning")
+    assert "STALE_DYNAMICS" not in codes(part) and "FLIPS_CHANGE_ENERGY" not in codes(part)
+
+
+def test_an_old_list_is_blamed():
+    part = Dynamics(smooth, steps=STEPS)(subject(planted.OldPairs, liquid()))
+    assert codes(part)["STALE_DYNAMICS"] == "error"
+
+
+def test_half_the_time_step_takes_three_quarters_of_the_integrators_error():
+    """Two atoms on a spring: the energy swings by a share that goes with the square of the time step."""
+
+    class Spring(planted.Good):
+        def answer(self, atoms):
+            vector = atoms.positions[1] - atoms.positions[0]
+            length = float(np.linalg.norm(vector))
+            force = (length - 2.0) * vector / length
+            return 0.5 * (length - 2.0) ** 2, np.array([force, -force])
+
+    atoms = Atoms("Ar2", positions=[[0, 0, 0], [2.3, 0, 0]], cell=[20] * 3)
+    asked = subject(Spring, atoms)
+    mass = float(atoms.get_masses()[0])
+    # reduced mass m/2, spring constant 1: the mode moves against both masses
+    step, period = fitting_timestep(asked, atoms, np.random.default_rng(0))
+    assert period == pytest.approx(2 * np.pi * np.sqrt(mass / 2), rel=1e-3)
+    assert step == pytest.approx(period / 40, rel=1e-9)
+    whole, _ = run(asked, atoms, step, 80)
+    half, _ = run(asked, atoms, step / 2, 160)
+    assert np.ptp(half.total) == pytest.approx(np.ptp(whole.total) / 4, rel=0.02)
+
+
+def test_a_run_that_flies_apart_is_told():
+    atoms = bulk("Ar", "fcc", a=5.26, cubic=True)
+    asked = subject(lambda: LennardJones(sigma=3.4, epsilon=0.01, rc=8.5), atoms)
+    part = Dynamics(None, timestep=60.0, steps=STEPS)(asked)
+    assert codes(part) == {"BLEW_UP": "error"}
+
+
+def test_atoms_that_feel_nothing_are_no_run():
+    atoms = Atoms("Ar", positions=[[0, 0, 0]], cell=[20] * 3)
+    asked = subject(planted.Good, atoms)
+    asked.kT = 0.0
+    part = Dynamics(None)(asked)
+    assert part.skipped and not part.findings
+
+
+def test_slope_and_its_error():
+    """Of white noise on a slope: the slope is found within its error, and the error is that of theory."""
+    rng = np.random.default_rng(0)
+    time = np.arange(400.0)
+    found = [drift(time, 0.02 * time + rng.standard_normal(400)) for _ in range(200)]
+    slopes = np.array([one.slope for one in found])
+    theory = 1 / np.sqrt(np.sum((time - time.mean()) ** 2))
+    assert slopes.mean() == pytest.approx(0.02, abs=4 * theory / np.sqrt(200))
+    assert np.mean([one.error for one in found]) == pytest.approx(theory, rel=0.1)
+    assert slopes.std() == pytest.approx(theory, rel=0.15)
+
+
+def test_a_walk_without_a_slope_is_not_told_to_have_one():
+    """The sum of jumps of either sign wanders: a straight line's residue would make it a drift."""
+    rng = np.random.default_rng(1)
+    time = np.arange(400.0)
+    walks = [rng.choice([-1.0, 1.0], 400) for _ in range(200)]
+    assert np.mean([wandering(time, walk).there for walk in walks]) < 0.05
+    assert np.mean([drift(time, np.cumsum(walk)).there for walk in walks]) > 0.3
+
+
+def test_drift_ratio_is_energy_drifted_over_scatter_of_kinetic_energy():
+    time = np.linspace(0.0, 10.0, 200)
+    kinetic = np.sin(time)
+    assert ratio(time, 0.03 * time, kinetic) == pytest.approx(0.3 / np.std(kinetic), rel=1e-9)
+    assert Drift(2.0, 1.0).minus(Drift(1.0, 1.0)).error == pytest.approx(np.sqrt(2))
+
+
+def test_rigid_molecules_keep_their_shape():
+    water = Atoms("OH2", positions=[[0, 0, 0], [0.96, 0, 0], [-0.24, 0.93, 0]], cell=[4] * 3, pbc=True)
+    bonds = rigid_bonds(water.repeat((2, 1, 1)))
+    assert bonds.tolist() == [[0, 1], [0, 2], [1, 2], [3, 4], [3, 5], [4, 5]]
+    assert rigid_bonds(liquid()).size == 0
