@@ -300,7 +300,7 @@ class Tracker:
             margin, earlier = radius - distance, radius - old
         bound = self.bound + max(before.rounding, now.rounding)
         return Flips(
-            np.full(len(i), self.frames - 1, np.int64), self._labels[i], self._labels[j], rank, entered,
+            np.full(len(i), self.frames, np.int64), self._labels[i], self._labels[j], rank, entered,
             distance, old, margin, earlier, np.full(len(i), bound),
             (np.abs(margin) <= bound) | (np.abs(earlier) <= bound),
         )  # fmt: skip
