@@ -1,0 +1,104 @@
+"""`mdnum flips`, from the command line: files nobody here made, what is printed, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import call, printed
+
+datafiles = pytest.importorskip("MDAnalysisTests.datafiles")
+GRO, XTC, PSF, DCD = (str(getattr(datafiles, name)) for name in ("GRO", "XTC", "PSF", "DCD"))
+TRICLINIC = (str(datafiles.PSF_TRICLINIC), str(datafiles.DCD_TRICLINIC))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("nope.xtc", "--cutoff", "4"), "no such file"),
+        ((XTC, "-s", GRO), "Add --cutoff R in Å"),
+        ((GRO, XTC, "--cutoff", "4"), f"Write mdnum flips {XTC} -s {GRO}"),
+        ((DCD, "-s", GRO, "--cutoff", "4"), "47,681 atoms and the trajectory 3,341"),
+        ((XTC, "-s", GRO, "--cutoff", "-1"), "expected a positive length"),
+        ((XTC, "-s", GRO, "--most", "3"), "Add --cutoff R"),
+        ((XTC, "-s", GRO, "--pairs", "O-H"), "is not of the form A-B=LENGTH"),
+        ((XTC, "-s", GRO, "--cutoff", "4", "--between", "name OW", "name XX"), "names no atom"),
+        ((XTC, "-s", GRO, "--cutoff", "4", "--between", "name OW", "name ("), "is no selection"),
+        ((f"{XTC}@99:", "-s", GRO, "--cutoff", "4"), "no frame is left"),
+        ((f"{XTC}@::-1", "-s", GRO, "--cutoff", "4"), "go backward"),
+    ],
+)
+def test_what_cannot_be_asked_is_refused_in_one_line(arguments, message, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert call("flips", *arguments) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+    assert not list(tmp_path.glob("runs/*/*.parquet"))
+
+
+def test_water_around_a_protein(capsys, tmp_path, monkeypatch):
+    """AdK in water, ten frames 100 ps apart on xtc's grid: what the file cannot tell is said."""
+    monkeypatch.chdir(tmp_path)
+    words = ("--cutoff", "4", "--between", "protein and name CA", "name OW", "--no-report")
+    assert call("flips", f"{XTC}@:4", "-s", GRO, *words) == 1
+    lines = printed(capsys)
+    assert "47,681 atoms, 4 frames 100 ps apart" in lines[1]
+    assert any("multiple of 0.01 Å" in line for line in lines)
+    assert any(line.startswith("warning: most contacts are over by the next frame") for line in lines)
+    assert lines[-1] == "wrote runs/flips-adk_oplsaa-1"
+    assert call("flips", f"{XTC}@:4", "-s", GRO, *words, "--json") == 1
+    told = json.loads(capsys.readouterr().out)
+    assert told["folder"] == "runs/flips-adk_oplsaa-2" and told["frames"] == 4
+    import MDAnalysis
+    from MDAnalysis.lib.distances import capped_distance
+
+    universe = MDAnalysis.Universe(GRO, XTC)
+    ca, water = universe.select_atoms("protein and name CA"), universe.select_atoms("name OW")
+    counts = []
+    for _ in universe.trajectory[:4]:
+        _, distance = capped_distance(
+            ca.positions, water.positions, 4.1, box=universe.dimensions, return_distances=True
+        )
+        # float32 there: pairs within its reach of the cutoff are neither in nor out
+        assert np.abs(distance - 4).min() > 1e-6
+        counts.append(int((distance < 4).sum()))
+    one = told["rules"][0]
+    assert (one["pairs_first"], one["pairs_last"]) == (counts[0], counts[-1])
+    assert one["pairs_mean"] == pytest.approx(np.mean(counts))
+    names = {row["first"] + row["second"] for row in one["by_residue_name"]}
+    assert names and all("SOL" in name for name in names)
+
+
+def test_a_triclinic_box_that_varies(capsys, tmp_path):
+    words = ("--cutoff", "5", "--between", "name OH2", "name OH2", "-o", str(tmp_path / "f"), "--json")
+    assert call("flips", TRICLINIC[1], "-s", TRICLINIC[0], *words) in (0, 1)
+    told = json.loads(capsys.readouterr().out)
+    assert told["frames"] == 10 and told["rules"][0]["flips"] > 0
+    page = (tmp_path / "f" / "report.html").read_text(encoding="utf-8")
+    assert "r &lt; 5 Å" in page
+    assert call("report", str(tmp_path / "f")) == 0
+    assert (tmp_path / "f" / "report.html").read_text(encoding="utf-8") == page
+
+
+def test_two_files_of_one_system(capsys, tmp_path):
+    out = ("-o", str(tmp_path / "f"), "--no-report")
+    words = ("-s", PSF, "--cutoff", "8", "--between", "name CA", "name CA")
+    assert call("flips", f"{DCD}@:6", f"{DCD}@1:7", *words, *out) == 1
+    lines = printed(capsys)
+    assert lines[0].startswith("Neighbor sets (r < 8 Å) differ from frame 0 on")
+    assert any(line.startswith("first to differ, frame 0") for line in lines)
+    assert any("a flip that came first is no cause" in line for line in lines)
+
+
+def test_a_file_that_breaks_off_is_kept_as_far_as_it_goes(capsys, tmp_path):
+    whole = Path(XTC).read_bytes()
+    (tmp_path / "cut.xtc").write_bytes(whole[: len(whole) // 2])
+    words = ("--nearest", "4", "--between", "name OW", "name OW", "-o", str(tmp_path / "f"), "--json")
+    assert call("flips", str(tmp_path / "cut.xtc"), "-s", GRO, *words, "--no-report") == 1
+    told = json.loads(capsys.readouterr().out)
+    # MDAnalysis counts the frames that begin, the last of which does not end
+    if told["status"] == "stopped":
+        assert told["findings"][0]["code"] == "STOPPED" and f"frame {told['frames']}" in told["stopped"]
+    assert 3 <= told["frames"] <= 5 and (tmp_path / "f" / "flips.parquet").exists()
