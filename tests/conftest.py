@@ -54,8 +54,11 @@ _CHECKED = [
     "mdnum.trajectories",
     "mdnum.doctor",
 ]
-typing_rules.keep_numba_whole()
-jaxtyping.install_import_hook(_CHECKED, "typing_rules.check")
+# The checks take a fifth of the time of a test that does not compile, and a user's run has none: CI makes its
+# first call with them and its second without.
+if os.environ.get("MDNUM_TEST_TYPES") != "off":
+    typing_rules.keep_numba_whole()
+    jaxtyping.install_import_hook(_CHECKED, "typing_rules.check")
 
 # compiling takes seconds and happens in the first example
 hypothesis.settings.register_profile(
