@@ -29,6 +29,8 @@ Groups = tuple[Int[np.ndarray, "first"] | None, Int[np.ndarray, "second"] | None
 
 # frames at which the flux through the threshold is measured from velocities
 _FLUX_FRAMES = 12
+# rows that wait to be handed over together
+_ROWS_HELD = 20_000
 # displacement for that, as a share of the usual distance of neighbors: small beside the way to a turn
 _FLUX_MOVE = 2e-3
 
@@ -80,6 +82,31 @@ class Neighbors:
             self.seen = np.concatenate([self.seen, np.zeros(len(here) - len(self.seen), np.int64)])
         self.seen[: len(here)] += here
         return int(numbers.min()), float(numbers.mean()), int(numbers.max())
+
+
+class Rows:
+    """Rows of a folder's tables, appended some hundred frames at a time: a call costs more than a row."""
+
+    def __init__(self, folder: RunFolder):
+        self._folder = folder
+        self._held: dict[str, list[dict[str, np.ndarray]]] = {}
+        self._count = 0
+
+    def add(self, table: str, columns: dict[str, np.ndarray]) -> None:
+        """Adds rows, equally long columns."""
+        self._held.setdefault(table, []).append(columns)
+        self._count += len(next(iter(columns.values())))
+
+    def checkpoint(self, frames: int, force: bool = False) -> None:
+        """Hands over what is held where it is much, or where the folder is due to be made whole."""
+        due = force or self._folder.checkpoint_due()
+        if due or self._count > _ROWS_HELD:
+            for table, parts in self._held.items():
+                joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+                self._folder.append(table, joined)
+            self._held, self._count = {}, 0
+        if due:
+            self._folder.checkpoint({"frames": frames}, force=True)
 
 
 @dataclass
@@ -147,7 +174,7 @@ def follow(
     atoms = (
         None if groups[0] is None else np.unique(np.concatenate([one for one in groups if one is not None]))
     )
-    flips = 0
+    flips, rows = 0, Rows(folder)
     at = _sampled(trajectory.count)
     frames = iter(checked(trajectory.frames(), atoms, str(trajectory.path)))
     while True:
@@ -168,13 +195,13 @@ def follow(
         elif found.frames == 1:
             found.moved = _moved(start, frame)
         for number, (one, new) in enumerate(zip(made, stepped, strict=True)):
-            _write(folder, number, one, new, frame, found.frames, (trajectory.atoms, groups))
+            _write(rows, number, one, new, frame, found.frames, (trajectory.atoms, groups))
             flips += len(new)
             if found.frames in at:
                 _measure_flux(one, frame, groups, species)
         found.times = (frame.time if not found.frames else found.times[0], frame.time)
         found.frames += 1
-        folder.checkpoint({"frames": found.frames})
+        rows.checkpoint(found.frames)
         told = {"phase": "run", "unit": "frames", "flips": flips}
         progress(found.frames, trajectory.count or 0, told)
     found.seconds = time.perf_counter() - began
@@ -182,7 +209,7 @@ def follow(
         raise InputError(
             "no frame is left of what was asked for", remedy="Ask for others", where=str(trajectory.path)
         )
-    folder.checkpoint({"frames": found.frames}, force=True)
+    rows.checkpoint(found.frames, force=True)
     return found
 
 
@@ -194,7 +221,7 @@ def _sampled(count: int | None) -> set[int]:
 
 
 def _write(
-    folder: RunFolder,
+    rows: Rows,
     number: int,
     one: Followed,
     flips: Flips,
@@ -208,12 +235,12 @@ def _write(
         one.neighbors = Neighbors.of(members, *size, one.rule.directed)
         one.reach = _reach(one.rule, members)
         columns = {"i": members.i, "j": members.j, "rank": members.rank, "distance": members.distance}
-        folder.append("members", {"rule": np.full(len(members), number), **columns})
+        rows.add("members", {"rule": np.full(len(members), number), **columns})
     else:
         one.neighbors.step(flips)
     if len(flips):
         columns = {name: getattr(flips, name) for name in flips.__dataclass_fields__}
-        folder.append("flips", {"rule": np.full(len(flips), number), **columns})
+        rows.add("flips", {"rule": np.full(len(flips), number), **columns})
     fewest, mean, most = one.neighbors.count()
     entered = int(np.count_nonzero(flips.entered))
     row = {
@@ -222,7 +249,7 @@ def _write(
         "ambiguous": int(np.count_nonzero(flips.ambiguous)), "min_margin": one.tracker.min_margin,
         "fewest": fewest, "neighbors": mean, "most": most,
     }  # fmt: skip
-    folder.append("frames", {name: [value] for name, value in row.items()})
+    rows.add("frames", {name: np.array([value]) for name, value in row.items()})
 
 
 def _reach(rule: Rule, members: Members) -> float:
