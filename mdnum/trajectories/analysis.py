@@ -28,7 +28,7 @@ from mdnum.trajectories.rules import Cutoff, Rule, SpeciesCutoffs
 from mdnum.trajectories.source import UnreadableFrame
 from mdnum.trajectories.table import Flips
 from mdnum.trajectories.tracker import Tracker
-from mdnum.trajectories.xtc_guard import XtcGuard, guard_of
+from mdnum.trajectories.xtc import XtcFile, opened
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ class NeighborFlips(AnalysisBase):
         self._at = 0
         self._trackers: list[Tracker] = []
         self._boxes: Boxes | None = None
-        self._guard: XtcGuard | None = None
+        self._guard: XtcFile | None = None
         self._opened = False
         self._done, self._reading = 0, True
 
@@ -176,7 +176,7 @@ class NeighborFlips(AnalysisBase):
     def timestep(self, number: int) -> Any:
         """MDAnalysis's timestep of a frame, once it is known that reading it does not end the process."""
         if not self._opened:
-            self._guard, self._boxes = guard_of(self._trajectory), Boxes(self._trajectory)
+            self._guard, self._boxes = opened(self._trajectory), Boxes(self._trajectory)
             self._opened = True
         if self._guard is not None:
             self._guard.check(number)

@@ -32,6 +32,7 @@ class AseTrajectory(Trajectory):
         from ase.io.formats import UnknownFileTypeError, filetype
 
         self.path, self.slice = path, frames
+        self.topology = None if topology is None else Path(topology)
         try:
             self.format = format or filetype(str(path))
         except UnknownFileTypeError as error:

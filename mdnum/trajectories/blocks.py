@@ -25,6 +25,7 @@ class TextTrajectory(Trajectory):
 
     def __init__(self, path: Path, topology: str | Path | None, frames: slice):
         self.path, self.slice = path, frames
+        self.topology = None if topology is None else Path(topology)
         self._count: int | None = None
         first = next(self._blocks(iter([0])), None)
         if first is None:

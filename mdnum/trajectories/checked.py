@@ -64,7 +64,9 @@ def check_frame(
         )
     x = frame.positions if atoms is None else frame.positions[atoms]
     # a sum is finite unless a term is not, or the terms are of no use anyway
-    if not np.isfinite(x.sum()) and (bad := np.flatnonzero(~np.isfinite(x).all(axis=1))).size:
+    with np.errstate(over="ignore", invalid="ignore"):
+        total = x.sum()
+    if not np.isfinite(total) and (bad := np.flatnonzero(~np.isfinite(x).all(axis=1))).size:
         first = int(bad[0] if atoms is None else atoms[bad[0]])
         values = ", ".join(f"{value:g}" for value in frame.positions[first])
         raise FrameError(

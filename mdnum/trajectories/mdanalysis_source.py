@@ -15,7 +15,6 @@ from mdnum.errors import InputError
 from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.slices import chosen
 from mdnum.trajectories.source import AtomTable, Trajectory, UnreadableFrame
-from mdnum.trajectories.xtc_guard import guard_of
 
 #: what readers raise on files that end early or hold something else
 READING_FAILS = (OSError, EOFError, ValueError, RuntimeError, StopIteration, IndexError, KeyError, TypeError)
@@ -31,14 +30,12 @@ class MDAnalysisTrajectory(Trajectory):
         self.path, self.slice = path, frames
         self._universe, said = open_universe(path, topology, format)
         self.table = table_of(self._universe.atoms)
-        if self.table.guessed and not hasattr(self._universe.atoms, "elements"):
-            # for selections by element
-            self._universe.add_TopologyAttr("elements", self.table.species)
+        with_elements(self._universe, self.table)
         trajectory = self._universe.trajectory
         self.format = str(trajectory.format if isinstance(trajectory.format, str) else trajectory.format[0])
         self.length = "Å"
         self.time = "frame" if _has_no_times(trajectory, said) else "ps"
-        self.notes = tuple(_notes(self.table))
+        self.notes = tuple(notes_on(self.table))
 
     @property
     def in_file(self) -> int | None:
@@ -50,14 +47,12 @@ class MDAnalysisTrajectory(Trajectory):
 
     def frames(self) -> Iterator[Frame]:
         trajectory = self._universe.trajectory
-        boxes, guard = Boxes(trajectory), guard_of(trajectory)
+        boxes = Boxes(trajectory)
         at = None
         for number in chosen(self.slice, self.in_file):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 try:
-                    if guard is not None:
-                        guard.check(number)
                     # some formats go forward only, so that the next frame is asked for as the next
                     step = at is not None and number == at + 1 and trajectory.ts.frame == at
                     ts = trajectory.next() if step else trajectory[number]
@@ -177,7 +172,7 @@ def open_universe(
         if topology is None:
             universe = _opened(path, lambda: MDAnalysis.Universe(str(path), format=format), path)
         else:
-            universe = _opened(Path(topology), lambda: MDAnalysis.Universe(str(topology)), path)
+            universe = topology_universe(topology)
             atoms = len(universe.atoms)
             if (other := atoms_in(path, atoms, format)) not in (None, atoms):
                 raise InputError(
@@ -186,12 +181,26 @@ def open_universe(
                     where=str(path),
                 )
             _opened(path, lambda: universe.load_new(str(path), format=format), path)
-        if len(universe.trajectory) == 0:
+        # a topology without coordinates has no trajectory at all
+        if not len(getattr(universe, "trajectory", ())):
             raise InputError("the file holds no frame", remedy="Check how it was written", where=str(path))
     return universe, [str(one.message) for one in caught]
 
 
-def _opened(file: Path, act: Any, trajectory: Path) -> Any:
+def topology_universe(topology: str | Path) -> Any:
+    """A Universe of a topology, with or without coordinates.
+
+    Raises:
+        InputError: MDAnalysis does not read it.
+    """
+    import MDAnalysis
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return _opened(Path(topology), lambda: MDAnalysis.Universe(str(topology)), None)
+
+
+def _opened(file: Path, act: Any, trajectory: Path | None) -> Any:
     hook = sys.unraisablehook
     # readers that could not open complain once more when they are thrown away
     sys.unraisablehook = lambda _: None
@@ -271,6 +280,12 @@ def table_of(atoms: Any) -> AtomTable:
     )
 
 
+def with_elements(universe: Any, table: AtomTable) -> None:
+    """Adds the elements that were guessed, for selections by element."""
+    if table.guessed and not hasattr(universe.atoms, "elements"):
+        universe.add_TopologyAttr("elements", table.species)
+
+
 def _element(name: str, known: dict[str, int]) -> str:
     """The element in an atom's name; "" where there is none ("OW1" -> "O", "CL" -> "Cl", "CA" -> "C")."""
     from MDAnalysis.guesser.default_guesser import DefaultGuesser
@@ -286,7 +301,8 @@ def _has_no_times(trajectory: Any, said: list[str]) -> bool:
     return any("no dt information" in one for one in [*said, *(str(w.message) for w in caught)])
 
 
-def _notes(table: AtomTable) -> Iterator[str]:
+def notes_on(table: AtomTable) -> Iterator[str]:
+    """What a reader of results from MDAnalysis's coordinates should know."""
     yield "MDAnalysis hands every coordinate over in float32, whatever the file stores."
     if not table.named:
         yield "The file says how many atoms there are and nothing else; names and elements need a topology."

@@ -222,7 +222,9 @@ def _thinned(values: Float[np.ndarray, "values"]) -> Float[np.ndarray, "fewer"]:
 def _of(frame: Frame, atoms: Int[np.ndarray, "chosen"] | None) -> Frame:
     """The frame of these atoms, without those that are nowhere: they have no distances."""
     x = frame.positions if atoms is None else frame.positions[atoms]
-    if not np.isfinite(x.sum()):
+    with np.errstate(over="ignore", invalid="ignore"):
+        total = x.sum()
+    if not np.isfinite(total):
         x = x[np.isfinite(x).all(axis=1)]
     return frame if x is frame.positions else replace(frame, positions=x, velocities=None)
 

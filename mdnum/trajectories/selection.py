@@ -10,6 +10,7 @@ from jaxtyping import Int
 
 from mdnum.errors import InputError
 from mdnum.trajectories.frame import Frame
+from mdnum.trajectories.mdanalysis_source import topology_universe, with_elements
 from mdnum.trajectories.source import AtomTable, Trajectory
 
 _LANGUAGE = (
@@ -62,7 +63,24 @@ def _universe(trajectory: Trajectory) -> Any:
     if trajectory.universe is not None:
         # `frames` has left the Universe there
         return trajectory.universe
+    if trajectory.topology is not None:
+        try:
+            universe = topology_universe(trajectory.topology)
+        except InputError:
+            # a topology of ASE's: it says no more than the table
+            return universe_of(trajectory.table, first)
+        with_elements(universe, trajectory.table)
+        return _standing(universe, first)
     return universe_of(trajectory.table, first)
+
+
+def _standing(universe: Any, frame: Frame) -> Any:
+    """The Universe at this frame. Distances in a selection are float32."""
+    from MDAnalysis.lib.mdamath import triclinic_box
+
+    box = triclinic_box(*frame.box.matrix) if frame.box.pbc.all() else np.zeros(6, np.float32)
+    universe.load_new(frame.positions[None].astype(np.float32), order="fac", dimensions=np.asarray(box)[None])
+    return universe
 
 
 def universe_of(table: AtomTable, frame: Frame) -> Any:
@@ -73,21 +91,14 @@ def universe_of(table: AtomTable, frame: Frame) -> Any:
         frame: where they are.
     """
     import MDAnalysis
-    from MDAnalysis.lib.mdamath import triclinic_box
 
     first = np.unique(table.residues, return_index=True)[1]
-    universe: Any = MDAnalysis.Universe.empty(
-        len(table), n_residues=len(first), atom_resindex=table.residues, trajectory=True
-    )
+    universe: Any = MDAnalysis.Universe.empty(len(table), n_residues=len(first), atom_resindex=table.residues)
     for name, values in (("names", table.names), ("types", table.species), ("elements", table.species)):
         universe.add_TopologyAttr(name, values)
     universe.add_TopologyAttr("resnames", table.residue_names[first])
     universe.add_TopologyAttr("resids", table.residue_ids[first])
-    universe.atoms.positions = frame.positions
-    if frame.box.pbc.all():
-        # distances in a selection are float32, and need the lengths and angles alone
-        universe.dimensions = triclinic_box(*frame.box.matrix)
-    return universe
+    return _standing(universe, frame)
 
 
 def _there_are(table: AtomTable) -> str:

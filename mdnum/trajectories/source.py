@@ -84,9 +84,11 @@ class Trajectory(ABC):
         table: what is known of the atoms.
         notes: what a reader of the results should know about the reading, each a sentence.
         slice: the frames asked for.
+        topology: the file that says what the atoms are, where it is another one.
     """
 
     path: Path
+    topology: Path | None = None
     format: str
     reader: str
     bits: int = 64
@@ -177,6 +179,10 @@ def open_trajectory(
         from mdnum.trajectories.lammps_dump import LammpsDump
 
         return LammpsDump(file, topology, frames)
+    if reader == "xtc":
+        from mdnum.trajectories.xtc_source import XtcTrajectory
+
+        return XtcTrajectory(file, topology, frames)
     if reader == "gro":
         from mdnum.trajectories.gro import GroTrajectory
 
@@ -192,10 +198,10 @@ def table_of_topology(topology: str | Path) -> AtomTable:
     Raises:
         InputError: neither reads it.
     """
-    from mdnum.trajectories.mdanalysis_source import open_universe, table_of
+    from mdnum.trajectories.mdanalysis_source import table_of, topology_universe
 
     try:
-        return table_of(open_universe(Path(topology), None)[0].atoms)
+        return table_of(topology_universe(topology).atoms)
     except InputError:
         from ase import Atoms
         from ase.io import read
@@ -212,11 +218,12 @@ def table_of_topology(topology: str | Path) -> AtomTable:
 _ASE_SUFFIXES = frozenset({".traj", ".extxyz", ".json", ".db", ".bundle", ".castep", ".xsf", ".con"})
 
 
-_OWN = {"lammpsdump": "lammps", "lammpstrj": "lammps", "lammps-dump-text": "lammps", "gro": "gro"}
+_OWN = {"lammpsdump": "lammps", "lammpstrj": "lammps", "lammps-dump-text": "lammps"}
+_OWN |= {"gro": "gro", "xtc": "xtc"}
 
 
 def _reader_of(file: Path, format: str | None) -> str:
-    """Which reader a file gets: "ase", "mdanalysis", or one of mdnum's own, "lammps" and "gro"."""
+    """Which reader a file gets: "ase", "mdanalysis", or one of mdnum's own: "lammps", "gro", "xtc"."""
     suffix = (file.with_suffix("") if file.suffix in (".gz", ".bz2") else file).suffix.lower()
     if format is not None and format.lower() in _OWN:
         return _OWN[format.lower()]
@@ -224,8 +231,8 @@ def _reader_of(file: Path, format: str | None) -> str:
         return "mdanalysis" if format.upper() in _mdanalysis_formats() else "ase"
     if suffix in _ASE_SUFFIXES:
         return "ase"
-    if suffix == ".gro":
-        return "gro"
+    if suffix in (".gro", ".xtc"):
+        return suffix[1:]
     if suffix[1:].upper() not in _mdanalysis_formats() and _first_lines(file)[0].startswith("item:"):
         return "lammps"
     if suffix == ".xyz" and _is_extended(file):

@@ -1,0 +1,279 @@
+"""Files that are not what they should be: refused in a line, or read up to where they go wrong."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import warnings
+
+import ase.io
+import MDAnalysis
+import numpy as np
+import pytest
+from ase import Atoms
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from MDAnalysisTests import datafiles
+
+from mdnum.errors import InputError
+from mdnum.trajectories import NeighborFlips
+from mdnum.trajectories.checked import FrameError, checked
+from mdnum.trajectories.frame import Box, Frame
+from mdnum.trajectories.selection import select
+from mdnum.trajectories.source import UnreadableFrame, open_trajectory
+from mdnum.trajectories.xtc import XtcFile
+
+warnings.filterwarnings("ignore", module="MDAnalysis")
+
+
+def read(trajectory):
+    """(frames before it went wrong, the error)."""
+    frames = []
+    try:
+        for frame in trajectory.frames():
+            frames.append(frame)
+    except InputError as error:
+        return frames, error
+    return frames, None
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    """A water box of 50 atoms as an xtc of 12 frames that MDAnalysis wrote."""
+    folder = tmp_path_factory.mktemp("xtc")
+    universe = MDAnalysis.Universe(datafiles.GRO, datafiles.XTC)
+    group = universe.select_atoms("resname SOL")[:200]
+    group.write(folder / "small.gro")
+    with MDAnalysis.Writer(str(folder / "small.xtc"), len(group)) as writer:
+        for _ in range(2):
+            for _ts in universe.trajectory[:6]:
+                writer.write(group)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("path", "topology", "counts"),
+    [
+        (datafiles.XTC, datafiles.PSF, ("3,341", "47,681")),
+        (datafiles.DCD, datafiles.GRO, ("47,681", "3,341")),
+        (datafiles.NCDF, datafiles.GRO, ("47,681", "2,661")),
+    ],
+)
+def test_a_topology_of_another_system_names_both_counts(path, topology, counts):
+    with pytest.raises(InputError) as caught:
+        open_trajectory(path, topology)
+    assert all(count in str(caught.value) for count in counts)
+
+
+def test_a_topology_of_another_system_for_a_file_of_ase(tmp_path):
+    ase.io.write(tmp_path / "run.traj", Atoms("H5", np.eye(5, 3)))
+    with pytest.raises(InputError, match=r"two_water_gro.gro has 6 atoms and the trajectory 5"):
+        open_trajectory(tmp_path / "run.traj", datafiles.two_water_gro)
+
+
+def test_a_file_that_is_not_there_or_nothing():
+    for path in ("nowhere.xtc", "nowhere.xtc@3:"):
+        with pytest.raises(InputError, match="no such file"):
+            open_trajectory(path)
+    with pytest.raises(InputError, match=r"nowhere.gro: no such file"):
+        open_trajectory(datafiles.XTC, "nowhere.gro")
+
+
+@pytest.mark.parametrize(
+    "suffix", ["xtc", "trr", "dcd", "ncdf", "traj", "extxyz", "lammpstrj", "gro", "pdb", "zzz"]
+)
+@pytest.mark.parametrize("content", [b"", b"\x93 no trajectory \xff\x00" * 40, b"words and words\n" * 9])
+def test_a_file_that_is_no_trajectory_is_refused_in_a_line(tmp_path, suffix, content):
+    path = tmp_path / f"run.{suffix}"
+    path.write_bytes(content)
+    with pytest.raises(InputError) as caught:
+        list(open_trajectory(path).frames())
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+@settings(max_examples=25)
+@given(at=st.floats(0.05, 0.98), size=st.integers(1, 200), byte=st.integers(0, 255))
+def test_a_damaged_xtc_never_ends_the_process(small, at, size, byte):
+    whole = list(open_trajectory(small / "small.xtc").frames())
+    data = bytearray((small / "small.xtc").read_bytes())
+    begin = int(at * len(data))
+    data[begin : begin + size] = bytes([byte]) * len(data[begin : begin + size])
+    path = small / "damaged.xtc"
+    for old in small.glob(".damaged*"):
+        old.unlink()
+    path.write_bytes(bytes(data))
+    frames, error = read(open_trajectory(path, small / "small.gro"))
+    assert error is None or (isinstance(error, UnreadableFrame) and error.frame == len(frames))
+    first = begin * 12 // len(data)
+    for frame, good in zip(frames[:first], whole, strict=False):
+        np.testing.assert_array_equal(frame.positions, good.positions)
+    assert len(frames) >= first
+
+
+def test_the_guard_takes_every_real_file():
+    for path in (datafiles.XTC, datafiles.XTC_multi_frame, datafiles.XTC_sub_sol):
+        with MDAnalysis.lib.formats.libmdaxdr.XTCFile(path) as file:
+            count = len(file)
+        guard = XtcFile(path)
+        for number in range(count):
+            guard.check(number)
+        with pytest.raises(ValueError, match="ends"):
+            guard.check(count)
+        guard.close()
+
+
+@pytest.mark.parametrize("kind", ["cut", "hole"])
+def test_the_analysis_keeps_what_it_read_of_a_damaged_file(tmp_path, small, kind):
+    data = bytearray((small / "small.xtc").read_bytes())
+    begin = int(0.62 * len(data))
+    if kind == "cut":
+        del data[begin:]
+    else:
+        data[begin : begin + 150] = b"\x7f" * 150
+    shutil.copy(small / "small.gro", tmp_path)
+    (tmp_path / "small.xtc").write_bytes(bytes(data))
+    universe = MDAnalysis.Universe(tmp_path / "small.gro", tmp_path / "small.xtc")
+    good = NeighborFlips(MDAnalysis.Universe(small / "small.gro", small / "small.xtc"), 6.0).run(stop=7)
+    for parts in (1, 3):
+        analysis = NeighborFlips(universe, 6.0)
+        with pytest.raises(UnreadableFrame, match="frame 7 cannot be read") as caught:
+            analysis.run(n_parts=parts)
+        assert caught.value.frame == 7 and "7 frames before it are kept" in str(caught.value)
+        assert analysis.frames.tolist() == list(range(7))
+        np.testing.assert_array_equal(analysis.results.flips.frame, good.results.flips.frame)
+        np.testing.assert_array_equal(analysis.results.flips.margin, good.results.flips.margin)
+
+
+def test_a_dcd_that_was_cut_says_so(tmp_path):
+    with open(datafiles.DCD, "rb") as file:
+        (tmp_path / "cut.dcd").write_bytes(file.read(1_000_000))
+    frames, error = read(open_trajectory(tmp_path / "cut.dcd", datafiles.PSF))
+    assert isinstance(error, UnreadableFrame) and error.frame == len(frames) == 24
+    # who asks for no more than there is gets it
+    assert read(open_trajectory(f"{tmp_path / 'cut.dcd'}@:24", datafiles.PSF))[1] is None
+    assert read(open_trajectory(datafiles.DCD, datafiles.PSF))[1] is None
+
+
+def test_a_trr_that_was_cut_says_so(tmp_path):
+    with open(datafiles.TRR, "rb") as file:
+        (tmp_path / "cut.trr").write_bytes(file.read(3_000_000))
+    frames, error = read(open_trajectory(tmp_path / "cut.trr", datafiles.GRO))
+    assert isinstance(error, UnreadableFrame) and error.frame == len(frames) == 2
+
+
+def images():
+    random = np.random.default_rng(0)
+    return [Atoms("Ar9", random.normal(size=(9, 3)), cell=[9, 9, 9], pbc=True) for _ in range(5)]
+
+
+LAMMPS = "ITEM: TIMESTEP\n{k}\nITEM: NUMBER OF ATOMS\n2\nITEM: BOX BOUNDS pp pp pp\n0 9\n0 9\n0 9\n"
+LAMMPS += "ITEM: ATOMS id type x y z\n1 1 1.5 1.5 1.5\n2 1 3.5 3.5 3.5\n"
+GRO = "frame {k}\n    2\n" + "".join(
+    f"    1SOL     OW{k:5d}{0.1 * k:8.3f}{0.2 * k:8.3f}{0.3 * k:8.3f}\n" for k in (1, 2)
+)
+GRO += "   1.00000   1.00000   1.00000\n"
+
+
+@pytest.mark.parametrize("kind", ["extxyz", "lammpstrj", "gro"])
+@pytest.mark.parametrize("damage", ["cut", "words", "number"])
+def test_text_is_read_up_to_where_it_goes_wrong(tmp_path, kind, damage):
+    path = tmp_path / f"run.{kind}"
+    if kind == "extxyz":
+        ase.io.write(path, images())
+    else:
+        path.write_text("".join({"lammpstrj": LAMMPS, "gro": GRO}[kind].format(k=k) for k in range(5)))
+    lines = path.read_text().splitlines(keepends=True)
+    each = len(lines) // 5
+    last = {"extxyz": each - 1, "lammpstrj": each - 1, "gro": each - 2}[kind]
+    if damage == "cut":
+        del lines[2 * each + last :]
+    elif damage == "words":
+        lines[2 * each + last] = "something else altogether\n"
+    else:
+        lines[2 * each + last] = re.sub(r"(\.\d)\d", r"\1x", lines[2 * each + last], count=1)
+        if kind == "lammpstrj":
+            lines[2 * each + last] = lines[2 * each + last].replace("3.5", "3.x", 1)
+    path.write_text("".join(lines))
+    frames, error = read(open_trajectory(path))
+    assert isinstance(error, UnreadableFrame), error
+    assert error.frame == len(frames) == 2 and "frame 2" in str(error) and "@:2" in str(error)
+
+
+def test_a_traj_that_was_cut_is_read_as_far_as_it_goes(tmp_path):
+    ase.io.write(tmp_path / "run.traj", images())
+    data = (tmp_path / "run.traj").read_bytes()
+    (tmp_path / "run.traj").write_bytes(data[:-300])
+    frames, error = read(open_trajectory(tmp_path / "run.traj"))
+    assert isinstance(error, UnreadableFrame) and error.frame == len(frames) == 4
+
+
+@pytest.mark.parametrize("kind", ["traj", "extxyz"])
+def test_atoms_that_come_and_go_are_refused(tmp_path, kind):
+    ase.io.write(tmp_path / f"run.{kind}", [*images()[:2], Atoms("Ar8", np.ones((8, 3)))])
+    frames, error = read(open_trajectory(tmp_path / f"run.{kind}"))
+    assert len(frames) == 2 and "frame 2 has 8 atoms and the first 9" in str(error)
+
+
+def test_lammps_atoms_that_are_others_are_refused(tmp_path):
+    text = LAMMPS.format(k=0) + LAMMPS.format(k=1).replace("\n2 1 3.5", "\n7 1 3.5")
+    (tmp_path / "run.lammpstrj").write_text(text)
+    frames, error = read(open_trajectory(tmp_path / "run.lammpstrj"))
+    assert len(frames) == 1 and "frame 1 lacks atom 2" in str(error)
+
+
+def frames(spoil=lambda k, x: None, pbc=lambda k: True):
+    random = np.random.default_rng(0)
+    for k in range(4):
+        x = random.normal(size=(6, 3))
+        spoil(k, x)
+        yield Frame(10 * k, float(k), x, Box(9 * np.eye(3), np.full(3, pbc(k))))
+
+
+def put(number, rows, value):
+    def spoil(k, x):
+        if k == number:
+            x[rows] = value
+
+    return spoil
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (put(2, slice(4, 5), np.nan), r"frame 20: atom 4 is at \(nan, nan, nan\)"),
+        (put(2, (slice(1, 4), 2), -np.inf), r"frame 20: atom 1 is at \(.*-inf\), and 2 others"),
+        (put(2, slice(None), 0.0), "frame 20: all coordinates are 0"),
+        (put(2, slice(3, 5), 0.0), "frame 20: atom 3 is at exactly 0, 0, 0, and 1 other"),
+    ],
+)
+def test_frame_and_atom_are_named(spoil, said):
+    seen = []
+    with pytest.raises(FrameError, match=said) as caught:
+        for frame in checked(frames(spoil)):
+            seen.append(frame.index)
+    assert seen == [0, 10] and caught.value.frame == 20
+
+
+def test_what_is_fine_is_not_refused():
+    assert len(list(checked(frames()))) == 4
+    # one atom may be at the origin, and what is not looked at may be anywhere
+    assert len(list(checked(frames(put(2, slice(4, 5), 0.0))))) == 4
+    assert len(list(checked(frames(put(2, slice(4, 5), np.nan)), np.array([0, 1, 2])))) == 4
+    # large, but numbers
+    assert len(list(checked(frames(put(2, slice(4, 5), 1e308))))) == 4
+
+
+def test_a_box_that_leaves_is_named():
+    with pytest.raises(FrameError, match="frame 20 has no box, and the first one looked at has a box"):
+        list(checked(frames(pbc=lambda k: k != 2)))
+
+
+def test_nobody_and_nothing(tmp_path):
+    ase.io.write(tmp_path / "run.traj", images())
+    with pytest.raises(InputError, match=r"names no atom of 9; there are names Ar"):
+        select(open_trajectory(tmp_path / "run.traj"), "name OW")
+    with pytest.raises(InputError, match="no frame is left"):
+        select(open_trajectory(f"{tmp_path / 'run.traj'}@9:"), "name Ar")
+    assert list(open_trajectory(f"{tmp_path / 'run.traj'}@9:").frames()) == []
+    with pytest.raises(InputError, match="named twice"):
+        open_trajectory(f"{tmp_path / 'run.traj'}@9:", slice=":2")
