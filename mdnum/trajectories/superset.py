@@ -50,7 +50,7 @@ class Superset:
     found: Found
     due: Float[np.ndarray, "pairs"]
     inside: Bool[np.ndarray, "pairs"]
-    start: Int[np.ndarray, "groups+1"]
+    start: Int[np.ndarray, "edges"]
     earliest: Float[np.ndarray, "groups"]
     combination: Int[np.ndarray, "3 3"]
     gone: float = 0.0
