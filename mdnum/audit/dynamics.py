@@ -15,7 +15,8 @@ from mdnum.audit.crossings import Threshold, crossings
 from mdnum.audit.dynamics_words import part
 from mdnum.audit.energy_ledger import Result, balance, by_means, crossing_rows, energy_rows
 from mdnum.audit.noise import FEW, Noise, along_a_line, roomy
-from mdnum.audit.nve import Run, at, fitting_timestep, prepared, rigid_bonds, run
+from mdnum.audit.nve import Run, at, fitting_timestep, prepared, run
+from mdnum.audit.rigid import rigid
 from mdnum.audit.subject import CalculatorError, only_trying
 from mdnum.references.findings import finding
 
@@ -58,10 +59,10 @@ class Dynamics:
         rng = np.random.default_rng(self.seed)
         limits, unknown = self._limits(subject)
         atoms = roomy(subject.atoms, FEW)
-        bonds = rigid_bonds(atoms) if _only_molecules(subject) else np.zeros((0, 2), np.int64)
+        held = rigid(atoms) if _only_molecules(subject) else None
         worker = subject.fresh()
         fitting, period = fitting_timestep(worker, atoms, rng)
-        start = prepared(worker, atoms, bonds, period, rng)
+        start = prepared(worker, atoms, held, period, rng)
         step = self.timestep if self.timestep is not None else fitting
         if not np.isfinite(step):
             return _nothing_moves(self.name, began)
@@ -102,7 +103,7 @@ class Dynamics:
 
 def _only_molecules(subject: Subject) -> bool:
     """Whether the calculator takes whole molecules alone, whose inner distances it does not know."""
-    if rigid_bonds(subject.atoms).size == 0:
+    if rigid(subject.atoms) is None:
         return False
     try:
         with only_trying(subject):

@@ -9,14 +9,13 @@ from typing import Any, cast
 import numpy as np
 from ase import Atoms
 from ase.calculators.calculator import Calculator, all_changes
-from ase.constraints import FixBondLengths
 from ase.md.velocitydistribution import MaxwellBoltzmannDistribution, Stationary
 from ase.md.verlet import VelocityVerlet
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from mdnum.audit.base import Subject
 from mdnum.audit.noise import direction, displaced
-from mdnum.audit.transformations import group
+from mdnum.audit.rigid import RigidGroups
 
 #: Steps in the period of the fastest vibration.
 _STEPS_A_PERIOD = 40
@@ -77,7 +76,7 @@ class Run:
 def prepared(
     subject: Subject,
     atoms: Atoms,
-    bonds: Int[np.ndarray, "bonds 2"],
+    held: RigidGroups | None,
     period: float,
     rng: np.random.Generator,
 ) -> Atoms:
@@ -86,7 +85,7 @@ def prepared(
     Args:
         subject: for its kT, and its forces.
         atoms: left as it is.
-        bonds: pairs of atoms at fixed distances.
+        held: molecules that keep their shape.
         period: of the fastest vibration, internal time.
         rng: draws the velocities.
     """
@@ -96,23 +95,13 @@ def prepared(
     thermal = np.sqrt(subject.kT * float(np.mean(atoms.get_masses()))) * 2 * np.pi / period
     relaxed = float(np.sqrt(np.mean(subject.forces(atoms) ** 2))) < _RELAXED * thermal
     there = atoms.copy()
-    if len(bonds):
-        there.set_constraint(FixBondLengths(bonds))
+    if held is not None:
+        there.set_constraint(held)
     kelvin = (2.0 if relaxed else 1.0) * subject.kT / units.kB
     MaxwellBoltzmannDistribution(there, temperature_K=kelvin, rng=rng)
     if len(there) > 1:
         Stationary(there)
     return there
-
-
-def rigid_bonds(atoms: Atoms) -> Int[np.ndarray, "bonds 2"]:
-    """All pairs within the groups of atoms that the order of species repeats: water in rigid models."""
-    size = group(atoms)
-    if size is None:
-        return np.zeros((0, 2), np.int64)
-    first, second = np.triu_indices(size, 1)
-    starts = np.arange(0, len(atoms), size)[:, None]
-    return np.stack([(starts + first).ravel(), (starts + second).ravel()], axis=1)
 
 
 def fitting_timestep(subject: Subject, atoms: Atoms, rng: np.random.Generator) -> tuple[float, float]:

@@ -14,7 +14,8 @@ from audit.test_invariance import codes
 from mdnum.audit.crossings import account, crossings
 from mdnum.audit.drift import Drift, drift, ratio, wandering
 from mdnum.audit.dynamics import Dynamics
-from mdnum.audit.nve import fitting_timestep, prepared, rigid_bonds, run
+from mdnum.audit.nve import fitting_timestep, prepared, run
+from mdnum.audit.rigid import rigid, rigid_bonds
 from mdnum.audit.thresholds import Threshold
 
 STEPS = 160
@@ -42,7 +43,7 @@ def liquid() -> Atoms:
 def hard_run():
     """A run over a hard cutoff, and its crossings."""
     asked = subject(planted.HardEdge, liquid())
-    start = prepared(asked, liquid(), np.zeros((0, 2), int), 1.0, np.random.default_rng(2))
+    start = prepared(asked, liquid(), None, 1.0, np.random.default_rng(2))
     found, _ = run(asked, start, 1.0, STEPS)
     return asked, found, start, crossings(found, start, hard())
 
@@ -186,7 +187,22 @@ def test_drift_ratio_is_energy_drifted_over_scatter_of_kinetic_energy():
 
 
 def test_rigid_molecules_keep_their_shape():
+    """As ASE's own constraint holds them, bond by bond."""
+    from ase.constraints import FixBondLengths
+
     water = Atoms("OH2", positions=[[0, 0, 0], [0.96, 0, 0], [-0.24, 0.93, 0]], cell=[4] * 3, pbc=True)
-    bonds = rigid_bonds(water.repeat((2, 1, 1)))
-    assert bonds.tolist() == [[0, 1], [0, 2], [1, 2], [3, 4], [3, 5], [4, 5]]
-    assert rigid_bonds(liquid()).size == 0
+    atoms = water.repeat((2, 1, 1))
+    held = rigid(atoms)
+    assert held is not None and held.get_removed_dof(atoms) == 6
+    assert rigid_bonds(atoms)[1].tolist() == [[3, 4], [3, 5], [4, 5]]
+    assert rigid(liquid()) is None
+    ours, theirs = atoms.copy(), atoms.copy()
+    ours.set_constraint(held)
+    theirs.set_constraint(FixBondLengths(rigid_bonds(atoms).reshape(-1, 2), tolerance=1e-13))
+    rng = np.random.default_rng(0)
+    momenta, moved = rng.standard_normal((6, 3)), atoms.positions + 0.02 * rng.standard_normal((6, 3))
+    for one in (ours, theirs):
+        one.set_momenta(momenta)
+        one.set_positions(moved)
+    np.testing.assert_allclose(ours.positions, theirs.positions, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(ours.get_momenta(), theirs.get_momenta(), rtol=0, atol=1e-9)
