@@ -33,7 +33,7 @@ def conform(
         None,
         metavar="WORD,WORD",
         help="What it does not claim to do: minimum-image, orthorhombic, along-axes, all-axes, periodic, "
-        "free, wrapped, fixed-cell, right-handed, lower-triangular.",
+        "free, wrapped, fixed-cell, right-handed, lower-triangular, whole-cell.",
     ),
     no_large: bool = typer.Option(False, "--no-large", help="Leave out 5,000 and 100,000 atoms."),
     out: Path | None = typer.Option(

@@ -32,6 +32,7 @@ LIMITS = {
     "fixed-cell": "fixed_cell",
     "right-handed": "right_handed",
     "lower-triangular": "lower",
+    "whole-cell": "whole_cell",
 }
 
 
@@ -210,9 +211,7 @@ def _summary(found: Report, scripts: list[str], seed: int) -> dict[str, Any]:
             _failure(failed, name) | {"alone": failed.alone}
             for failed, name in zip(found.failed, scripts, strict=True)
         ],
-        "large": None
-        if found.large is None
-        else {"atoms": found.large[0], "seconds": found.large[1]},
+        "large": None if found.large is None else {"atoms": found.large[0], "seconds": found.large[1]},
         "seed": seed,
         "seconds": found.seconds,
         "findings": [],

@@ -73,7 +73,11 @@ def _boxes() -> Iterator[Case]:
     yield one("large numbers", "boxes", gas(24, 4e9, 17), 4e9, r_cut=1e9)
     ulp = float(np.nextafter(4.0, 5.0))
     places = np.array([[0.0, 1, 1], [3.75, 1, 1], [2.0, 0, 0], [2.0, 3.5, 0], [0, 0, 2], [0, 0.5, 2]])
-    for edge, name in ((4.0, "exactly 4"), (ulp, "4 and an ulp"), (float(np.nextafter(4.0, 0.0)), "an ulp below 4")):
+    for edge, name in (
+        (4.0, "exactly 4"),
+        (ulp, "4 and an ulp"),
+        (float(np.nextafter(4.0, 0.0)), "an ulp below 4"),
+    ):
         yield one(f"pairs through faces, edges {name}", "boxes", places, edge)
 
 
@@ -97,7 +101,9 @@ def _axes() -> Iterator[Case]:
     yield one("free, negative coordinates, in a dummy box", "axes", molecule - 7.5, 1.0, False)
     tilted = np.array([[4.0, 0, 0], [1.5, 4.0, 0], [1.0, -1.2, 5.0]])
     yield one("skewed slab", "axes", gas(24, tilted, 23), tilted, (True, True, False))
-    yield one("slab with a tilted free axis", "axes", gas(24, tilted, 24, -0.7, 1.7), tilted, (True, False, True))
+    yield one(
+        "slab with a tilted free axis", "axes", gas(24, tilted, 24, -0.7, 1.7), tilted, (True, False, True)
+    )
 
 
 def _images() -> Iterator[Case]:
@@ -106,8 +112,13 @@ def _images() -> Iterator[Case]:
     yield one("two atoms, edges of 1.5 cutoffs", "images", [[0.1, 0.1, 0.1], [0.8, 0.9, 0.7]], 1.5)
     yield one("two atoms, edges of 0.6 cutoffs", "images", [[0.1, 0.1, 0.1], [0.3, 0.4, 0.5]], 0.6)
     yield one("one axis below two cutoffs", "images", gas(10, [1.7, 4.0, 4.0], 30), np.diag([1.7, 4.0, 4.0]))
-    yield one("one axis just below one cutoff", "images", gas(6, [0.96, 4.0, 4.0], 31), np.diag([0.96, 4.0, 4.0]))
+    yield one(
+        "one axis just below one cutoff", "images", gas(6, [0.96, 4.0, 4.0], 31), np.diag([0.96, 4.0, 4.0])
+    )
     yield one("one cell, both neighbors the same atom", "images", [[0.0, 0, 0], [0.9, 0, 0]], np.diag([1.8, 5, 5]), r_cut=1.0)  # fmt: skip
+    for edge in (0.45, 0.7, 0.95, 1.9):
+        walls = np.array([[0.02, 0.03, 0.02], [0.98, 0.97, 0.96]]) * edge
+        yield one(f"two atoms at opposite walls, edges of {edge} cutoffs", "images", walls, edge)
     skewed = np.array([[1.4, 0, 0], [1.1, 1.2, 0], [-0.9, 0.8, 1.3]])
     yield one("small and skewed", "images", gas(4, skewed, 32), skewed)
     yield one("small and skewed, slab", "images", gas(4, skewed, 33), skewed, (True, True, False))
@@ -123,7 +134,9 @@ def _outside() -> Iterator[Case]:
     yield one("all of one box over", "outside", inside + [4.0, 0, 0], 4.0)
     yield one("all of one box back", "outside", inside - [0, 4.0, 4.0], 4.0)
     yield one("a thousand boxes over", "outside", inside + 4000.0 * np.sign(shifts), 4.0)
-    yield one("one atom a million boxes over", "outside", [[1.0, 1, 1], [1.5 + 4e6, 1, 1], [1, 1.6, 1 - 8e6]], 4.0)
+    yield one(
+        "one atom a million boxes over", "outside", [[1.0, 1, 1], [1.5 + 4e6, 1, 1], [1, 1.6, 1 - 8e6]], 4.0
+    )
     skewed = np.array([[4.0, 0, 0], [1.9, 4.0, 0], [-1.7, 1.5, 4.0]])
     yield one("skewed, lattice vectors added", "outside", gas(24, skewed, 42) + shifts @ skewed, skewed)
     beyond = np.where([True, False, True], 4.0 * shifts, 0.0)
@@ -136,17 +149,42 @@ def _outside() -> Iterator[Case]:
         near = np.array([[0.5, 2, 2], [3.5, 2, 2], [2, 0.5, 2], [2, 3.5, 2], [2, 2, 0.5], [2, 2, 3.5]])
         on = np.array([[place, 2, 2], [2, place, 2], [2, 2, place], [place, place, place]])
         yield one(f"atoms at {word}", "outside", np.vstack([on, near, [[0.4, 0.4, 0.4]]]), 4.0)
+    for edge in (4.0, 4.0 * (1 + 1e-9), 4.0 * (1 + 1e-6)):
+        name = f"pairs a hair inside the cutoff, across walls of cells, edges {edge!r}"
+        yield one(name, "outside", _across_walls(edge), [edge, 200.0, 200.0])
     third = 1.0 / 3.0
-    yield one("a face that no double holds", "outside", [[0.0, 1, 1], [3 * third * 2.1, 1, 1], [2.1 - 0.5, 1, 1]], 2.1)
+    yield one(
+        "a face that no double holds",
+        "outside",
+        [[0.0, 1, 1], [3 * third * 2.1, 1, 1], [2.1 - 0.5, 1, 1]],
+        2.1,
+    )
     for edge in (2.1, 3.3, 4.7):
         grid = np.stack(np.meshgrid(*[np.arange(3) / 3 * edge] * 3, indexing="ij"), -1).reshape(-1, 3)
         yield one("a grid on the walls of the cells", "outside", grid, edge, r_cut=edge / 3 * 1.1)
 
 
+def _across_walls(edge: float) -> np.ndarray:
+    """Pairs along x whose atoms lie just below a multiple of the cutoff, and a cutoff less a hair below that.
+
+    A search that puts one of them into the next cell, as float32 does, has two cells between them.
+    """
+    hairs = (1e-6, 5.5e-8, 1e-9, 3e-12, 2e-16)
+    pairs = []
+    for wall in range(1, 5):
+        for n, below in enumerate(hairs):
+            for k, hair in enumerate(hairs):
+                first = np.array([wall - below, 6.0 * (5 * wall - 4 + n), 6.0 * (1 + k)])
+                pairs += [first, first - [1.0 - hair, 0.0, 0.0]]
+    return np.array(pairs)
+
+
 def _ties() -> Iterator[Case]:
     grid = np.stack(np.meshgrid(*[np.arange(4.0)] * 3, indexing="ij"), -1).reshape(-1, 3)
     yield one("whole numbers, first shell at the cutoff", "ties", grid, 4.0, r_cut=1.0)
-    yield one("whole numbers, 3-4-5", "ties", [[0.0, 0, 0], [3, 4, 0], [3, 4, 12], [0, 4, 3], [-5, 0, 0]], r_cut=5.0)
+    yield one(
+        "whole numbers, 3-4-5", "ties", [[0.0, 0, 0], [3, 4, 0], [3, 4, 12], [0, 4, 3], [-5, 0, 0]], r_cut=5.0
+    )
     yield one("whole numbers, 3-4-5 through faces", "ties", [[0.0, 0, 0], [13, 12, 0], [4, 3, 0], [0, 0, 11]], 16.0, r_cut=5.0)  # fmt: skip
     yield one("second shell at the cutoff, which is no double", "ties", grid, 4.0, r_cut=float(np.sqrt(2.0)))
     for ulps in (-2, -1, 0, 1, 2):
@@ -155,8 +193,12 @@ def _ties() -> Iterator[Case]:
     rng = np.random.default_rng(50)
     direction = rng.normal(size=(30, 3))
     direction /= np.linalg.norm(direction, axis=1)[:, None]
-    yield one("30 atoms on a sphere of the cutoff", "ties", np.vstack([np.zeros((1, 3)), direction]) + 4.0, 9.0)
-    yield one("an image of itself at the cutoff", "ties", [[0.3, 0.3, 0.3]], np.diag([2.0, 7.0, 7.0]), r_cut=2.0)
+    yield one(
+        "30 atoms on a sphere of the cutoff", "ties", np.vstack([np.zeros((1, 3)), direction]) + 4.0, 9.0
+    )
+    yield one(
+        "an image of itself at the cutoff", "ties", [[0.3, 0.3, 0.3]], np.diag([2.0, 7.0, 7.0]), r_cut=2.0
+    )
     yield one("half of the box at the cutoff", "ties", [[0.0, 0, 0], [2.0, 0, 0]], 4.0, r_cut=2.0)
 
 

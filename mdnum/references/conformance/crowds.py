@@ -17,11 +17,12 @@ SMALL_EDGE, LARGE_EDGE = 17, 47
 
 def crowds() -> Iterator[Case]:
     """Clusters with more neighbors than lists like to give an atom, alone and in a thin gas."""
-    for count in (20, 33, 41, 66, 130, 260, 520):
+    for count in (20, 33, 41, 66, 130, 260):
         cluster = 5.0 + 0.45 * gas(count, 1.0, 70 + count, -1.0, 1.0)
         yield one(f"{count} atoms in one clump", "crowded", cluster, 12.0, r_cut=1.6)
-    around = 0.97 * _sphere(150)
-    yield one("150 neighbors on one atom", "crowded", np.vstack([np.zeros((1, 3)), around]) + 4.0, 9.0)
+    for count in (150, 520):
+        around = np.vstack([np.zeros((1, 3)), 0.97 * _sphere(count)])
+        yield one(f"{count} neighbors on one atom", "crowded", around + 4.0, 9.0)
     thin = gas(300, 24.0, 71)
     clump = 12.0 + 0.3 * gas(60, 1.0, 72, -1.0, 1.0)
     yield one("a clump in a thin gas", "crowded", np.vstack([thin, clump]), 24.0)

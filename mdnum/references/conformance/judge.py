@@ -36,7 +36,7 @@ class Failure:
 
     Attributes:
         code: MISSING, EXTRA, DUPLICATE, SELF, ONE_SIDED, SHIFTS, DISTANCES, VECTORS, RANGE, MALFORMED,
-            RAISED, CHANGED_INPUT, UNSTABLE or CRASHED.
+            RAISED, NO_ANSWER, CHANGED_INPUT or CRASHED.
         text: what was seen, with atoms and numbers.
         count: how many rows.
         step: at which still.
@@ -55,7 +55,7 @@ class Failure:
 #: Codes by how bad they are: the first is what makes energies wrong without a word.
 CODES = (
     "CRASHED", "MISSING", "EXTRA", "DUPLICATE", "SELF", "RANGE", "ONE_SIDED", "SHIFTS", "DISTANCES", "VECTORS",
-    "MALFORMED", "CHANGED_INPUT", "UNSTABLE", "RAISED",
+    "MALFORMED", "NO_ANSWER", "CHANGED_INPUT", "RAISED",
 )  # fmt: skip
 
 
@@ -285,6 +285,14 @@ def _measures(answer: Answer, truth: Truth, how: Conventions) -> list[Failure]:
         )
         found.append(Failure(code, text, int(wrong.sum())))
     return found
+
+
+def measures_well(answer: Answer, truth: Truth, how: Conventions) -> bool:
+    """Whether an answer has distances or vectors, and they are as good as the conventions say."""
+    given = answer.distance is not None or answer.vector is not None
+    n = len(truth.positions)
+    named = bool(((answer.i >= 0) & (answer.i < n) & (answer.j >= 0) & (answer.j < n)).all())
+    return given and len(answer) > 0 and named and not _measures(answer, truth, how)
 
 
 def _nearest(mine: ndarray, told: ndarray, theirs: ndarray, length: ndarray) -> ndarray:

@@ -14,7 +14,7 @@ class AseSkinList:
     pbc: Any
 
     def allocate(self, positions, cell, pbc, r_cut, skin):
-        from ase.neighborlist import NewPrimitiveNeighborList, NeighborList
+        from ase.neighborlist import NeighborList, NewPrimitiveNeighborList
 
         self.pbc = pbc
         self.kept = NeighborList(

@@ -50,6 +50,7 @@ class Limits:
         fixed_atoms: a list in use cannot be given other atoms: `allocate` is called again.
         right_handed: no left-handed cell.
         lower: no cell that is not lower triangular.
+        whole_cell: no cell that lacks a vector, even along an axis that does not repeat.
         atoms: no fewer atoms.
         most_atoms: no more atoms.
         least_cutoff: no shorter cutoff: a library for one unit of length.
@@ -67,6 +68,7 @@ class Limits:
     fixed_atoms: bool = True
     right_handed: bool = False
     lower: bool = False
+    whole_cell: bool = False
     atoms: int = 0
     most_atoms: int | None = None
     least_cutoff: float = 0.0
@@ -87,6 +89,8 @@ class Limits:
             return "no free atoms"
         if self.free and pbc.any():
             return "free atoms only"
+        if self.whole_cell and any(np.linalg.matrix_rank(still.cell) < 3 for still in case.stills):
+            return "no cell that lacks a vector"
         if not pbc.any():
             return None
         if self.all_axes and not pbc.all():
@@ -182,7 +186,8 @@ class Outcome:
         refused: the exception says on purpose that this cannot be done.
         malformed: why the answer is none, or None.
         changed: the input that the call wrote to, or None.
-        crashed: how the process ended that made the call, or that it did not end in time; or None.
+        crashed: how the process ended that made the call, or None.
+        late: that it did not answer in time, or None.
     """
 
     answer: Answer | None = None
@@ -191,6 +196,7 @@ class Outcome:
     malformed: str | None = None
     changed: str | None = None
     crashed: str | None = None
+    late: str | None = None
 
 
 class Session:
@@ -254,8 +260,9 @@ class Session:
 
 
 def _failed(error: Exception, case: Case) -> Outcome:
-    # LinAlgError is a ValueError that nobody raises on purpose
-    meant = isinstance(error, ValueError | NotImplementedError) and not isinstance(error, np.linalg.LinAlgError)
+    # those that compiled code raises on purpose are RuntimeErrors; LinAlgError is a ValueError by accident
+    meant = isinstance(error, ValueError | RuntimeError)
+    meant = meant and not isinstance(error, np.linalg.LinAlgError | RecursionError)
     words = " ".join(str(error).split())
     refused = bool(words) and meant and case.atoms > 0
     return Outcome(raised=f"{type(error).__name__}: {words[:300]}", refused=refused)
@@ -288,5 +295,3 @@ def source_of(made: Any) -> str:
         return inspect.getsource(made)
     except (OSError, TypeError):
         return ""
-
-

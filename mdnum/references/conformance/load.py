@@ -133,5 +133,7 @@ def _import_line(place: str, attribute: str) -> str:
     alias = f"\n{rest.rpartition('.')[2]} = {attribute}" if rest else ""
     if place.endswith(".py"):
         path = Path(place).resolve()
-        return f"import sys\nsys.path.insert(0, {str(path.parent)!r})\nfrom {path.stem} import {first}{alias}\n"
+        return (
+            f"import sys\nsys.path.insert(0, {str(path.parent)!r})\nfrom {path.stem} import {first}{alias}\n"
+        )
     return f"from {place} import {first}{alias}\n"

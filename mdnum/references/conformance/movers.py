@@ -47,7 +47,11 @@ def _pairs() -> Iterator[Case]:
     path = [np.array([middle + [0, 0, k * 0.0], middle + [0.9 + 0.01 * k, 0, 0]]) for k in range(40)]
     yield script("two atoms part slowly", "motion", path, _L, _R, _SKIN)
     at = middle + [apart, 0, 0]
-    path = [np.array([middle, at])] * 3 + [np.array([middle, middle + [0.5, 0, 0]])] + [np.array([middle, at])] * 3
+    path = (
+        [np.array([middle, at])] * 3
+        + [np.array([middle, middle + [0.5, 0, 0]])]
+        + [np.array([middle, at])] * 3
+    )
     yield script("an atom jumps in and out", "motion", path, _L, _R, _SKIN)
 
 
@@ -80,9 +84,13 @@ def _many() -> Iterator[Case]:
     order = np.random.default_rng(84).permutation(len(start))
     yield script("atoms change places", "motion", [start, start[order], start], _L, _R, _SKIN)
     dense, sparse = 3.0 + 0.25 * gas(40, _L, 85, -1.0, 1.0), gas(40, _L, 86)
-    yield script("dense, sparse, dense, sparse", "motion", [sparse, dense, sparse, dense, sparse], _L, _R, _SKIN)
+    yield script(
+        "dense, sparse, dense, sparse", "motion", [sparse, dense, sparse, dense, sparse], _L, _R, _SKIN
+    )
     jitter = np.random.default_rng(87).normal(scale=0.12, size=(60, *start.shape))
-    yield script("a jitter of a third of the skin", "motion", [start + noise for noise in jitter], _L, _R, _SKIN)
+    yield script(
+        "a jitter of a third of the skin", "motion", [start + noise for noise in jitter], _L, _R, _SKIN
+    )
 
 
 def _wrapping() -> Iterator[Case]:
@@ -97,9 +105,15 @@ def _wrapping() -> Iterator[Case]:
     tossed = [start + _L * rng.integers(-2, 3, start.shape) for _ in range(6)]
     yield script("other images of the same atoms", "wrapping", tossed, _L, _R, _SKIN)
     pair = [np.array([[0.05, 3, 3], [5.2, 3, 3]]) + [k * 0.01 - 0.1, 0, 0] for k in range(20)]
-    yield script("a pair goes through a face, wrapped", "wrapping", [np.mod(x, _L) for x in pair], _L, _R, _SKIN)
-    meet = [np.array([[0.02 + 0.01 * k, 3, 3], [_L - 1.4 + 0.01 * k * (1 + k / 10), 3, 3]]) for k in range(30)]
-    yield script("an atom follows another through a face", "wrapping", [np.mod(x, _L) for x in meet], _L, _R, _SKIN)
+    yield script(
+        "a pair goes through a face, wrapped", "wrapping", [np.mod(x, _L) for x in pair], _L, _R, _SKIN
+    )
+    meet = [
+        np.array([[0.02 + 0.01 * k, 3, 3], [_L - 1.4 + 0.01 * k * (1 + k / 10), 3, 3]]) for k in range(30)
+    ]
+    yield script(
+        "an atom follows another through a face", "wrapping", [np.mod(x, _L) for x in meet], _L, _R, _SKIN
+    )
     skewed = np.array([[5.0, 0, 0], [2.0, 5.0, 0], [-1.5, 1.0, 5.0]])
     slanted = gas(30, skewed, 93)
     moved = [slanted + k * speeds[:30] for k in range(40)]
@@ -130,6 +144,14 @@ def _strain() -> Iterator[Case]:
         shears = [np.array([[1.0, 0, 0], [size * k, 1, 0], [0, 0, 1]]) for k in range(9)]
         path = [(start @ shear, _L * shear) for shear in shears]
         yield script(f"the box is sheared by {size} at a step", "strain", path, _L, _R, _SKIN)
+    over = np.array([[1.0, 0.3, 2], [2.4, edge - 0.3, 2], [3.0, 2, 2]])
+    for steps in (1, 12):
+        tilts = [np.array([[edge, 0, 0], [1.4 * k / steps, edge, 0], [0, 0, edge]]) for k in range(steps + 1)]
+        how = "at once" if steps == 1 else f"in {steps} steps"
+        name = f"the box is sheared {how}, the atoms rest, the volume stays"
+        yield script(name, "strain", [(over, tilt) for tilt in tilts], edge, _R, _SKIN)
+    swapped = [(across, np.diag([edge - w, edge * edge / (edge - w), edge])) for w in np.linspace(0, 0.5, 6)]
+    yield script("one edge shrinks, one grows, the atoms rest", "strain", swapped, edge, _R, _SKIN)
     angles = np.linspace(0.0, 1.2, 7)
     turns = [np.array([[np.cos(a), np.sin(a), 0], [-np.sin(a), np.cos(a), 0], [0, 0, 1.0]]) for a in angles]
     yield script("box and atoms turn", "strain", [(start @ turn, _L * turn) for turn in turns], _L, _R, _SKIN)
@@ -145,9 +167,13 @@ def _reuse() -> Iterator[Case]:
     dense = 3.0 + 0.2 * gas(40, _L, 112, -1.0, 1.0)
     yield script("fewer atoms each time", "reuse", [start[:n] for n in (40, 23, 9, 2, 1, 0)], _L, _R, _SKIN)
     yield script("more atoms each time", "reuse", [start[:n] for n in (1, 2, 9, 23, 40)], _L, _R, _SKIN)
-    yield script("an atom is removed and added", "reuse", [start, start[1:], start, start[:-1]], _L, _R, _SKIN)
+    yield script(
+        "an atom is removed and added", "reuse", [start, start[1:], start, start[:-1]], _L, _R, _SKIN
+    )
     yield _anew(script("as many other atoms", "reuse", [start, other, start], _L, _R, _SKIN))
-    yield _anew(script("many neighbors, then few, then many", "reuse", [dense, start, dense, start], _L, _R, _SKIN))
+    yield _anew(
+        script("many neighbors, then few, then many", "reuse", [dense, start, dense, start], _L, _R, _SKIN)
+    )
     boxes = [(start, np.eye(3) * _L), (start, np.eye(3) * 9.0), (start * 0.6, np.eye(3) * 3.6)]
     yield _anew(script("other boxes", "reuse", boxes, _L, _R, _SKIN))
     yield _anew(script("the same atoms three times", "reuse", [start] * 3, _L, _R, _SKIN))

@@ -5,7 +5,6 @@ scripts that reproduce a failure without mdnum. It calls its library as a user w
 outside the box, odd cells and few atoms go in as they are.
 """
 
-# ruff: noqa: E731
 from __future__ import annotations
 
 from mdnum.references.conformance.lists import Limits, PairList, source_of
@@ -83,9 +82,7 @@ def mdanalysis_nsgrid(positions, cell, pbc, r_cut):
     from MDAnalysis.lib.mdamath import triclinic_box
 
     box = triclinic_box(*cell) if pbc.all() else None
-    pairs, distance = self_capped_distance(
-        np.asarray(positions, np.float32), r_cut, box=box, method="nsgrid"
-    )
+    pairs, distance = self_capped_distance(np.asarray(positions, np.float32), r_cut, box=box, method="nsgrid")
     return {"i": pairs[:, 0], "j": pairs[:, 1], "distance": distance}
 
 
@@ -202,7 +199,8 @@ PEERS: tuple[PairList, ...] = (
     ),  # fmt: skip
     _peer("vesin", "vesin", vesin_cells, "vesin's cell list, every pair from both atoms"),
     _peer("vesin-half", "vesin", vesin_half, "vesin, every pair once"),
-    _peer("matscipy", "matscipy", matscipy_list, "matscipy.neighbours.neighbour_list"),
+    _peer("matscipy", "matscipy", matscipy_list, "matscipy.neighbours.neighbour_list",
+        limits=Limits(whole_cell=True)),
     _peer("pymatgen", "pymatgen", pymatgen_points, "pymatgen's find_points_in_spheres",
         limits=Limits(least_cutoff=0.01)),
     _peer(
@@ -221,7 +219,7 @@ PEERS: tuple[PairList, ...] = (
     ),
     _peer(
         "freud", "freud-analysis", freud_query, "freud.locality.AABBQuery", unit=_SINGLE,
-        limits=Limits(minimum_image=True, all_axes=True, lower=True, right_handed=True),
+        limits=Limits(minimum_image=True, all_axes=True, lower=True, right_handed=True, atoms=1),
     ),
     _peer("torch-sim", "torch-sim-atomistic", torch_sim_pairs, "torch-sim's torch_nl_linked_cell", affords=0.3),
     _peer("nvalchemi-ops", "nvalchemi-toolkit-ops", nvalchemi_pairs, "nvalchemi-ops' cell_list", affords=0.1),

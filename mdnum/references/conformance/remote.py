@@ -16,7 +16,7 @@ from mdnum.references.conformance.case import Case
 from mdnum.references.conformance.lists import Outcome, PairList, Session
 
 #: Seconds that an answer may take, for so many atoms at most and for more; and those to import a library.
-FEW, CALL, LONG, START = 1000, 20.0, 120.0, 120.0
+FEW, CALL, LONG, START = 1000, 45.0, 120.0, 120.0
 _SIZE = struct.Struct("<Q")
 
 
@@ -37,10 +37,12 @@ class RemoteSession:
         try:
             if self._process is None:
                 self._process = self._started()
-            return self._exchanged((case, self.reuse, self.tested.limits), CALL if case.atoms <= FEW else LONG)
+            return self._exchanged(
+                (case, self.reuse, self.tested.limits), CALL if case.atoms <= FEW else LONG
+            )
         except _Ended as ended:
             self.close()
-            return [Outcome(crashed=str(ended))]
+            return [Outcome(late=str(ended)) if isinstance(ended, _Late) else Outcome(crashed=str(ended))]
 
     def close(self) -> None:
         """Ends the process."""
@@ -87,7 +89,7 @@ class RemoteSession:
             return _receive(process.stdout)
         except EOFError as error:
             if late.is_set():
-                raise _Ended(f"no answer within {seconds:.0f} s") from error
+                raise _Late(f"no answer within {seconds:.0f} s") from error
             raise _Ended(self._how_it_ended()) from error
         finally:
             timer.cancel()
@@ -105,6 +107,10 @@ class RemoteSession:
 
 class _Ended(Exception):
     """The other process is gone; the message says how."""
+
+
+class _Late(_Ended):
+    """It was ended, because it did not answer."""
 
 
 def _send(stream: BinaryIO | Any, message: Any) -> None:

@@ -79,7 +79,7 @@ def check(step, x, cell, given):
     return not bad
 '''
 
-_ONCE = '''
+_ONCE = """
 fine = True
 for step, (x, cell, _) in enumerate(STEPS):
     before = x.copy(), cell.copy()
@@ -88,15 +88,15 @@ for step, (x, cell, _) in enumerate(STEPS):
         print(f"step {{step}}: the call wrote to its input")
         fine = False
     fine = check(step, *before, given) and fine
-'''
+"""
 
-_KEPT = '''
+_KEPT = """
 fine, kept = True, {call}()
 for step, (x, cell, fresh) in enumerate(STEPS):
     before = x.copy(), cell.copy()
     given = as_mapping(kept.allocate(x, cell, PBC, R_CUT, SKIN) if fresh else kept.update(x, cell))
     fine = check(step, *before, given) and fine
-'''
+"""
 
 _MAPPING = '''
 def as_mapping(given):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mdnum.references.conformance.case import Case, Still
+from mdnum.references.conformance.judge import Failure
 from mdnum.references.conformance.lists import completed
 from mdnum.references.oracle import widths
 
@@ -28,25 +30,28 @@ def shrunk(examiner: Examiner, failed: Failed) -> Failed:
         examiner: asks the list; a new object of a kept list for each try.
         failed: the case as it was met.
     """
-    wanted = failed.code
+    wanted, kind = failed.code, _kind(failed.worst)
+    least = min(1, failed.case.atoms)
     tries, until = 0, time.perf_counter() + SECONDS
 
     def still_fails(case: Case) -> bool:
         nonlocal tries
         tries += 1
-        if examiner.tested.limits.refusal(case) is not None or not _sensible(case):
+        if case.atoms < least or not _sensible(case) or examiner.tested.limits.refusal(case) is not None:
             return False
         how, single = examiner.report.how, examiner.report.single
         failures = examiner.failures(case)
         if examiner.report.how is not how:  # it passed for float32: the conventions stay as they were
             examiner.report.how, examiner.report.single = how, single
             return False
-        return any(failure.code == wanted for failure in failures)
+        return any(_kind(failure) == kind for failure in failures)
 
     def spent() -> bool:
         return tries >= TRIES or time.perf_counter() > until
 
     case = failed.case
+    if wanted == "NO_ANSWER":
+        return failed  # every try would take as long
     if not still_fails(case):
         # what it kept from earlier questions was part of it: told as it is
         return replace(failed, alone=False)
@@ -62,6 +67,12 @@ def shrunk(examiner: Examiner, failed: Failed) -> Failed:
     return replace(failed, case=case.until(found[0].step + 1), failures=found)
 
 
+def _kind(failure: Failure) -> tuple[str, str]:
+    """What a smaller case has to show: the code; of an exception or a crash also which, whatever its numbers."""
+    said = failure.text if failure.code in ("RAISED", "CRASHED", "MALFORMED") else ""
+    return failure.code, re.sub(r"[-+\d.e]+", "#", said)
+
+
 def _sensible(case: Case) -> bool:
     """Whether it is a question: finite numbers, a box with room in it, not too many images to count."""
     if not (case.r_cut > 0 and np.isfinite(case.r_cut)):
@@ -72,6 +83,9 @@ def _sensible(case: Case) -> bool:
             return False
         if pbc.any():
             with np.errstate(all="ignore"):
+                used = still.cell[pbc]
+                if np.linalg.matrix_rank(used) < len(used):
+                    return False
                 matrix = completed(still.cell, pbc)
                 if not abs(np.linalg.det(matrix)) > 0:
                     return False

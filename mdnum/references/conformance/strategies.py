@@ -16,7 +16,16 @@ from mdnum.references.conformance.case import Case, one
 #: Kinds of boxes, and of places of atoms, by the words that a case is named after.
 SHAPES = ("cube", "orthorhombic", "skewed", "strongly skewed", "turned", "left-handed")
 SIZES = ("ordinary", "wide", "thin", "two cutoffs", "narrow", "long", "huge")
-PLACES = ("inside", "outside", "far outside", "on walls", "clustered", "coincident", "on a grid", "at the cutoff")
+PLACES = (
+    "inside",
+    "outside",
+    "far outside",
+    "on walls",
+    "clustered",
+    "coincident",
+    "on a grid",
+    "at the cutoff",
+)
 
 _FEW_IMAGES = 400  # lattice vectors that the oracle may have to try for a pair
 

@@ -13,8 +13,8 @@ from mdnum.report.words import count, listed, many, typeset
 #: (severity, title, remedy) by the code of a failure; {list} is the list's name.
 _CODES: Mapping[str, tuple[str, str, str]] = {
     "CRASHED": (
-        "error", "{list} ends the process, or never answers",
-        "Check what it divides by and allocates before it starts; a program that calls it loses its run.",
+        "error", "{list} ends the process",
+        "Check what it divides by and allocates; a program that calls it loses its run.",
     ),
     "MISSING": (
         "error", "{list} misses pairs inside the cutoff",
@@ -47,7 +47,11 @@ _CODES: Mapping[str, tuple[str, str, str]] = {
         "Return (i, j), (i, j, shift), ... or a mapping with i and j, whole numbers of equal length.",
     ),
     "CHANGED_INPUT": ("warning", "{list} writes to its input", "Copy before wrapping in place."),
-    "UNSTABLE": ("warning", "{list} gives other pairs when asked again", "Find what it keeps between calls."),
+    "NO_ANSWER": (
+        "warning",
+        "{list} gives no answer in time",
+        "Look at what its time and memory grow with: empty space, a long cutoff, a unit of length.",
+    ),
     "RAISED": (
         "warning", "{list} raises on input that has an answer",
         "Answer it, or say in a ValueError what cannot be done.",
@@ -177,7 +181,7 @@ def _conduct(run: Question) -> Iterator[Finding]:
         total = sum(area["refused"] for area in summary["areas"])
         yield Finding(
             "REFUSES",
-            "info",
+            "warning" if total > 0.2 * summary["asked"] else "info",
             f"{run.name} refuses {many(total, 'case')}",
             f"It says so, which is safe. Most often: {one['why']}, about {row['area']}.",
         )

@@ -71,7 +71,11 @@ def _bars(run: Question, figure: Figure) -> None:
     # a share of each area: one of 100,000 atoms counts as much as 500 drawn at random
     for at, row in zip(place, rows, strict=True):
         left = 0.0
-        for name, color, alpha in (("passed", FIRST, 0.75), ("refused", MUTED, 0.45), ("failed", SECOND, 0.9)):
+        for name, color, alpha in (
+            ("passed", FIRST, 0.75),
+            ("refused", MUTED, 0.45),
+            ("failed", SECOND, 0.9),
+        ):
             share = row[name] / row["asked"]
             # a case that fails is never too small to be seen
             share = max(share, 0.006) if row[name] else share
@@ -101,7 +105,11 @@ def _key_figures(run: Question) -> Iterator[tuple[str, str, str]]:
     skipped = sum(row["skipped"] for row in summary["areas"])
     yield "Not asked", count(skipped), "outside of what it claims"
     if summary["large"]:
-        yield "Largest", f"{count(summary['large']['atoms'])} atoms", f"{number(summary['large']['seconds'], 2)} s"
+        yield (
+            "Largest",
+            f"{count(summary['large']['atoms'])} atoms",
+            f"{number(summary['large']['seconds'], 2)} s",
+        )
 
 
 def _area(row: Mapping[str, Any]) -> dict[str, Any]:
@@ -112,7 +120,9 @@ def _area(row: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "name": heading(row["area"]),
         "about": row["about"],
-        "cells": [count(row[name]) if row[name] else "–" for name in ("asked", "failed", "refused", "skipped")],
+        "cells": [
+            count(row[name]) if row[name] else "–" for name in ("asked", "failed", "refused", "skipped")
+        ],
         "bad": bool(row["failed"]),
         "why": "; ".join(why),
     }

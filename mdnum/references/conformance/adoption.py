@@ -1,0 +1,85 @@
+"""The suite in a library's own tests: a class to subclass, with a test for each area.
+
+    from mdnum.references.conformance import Limits, NeighborListConformance
+    from mylibrary import neighbor_list
+
+    class TestNeighborList(NeighborListConformance):
+        pairs = staticmethod(neighbor_list)
+        limits = Limits(minimum_image=True)
+
+A failure prints what is wrong and a script of a few atoms that reproduces it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import pytest
+
+from mdnum.references.conformance.case import AREAS, Case
+from mdnum.references.conformance.crowds import LARGE_EDGE, SMALL_EDGE, lattice
+from mdnum.references.conformance.lists import Limits, PairList
+from mdnum.references.conformance.load import from_object, load
+from mdnum.references.conformance.script import script
+from mdnum.references.conformance.suite import examine, questions
+
+
+class NeighborListConformance:
+    """Tests of a neighbor list; subclass it under a name that pytest collects, and say which list.
+
+    Attributes:
+        pairs: a function of (positions, cell, pbc, r_cut) in `staticmethod`, a class or an object with
+            `allocate` and `update` (`KeptList`), or a word that `load` knows.
+        full: every pair from both of its atoms (True) or once (False); None to find out.
+        unit: roundoff of its arithmetic, 2**-53 or 2**-24; None to find out.
+        superset: pairs beyond the cutoff may be listed.
+        limits: what it does not claim to do; such cases are not asked.
+        cases: random cases.
+        seed: of the random cases; change it now and then.
+        large: ask about 100,000 atoms, too.
+    """
+
+    pairs: ClassVar[Any] = None
+    full: ClassVar[bool | None] = None
+    unit: ClassVar[float | None] = None
+    superset: ClassVar[bool | None] = None
+    limits: ClassVar[Limits | None] = None
+    cases: ClassVar[int] = 200
+    seed: ClassVar[int] = 0
+    large: ClassVar[bool] = False
+
+    def tested(self) -> PairList:
+        """The list with what the class says about it."""
+        if self.pairs is None:
+            pytest.skip("no list: set `pairs` in a subclass")
+        found = load(self.pairs) if isinstance(self.pairs, str) else from_object(self.pairs)
+        return found.with_options(full=self.full, unit=self.unit, superset=self.superset, limits=self.limits)
+
+    def asked(self, tested: PairList, area: str) -> list[Case]:
+        """The cases of one area."""
+        if area == "large":
+            return [lattice(edge) for edge in (SMALL_EDGE, LARGE_EDGE)[: 1 + self.large]]
+        count = self.cases if area == "random" else 0
+        found = questions(replace(tested, affords=1.0), count, self.seed, large=False)
+        return [case for case in found if case.area == area]
+
+    @pytest.mark.parametrize("area", AREAS)
+    def test_neighbor_list(self, area: str) -> None:
+        """The list gives the right pairs in the cases of an area."""
+        tested = self.tested()
+        cases = self.asked(tested, area)
+        if not cases:
+            pytest.skip("for lists that are kept")
+        report = examine(tested, asked=cases, large=False)
+        if not report.asked:
+            pytest.skip("; ".join(report.areas[area].why))
+        if report.failed:
+            said = [f"{failed.code}: {failed.worst.text}" for failed in report.failed]
+            lines = script(tested, report.failed[0], report.how, report.superset)
+            pytest.fail(
+                f"{report.wrong} of {report.asked} cases about {AREAS[area]}\n"
+                + "\n".join(said)
+                + f"\n\nThis reproduces the first:\n\n{lines}",
+                pytrace=False,
+            )

@@ -1,0 +1,408 @@
+"""A neighbor list that is right, and what people have got wrong in theirs: one word for each mechanism.
+
+`search` is a cell list of its own kind, which shares no code with the oracle; `Kept` keeps one with a skin. Both
+do as told by `defect`; with none they are right. The words are told by the threads they were reported in.
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+
+#: What a list made anew gets wrong, and where that was reported.
+SEARCH_DEFECTS = {
+    "drops atoms outside": "jax-md 168, 171, 302",
+    "shifts of wrapped positions": "torch-sim 423, nvalchemi-ops 18",
+    "no images": "torch-sim 423",
+    "wraps free axes": "torch-sim 575, nvalchemi-ops 104",
+    "skips by bounding box": "openmm 714",
+    "ghosts by coordinate": "lammps 2759, 3846",
+    "half stencil": "lammps 2930, deepmd 1109",
+    "half trimmed from full": "lammps 4487",
+    "too many bins": "GPUMD 190",
+    "wraps to the far face": "Atomistica 30",
+    "two bins counted twice": "MDAnalysis 2345",
+    "one side in float32": "MDAnalysis 2229, 3181",
+    "images undercounted": "kUPS 127",
+    "next cell only": "fairchem 268",
+    "minimum image": "apax 121, jax-md (r_cut > L/2)",
+    "no wrapping": "torch_nl 1, NeighbourLists.jl 6",
+    "bins by edges": "jax-md 223",
+    "last bin lost": "jax-md 291, 322",
+    "stencil aliases": "PQ 274",
+    "zero distance twice": "CellListMap 84",
+    "tail not cut": "CellListMap 86",
+    "silent overflow": "jax-md 165, 75",
+    "32 neighbors": "torchmd-net 21, pyg 2933",
+    "capacity of all for each": "NNPOps 80",
+    "nearest only": "fairchem 428",
+    "fixed slots": "deepmd 108",
+    "rows beyond 4096": "deepmd 5616",
+    "tile overflow": "nvalchemi-ops 160",
+    # not reported anywhere that we know of
+    "coincident atoms dropped": "",
+    "keeps itself": "",
+    "padding handed out": "",
+    "real indices": "",
+    "unequal lengths": "",
+    "squared distances": "",
+    "distances of neighbors": "",
+    "vectors turned": "",
+    "wraps in place": "",
+    "grid in float32": "",
+    "32-bit keys": "",
+    "divides by a spread": "",
+    "remembers by count": "",
+    "box of the first call": "",
+}
+
+#: What a list that is kept gets wrong.
+KEPT_DEFECTS = {
+    "whole skin": "schnetpack 397",
+    "stale tail": "nvalchemi-toolkit 54",
+    "negative skin squared": "lammps 1701",
+    "box not looked at": "timemachine 316, glp 3",
+    "reference overwritten": "timemachine 497",
+    "images counted once": "jax-md 399",
+    "frozen ghosts": "librascal 143",
+    "skin for another frequency": "LADDS 59",
+    "every 20 steps": "openmm 4230",
+    "delay of 10": "lammps 3485",
+    "known by its size": "lammps 4239",
+    "one step late": "hoomd-blue 563",
+    "average motion": "AutoPas 917",
+    "never again": "MCGPU 25",
+    "overflow of the first": "jax-md 141, 161; so3lr 25",
+    # not reported anywhere that we know of
+    "nearest image of motion": "",
+    "first atom not looked at": "",
+    "motion along x": "",
+    "rebuilt from old positions": "",
+    "counts of the first": "",
+    "volume looked at": "",
+}
+
+_remembered: dict = {}
+
+
+def search(positions, cell, pbc, r_cut, defect=""):
+    """(i, j, shift, distance, vector) by name: every pair from both atoms."""
+    given, pbc = positions, np.asarray(pbc)
+    n = len(positions)
+    if defect == "divides by a spread" and n:
+        positions = positions + 0.0 / int(np.ptp(positions, axis=0).max())
+    if n == 0:
+        return _rows(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3), int), np.zeros((0, 3)))
+    if defect == "box of the first call":
+        cell = _remembered.setdefault("cell", np.array(cell))
+    matrix = _complete(np.asarray(cell, float), pbc)
+    if defect == "wraps free axes" and np.linalg.matrix_rank(cell) == 3:
+        matrix = np.array(cell, float)
+    inverse = np.linalg.inv(matrix)
+    width = 1.0 / np.linalg.norm(inverse, axis=0)
+    fraction = positions @ inverse
+    if defect == "grid in float32":
+        fraction = fraction.astype(np.float32).astype(float)
+    wraps = pbc if defect != "wraps free axes" else np.ones(3, bool)
+    home = np.where(wraps, np.floor(fraction), 0.0)
+    if defect in ("drops atoms outside", "no wrapping", "no images"):
+        home[:] = 0.0
+    if defect == "wraps in place":
+        given -= np.where(pbc, home, 0.0) @ matrix
+        home[:] = 0.0
+    fraction = fraction - home
+    shown = np.where(pbc, 0.0, fraction.min(axis=0))
+    size = np.linalg.norm(matrix, axis=1) if defect == "bins by edges" else width
+    span = np.where(pbc, 1.0, np.maximum(np.ptp(fraction, axis=0), r_cut / width))
+    bins = np.maximum(1, np.floor(span * size / r_cut * (1 - 1e-12))).astype(int)
+    if defect == "too many bins":
+        bins = np.maximum(1, np.ceil(span * width / r_cut)).astype(int)
+    bins = np.minimum(bins, 512)
+    place = np.floor((fraction - shown) / span * bins).astype(int)
+    listed = np.ones(n, bool)
+    if defect == "drops atoms outside":
+        listed = ((fraction >= 0) & (fraction < 1) | ~pbc).all(axis=1)
+    elif defect == "wraps to the far face":
+        listed = ((place < bins) | ~pbc).all(axis=1)
+    if defect == "last bin lost":
+        listed &= ((place < bins - 1) | (bins < 4)).all(axis=1)
+    place = np.clip(place, 0, bins - 1)
+    reach = np.ceil(r_cut / (span * width / bins) - 1e-9).astype(int)
+    if defect in ("too many bins", "bins by edges", "two bins counted twice", "next cell only"):
+        reach = np.ones(3, int) if defect != "next cell only" else np.minimum(reach, bins)
+    if defect == "images undercounted":
+        reach = np.where(bins == 1, np.maximum(1, np.round(r_cut / width).astype(int)), reach)
+    if defect == "no wrapping":
+        reach = np.minimum(reach, bins)
+    if defect in ("no images", "drops atoms outside", "no wrapping"):
+        # a grid over all atoms wherever they are, or bins that make no sense outside
+        place = np.where(listed[:, None], place, 0)
+    i, j, lattice = _candidates(place, bins, reach, pbc, defect)
+    keep = listed[i] & listed[j]
+    i, j, lattice = i[keep], j[keep], lattice[keep]
+    if defect == "no images":
+        i, j = np.divmod(np.arange(n * n), n)
+        lattice = np.zeros((n * n, 3), int)
+    shift = (lattice + home[i] - home[j]).astype(int)
+    box = np.where(pbc[:, None], matrix, 0.0)
+    if defect == "wraps free axes":
+        wrapped = positions - home @ matrix
+        vector = wrapped[j] - wrapped[i] + lattice @ box
+        shift = np.where(pbc, shift, 0)
+    else:
+        vector = positions[j] - positions[i] + shift @ box
+    if defect in ("minimum image", "two bins counted twice"):
+        vector = positions[j] - positions[i]
+        shift = -np.where(pbc, np.rint(vector @ inverse), 0).astype(int)
+        vector = vector + shift @ box
+        if defect == "minimum image":
+            _, first = np.unique(i * n + j, return_index=True)
+            i, j, shift, vector = i[first], j[first], shift[first], vector[first]
+    distance = np.sqrt((vector**2).sum(axis=1))
+    inside = distance < r_cut
+    if defect == "one side in float32":
+        inside = np.where(i < j, inside, distance.astype(np.float32) < np.float32(r_cut))
+    if defect == "skips by bounding box":
+        inside &= ~((np.abs(vector[:, 0]) > 0.93 * r_cut) & (np.abs(vector[:, 1]) < 0.2 * r_cut))
+    itself = (i == j) & (np.all(shift == 0, axis=1) if defect != "keeps itself" else False)
+    if defect == "coincident atoms dropped":
+        itself |= distance == 0
+    inside &= ~itself
+    i, j, shift, vector = i[inside], j[inside], shift[inside], vector[inside]
+    if defect == "shifts of wrapped positions":
+        shift = shift - (home[i] - home[j]).astype(int)
+    return _spoiled(n, r_cut, place, i, j, shift, vector, defect)
+
+
+def _candidates(place, bins, reach, pbc, defect):
+    """Atoms in the bins around each atom, and the lattice vectors that bring those bins near."""
+    steps = np.array(list(itertools.product(*(range(-r, r + 1) for r in reach))))
+    if defect == "half stencil":
+        steps = steps[[tuple(step) >= (0, 0, 0) for step in steps]]
+    target = place[:, None, :] + steps[None]
+    lattice = np.floor_divide(target, bins)
+    target = target - lattice * bins
+    ok = ((lattice == 0) | pbc).all(axis=2)
+    if defect == "next cell only" or defect == "no wrapping":
+        ok &= (np.abs(lattice) <= 1).all(axis=2)
+    number = (target[..., 0] * bins[1] + target[..., 1]) * bins[2] + target[..., 2]
+    number = np.where(ok, number, -1)
+    if defect == "stencil aliases":
+        # each neighboring bin once, whichever way it was come to
+        for row in range(len(number)):
+            _, first = np.unique(number[row], return_index=True)
+            once = np.zeros(number.shape[1], bool)
+            once[first] = True
+            ok[row] &= once
+    home = (place[:, 0] * bins[1] + place[:, 1]) * bins[2] + place[:, 2]
+    order = np.argsort(home, kind="stable")
+    first = np.searchsorted(home[order], number, "left")
+    count = np.where(ok, np.searchsorted(home[order], number, "right") - first, 0)
+    which = np.repeat(np.arange(count.size), count.ravel())
+    within = np.arange(len(which)) - np.repeat(np.cumsum(count.ravel()) - count.ravel(), count.ravel())
+    i = which // count.shape[1]
+    j = order[first.ravel()[which] + within]
+    return i, j, lattice.reshape(-1, 3)[which]
+
+
+def _spoiled(n, r_cut, place, i, j, shift, vector, defect):
+    """What goes wrong after the pairs were found."""
+    distance = np.sqrt((vector**2).sum(axis=1))
+    if defect == "ghosts by coordinate":
+        # a pair through a face is kept by the side from which the ghost lies higher
+        ghost = np.any(shift != 0, axis=1)
+        higher = (vector[:, 2] > 0) | ((vector[:, 2] == 0) & (vector[:, 1] > 0))
+        once = np.where(ghost, higher, i < j)
+        i, j, shift, vector = (np.concatenate([part[once], other[once]]) for part, other in (
+            (i, j), (j, i), (shift, -shift), (vector, -vector)))  # fmt: skip
+    elif defect == "half trimmed from full":
+        kept = np.all(shift == 0, axis=1) & (i < j)
+        i, j, shift, vector = i[kept], j[kept], shift[kept], vector[kept]
+    elif defect == "zero distance twice":
+        more = np.flatnonzero(distance == 0)
+        i, j, shift, vector = (np.concatenate([part, part[more]]) for part in (i, j, shift, vector))
+    elif defect in ("32 neighbors", "fixed slots", "nearest only", "silent overflow", "tile overflow"):
+        rank_by = distance if defect == "nearest only" else j
+        room = {"32 neighbors": 32, "fixed slots": 100, "nearest only": 60, "tile overflow": 48}
+        most = room.get(defect, int(1.25 * len(i) / max(n, 1)) + 4)
+        group = i // 8 if defect == "tile overflow" else i
+        most = most * 4 if defect == "tile overflow" else most
+        order = np.lexsort((rank_by, group))
+        starts = np.searchsorted(group[order], group[order], "left")
+        kept = order[np.arange(len(order)) - starts < most]
+        i, j, shift, vector = i[kept], j[kept], shift[kept], vector[kept]
+    elif defect == "capacity of all for each":
+        most = max(64, 16 * n)
+        i, j, shift, vector = i[:most], j[:most], shift[:most], vector[:most]
+    elif defect == "rows beyond 4096":
+        kept = i < 4096
+        i, j, shift, vector = i[kept], j[kept], shift[kept], vector[kept]
+    elif defect == "32-bit keys":
+        key = (i * n + j).astype(np.int32).astype(np.int64) * 1000 + (shift @ [100, 10, 1])
+        _, kept = np.unique(key, return_index=True)
+        i, j, shift, vector = i[kept], j[kept], shift[kept], vector[kept]
+    elif defect == "remembers by count":
+        i, j, shift, vector = _remembered.setdefault(n, (i, j, shift, vector))
+    elif defect == "tail not cut":
+        last = _remembered.get("tail")
+        if last is not None and len(last[0]) > len(i):
+            i, j, shift, vector = (
+                np.concatenate([new, old[len(new) :]])
+                for new, old in zip((i, j, shift, vector), last, strict=True)
+            )
+        _remembered["tail"] = (i, j, shift, vector)
+    rows = _rows(i, j, shift, vector)
+    if defect == "padding handed out":
+        rows["i"], rows["j"] = np.append(i, n), np.append(j, n)
+        del rows["shift"], rows["distance"], rows["vector"]
+    elif defect == "real indices":
+        rows["i"] = i.astype(float)
+    elif defect == "unequal lengths":
+        rows["j"] = j[: len(j) - len(j) // 9]
+    elif defect == "squared distances":
+        rows["distance"] = rows["distance"] ** 2
+    elif defect == "distances of neighbors":
+        rows["distance"] = np.roll(rows["distance"], 1)
+    elif defect == "vectors turned":
+        rows["vector"] = np.where((i < j)[:, None], vector, -vector)
+    return rows
+
+
+def _rows(i, j, shift, vector):
+    return {"i": i, "j": j, "shift": shift, "distance": np.sqrt((vector**2).sum(axis=1)), "vector": vector}
+
+
+def _complete(cell, pbc):
+    """The cell with normals in place of what does not repeat."""
+    made = np.where(pbc[:, None], cell, 0.0)
+    for axis in np.flatnonzero(~pbc):
+        for trial in np.eye(3)[np.roll(np.arange(3), -axis)]:
+            others = [row for k, row in enumerate(made) if k != axis and row.any()]
+            for row in np.linalg.qr(np.array(others).T)[0].T if others else ():
+                trial = trial - (trial @ row) * row
+            if np.linalg.norm(trial) > 0.3:
+                made[axis] = trial / np.linalg.norm(trial)
+                break
+    return made
+
+
+def planted(defect):
+    """The search with a defect, as a function of its own."""
+
+    def list_with_defect(positions, cell, pbc, r_cut):
+        return search(positions, cell, pbc, r_cut, defect)
+
+    _remembered.clear()
+    return list_with_defect
+
+
+class Kept:
+    """A list with a skin: rebuilt when two atoms could have used it up, or the box has changed."""
+
+    def __init__(self, defect=""):
+        self.defect = defect
+        self.rows = self.tail = None
+        self.age = 0
+
+    def allocate(self, positions, cell, pbc, r_cut, skin):
+        known = self.rows is not None and len(positions) == len(self.reference)
+        self.pbc, self.r_cut, self.skin = pbc, r_cut, skin
+        self.first, self.most, self.slots = (np.array(cell), np.array(positions)), None, None
+        self.late = False
+        if not (self.defect == "known by its size" and known):
+            self._build(positions, cell)
+        return self._pairs(positions, cell)
+
+    def update(self, positions, cell):
+        self.age += 1
+        due = self._due(positions, cell)
+        if self.defect == "one step late":
+            due, self.late = self.late, due
+        if due:
+            at = self.previous if self.defect == "rebuilt from old positions" else positions
+            self._build(at, cell)
+        elif self.defect == "reference overwritten":
+            self.reference = np.array(positions)
+        self.previous = np.array(positions)
+        return self._pairs(positions, cell)
+
+    def _due(self, positions, cell):
+        moved = positions - self.reference
+        if self.defect == "nearest image of motion" and self.pbc.all():
+            moved = moved - np.rint(moved @ np.linalg.inv(cell)) @ cell
+        size = np.sqrt((moved**2).sum(axis=1))
+        if self.defect == "first atom not looked at":
+            size = size[1:]
+        if self.defect == "motion along x":
+            size = np.abs(moved[:, 0])
+        most = float(size.max(initial=0.0))
+        if self.defect == "average motion":
+            most = 2.0 * float(size.mean())
+        room = self.skin if self.defect == "whole skin" else self.skin / 2
+        corner = float(np.abs((cell - self.cell).sum(axis=0)).max())
+        if self.defect == "negative skin squared":
+            return most**2 > (0.5 * (self.skin - 2 * corner)) ** 2
+        blind = {"every 20 steps": 20, "skin for another frequency": 6}
+        if self.defect in blind:
+            return self.age >= blind[self.defect] or corner > 0
+        if self.defect == "delay of 10" and self.age < 10 and not corner:
+            return False
+        if self.defect == "never again":
+            return False
+        changed = not np.array_equal(cell, self.cell)
+        if self.defect == "box not looked at":
+            changed = False
+        if self.defect == "volume looked at":
+            changed = (
+                abs(np.linalg.det(cell) / np.linalg.det(self.cell) - 1) > 1e-12 if self.pbc.all() else False
+            )
+        return changed or most > room
+
+    def _build(self, positions, cell):
+        self.age = 0
+        self.cell, self.reference = np.array(cell), np.array(positions)
+        self.previous = self.reference
+        rows = search(positions, cell, self.pbc, self.r_cut + self.skin)
+        if self.defect == "images counted once":
+            # as many images as the first box needed
+            far = np.abs(rows["shift"]).max(axis=1, initial=0)
+            self.most = int(far.max(initial=0)) if self.most is None else self.most
+            rows = {name: part[far <= self.most] for name, part in rows.items()}
+        if self.defect in ("overflow of the first", "counts of the first"):
+            count = np.bincount(rows["i"], minlength=len(positions))
+            if self.slots is None:
+                self.slots = int(1.25 * count.max(initial=0)) + 2 if self.defect[0] == "o" else count
+            order = np.argsort(rows["i"], kind="stable")
+            rank = np.arange(len(order)) - np.searchsorted(rows["i"][order], rows["i"][order], "left")
+            room = self.slots if np.ndim(self.slots) == 0 else np.asarray(self.slots)[rows["i"][order]] + 2
+            rows = {name: part[order[rank < room]] for name, part in rows.items()}
+        if self.defect == "stale tail":
+            if self.tail is not None and len(self.tail["i"]) > len(rows["i"]):
+                rows = {
+                    name: np.concatenate([part, self.tail[name][len(part) :]]) for name, part in rows.items()
+                }
+            self.tail = rows
+        self.rows = rows
+        self.ghosts = positions[rows["j"]] if self.defect != "stale tail" else None
+
+    def _pairs(self, positions, cell):
+        i, j, shift = self.rows["i"], self.rows["j"], self.rows["shift"]
+        if self.defect == "frozen ghosts":
+            # images are where they were at the build; what is listed is decided with them
+            through = np.any(shift != 0, axis=1)
+            at = np.where(through[:, None], self.ghosts, positions[j])
+            apart = np.linalg.norm(at - positions[i] + shift @ np.where(self.pbc[:, None], cell, 0), axis=1)
+            near = apart < self.r_cut
+            return {"i": i[near], "j": j[near], "shift": shift[near]}
+        return {"i": i, "j": j, "shift": shift}
+
+
+def kept(defect):
+    """A class of lists that are kept, with a defect."""
+
+    class KeptWithDefect(Kept):
+        def __init__(self):
+            super().__init__(defect)
+
+    return KeptWithDefect

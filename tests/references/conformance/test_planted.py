@@ -1,0 +1,131 @@
+"""Every mechanism that neighbor lists have been seen to fail by is planted in one, and found."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import planted_lists
+import pytest
+
+from mdnum.references.conformance.crowds import LARGE_EDGE, SMALL_EDGE, lattice
+from mdnum.references.conformance.load import from_object
+from mdnum.references.conformance.script import script
+from mdnum.references.conformance.suite import Report, drawn, examine, questions
+
+ROOT = Path(__file__).parents[3]
+# what needs more atoms than the small questions have
+_LARGE = {"rows beyond 4096": SMALL_EDGE, "32-bit keys": LARGE_EDGE}
+# some are the same mistake as another to whoever sees the pairs alone
+_CODES = {
+    "shifts of wrapped positions": "SHIFTS",
+    "wraps free axes": "EXTRA",
+    "one side in float32": "ONE_SIDED",
+    "two bins counted twice": "DUPLICATE",
+    "zero distance twice": "DUPLICATE",
+    "tail not cut": "RANGE",
+    "keeps itself": "SELF",
+    "padding handed out": "RANGE",
+    "real indices": "MALFORMED",
+    "unequal lengths": "MALFORMED",
+    "squared distances": "DISTANCES",
+    "distances of neighbors": "DISTANCES",
+    "vectors turned": "VECTORS",
+}
+
+
+def _examined(made, name: str, **options) -> Report:
+    options = {"cases": 40, "large": False, "shrink": False} | options
+    return examine(from_object(made, name), **options)
+
+
+def _found(defect: str, **options) -> Report:
+    made = planted_lists.planted if defect in planted_lists.SEARCH_DEFECTS else planted_lists.kept
+    return _examined(made(defect), defect, **options)
+
+
+@pytest.mark.parametrize("make", [planted_lists.planted, planted_lists.kept], ids=["made anew", "kept"])
+def test_the_list_that_is_right_passes(make):
+    report = _examined(make(""), "right", cases=30)
+    assert report.conforms, [(one.code, one.case.name, one.worst.text) for one in report.failed]
+    assert report.how.full and report.how.sign == 1 and report.single is None and report.keeps_order
+    assert report.superset == (make is planted_lists.kept)
+
+
+@pytest.mark.parametrize("defect", sorted(set(planted_lists.SEARCH_DEFECTS) - set(_LARGE)))
+def test_a_list_made_anew_is_found_out(defect: str):
+    report = _found(defect, stop=True)
+    assert report.failed, f"{defect} passed {report.asked} cases"
+    if defect in _CODES:
+        assert report.failed[0].code == _CODES[defect], report.failed[0].worst.text
+
+
+@pytest.mark.parametrize("defect", planted_lists.KEPT_DEFECTS)
+def test_a_list_that_is_kept_is_found_out(defect: str):
+    report = _found(defect, stop=True)
+    assert report.failed, f"{defect} passed {report.asked} cases"
+
+
+def test_rows_beyond_4096_are_found_lost():
+    report = _found("rows beyond 4096", asked=[lattice(SMALL_EDGE)])
+    assert report.failed[0].code == "MISSING"
+
+
+@pytest.mark.slow
+def test_keys_that_overflow_are_found_at_100_000_atoms():
+    assert not _found("32-bit keys", asked=[lattice(SMALL_EDGE)]).failed
+    assert _found("32-bit keys", asked=[lattice(LARGE_EDGE)]).failed
+    assert not _found("", asked=[lattice(LARGE_EDGE)]).failed
+
+
+@pytest.mark.parametrize(
+    ("defect", "area", "atoms", "steps"),
+    [
+        ("half stencil", "boxes", 2, 1),
+        ("drops atoms outside", "outside", 2, 1),
+        ("images undercounted", "images", 2, 1),
+        ("32 neighbors", "crowded", 35, 1),
+        ("whole skin", "motion", 2, 2),
+        ("box not looked at", "strain", 2, 2),
+        ("stale tail", "reuse", 3, 2),
+        ("reference overwritten", "motion", 2, 4),
+    ],
+)
+def test_failures_shrink_and_are_reproduced_without_mdnum(defect, area, atoms, steps, tmp_path: Path):
+    """The smallest case fails in a script that cannot import mdnum, and the right list passes the same script."""
+    made = planted_lists.planted if defect in planted_lists.SEARCH_DEFECTS else planted_lists.kept
+    tested = from_object(made(defect), defect).with_options(full=True)
+
+    cases = [case for case in questions(tested, 40, 0, False) if case.area == area]
+    report = examine(tested, asked=cases, shrink=True)
+    failed = report.failed[0]
+    assert failed.alone
+    assert failed.case.atoms <= atoms and failed.case.steps <= steps, failed.case
+    for planted, wanted in ((defect, 1), ("", 0)):
+        kind = "planted" if made is planted_lists.planted else "kept"
+        source = f"from planted_lists import {kind}\nlist_under_test = {kind}({planted!r})\n"
+        lines = script(
+            replace(tested, source=source, call="list_under_test"), failed, report.how, report.superset
+        )
+        path = tmp_path / f"reproduce-{wanted}.py"
+        path.write_text(lines)
+        assert "mdnum" not in lines.partition('"""')[2].partition('"""')[2]
+        blocked = (
+            f"import sys, runpy; sys.modules['mdnum'] = None; sys.path.insert(0, {str(ROOT / 'tests')!r}); "
+        )
+        done = subprocess.run(
+            [sys.executable, "-c", blocked + f"runpy.run_path({str(path)!r}, run_name='__main__')"],
+            capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        assert done.returncode == wanted, done.stdout + done.stderr
+        assert ("the list is wrong" if wanted else "the list is right") in done.stdout
+
+
+@pytest.mark.slow
+def test_10_000_clean_cases_raise_no_alarm():
+    asked = [case for seed in range(4) for case in drawn(2500, seed)]
+    report = examine(from_object(planted_lists.planted(""), "right"), asked=asked, shrink=False)
+    assert report.asked == 10_000
+    assert report.conforms, [(one.code, one.case.name, one.worst.text) for one in report.failed]
