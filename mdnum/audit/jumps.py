@@ -23,7 +23,7 @@ _DIVISIONS = 24
 _NARROWER = 6
 """How much each zoom narrows: four of the divisions are kept."""
 
-_LEVELS = 7
+_LEVELS = 10
 _OUTLIER = 4.0
 """A mismatch this many times those around it is looked at more closely."""
 
@@ -108,10 +108,9 @@ def find_jumps(
     Returns:
         (jumps by coordinate, how many places that stood out were left out).
     """
-    places = np.linspace(low, high, max(int(np.ceil((high - low) / step)), 12) + 1)
     suspects = [
         one
-        for one in _outliers(curve, places)
+        for one in _outliers(curve, grid(low, high, step))
         if not any(one[1] - 2.5 * step < place < one[2] + 2.5 * step for place in expected)
     ]
     found: list[Jump] = []
@@ -122,6 +121,11 @@ def find_jumps(
             if not any(abs(jump.at - other.at) <= _same(jump, other) for other in found):
                 found.append(jump)
     return sorted(found, key=lambda jump: jump.at), max(len(suspects) - most, 0)
+
+
+def grid(low: float, high: float, step: float) -> Float[np.ndarray, "points"]:
+    """Where `find_jumps` looks first."""
+    return np.linspace(low, high, max(int(np.ceil((high - low) / step)), 12) + 1)
 
 
 def bisect(told: Callable[[float], bool], low: float, high: float) -> tuple[float, float]:

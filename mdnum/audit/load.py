@@ -240,6 +240,8 @@ def _made(value: Any, text: str) -> Any:
 
 
 def _is_calculator(value: Any) -> bool:
+    if hasattr(value, "get_positions"):  # atoms, which pass the question on to their calculator
+        return False
     return hasattr(value, "get_potential_energy") and hasattr(value, "get_forces")
 
 

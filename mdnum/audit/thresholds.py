@@ -18,6 +18,7 @@ from mdnum.audit.jumps import (
     bisect,
     decay_power,
     find_jumps,
+    grid,
     measure,
     scatter,
 )
@@ -168,12 +169,14 @@ def walk(subject: Subject, pair: Pair, step: float = STEP) -> PairWalk:
     thresholds: list[Threshold] = []
     left_out = 0
     margin = 8 * step
+    distance = np.append(coarse[coarse >= near][:12], near + margin)
     if end > near + 12 * step:
         jumps, left_out = find_jumps(curve, near + margin, end + margin, step)
         thresholds = [_threshold(pair, jump) for jump in jumps]
+        scanned = grid(near + margin, end + margin, step)
+        distance = np.append(coarse[(coarse >= near) & (coarse < near + margin)], scanned)
     if edge is not None:
         thresholds = _with_edge(pair, curve, edge, thresholds, near)
-    distance = np.linspace(near, max(end + 0.5, near + 1.0), 400)
     values = curve.many(distance)
     return PairWalk(
         pair, tuple(sorted(thresholds, key=lambda one: one.radius)), distance, values[0] - energy_far,

@@ -1,0 +1,197 @@
+"""From words to a calculator, what a mistake in the words says, and what happens when a calculator fails."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import ase.io
+import numpy as np
+import pytest
+from ase import Atoms
+from ase.build import bulk
+from ase.calculators.calculator import Calculator, all_changes
+from ase.calculators.emt import EMT
+from ase.calculators.lj import LennardJones
+from audit.laws import subject
+
+from mdnum.audit.load import load_calculator
+from mdnum.audit.structures import default_structure, read_structure
+from mdnum.audit.subject import CalculatorError, CalculatorSubject, only_trying
+from mdnum.errors import InputError
+
+
+@pytest.mark.parametrize(
+    ("words", "kind", "parameters"),
+    [
+        ("ase.calculators.emt:EMT", EMT, {}),
+        ("ase.calculators.emt:EMT()", EMT, {}),
+        (
+            "ase.calculators.lj:LennardJones(sigma=3.4, rc=-(-8.5), smooth=True)",
+            LennardJones,
+            {"sigma": 3.4, "rc": 8.5, "smooth": True},
+        ),
+    ],
+)
+def test_a_class_with_its_arguments(words: str, kind: type, parameters: dict[str, object]):
+    if "-(-" in words:  # a literal, and nothing that has to be computed
+        with pytest.raises(InputError, match="not a literal"):
+            load_calculator(words)
+        words = words.replace("-(-8.5)", "8.5")
+    loaded = load_calculator(words)
+    one, other = loaded.make(), loaded.make()
+    assert isinstance(one, kind)
+    assert isinstance(one, Calculator)
+    assert one is not other
+    assert {name: one.parameters[name] for name in parameters} == parameters
+    assert loaded.stem == kind.__name__
+
+
+def test_a_file_is_run_anew_for_each_calculator(tmp_path: Path):
+    (tmp_path / "neighbor.py").write_text("WELL = 0.25\n")
+    text = "from ase.calculators.lj import LennardJones\nfrom neighbor import WELL\n"
+    for name, body in {
+        "calculator": "calculator = LennardJones(epsilon=WELL)\n",
+        "calc": "calc = LennardJones(epsilon=WELL)\n",
+        "make": "def make():\n    return LennardJones(epsilon=WELL)\n",
+        "other": "mine = LennardJones(epsilon=WELL)\n",
+    }.items():
+        path = tmp_path / f"{name}.py"
+        path.write_text(text + body)
+        loaded = load_calculator(f"{path}:mine" if name == "other" else str(path))
+        one, other = loaded.make(), loaded.make()
+        assert one.parameters["epsilon"] == 0.25
+        assert one is not other
+        assert loaded.stem == name
+
+
+def test_a_system_brings_its_structure_and_temperature():
+    loaded = load_calculator("argon/crystal-108")
+    assert loaded.atoms is not None
+    assert len(loaded.atoms) == 108
+    assert loaded.units.name == "lj"
+    assert loaded.kT == pytest.approx(0.02)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("", "no calculator named"),
+        ("nonesuch.package:Thing", "no module 'nonesuch'"),
+        ("ase.calculators.emt:Emt", "Did you mean EMT"),
+        ("ase.calculators.emt.EMT", "put a colon before its name: ase.calculators.emt:EMT"),
+        ("ase.calculators.emt:EMT(a=open('x'))", "not a literal"),
+        ("ase.calculators.emt:EMT(**{})", "cannot be used here"),
+        ("ase.calculators.emt:EMT().results", "only a name"),
+        ("ase.calculators.emt:EMT(", "not a name with arguments"),
+        ("ase.calculators.lj:LennardJones(3)", "making it failed: TypeError"),
+        ("ase.calculators.tersoff:Tersoff", "Give the arguments it needs"),
+        ("ase.build:molecule('H2O')", "not an ASE calculator"),
+        ("argon/crystl-108", "Did you mean argon/crystal-108"),
+        ("none.py", "no such file"),
+    ],
+)
+def test_a_mistake_says_what_to_write(words: str, said: str):
+    with pytest.raises(InputError) as error:
+        load_calculator(words)
+    assert said in str(error.value)
+
+
+def test_a_file_that_fails_or_makes_nothing_says_so(tmp_path: Path):
+    (tmp_path / "fails.py").write_text("1 / 0\n")
+    (tmp_path / "empty.py").write_text("x = 1\n")
+    with pytest.raises(InputError, match="ZeroDivisionError"):
+        load_calculator(str(tmp_path / "fails.py"))
+    with pytest.raises(InputError, match="makes no `calculator`"):
+        load_calculator(str(tmp_path / "empty.py"))
+
+
+class Counting(Calculator):
+    """Tells how often it was asked, and can be made to fail."""
+
+    implemented_properties = ["energy", "forces"]  # noqa: RUF012
+
+    def __init__(self, energy: object = 1.0, forces: object = None, raises: Exception | None = None):
+        super().__init__()
+        self.asked, self.answer, self.pushes, self.raises = 0, energy, forces, raises
+
+    def calculate(self, atoms=None, properties=None, system_changes=all_changes):
+        super().calculate(atoms, properties, system_changes)
+        self.asked += 1
+        if self.raises:
+            raise self.raises
+        assert isinstance(atoms, Atoms)
+        forces = np.zeros((len(atoms), 3)) if self.pushes is None else np.asarray(self.pushes)
+        self.results = {"energy": self.answer, "forces": forces}
+
+
+def test_the_last_bit_of_a_coordinate_is_a_new_question():
+    """ASE's cache takes coordinates within 1e-15 for the same, hundreds of doubles near 0."""
+    atoms = Atoms("Ar2", [(0.0, 0, 0), (3.0, 0, 0)])
+    asked = subject(Counting, atoms)
+    asked.energy(atoms)
+    asked.forces(atoms)
+    assert asked.calculator.asked == 1
+    atoms.positions[0, 0] = 1e-300
+    asked.energy(atoms)
+    assert asked.calculator.asked == 2
+    asked.forget()
+    asked.energy(atoms)
+    assert asked.calculator.asked == 3
+
+
+@pytest.mark.parametrize(
+    ("calculator", "said"),
+    [
+        (lambda: Counting(energy=float("nan")), "gave an energy of nan"),
+        (lambda: Counting(energy=[1.0, 2.0]), "not one number"),
+        (lambda: Counting(raises=ValueError("no such element")), "raised ValueError.*no such element"),
+        (lambda: Counting(forces=[[0.0, 0.0, 0.0], [0.0, np.inf, 0.0]]), "on atom 1"),
+        (lambda: Counting(forces=[[0.0, 0.0, 0.0]]), r"shape \(1, 3\) for 2 atoms"),
+    ],
+)
+def test_a_calculator_that_fails_leaves_the_structure_to_the_last_bit(calculator, said: str, tmp_path: Path):
+    rng = np.random.default_rng(0)
+    atoms = Atoms("Ar2", rng.normal(size=(2, 3)), cell=rng.normal(size=(3, 3)), pbc=(True, False, True))
+    asked = CalculatorSubject("planted", calculator, atoms, folder=tmp_path / "made")
+    with pytest.raises(CalculatorError, match=said) as error:
+        asked.energy(atoms)
+        asked.forces(atoms)
+    assert error.value.structure == tmp_path / "made" / "failed-1.extxyz"
+    saved = ase.io.read(error.value.structure)
+    assert isinstance(saved, Atoms)
+    assert (saved.positions == atoms.positions).all()
+    assert (np.asarray(saved.cell) == np.asarray(atoms.cell)).all()
+    assert (saved.pbc == atoms.pbc).all()
+    with only_trying(asked), pytest.raises(CalculatorError) as error:
+        asked.energy(atoms)
+        asked.forces(atoms)
+    assert error.value.structure is None
+
+
+def test_default_structures():
+    """A crystal at the calculator's own least energy with room for two cutoffs, and water for rigid water."""
+    argon = default_structure(
+        load_calculator("ase.calculators.lj:LennardJones(sigma=3.0, epsilon=0.01, rc=7)")
+    )
+    assert set(argon.symbols) == {"Ar"}
+    assert argon.cell.lengths().min() >= 14
+    # fcc Lennard-Jones has its nearest neighbors at about 1.09 σ (1.0902 without a cutoff)
+    distances = argon.get_all_distances(mic=True)
+    assert np.median(np.sort(distances, axis=1)[:, 1:13]) == pytest.approx(1.09 * 3.0, rel=0.04)
+    assert default_structure(load_calculator("ase.calculators.emt:EMT")).symbols[0] == "Cu"
+    water = default_structure(load_calculator("ase.calculators.tip3p:TIP3P(rc=4.5)"))
+    assert water.get_chemical_symbols()[:4] == ["O", "H", "H", "O"]
+
+
+def test_structures_from_files(tmp_path: Path):
+    ase.io.write(tmp_path / "three.extxyz", [bulk("Ar"), bulk("Cu"), bulk("Al")])
+    assert read_structure(tmp_path / "three.extxyz").symbols[0] == "Al"
+    assert read_structure(f"{tmp_path / 'three.extxyz'}@1").symbols[0] == "Cu"
+    (tmp_path / "bad.extxyz").write_text("1\n\nAr 0 nan 0\n")
+    for name, said in {
+        "none.xyz": "no such",
+        "bad.extxyz": "not finite",
+        "three.extxyz@9": "cannot be",
+    }.items():
+        with pytest.raises(InputError, match=said):
+            read_structure(tmp_path / name)

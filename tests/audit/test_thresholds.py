@@ -1,0 +1,139 @@
+"""Thresholds are found where they are, to the last bit, with the jumps that a closed form has there."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from audit import laws
+from audit.laws import R_CUT, R_ON, law, pair_subject
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mdnum.audit.jumps import Curve, bisect, find_jumps
+from mdnum.audit.thresholds import STEP, find_thresholds, walk_pairs
+
+BEFORE = float(np.nextafter(R_CUT, 0.0))
+AFTER = float(np.nextafter(R_CUT, 9.0))
+
+
+@pytest.mark.parametrize(
+    ("pair", "inside", "outside"),
+    [(laws.hard, BEFORE, R_CUT), (laws.including, R_CUT, AFTER)],
+)
+def test_a_hard_cutoff_is_located_to_neighboring_doubles(pair, inside: float, outside: float):
+    (found,) = find_thresholds(pair_subject(pair))
+    assert (found.inside, found.outside, found.radius) == (inside, outside, outside)
+    assert found.order == 0
+    assert found.dies
+    energy, force, curvature = law(inside)
+    assert found.jumps[0] == pytest.approx(-energy, rel=1e-13)
+    assert found.jumps[1] == pytest.approx(-force, rel=1e-13)
+    assert found.jumps[2] == pytest.approx(-curvature, rel=1e-6)
+
+
+def test_a_decision_on_squares_is_located_where_the_squares_differ():
+    """The last double whose rounded square is below the rounded square of the cutoff."""
+    (found,) = find_thresholds(pair_subject(laws.squared))
+    limit = Fraction(R_CUT * R_CUT)
+    assert Fraction(found.inside * found.inside) < limit <= Fraction(found.outside * found.outside)
+    assert np.nextafter(found.inside, 9.0) == found.outside
+
+
+def test_orders_and_sizes_of_jumps():
+    """Shifted, force-shifted, switched once and twice; an energy of the atoms' own hides none of them."""
+    own = -1234.5
+    (shifted,) = find_thresholds(pair_subject(laws.shifted, own=own))
+    assert (shifted.order, shifted.radius) == (1, R_CUT)
+    assert shifted.jumps[1] == pytest.approx(-law(R_CUT)[1], rel=1e-12)
+
+    (force_shifted,) = find_thresholds(pair_subject(laws.force_shifted, own=own))
+    assert force_shifted.order == 2
+    assert force_shifted.radius == pytest.approx(R_CUT, abs=1e-9)
+    assert force_shifted.jumps[2] == pytest.approx(-law(R_CUT)[2], rel=1e-5)
+
+    onset, end = find_thresholds(pair_subject(laws.switched(1), own=own))
+    assert (onset.order, end.order) == (2, 2)
+    assert (onset.dies, end.dies) == (False, True)
+    assert onset.radius == pytest.approx(R_ON, abs=2e-5)
+    # E'' of e s is e s'' more than before the onset, and s'' is -6 / width² there and 6 / width² at the end
+    bend = 6 / (R_CUT - R_ON) ** 2
+    assert onset.jumps[2] == pytest.approx(-law(R_ON)[0] * bend, rel=1e-4)
+    assert end.jumps[2] == pytest.approx(-law(R_CUT)[0] * bend, rel=1e-4)
+
+    twice = find_thresholds(pair_subject(laws.switched(2), own=own))
+    assert [one.order for one in twice] == [3]
+    assert twice[0].radius == pytest.approx(R_CUT, abs=3e-3)
+
+
+def test_what_has_no_cutoff_has_no_threshold():
+    (walk,) = walk_pairs(pair_subject(laws.endless)).walks
+    assert walk.cutoff is None
+    assert not walk.thresholds
+
+
+def test_what_feels_nothing_has_no_threshold():
+    (walk,) = walk_pairs(pair_subject(lambda r: (0.0, 0.0))).walks
+    assert not walk.thresholds
+    assert not walk.energy.any()
+
+
+def test_float32_is_not_taken_for_jumps():
+    """What rounds everything has a step at every representable float32; only the real one counts."""
+    (found,) = find_thresholds(pair_subject(laws.shifted, single=True))
+    assert found.order == 1
+    assert found.radius == pytest.approx(R_CUT, abs=1e-6)
+    assert found.jumps[1] == pytest.approx(-law(R_CUT)[1], rel=1e-4)
+
+
+@given(
+    place=st.floats(3.2, 5.9),
+    size=st.floats(-8.0, -2.0).map(lambda power: 10.0**power),
+    of=st.sampled_from(["energy", "force"]),
+)
+@settings(max_examples=40)
+def test_a_planted_step_is_found_wherever_it_is(place: float, size: float, of: str):
+    """Steps of the energy alone, down to 1e-8 eV, and of the force, down to 1e-8 eV/Å."""
+
+    def pair(r: float) -> tuple[float, float]:
+        energy, force = laws.soft(r)
+        if r < place:
+            return (energy + size, force) if of == "energy" else (energy + size * (place - r), force + size)
+        return energy, force
+
+    (found,), _ = find_jumps(Curve(pair), 2.8, 6.2, STEP)
+    assert (found.low, found.high) == (np.nextafter(place, 0.0), place)
+    assert found.order == (0 if of == "energy" else 1)
+    assert (found.energy if of == "energy" else found.force) == pytest.approx(-size, rel=1e-4)
+
+
+def test_smooth_curves_have_no_jumps():
+    """Steep, wavy, large: what a scan cannot resolve well must not be called a jump."""
+
+    def wall(x: float) -> tuple[float, float]:
+        return float(x**-12), float(12 * x**-13)
+
+    def wave(x: float) -> tuple[float, float]:
+        return float(np.sin(9 * x)), float(-9 * np.cos(9 * x))
+
+    def offset(x: float) -> tuple[float, float]:
+        return float(1e5 + np.exp(-x * x)), float(2 * x * np.exp(-x * x))
+
+    for curve in (wall, wave, offset):
+        assert find_jumps(Curve(curve), 0.7, 4.0, 0.025) == ([], 0)
+
+
+def test_two_steps_close_together_are_two():
+    def steps(x: float) -> tuple[float, float]:
+        return float((x > 1.3) + 0.5 * (x > 1.45)), 0.0
+
+    jumps, _ = find_jumps(Curve(steps), 1.0, 2.0, 0.025)
+    assert [(one.order, one.energy) for one in jumps] == [(0, 1.0), (0, 0.5)]
+
+
+@given(st.floats(-1e3, 1e3))
+def test_bisection_ends_at_neighboring_doubles(edge: float):
+    low, high = bisect(lambda x: x <= edge, -2e3, 2e3)
+    assert low == edge or (edge == 0 and low <= 0 <= high)
+    assert high == np.nextafter(low, np.inf)
