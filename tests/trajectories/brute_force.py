@@ -19,7 +19,9 @@ def image_list(positions, matrix, pbc, i, j, reach):
     middle = d @ inverse
     margin = reach * np.linalg.norm(inverse, axis=0)
     spans = [
-        np.arange(np.floor(-middle[k] - margin[k]) - 1, np.ceil(-middle[k] + margin[k]) + 2) if pbc[k] else [0.0]
+        np.arange(np.floor(-middle[k] - margin[k]) - 1, np.ceil(-middle[k] + margin[k]) + 2)
+        if pbc[k]
+        else [0.0]
         for k in range(3)
     ]
     shifts = np.array(list(itertools.product(*spans)))
@@ -88,6 +90,9 @@ def exactly_inside(positions, matrix, pbc, i, j, rank, radius):
     squares = []
     for shift in itertools.product(*spans):
         if i == j and shift <= (0, 0, 0):
+            continue
+        if np.linalg.norm(d + np.array(shift) @ rows) > 2.0 * radius:
+            # fractions are slow
             continue
         total = Fraction(0)
         for axis in range(3):
