@@ -59,9 +59,19 @@ def members(pairs, radius_of):
     return inside
 
 
+def clear(pairs, radius_of, by=1e-9):
+    """Whether no pair is so close to its radius that another order of operations could decide otherwise."""
+    close = (
+        radius_of(i, j) is not None and (abs(np.sqrt(squares) - radius_of(i, j)) < by).any()
+        for (i, j), squares in pairs.items()
+    )
+    return not any(close)
+
+
 def nearest(positions, matrix, pbc, first, second, most, radius, reach):
-    """{(i, j, rank): distance}, and per center (distance of the last inside, of the first outside)."""
-    inside, limits = {}, {}
+    """{(i, j, rank): distance}, per center (distance of the last inside, of the first outside), and whether no
+    two distances that compete for a last place are the same but for rounding."""
+    inside, limits, clearly = {}, {}, True
     for i in first:
         candidates = []
         for j in second:
@@ -77,7 +87,9 @@ def nearest(positions, matrix, pbc, first, second, most, radius, reach):
         last = float(np.sqrt(within[most - 1][0])) if full else radius
         after = float(np.sqrt(candidates[most][0])) if full and len(candidates) > most else np.inf
         limits[i] = (last, min(radius, after))
-    return inside, limits
+        clearly &= not full or after - last > 1e-9
+        clearly &= all(abs(np.sqrt(one[0]) - radius) > 1e-9 for one in candidates)
+    return inside, limits, clearly
 
 
 def exactly_inside(positions, matrix, pbc, i, j, rank, radius):
