@@ -69,8 +69,8 @@ def clear(pairs, radius_of, by=1e-9):
 
 
 def nearest(positions, matrix, pbc, first, second, most, radius, reach):
-    """{(i, j, rank): distance}, per center (distance of the last inside, of the first outside), and whether no
-    two distances that compete for a last place are the same but for rounding."""
+    """{(i, j, rank): distance}, per center (distance of the last inside, of the first outside), and whether
+    no two distances that compete for a last place are the same but for rounding."""
     inside, limits, clearly = {}, {}, True
     for i in first:
         candidates = []
