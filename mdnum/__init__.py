@@ -19,6 +19,7 @@ _HOMES = {
     "MdnumCalculator": "mdnum.references:MdnumCalculator",
     "MdnumError": "mdnum.errors:MdnumError",
     "NumericalError": "mdnum.errors:NumericalError",
+    "audit_calculator": "mdnum.workflow:audit",
     "bounce": "mdnum.workflow:bounce",
     "build": "mdnum.systems:build",
     "conform": "mdnum.workflow:conform",
@@ -47,6 +48,7 @@ if TYPE_CHECKING:
     from mdnum.references import MdnumCalculator as MdnumCalculator
     from mdnum.systems import build as build
     from mdnum.systems import load as load
+    from mdnum.workflow import audit as audit_calculator
     from mdnum.workflow import bounce as bounce
     from mdnum.workflow import conform as conform
     from mdnum.workflow import flips as flips
@@ -67,6 +69,7 @@ __all__ = [
     "MdnumError",
     "NumericalError",
     "__version__",
+    "audit_calculator",
     "bounce",
     "build",
     "conform",

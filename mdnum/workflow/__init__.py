@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from mdnum.workflow.audit import AuditResult, audit
 from mdnum.workflow.ball import BallResult, bounce
 from mdnum.workflow.conform import ConformResult, conform
 from mdnum.workflow.flips import FlipsResult, flips
@@ -15,15 +16,17 @@ from mdnum.workflow.grad import GradResult, grad
 from mdnum.workflow.md import run
 
 __all__ = [
+    "AuditResult",
     "BallResult",
     "CertifyResult",
     "ConformResult",
-    "ForecastResult",
     "FlipsResult",
+    "ForecastResult",
     "ForkResult",
     "GradResult",
     "MapResult",
     "ProcessesResult",
+    "audit",
     "bounce",
     "conform",
     "flips",
