@@ -1,0 +1,201 @@
+"""An audit from a calculator to a folder: answers, evidence, and a page made from the folder alone."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from ase import Atoms
+from ase.io import read
+from audit import planted
+
+import mdnum
+from mdnum.audit.base import Part
+from mdnum.audit.verdict import judge
+from mdnum.errors import InputError
+from mdnum.references.findings import finding
+from mdnum.report import write
+from mdnum.store import RunFolder
+from mdnum.workflow import audit_record
+
+QUICK = "invariance,forces"
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory):
+    return mdnum.audit_calculator(
+        planted.Good, planted.crystal(), temperature=120, steps=40, out=tmp_path_factory.mktemp("good") / "a"
+    )
+
+
+@pytest.fixture(scope="module")
+def bad(tmp_path_factory):
+    return mdnum.audit_calculator(
+        planted.OneImage, planted.crystal(), checks=QUICK, out=tmp_path_factory.mktemp("bad") / "a"
+    )
+
+
+@pytest.mark.slow
+def test_what_is_right_is_safe(good):
+    summary = good.summary
+    assert summary["safe_to_run"] == summary["safe_to_differentiate"] == "yes"
+    assert "6 checks found nothing" in summary["headline"]
+    assert not [one for one in good.findings if one["severity"] != "info"]
+    assert set(good.parts) == {"smoothness", "invariance", "forces", "curl", "state", "dynamics"}
+    assert summary["kT"] == pytest.approx(120 * 8.617333e-5, rel=1e-6)
+
+
+@pytest.mark.slow
+def test_the_folder_has_what_the_page_is_made_of(good):
+    folder = RunFolder.open(good.folder)
+    assert folder.world == "audit" and folder.summary == good.summary
+    energies = folder.read("energies")
+    mine = energies["run"] == "run"
+    assert mine.sum() == 41 and (~mine).sum() == 81
+    np.testing.assert_allclose(energies["total"], energies["potential"] + energies["kinetic"], rtol=1e-12)
+    named = {curve["name"] for part in good.summary["parts"] for curve in part["curves"]}
+    assert set(folder.read("curves")["curve"]) == named
+    before = (good.folder / "report.html").read_text()
+    write(good.folder)
+    assert (good.folder / "report.html").read_text() == before
+    for title in ("Smoothness", "Invariance", "Forces", "Curl", "Memory", "Dynamics"):
+        assert f"<h2>{title}</h2>" in before
+    assert "reproduce.py" not in before and not (good.folder / audit_record.SCRIPT).exists()
+
+
+def test_a_mistake_is_evidence_that_others_can_see(bad, tmp_path):
+    """Both ways of writing the structure down are saved to the last bit, with a script beside them."""
+    assert bad.summary["safe_to_run"] == "no" and bad.summary["headline"].startswith("Neither run nor")
+    saved = [
+        read(bad.folder / audit_record.STRUCTURES / f"images-{when}.extxyz") for when in ("before", "after")
+    ]
+    energies = []
+    for atoms in saved:
+        assert isinstance(atoms, Atoms)
+        atoms.calc = planted.OneImage()
+        energies.append(atoms.get_potential_energy())
+    told = next(one for one in bad.findings if one["code"] == "IMAGES")
+    assert f"{abs(energies[1] - energies[0]):.3g} eV" in told["text"]
+    assert "images-before" in told["text"]
+    assert "reproduce.py" in (bad.folder / "report.html").read_text()
+
+
+def test_the_script_shows_it_without_mdnum(tmp_path):
+    file = tmp_path / "mine.py"
+    file.write_text(
+        "from ase.calculators.emt import EMT\n"
+        "class Late(EMT):\n"
+        "    def calculate(self, *words, **more):\n"
+        "        super().calculate(*words, **more)\n"
+        "        up = float(self.atoms.positions[0, 2])\n"
+        "        self.results['energy'] += up\n"
+        "        self.results['free_energy'] += up\n"
+        "def make():\n"
+        "    return Late()\n"
+    )
+    copper = Atoms(
+        "Cu4", positions=[[0, 0, 0], [1.8, 1.8, 0], [1.8, 0, 1.8], [0, 1.8, 1.8]], cell=[3.6] * 3, pbc=True
+    )
+    result = mdnum.audit_calculator(str(file), copper, checks="invariance", out=tmp_path / "a", report=False)
+    assert {"TRANSLATION", "FACES"} <= {one["code"] for one in result.findings}
+    script = (result.folder / audit_record.SCRIPT).read_text()
+    assert "mdnum" not in script
+    done = subprocess.run(
+        [sys.executable, audit_record.SCRIPT], cwd=result.folder, capture_output=True, text=True, check=True
+    )
+    assert "translation: " in done.stdout and "differ by " in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        ("ase.calculators.emt:EMT", "return ase.calculators.emt.EMT()"),
+        ("ase.calculators.lj:LennardJones(rc=3.0)", "return ase.calculators.lj.LennardJones(rc=3.0)"),
+        ("argon/crystal-108", "return mdnum.MdnumCalculator('argon/crystal-108')"),
+    ],
+)
+def test_a_script_makes_the_calculator_that_was_named(words, line):
+    assert line in audit_record.script(words, ["images"])
+    compile(audit_record.script(words, ["images"]), "script", "exec")
+
+
+def test_a_calculator_that_fails_is_a_finding_with_its_structure(tmp_path):
+    class Dies(planted.Good):
+        def answer(self, atoms):
+            raise RuntimeError("out of table")
+
+    result = mdnum.audit_calculator(Dies, planted.crystal(), checks="forces,curl", out=tmp_path / "a")
+    assert {one["code"] for one in result.findings} == {"CALCULATOR_FAILED"}
+    assert result.summary["safe_to_run"] == "no"
+    assert list((tmp_path / "a" / "structures").glob("failed-*.extxyz"))
+    assert "out of table" in (tmp_path / "a" / "report.html").read_text()
+
+
+def test_nan_is_a_finding_with_its_structure(tmp_path):
+    class Nan(planted.Good):
+        def extra(self, atoms, energy, forces):
+            return energy, forces * np.nan
+
+    result = mdnum.audit_calculator(Nan, planted.crystal(), checks="forces", out=tmp_path / "a", report=False)
+    assert "CALCULATOR_FAILED" in {one["code"] for one in result.findings}
+    assert "nan" in result.findings[0]["text"]
+    assert not (tmp_path / "a" / "report.html").exists()
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        ({"checks": "smoothnes"}, "Did you mean smoothness"),
+        ({"checks": ","}, "no check is named"),
+        ({"structure": Atoms()}, "without atoms"),
+        ({"calculator": 7}, "that is a int"),
+        ({"timestep": -1.0, "checks": "dynamics"}, "expected one above 0"),
+        ({"structure": "nowhere.xyz"}, "nowhere.xyz"),
+    ],
+)
+def test_what_cannot_be_asked_is_refused(asked, message, tmp_path):
+    words = {"calculator": planted.Good, "structure": planted.crystal()} | asked
+    with pytest.raises(InputError, match=message):
+        mdnum.audit_calculator(**words, out=tmp_path / "a")
+
+
+REST = ("invariance", "forces", "curl", "state", "dynamics")
+
+
+def part(name: str, *found: tuple[str, str]) -> Part:
+    return Part(
+        name, name, f"{name}.", [finding(code, severity, code.lower(), "") for code, severity in found]
+    )
+
+
+@pytest.mark.parametrize(
+    ("parts", "run", "differentiate", "words"),
+    [
+        ([part("forces")], "not asked", "not asked", "x: 1 check found nothing."),
+        (
+            [part("smoothness", ("FORCE_JUMP", "warning")), *map(part, REST)],
+            "yes", "with care", "x is safe to run, and to be differentiated with care: force_jump.",
+        ),
+        ([part("curl", ("CURL", "error"))], "no", "no", "Neither run nor differentiate x as it is: curl."),
+        (
+            [*map(part, ("smoothness", "forces", "curl")), part("dynamics", ("DRIFT", "warning"))],
+            "with care", "yes", "x is to be run with care, and safe to differentiate: drift.",
+        ),
+        (
+            [part("state", *((f"A{n}", "warning") for n in range(5)))],
+            "with care", "with care", "Use x with care, to run and to differentiate: a0; a1; and 3 more "
+            "findings.",
+        ),
+    ],
+)  # fmt: skip
+def test_findings_add_up_to_two_answers(parts, run, differentiate, words):
+    judged = judge("x", parts)
+    assert (judged.run, judged.differentiate, judged.headline) == (run, differentiate, words)
+
+
+def test_a_summary_is_json_whatever_was_not_finite(bad):
+    text = (bad.folder / "summary.json").read_text()
+    json.loads(text, parse_constant=lambda word: pytest.fail(word))
