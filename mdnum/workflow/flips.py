@@ -179,13 +179,16 @@ def _steps(frames: Mapping[str, np.ndarray], timed: bool) -> dict[str, Any]:
     steps = np.diff(times)
     interval = float((times[-1] - times[0]) / len(steps)) if len(steps) else float("nan")
     even = bool(np.all(np.abs(steps - interval) <= 1e-3 * abs(interval))) if len(steps) else True
+    backward = int(np.count_nonzero(steps <= 0))
     return {
-        "timed": timed,
+        # frames are counted where their times do not go forward
+        "timed": timed and not backward,
+        "has_times": timed and not (len(steps) and (steps == 0).all()),
         "first_time": float(times[0]),
         "last_time": float(times[-1]),
         "interval": interval,
         "even": even,
-        "backward": int(np.count_nonzero(steps <= 0)),
+        "backward": backward,
     }
 
 

@@ -105,13 +105,20 @@ def _stopped(run: Question) -> Iterator[Finding]:
 
 def _times(run: Question) -> Iterator[Finding]:
     summary = run.summary
-    if summary["backward"]:
+    if not summary["has_times"]:
+        yield Finding(
+            "NO_TIMES",
+            "info",
+            "the file has no times",
+            "All of its frames have the same one, or none: lifetimes and rates are in frames.",
+        )
+    elif summary["backward"]:
         yield Finding(
             "TIME_GOES_BACK",
             "warning",
             f"time stands still or goes back at {many(summary['backward'], 'frame')}",
             "Two files may have been put one behind the other. Flips between such frames compare states "
-            "that do not follow one another, and no time is told.",
+            "that do not follow one another; lifetimes and rates are in frames.",
             "Leave the repeated frames out with @START:STOP.",
         )
     elif not summary["even"]:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mdnum.report.flips.words import duration, life, rule_words
+from mdnum.report.flips.words import duration, life, rule_words, timed
 from mdnum.report.fork.question import Question
 from mdnum.report.verdict import Finding
 from mdnum.report.words import count, many, number, percent
@@ -80,13 +80,14 @@ def _between(run: Question, one: Mapping[str, Any]) -> Iterator[Finding]:
     found = one["stride"]
     if far_apart(one):
         again = one["stays_over"]
+        apart = f"frames are {duration(run, 1)} apart; " if timed(run) else ""
         yield Finding(
             "FRAMES_FAR_APART",
             "warning",
-            "most contacts are over by the next frame",
-            f"{rule_words(run, one)}: frames are {duration(run, 1)} apart. Of the pairs inside at a frame "
-            f"{percent(again)} are inside at the next; of those that begin, at most half. Lifetimes are "
-            "upper bounds, and flips compare states between which most pairs came and went unseen.",
+            "most contacts that begin are over by the next frame",
+            f"{rule_words(run, one)}: {apart}of the pairs inside at a frame {percent(again)} are inside at "
+            "the next; of those that begin, at most half. Lifetimes are "
+            "upper bounds, and pairs came and went between the frames unseen.",
             _BOUND,
         )
     elif one["flips"] >= FEW and found["says"] and found["lost"] is None:

@@ -12,7 +12,7 @@ from mdnum.report.words import count, many, number, plain
 def timed(run: Question) -> bool:
     """Whether the frames have times that go forward."""
     summary = run.summary
-    return bool(summary["timed"] and not summary["backward"] and summary["interval"])
+    return bool(summary["timed"] and summary["interval"])
 
 
 def duration(run: Question, frames: float | None, digits: int = 3, beyond: str = "longer than seen") -> str:
@@ -21,7 +21,7 @@ def duration(run: Question, frames: float | None, digits: int = 3, beyond: str =
         return beyond
     if timed(run):
         return f"{number(frames * run.summary['interval'], digits)} {run.summary['time']}"
-    return f"{number(frames, digits)} frame{'' if frames == 1 else 's'}"
+    return f"{plain(frames, digits)} frame{'' if frames == 1 else 's'}"
 
 
 def life(run: Question, found: Mapping[str, Any]) -> str:
