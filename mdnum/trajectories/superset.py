@@ -43,7 +43,6 @@ class Superset:
         inside: the decision on each pair at the last frame.
         start: first pair of each group.
         earliest: reading before which no pair of the group is due.
-        combination: of the reduced lattice that the list counts in.
     """
 
     skin: float
@@ -52,7 +51,6 @@ class Superset:
     inside: Bool[np.ndarray, "pairs"]
     start: Int[np.ndarray, "edges"]
     earliest: Float[np.ndarray, "groups"]
-    combination: Int[np.ndarray, "3 3"]
     gone: float = 0.0
     last: float = field(default=0.0)
 
@@ -65,10 +63,8 @@ class Superset:
             radius: largest one, length.
             clear: length.
         """
-        if reading + clear >= self.skin or not (self.combination == lattice.combination).all():
-            return False
         # a second image within reach would have a rank, and the list knows the nearest alone
-        return lattice.narrowest >= 2.0 * (radius + self.skin)
+        return reading + clear < self.skin and lattice.narrowest >= 2.0 * (radius + self.skin)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -175,7 +171,7 @@ def listed(
     _group(found.i, found.j, found.code, found.value, skin, start, i, j, code, due, inside)
     found = replace(found, i=i, j=j, code=code, value=found.value[:0])
     earliest = np.arange(GROUPS) * (skin / GROUPS) - 1e-6 * skin
-    return Superset(skin, found, due, inside, start, earliest, lattice.combination)
+    return Superset(skin, found, due, inside, start, earliest)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -183,6 +183,18 @@ def test_a_list_in_use_misses_nothing(mover, bound):
     assert used > 25 and (flipped > 0 or mover is drift or mover is resting)
 
 
+def test_the_nearest_miss_is_found_though_only_another_pair_is_due():
+    # two pairs rest at margins 0.04 and 0.03 while a third atom, far away, turns the odometer
+    x = np.array([[0.0, 0, 0], [1.96, 0, 0], [0, 8, 0], [1.97, 8, 0], [6, 5, 5]])
+    tracker, used = Tracker(Cutoff(2.0)), 0
+    for k in range(40):
+        tracker.step(Frame(k, 0.0, x, Box(np.eye(3) * 20.0, PERIODIC)))
+        used += tracker._list is not None
+        assert tracker.min_margin == pytest.approx(0.03)
+        x[4, 2] += 0.01
+    assert used > 30
+
+
 def test_a_list_and_a_fresh_search_tell_the_same_to_the_last_bit(monkeypatch):
     rng = np.random.default_rng(2)
     frames = [rng.uniform(0, 10, (200, 3))]
