@@ -1,7 +1,7 @@
 """A neighbor list that is right, and what people have got wrong in theirs: one word for each mechanism.
 
-`search` is a cell list of its own kind, which shares no code with the oracle; `Kept` keeps one with a skin. Both
-do as told by `defect`; with none they are right. The words are told by the threads they were reported in.
+`search` is a cell list of its own kind, which shares no code with the oracle; `Kept` keeps one with a skin.
+Both do as told by `defect`; with none they are right. Beside each word is the thread that reported it.
 """
 
 from __future__ import annotations

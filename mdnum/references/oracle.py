@@ -220,7 +220,8 @@ def _within(positions: ndarray, cell: ndarray, image, reach: float):
     """(i, j, shift, distance) of the pairs within reach for one choice of image, block by block."""
     n = len(positions)
     if isinstance(image[0], np.ndarray):
-        yield _at_once(positions, cell, *image, reach)
+        vectors, home = image
+        yield _at_once(positions, cell, vectors, home, reach)
         return
     shift_of, own_image = image
     rows = max(1, _BLOCK // max(n, 1))

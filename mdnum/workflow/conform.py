@@ -135,8 +135,7 @@ def _declared(
 
 def _slug(name: str) -> str:
     """A name that a folder can have."""
-    place, colon, attribute = name.rpartition(":")
-    return f"{Path(place).stem if place.endswith('.py') else place}-{attribute}" if colon else name
+    return name.replace(":", "-")
 
 
 def _write(folder: RunFolder, found: Report) -> list[str]:

@@ -49,7 +49,7 @@ class NeighborListConformance:
     seed: ClassVar[int] = 0
     large: ClassVar[bool] = False
 
-    def tested(self) -> PairList:
+    def subject(self) -> PairList:
         """The list with what the class says about it."""
         if self.pairs is None:
             pytest.skip("no list: set `pairs` in a subclass")
@@ -67,7 +67,7 @@ class NeighborListConformance:
     @pytest.mark.parametrize("area", AREAS)
     def test_neighbor_list(self, area: str) -> None:
         """The list gives the right pairs in the cases of an area."""
-        tested = self.tested()
+        tested = self.subject()
         cases = self.asked(tested, area)
         if not cases:
             pytest.skip("for lists that are kept")

@@ -46,12 +46,15 @@ class Answer:
     def same(self, other: Answer) -> bool:
         """Whether two answers have the same rows in the same order."""
         return all(
-            (mine is None) == (theirs is None) and (mine is None or np.array_equal(mine, theirs))
+            mine is theirs if mine is None or theirs is None else np.array_equal(mine, theirs)
             for mine, theirs in (
-                (self.i, other.i), (self.j, other.j), (self.shift, other.shift),
-                (self.distance, other.distance), (self.vector, other.vector),
+                (self.i, other.i),
+                (self.j, other.j),
+                (self.shift, other.shift),
+                (self.distance, other.distance),
+                (self.vector, other.vector),
             )
-        )  # fmt: skip
+        )
 
 
 def read(given: Any) -> Answer:

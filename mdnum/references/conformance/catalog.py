@@ -115,14 +115,16 @@ def _images() -> Iterator[Case]:
     yield one(
         "one axis just below one cutoff", "images", gas(6, [0.96, 4.0, 4.0], 31), np.diag([0.96, 4.0, 4.0])
     )
-    yield one("one cell, both neighbors the same atom", "images", [[0.0, 0, 0], [0.9, 0, 0]], np.diag([1.8, 5, 5]), r_cut=1.0)  # fmt: skip
+    pair = [[0.0, 0, 0], [0.9, 0, 0]]
+    yield one("one cell, both neighbors the same atom", "images", pair, np.diag([1.8, 5, 5]))
     for edge in (0.45, 0.7, 0.95, 1.9):
         walls = np.array([[0.02, 0.03, 0.02], [0.98, 0.97, 0.96]]) * edge
         yield one(f"two atoms at opposite walls, edges of {edge} cutoffs", "images", walls, edge)
     skewed = np.array([[1.4, 0, 0], [1.1, 1.2, 0], [-0.9, 0.8, 1.3]])
     yield one("small and skewed", "images", gas(4, skewed, 32), skewed)
     yield one("small and skewed, slab", "images", gas(4, skewed, 33), skewed, (True, True, False))
-    yield one("the 24th shell of a primitive cell", "images", [[0.0, 0, 0]], np.array([[0, 1, 1], [1, 0, 1], [1, 1, 0.0]]), r_cut=3.05)  # fmt: skip
+    cubic = np.array([[0, 1, 1], [1, 0, 1], [1, 1, 0.0]])
+    yield one("four shells of a primitive cell", "images", [[0.0, 0, 0]], cubic, r_cut=3.05)
     yield one("many images along a needle", "images", gas(3, [0.3, 9.0, 9.0], 34), np.diag([0.3, 9.0, 9.0]))
     yield one("many images, far outside", "images", gas(4, 1.3, 35, -9.0, 9.0), 1.3)
 
@@ -131,7 +133,7 @@ def _outside() -> Iterator[Case]:
     inside = gas(24, 4.0, 40)
     shifts = np.random.default_rng(41).integers(-3, 4, inside.shape)
     yield one("lattice vectors added", "outside", inside + 4.0 * shifts, 4.0)
-    yield one("all of one box over", "outside", inside + [4.0, 0, 0], 4.0)
+    yield one("all of one box over", "outside", inside + np.array([4.0, 0, 0]), 4.0)
     yield one("all of one box back", "outside", inside - [0, 4.0, 4.0], 4.0)
     yield one("a thousand boxes over", "outside", inside + 4000.0 * np.sign(shifts), 4.0)
     yield one(
@@ -139,13 +141,23 @@ def _outside() -> Iterator[Case]:
     )
     skewed = np.array([[4.0, 0, 0], [1.9, 4.0, 0], [-1.7, 1.5, 4.0]])
     yield one("skewed, lattice vectors added", "outside", gas(24, skewed, 42) + shifts @ skewed, skewed)
+    tilted = gas(8, skewed, 43) + 1000.0 * np.where([True, True, False], shifts[:8], 0) @ skewed
+    yield one("skewed slab, a thousand boxes over", "outside", tilted, skewed, (True, True, False))
     beyond = np.where([True, False, True], 4.0 * shifts, 0.0)
     yield one("slab, lattice vectors added", "outside", inside + beyond, 4.0, (True, False, True))
     for place, word in (
-        (0.0, "0"), (4.0, "L"), (-0.0, "-0"), (-1e-52, "-1e-52"), (-1e-17, "-1e-17"), (-1e-9, "-1e-9"),
-        (float(np.nextafter(4.0, 0.0)), "an ulp below L"), (float(np.nextafter(4.0, 9.0)), "an ulp above L"),
-        (-4.0, "-L"), (8.0, "2 L"), (float(-np.spacing(4.0)), "minus an ulp of L"),
-    ):  # fmt: skip
+        (0.0, "0"),
+        (4.0, "L"),
+        (-0.0, "-0"),
+        (-1e-52, "-1e-52"),
+        (-1e-17, "-1e-17"),
+        (-1e-9, "-1e-9"),
+        (float(np.nextafter(4.0, 0.0)), "an ulp below L"),
+        (float(np.nextafter(4.0, 9.0)), "an ulp above L"),
+        (-4.0, "-L"),
+        (8.0, "2 L"),
+        (float(-np.spacing(4.0)), "minus an ulp of L"),
+    ):
         near = np.array([[0.5, 2, 2], [3.5, 2, 2], [2, 0.5, 2], [2, 3.5, 2], [2, 2, 0.5], [2, 2, 3.5]])
         on = np.array([[place, 2, 2], [2, place, 2], [2, 2, place], [place, place, place]])
         yield one(f"atoms at {word}", "outside", np.vstack([on, near, [[0.4, 0.4, 0.4]]]), 4.0)
@@ -185,11 +197,13 @@ def _ties() -> Iterator[Case]:
     yield one(
         "whole numbers, 3-4-5", "ties", [[0.0, 0, 0], [3, 4, 0], [3, 4, 12], [0, 4, 3], [-5, 0, 0]], r_cut=5.0
     )
-    yield one("whole numbers, 3-4-5 through faces", "ties", [[0.0, 0, 0], [13, 12, 0], [4, 3, 0], [0, 0, 11]], 16.0, r_cut=5.0)  # fmt: skip
+    through = [[0.0, 0, 0], [13, 12, 0], [4, 3, 0], [0, 0, 11]]
+    yield one("whole numbers, 3-4-5 through faces", "ties", through, 16.0, r_cut=5.0)
     yield one("second shell at the cutoff, which is no double", "ties", grid, 4.0, r_cut=float(np.sqrt(2.0)))
     for ulps in (-2, -1, 0, 1, 2):
         r_cut = 2.5 + ulps * float(np.spacing(2.5))
-        yield one(f"pairs {-ulps:+d} ulp from the cutoff", "ties", [[1.0, 1, 1], [3.5, 1, 1], [1, 3.5, 1]], 8.0, r_cut=r_cut)  # fmt: skip
+        corner = [[1.0, 1, 1], [3.5, 1, 1], [1, 3.5, 1]]
+        yield one(f"pairs {-ulps:+d} ulp from the cutoff", "ties", corner, 8.0, r_cut=r_cut)
     rng = np.random.default_rng(50)
     direction = rng.normal(size=(30, 3))
     direction /= np.linalg.norm(direction, axis=1)[:, None]

@@ -54,16 +54,28 @@ class Failure:
 
 #: Codes by how bad they are: the first is what makes energies wrong without a word.
 CODES = (
-    "CRASHED", "MISSING", "EXTRA", "DUPLICATE", "SELF", "RANGE", "ONE_SIDED", "SHIFTS", "DISTANCES", "VECTORS",
-    "MALFORMED", "NO_ANSWER", "CHANGED_INPUT", "RAISED",
-)  # fmt: skip
+    "CRASHED",
+    "MISSING",
+    "EXTRA",
+    "DUPLICATE",
+    "SELF",
+    "RANGE",
+    "ONE_SIDED",
+    "SHIFTS",
+    "DISTANCES",
+    "VECTORS",
+    "MALFORMED",
+    "NO_ANSWER",
+    "CHANGED_INPUT",
+    "RAISED",
+)
 
 
 def judge(answer: Answer, truth: Truth, how: Conventions) -> list[Failure]:
     """Everything that is wrong with an answer; nothing where it conforms.
 
-    A pair within rounding of the cutoff (`Truth.scale` times the roundoff of the list) may be there or not, but
-    from both of its atoms alike.
+    A pair within rounding of the cutoff (`Truth.scale` times the roundoff of the list) may be there or not,
+    but from both of its atoms alike.
 
     Args:
         truth: listed as far as the answer may reach.
@@ -161,8 +173,9 @@ class _Rows:
         for row in rows[:_TOLD]:
             i, j, shift = self._named(self.right, row)
             told.append(f"{i}-{j}{_through(shift)} at {self.truth.distance[row % half]:.9g}")
-        what = "from one of its atoms only" if one_sided else f"inside r_cut = {self.truth.r_cut:.9g}"
-        return f"{total} of {int(self.needed.sum())} rows {what}, first {', '.join(told)}"
+        of = f"{total} of {int(self.needed.sum())} rows"
+        what = "from one of its atoms only" if one_sided else f"missing inside r_cut = {self.truth.r_cut:.9g}"
+        return f"{of} {what}: {', '.join(told)}{', ...' if len(rows) > _TOLD else ''}"
 
     def _surplus(self, surplus: ndarray, allowed: ndarray, mine: ndarray) -> list[Failure]:
         found = []
@@ -280,8 +293,8 @@ def _measures(answer: Answer, truth: Truth, how: Conventions) -> list[Failure]:
             continue
         row = int(np.argmax(np.where(np.isnan(error), np.inf, error)))
         text = (
-            f"{int(wrong.sum())} of {len(answer)} rows have a {what} that is off by more than {bound:.2g}, most "
-            f"{answer.i[row]}-{answer.j[row]} by {error[row]:.3g}"
+            f"{int(wrong.sum())} of {len(answer)} rows have a {what} that is off by more than {bound:.2g}, "
+            f"most {answer.i[row]}-{answer.j[row]} by {error[row]:.3g}"
         )
         found.append(Failure(code, text, int(wrong.sum())))
     return found

@@ -18,9 +18,12 @@ class AseSkinList:
 
         self.pbc = pbc
         self.kept = NeighborList(
-            [r_cut / 2] * len(positions), skin=skin / 2, self_interaction=False, bothways=True,
-            primitive=NewPrimitiveNeighborList,
-        )  # fmt: skip
+            [r_cut / 2] * len(positions),
+            skin=skin / 2,
+            self_interaction=False,
+            bothways=True,
+            primitive=NewPrimitiveNeighborList,  # type: ignore
+        )
         return self.update(positions, cell)
 
     def update(self, positions, cell):
@@ -64,9 +67,14 @@ class JaxMdList:
             box = jnp.asarray(np.diag(cell))
             displacement, _ = space.periodic(box, wrapped=False)
         neighbor = partition.neighbor_list(
-            displacement, box, jnp.float64(r_cut), jnp.float64(skin), fractional_coordinates=self.skewed,
-            disable_cell_list=self.free, format=partition.Sparse,
-        )  # fmt: skip
+            displacement,
+            box,
+            jnp.float64(r_cut),
+            jnp.float64(skin),
+            fractional_coordinates=self.skewed,
+            disable_cell_list=self.free,
+            format=partition.Sparse,
+        )
         self.found = neighbor.allocate(self.placed(positions, cell))
         return self.pairs(positions)
 
@@ -134,28 +142,49 @@ def mdnum_host_list(positions, cell, pbc, r_cut):
 
 def _kept(name: str, package: str, made: type, about: str, **declared: Any) -> PairList:
     return PairList(
-        name, made, kept=True, package=package, source=source_of(made), call=made.__name__, about=about,
+        name,
+        made,
+        kept=True,
+        package=package,
+        source=source_of(made),
+        call=made.__name__,
+        about=about,
         **declared,
-    )  # fmt: skip
+    )
 
 
 KEPT_PEERS: tuple[PairList, ...] = (
     _kept(
-        "ase-skin", "ase", AseSkinList, "ase.neighborlist.NeighborList with a skin, updated", affords=0.1,
+        "ase-skin",
+        "ase",
+        AseSkinList,
+        "ase.neighborlist.NeighborList with a skin, updated",
+        affords=0.1,
         limits=Limits(most_atoms=20_000, roomy=1e5, least_cutoff=0.5),
     ),
     _kept(
-        "jax-md-kept", "jax-md", JaxMdList, "jax-md's partition.neighbor_list, allocated and updated",
+        "jax-md-kept",
+        "jax-md",
+        JaxMdList,
+        "jax-md's partition.neighbor_list, allocated and updated",
         affords=0.01,
         limits=Limits(minimum_image=True, all_axes=True, fixed_cell=True, atoms=1, most_atoms=5_000),
     ),
     PairList(
-        "mdnum", lambda: mdnum_host_list, package="mdnum", source=source_of(mdnum_host_list),
-        call="mdnum_host_list", about="mdnum's own cell list", limits=Limits(minimum_image=True, atoms=1),
-    ),
-    _kept(
-        "mdnum-verlet", "mdnum", MdnumVerletList, "mdnum's own list with a skin, updated",
+        "mdnum",
+        lambda: mdnum_host_list,
+        package="mdnum",
+        source=source_of(mdnum_host_list),
+        call="mdnum_host_list",
+        about="mdnum's own cell list",
         limits=Limits(minimum_image=True, atoms=1),
     ),
-)  # fmt: skip
+    _kept(
+        "mdnum-verlet",
+        "mdnum",
+        MdnumVerletList,
+        "mdnum's own list with a skin, updated",
+        limits=Limits(minimum_image=True, atoms=1),
+    ),
+)
 """Lists that are kept, and mdnum's own."""

@@ -1,4 +1,4 @@
-"""From a word to a list: a library's by name, or anybody's as `package.module:function` or `file.py:function`."""
+"""From a word to a list: a library's by name, or anybody's as `module:function` or `file.py:function`."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ def load(word: str) -> PairList:
     """The list that a word names.
 
     Args:
-        word: a name from `known()`, `package.module:function`, or `path/to/file.py:function`. The function takes
-            (positions, cell, pbc, r_cut) and returns pairs as `answer.read` takes them; a class or an object
-            with `allocate` and `update` is a list that is kept (`KeptList`).
+        word: a name from `known()`, `package.module:function`, or `path/to/file.py:function`. The function
+            takes (positions, cell, pbc, r_cut) and returns pairs as `answer.read` takes them; a class or an
+            object with `allocate` and `update` is a list that is kept (`KeptList`).
 
     Raises:
         InputError: there is no such list, or it cannot be imported.
@@ -53,7 +53,7 @@ def load(word: str) -> PairList:
     if not colon or not place:
         raise InputError(
             f"{word!r} is no list that is known here",
-            remedy=f"Give one of {', '.join(sorted(by_name))}, or package.module:function, or file.py:function",
+            remedy=f"Give {', '.join(sorted(by_name))}, package.module:function or file.py:function",
         )
     module = _module(place)
     made = module
@@ -65,7 +65,8 @@ def load(word: str) -> PairList:
                 remedy=f"It has {', '.join(public[:8])}" if public else "Give the name of a function in it",
             )
         made = getattr(made, part)
-    return replace(from_object(made, word, source=_import_line(place, attribute)), word=word)
+    shown = f"{Path(place).stem}:{attribute}" if place.endswith(".py") else word
+    return replace(from_object(made, shown, source=_import_line(place, attribute)), word=word)
 
 
 def from_object(made: Any, name: str | None = None, source: str | None = None) -> PairList:
@@ -77,14 +78,14 @@ def from_object(made: Any, name: str | None = None, source: str | None = None) -
     Raises:
         InputError: it is none of these.
     """
-    name = name or getattr(made, "__name__", type(made).__name__)
+    name = str(name or getattr(made, "__name__", type(made).__name__))
     kept = isinstance(made, KeptList) if not inspect.isclass(made) else _is_kept(made)
     if not kept and not callable(made):
         raise InputError(
             f"{name} is neither a function nor an object with allocate and update",
             remedy="Give a function of (positions, cell, pbc, r_cut) that returns (i, j)",
         )
-    call = getattr(made, "__name__", None) or name.rpartition(":")[2]
+    call: str = str(getattr(made, "__name__", None) or name.rpartition(":")[2])
     declared = {
         word: getattr(made, word)
         for word in ("full", "unit", "superset", "limits")

@@ -38,18 +38,18 @@ def _pairs() -> Iterator[Case]:
         yield script(f"two atoms head-on, each by {share} skins {how}", "motion", path, _L, _R, _SKIN)
     path = [_two(middle, apart - 0.02 * _SKIN * k) for k in range(120)]
     yield script("two atoms creep together, 120 steps", "motion", path, _L, _R, _SKIN)
-    path = [np.array([middle, middle + [apart - 1.1 * _SKIN * k / 10, 0, 0]]) for k in range(11)]
+    path = [np.array([middle, middle + np.array([apart - 1.1 * _SKIN * k / 10, 0, 0])]) for k in range(11)]
     yield script("one atom comes to another at rest", "motion", path, _L, _R, _SKIN)
     others = gas(12, _L, 80)
     others = others[np.linalg.norm(others - middle, axis=1) > 2.0]
     path = [np.vstack([_two(middle, apart - 0.09 * _SKIN * k), others]) for k in range(14)]
     yield script("two atoms head-on among others at rest", "motion", path, _L, _R, _SKIN)
-    path = [np.array([middle + [0, 0, k * 0.0], middle + [0.9 + 0.01 * k, 0, 0]]) for k in range(40)]
+    path = [np.array([middle, middle + np.array([0.9 + 0.01 * k, 0, 0])]) for k in range(40)]
     yield script("two atoms part slowly", "motion", path, _L, _R, _SKIN)
-    at = middle + [apart, 0, 0]
+    at = middle + np.array([apart, 0, 0])
     path = (
         [np.array([middle, at])] * 3
-        + [np.array([middle, middle + [0.5, 0, 0]])]
+        + [np.array([middle, middle + np.array([0.5, 0, 0])])]
         + [np.array([middle, at])] * 3
     )
     yield script("an atom jumps in and out", "motion", path, _L, _R, _SKIN)
@@ -78,9 +78,14 @@ def _many() -> Iterator[Case]:
     yield script("one fast atom among atoms at rest", "motion", fast, _L, _R, _SKIN)
     free = gas(30, 4.0, 83)
     yield script(
-        "a free cluster flies apart and comes back", "motion",
-        [free * (1 + 0.1 * abs(5 - k)) for k in range(11)], np.zeros((3, 3)), _R, _SKIN, False,
-    )  # fmt: skip
+        "a free cluster flies apart and comes back",
+        "motion",
+        [free * (1 + 0.1 * abs(5 - k)) for k in range(11)],
+        np.zeros((3, 3)),
+        _R,
+        _SKIN,
+        False,
+    )
     order = np.random.default_rng(84).permutation(len(start))
     yield script("atoms change places", "motion", [start, start[order], start], _L, _R, _SKIN)
     dense, sparse = 3.0 + 0.25 * gas(40, _L, 85, -1.0, 1.0), gas(40, _L, 86)
@@ -104,7 +109,7 @@ def _wrapping() -> Iterator[Case]:
     rng = np.random.default_rng(92)
     tossed = [start + _L * rng.integers(-2, 3, start.shape) for _ in range(6)]
     yield script("other images of the same atoms", "wrapping", tossed, _L, _R, _SKIN)
-    pair = [np.array([[0.05, 3, 3], [5.2, 3, 3]]) + [k * 0.01 - 0.1, 0, 0] for k in range(20)]
+    pair = [np.array([[0.05, 3, 3], [5.2, 3, 3]]) + np.array([k * 0.01 - 0.1, 0, 0]) for k in range(20)]
     yield script(
         "a pair goes through a face, wrapped", "wrapping", [np.mod(x, _L) for x in pair], _L, _R, _SKIN
     )

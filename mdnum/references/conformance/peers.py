@@ -26,9 +26,12 @@ def ase_primitive_list(positions, cell, pbc, r_cut):
 
     atoms = Atoms(numbers=[1] * len(positions), positions=positions, cell=cell, pbc=pbc)
     kept = NeighborList(
-        [r_cut / 2] * len(positions), skin=0.0, self_interaction=False, bothways=True,
+        [r_cut / 2] * len(positions),
+        skin=0.0,
+        self_interaction=False,
+        bothways=True,
         primitive=PrimitiveNeighborList,
-    )  # fmt: skip
+    )
     kept.update(atoms)
     rows = [kept.get_neighbors(atom) for atom in range(len(positions))]
     i = np.repeat(np.arange(len(rows)), [len(row[0]) for row in rows])
@@ -55,7 +58,7 @@ def vesin_half(positions, cell, pbc, r_cut):
 
 def matscipy_list(positions, cell, pbc, r_cut):
     from ase import Atoms
-    from matscipy.neighbours import neighbour_list
+    from matscipy.neighbours import neighbour_list  # type: ignore
 
     atoms = Atoms(numbers=[1] * len(positions), positions=positions, cell=cell, pbc=pbc)
     i, j, shift, distance, vector = neighbour_list("ijSdD", atoms, r_cut)
@@ -64,14 +67,18 @@ def matscipy_list(positions, cell, pbc, r_cut):
 
 def pymatgen_points(positions, cell, pbc, r_cut):
     import numpy as np
-    from pymatgen.core import Lattice
-    from pymatgen.optimization.neighbors import find_points_in_spheres
+    from pymatgen.core import Lattice  # type: ignore
+    from pymatgen.optimization.neighbors import find_points_in_spheres  # type: ignore
 
-    lattice = np.ascontiguousarray(Lattice(cell, pbc=tuple(bool(axis) for axis in pbc)).matrix)
+    lattice = np.ascontiguousarray(Lattice(cell, pbc=(bool(pbc[0]), bool(pbc[1]), bool(pbc[2]))).matrix)
     i, j, shift, distance = find_points_in_spheres(
-        np.ascontiguousarray(positions), np.ascontiguousarray(positions), r=float(r_cut),
-        pbc=np.array(pbc, dtype=np.int64), lattice=lattice, tol=1e-12,
-    )  # fmt: skip
+        np.ascontiguousarray(positions),
+        np.ascontiguousarray(positions),
+        r=float(r_cut),
+        pbc=np.array(pbc, dtype=np.int64),
+        lattice=lattice,
+        tol=1e-12,
+    )
     other = (i != j) | np.any(shift != 0, axis=1)
     return {"i": i[other], "j": j[other], "shift": shift[other].astype(int), "distance": distance[other]}
 
@@ -100,16 +107,16 @@ def mdanalysis_brute_force(positions, cell, pbc, r_cut):
 
 def scipy_tree(positions, cell, pbc, r_cut):
     import numpy as np
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     edges = np.where(pbc, np.diag(cell), 0.0)
-    tree = cKDTree(positions, boxsize=edges if pbc.any() else None)
+    tree = KDTree(positions, boxsize=edges if pbc.any() else None)
     pairs = tree.query_pairs(r_cut, output_type="ndarray")
     return {"i": pairs[:, 0], "j": pairs[:, 1]}
 
 
 def freud_query(positions, cell, pbc, r_cut):
-    import freud
+    import freud  # type: ignore
     import numpy as np
 
     if pbc.any():
@@ -125,25 +132,32 @@ def freud_query(positions, cell, pbc, r_cut):
 
 
 def torch_sim_pairs(positions, cell, pbc, r_cut):
-    import torch
-    from torch_sim.neighbors import torch_nl_linked_cell
+    import torch  # type: ignore
+    from torch_sim.neighbors import torch_nl_linked_cell  # type: ignore
 
     n = len(positions)
     pairs, _, shift = torch_nl_linked_cell(
-        torch.as_tensor(positions), torch.as_tensor(cell), torch.as_tensor(pbc), torch.tensor(float(r_cut)),
-        torch.zeros(n, dtype=torch.long), self_interaction=False,
-    )  # fmt: skip
+        torch.as_tensor(positions),
+        torch.as_tensor(cell),
+        torch.as_tensor(pbc),
+        torch.tensor(float(r_cut)),
+        torch.zeros(n, dtype=torch.long),
+        self_interaction=False,
+    )
     return {"i": pairs[0].numpy(), "j": pairs[1].numpy(), "shift": shift.numpy()}
 
 
 def nvalchemi_pairs(positions, cell, pbc, r_cut):
-    import torch
-    from nvalchemiops.torch.neighbors import cell_list
+    import torch  # type: ignore
+    from nvalchemiops.torch.neighbors import cell_list  # type: ignore
 
     pairs, _, shift = cell_list(
-        torch.as_tensor(positions), float(r_cut), torch.as_tensor(cell)[None], torch.as_tensor(pbc)[None],
+        torch.as_tensor(positions),
+        float(r_cut),
+        torch.as_tensor(cell)[None],
+        torch.as_tensor(pbc)[None],
         return_neighbor_list=True,
-    )  # fmt: skip
+    )
     return {"i": pairs[0].numpy(), "j": pairs[1].numpy(), "shift": shift.numpy()}
 
 
@@ -169,9 +183,14 @@ def jax_md_pairs(positions, cell, pbc, r_cut):
         # the word for coordinates that may be outside of the box
         displacement, _ = space.periodic(box, wrapped=False)
     neighbor = partition.neighbor_list(
-        displacement, box, r_cut, jnp.float64(0.0), fractional_coordinates=skewed,
-        disable_cell_list=not pbc.any(), format=partition.Sparse,
-    )  # fmt: skip
+        displacement,
+        box,
+        r_cut,
+        jnp.float64(0.0),
+        fractional_coordinates=skewed,
+        disable_cell_list=not pbc.any(),
+        format=partition.Sparse,
+    )
     found = neighbor.allocate(positions)
     if bool(found.did_buffer_overflow):
         raise ValueError("jax-md says that its list overflowed")
@@ -185,47 +204,94 @@ _SINGLE = 2.0**-24
 
 def _peer(name, package, function, about, **declared) -> PairList:
     return PairList(
-        name, lambda: function, package=package, source=source_of(function), call=function.__name__,
-        about=about, **declared,
-    )  # fmt: skip
+        name,
+        lambda: function,
+        package=package,
+        source=source_of(function),
+        call=function.__name__,
+        about=about,
+        **declared,
+    )
 
 
 PEERS: tuple[PairList, ...] = (
-    _peer("ase", "ase", ase_neighbor_list, "ase.neighborlist.neighbor_list", affords=0.3,
-        limits=Limits(least_cutoff=0.5)),
     _peer(
-        "ase-primitive", "ase", ase_primitive_list, "the list under ASE's LennardJones, EAM and Tersoff",
-        affords=0.3, limits=Limits(atoms=1, most_atoms=20_000),
-    ),  # fmt: skip
+        "ase",
+        "ase",
+        ase_neighbor_list,
+        "ase.neighborlist.neighbor_list",
+        affords=0.3,
+        limits=Limits(least_cutoff=0.5),
+    ),
+    _peer(
+        "ase-primitive",
+        "ase",
+        ase_primitive_list,
+        "the list under ASE's LennardJones, EAM and Tersoff",
+        affords=0.3,
+        limits=Limits(atoms=1, most_atoms=20_000),
+    ),
     _peer("vesin", "vesin", vesin_cells, "vesin's cell list, every pair from both atoms"),
     _peer("vesin-half", "vesin", vesin_half, "vesin, every pair once"),
-    _peer("matscipy", "matscipy", matscipy_list, "matscipy.neighbours.neighbour_list",
-        limits=Limits(whole_cell=True)),
-    _peer("pymatgen", "pymatgen", pymatgen_points, "pymatgen's find_points_in_spheres",
-        limits=Limits(least_cutoff=0.01)),
     _peer(
-        "mdanalysis", "MDAnalysis", mdanalysis_nsgrid, "MDAnalysis self_capped_distance, nsgrid",
-        full=False, unit=_SINGLE, affords=0.3,
+        "matscipy",
+        "matscipy",
+        matscipy_list,
+        "matscipy.neighbours.neighbour_list",
+        limits=Limits(whole_cell=True),
+    ),
+    _peer(
+        "pymatgen",
+        "pymatgen",
+        pymatgen_points,
+        "pymatgen's find_points_in_spheres",
+        limits=Limits(least_cutoff=0.01),
+    ),
+    _peer(
+        "mdanalysis",
+        "MDAnalysis",
+        mdanalysis_nsgrid,
+        "MDAnalysis, nsgrid",
+        full=False,
+        unit=_SINGLE,
+        affords=0.3,
         limits=Limits(minimum_image=True, all_axes=True, lower=True, right_handed=True),
     ),
     _peer(
-        "mdanalysis-brute", "MDAnalysis", mdanalysis_brute_force, "MDAnalysis self_capped_distance, bruteforce",
-        full=False, unit=_SINGLE, affords=0.3,
+        "mdanalysis-brute",
+        "MDAnalysis",
+        mdanalysis_brute_force,
+        "MDAnalysis, bruteforce",
+        full=False,
+        unit=_SINGLE,
+        affords=0.3,
         limits=Limits(minimum_image=True, all_axes=True, lower=True, right_handed=True, most_atoms=20_000),
     ),
     _peer(
-        "scipy", "scipy", scipy_tree, "scipy.spatial.cKDTree.query_pairs", full=False,
+        "scipy",
+        "scipy",
+        scipy_tree,
+        "scipy.spatial.KDTree.query_pairs",
+        full=False,
         limits=Limits(minimum_image=True, along_axes=True),
     ),
     _peer(
-        "freud", "freud-analysis", freud_query, "freud.locality.AABBQuery", unit=_SINGLE,
+        "freud",
+        "freud-analysis",
+        freud_query,
+        "freud.locality.AABBQuery",
+        unit=_SINGLE,
         limits=Limits(minimum_image=True, all_axes=True, lower=True, right_handed=True, atoms=1),
     ),
-    _peer("torch-sim", "torch-sim-atomistic", torch_sim_pairs, "torch-sim's torch_nl_linked_cell", affords=0.3),
+    _peer("torch-sim", "torch-sim-atomistic", torch_sim_pairs, "torch-sim's linked cells", affords=0.3),
     _peer("nvalchemi-ops", "nvalchemi-toolkit-ops", nvalchemi_pairs, "nvalchemi-ops' cell_list", affords=0.1),
     _peer(
-        "jax-md", "jax-md", jax_md_pairs, "jax-md's partition.neighbor_list, allocated anew for each question",
-        affords=0.01, limits=Limits(minimum_image=True, all_axes=True, most_atoms=5_000),
+        "jax-md",
+        "jax-md",
+        jax_md_pairs,
+        "jax-md's partition.neighbor_list, allocated each time",
+        affords=0.01,
+        limits=Limits(minimum_image=True, all_axes=True, most_atoms=5_000),
     ),
-)  # fmt: skip
+)
 """Searches that start from nothing at every question."""

@@ -8,6 +8,7 @@ import signal
 import struct
 import subprocess
 import sys
+import tempfile
 import threading
 from typing import Any, BinaryIO
 
@@ -31,6 +32,9 @@ class RemoteSession:
     def __init__(self, tested: PairList, reuse: bool = False):
         self.tested, self.reuse = tested, reuse
         self._process: subprocess.Popen[bytes] | None = None
+        # what a library prints is no part of the report; its last words before a crash are
+        self._said: Any = tempfile.TemporaryFile()  # noqa: SIM115 (closed with the session)
+        self._from = 0
 
     def ask(self, case: Case) -> list[Outcome]:
         """The outcome at every still, as far as the list goes."""
@@ -56,10 +60,12 @@ class RemoteSession:
                 stream.close()
 
     def _started(self) -> subprocess.Popen[bytes]:
+        self._from = self._said.seek(0, os.SEEK_END)
         self._process = subprocess.Popen(
             [sys.executable, "-m", "mdnum.references.conformance.remote", self.tested.word],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
+            stderr=self._said,
         )
         ready = self._received(START)
         if isinstance(ready, Exception):
@@ -98,11 +104,18 @@ class RemoteSession:
         assert self._process is not None
         code = self._process.wait()
         if code >= 0:
-            return f"the process ended with exit code {code}"
-        try:
-            return f"the process was ended by {signal.Signals(-code).name}"
-        except ValueError:
-            return f"the process was ended by signal {-code}"
+            how = f"the process ended with exit code {code}"
+        else:
+            name = signal.Signals(-code).name if -code in {*signal.Signals} else f"signal {-code}"
+            how = f"the process was ended by {name}"
+        last = self._last_words()
+        return f"{how}: {last}" if last else how
+
+    def _last_words(self) -> str:
+        """The last line that the process wrote to stderr since it was started."""
+        self._said.seek(self._from)
+        lines = self._said.read().decode(errors="replace").strip().splitlines()
+        return lines[-1].strip()[:200] if lines else ""
 
 
 class _Ended(Exception):

@@ -69,7 +69,7 @@ def check(step, x, cell, given):
     for key in sorted(set(listed) | set(needed)):
         if listed[key] < needed[key]:
             nearest = min(d for k, d in right.items() if k[:len(key)] == key)
-            bad.append(f"pair {key}: listed {listed[key]} times, should be {needed[key]}; distance {nearest:.9g}")
+            bad.append(f"pair {key}: listed {listed[key]} times, should be {needed[key]}; at {nearest:.9g}")
         elif listed[key] > allowed[key]:
             bad.append(f"pair {key}: listed {listed[key]} times, should be at most {allowed[key]}")
         elif FULL and listed[key] % 2:
@@ -122,8 +122,8 @@ def as_mapping(given):
 def script(tested: PairList, failed: Failed, how: Conventions, superset: bool = False) -> str:
     """Lines that call the list with the numbers of a failing case and compare it with brute force.
 
-    It needs numpy and the list; it prints what is wrong and exits with 1, or with 0 once the list is right. An
-    exception of the list is left to be seen.
+    It needs numpy and the list; it prints what is wrong and exits with 1, or with 0 once the list is right.
+    An exception of the list is left to be seen.
 
     Args:
         how: conventions of the list.

@@ -68,7 +68,7 @@ def shrunk(examiner: Examiner, failed: Failed) -> Failed:
 
 
 def _kind(failure: Failure) -> tuple[str, str]:
-    """What a smaller case has to show: the code; of an exception or a crash also which, whatever its numbers."""
+    """What a smaller case has to show: the code; of an exception or a crash also which, without numbers."""
     said = failure.text if failure.code in ("RAISED", "CRASHED", "MALFORMED") else ""
     return failure.code, re.sub(r"[-+\d.e]+", "#", said)
 

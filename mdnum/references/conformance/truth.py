@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy import ndarray
@@ -104,7 +105,7 @@ def keys(count: int, i: ndarray, j: ndarray, shift: ndarray | None, *others: tup
             _, rank = np.unique(column, return_inverse=True)
             _, key = np.unique(key, return_inverse=True)
             key = key * (int(rank.max(initial=0)) + 1) + rank
-    return [key[first:last] for first, last in zip(lengths, lengths[1:], strict=False)]
+    return [key[first:last] for first, last in pairwise(lengths)]
 
 
 def of(pairs: Truth, mask: ndarray) -> PairSet:

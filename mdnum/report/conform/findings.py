@@ -10,50 +10,50 @@ from mdnum.report.fork.question import Question, verdict
 from mdnum.report.verdict import Finding
 from mdnum.report.words import count, listed, many, typeset
 
-#: (severity, title, remedy) by the code of a failure; {list} is the list's name.
+#: (severity, title, remedy) by the code of a failure.
 _CODES: Mapping[str, tuple[str, str, str]] = {
     "CRASHED": (
-        "error", "{list} ends the process",
+        "error", "the process ends",
         "Check what it divides by and allocates; a program that calls it loses its run.",
     ),
     "MISSING": (
-        "error", "{list} misses pairs inside the cutoff",
+        "error", "pairs inside the cutoff are missing",
         "Do not run with it on such input: energies are wrong without a word.",
     ),
     "EXTRA": (
-        "error", "{list} lists pairs that are beyond the cutoff",
+        "error", "pairs beyond the cutoff are listed",
         "Test the distance in whatever sums over it, or do not use it on such input.",
     ),
     "DUPLICATE": (
-        "error", "{list} lists pairs more than once", "Do not sum over it on such input: a pair counts twice.",
+        "error", "pairs are listed more than once", "A sum over it counts such pairs twice.",
     ),
-    "SELF": ("error", "{list} lists atoms as their own neighbors", "Leave out i = j where there is no shift."),
+    "SELF": ("error", "atoms are listed as their own neighbors", "Leave out i = j without a shift."),
     "RANGE": (
-        "error", "{list} names atoms that do not exist",
+        "error", "atoms are named that do not exist",
         "Cut padding off before the list is handed on; what reads it reads other memory.",
     ),
     "ONE_SIDED": (
-        "error", "{list} lists pairs from one of their atoms only",
+        "error", "pairs are listed from one of their atoms only",
         "Decide each pair once and list it both ways: forces on the two atoms differ else.",
     ),
     "SHIFTS": (
-        "error", "{list} gives the wrong images",
+        "error", "the images are wrong",
         "Say whether shifts are for positions as given or wrapped, and return those for positions as given.",
     ),
-    "DISTANCES": ("error", "{list} gives wrong distances", "Compute x_j - x_i + shift @ cell and its length."),
-    "VECTORS": ("error", "{list} gives wrong vectors", "Compute x_j - x_i + shift @ cell."),
+    "DISTANCES": ("error", "distances are wrong", "Compute |x_j - x_i + shift @ cell|."),
+    "VECTORS": ("error", "vectors are wrong", "Compute x_j - x_i + shift @ cell."),
     "MALFORMED": (
-        "error", "{list} returns what is no list of pairs",
+        "error", "what is returned is no list of pairs",
         "Return (i, j), (i, j, shift), ... or a mapping with i and j, whole numbers of equal length.",
     ),
-    "CHANGED_INPUT": ("warning", "{list} writes to its input", "Copy before wrapping in place."),
+    "CHANGED_INPUT": ("warning", "the input is written to", "Copy before wrapping in place."),
     "NO_ANSWER": (
         "warning",
-        "{list} gives no answer in time",
+        "no answer comes in time",
         "Look at what its time and memory grow with: empty space, a long cutoff, a unit of length.",
     ),
     "RAISED": (
-        "warning", "{list} raises on input that has an answer",
+        "warning", "an exception, for input that has an answer",
         "Answer it, or say in a ValueError what cannot be done.",
     ),
 }  # fmt: skip
@@ -84,8 +84,8 @@ def _evidence(run: Question) -> Iterator[str]:
     if scripts:
         least = min(row["atoms"] for row in summary["failures"])
         yield (
-            f"{many(scripts, 'script')} beside this page reproduce{'s' * (scripts == 1)} the failures without "
-            f"mdnum, the smallest with {many(least, 'atom')}."
+            f"{many(scripts, 'script')} beside this page reproduce{'s' * (scripts == 1)} the failures "
+            f"without mdnum, the smallest with {many(least, 'atom')}."
         )
     refused = sum(row["refused"] for row in summary["areas"])
     skipped = sum(row["skipped"] for row in summary["areas"])
@@ -136,7 +136,7 @@ def _findings(run: Question) -> Iterator[Finding]:
         text = f"In {many(total, 'case')}, about {areas}. {_sentence(first)} Reproduced by {first['script']}."
         if not first["alone"]:
             text += " It fails only after other questions, so the script alone may not show it."
-        yield Finding(code, severity, title.format(list=run.name), text, remedy)  # type: ignore[arg-type]
+        yield Finding(code, severity, title, text, remedy)  # type: ignore[arg-type]
     yield from _conduct(run)
 
 
@@ -161,8 +161,8 @@ def _conduct(run: Question) -> Iterator[Finding]:
         yield Finding(
             "SINGLE_PRECISION",
             "info",
-            f"{run.name} decides in single precision",
-            f"Its decisions are those of float32 and not those of float64, first seen in: {summary['single']}. "
+            "decisions are those of single precision",
+            f"Its decisions are those of float32 and not those of float64, first in: {summary['single']}. "
             "It was judged by the rounding of float32 from there on.",
             "Expect other pairs near the cutoff than in a code that works in float64.",
         )
@@ -182,7 +182,7 @@ def _conduct(run: Question) -> Iterator[Finding]:
         yield Finding(
             "REFUSES",
             "warning" if total > 0.2 * summary["asked"] else "info",
-            f"{run.name} refuses {many(total, 'case')}",
+            f"{many(total, 'case')} refused",
             f"It says so, which is safe. Most often: {one['why']}, about {row['area']}.",
         )
     answered = summary["asked"] - sum(row["refused"] for row in summary["areas"])
@@ -190,7 +190,7 @@ def _conduct(run: Question) -> Iterator[Finding]:
         yield Finding(
             "NOTHING_ANSWERED",
             "error",
-            f"{run.name} answered no question",
+            "no question was answered",
             "Nothing is known about it.",
             "Ask it about fewer things with --limits, or look at what it raises.",
         )

@@ -39,8 +39,8 @@ def write_report(folder: RunFolder | str | Path) -> Path:
         "conform/run.html.j2",
         {"areas": (title, partial(areas, run), [])},
         captions={
-            "areas": "Cases asked, by what they are about: right, wrong, and refused by the list itself. Beside "
-            "the bars, how many are wrong."
+            "areas": "Cases asked, by what they are about: right, wrong, and refused by the list itself. "
+            "Beside the bars, how many are wrong."
         },
         figures=list(_key_figures(run)),
         about=[_area(row) for row in run.summary["areas"]],

@@ -94,7 +94,7 @@ def test_keys_that_overflow_are_found_at_100_000_atoms():
     ],
 )
 def test_failures_shrink_and_are_reproduced_without_mdnum(defect, area, atoms, steps, tmp_path: Path):
-    """The smallest case fails in a script that cannot import mdnum, and the right list passes the same script."""
+    """The smallest case fails in a script that cannot import mdnum, which the right list passes."""
     made = planted_lists.planted if defect in planted_lists.SEARCH_DEFECTS else planted_lists.kept
     tested = from_object(made(defect), defect).with_options(full=True)
 

@@ -1,0 +1,278 @@
+"""The suite on real lists, in another process, from a library's own tests; and that nothing stops it."""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import planted_lists
+import pytest
+
+from mdnum.errors import InputError
+from mdnum.references.conformance import NeighborListConformance
+from mdnum.references.conformance.case import AREAS, one, script
+from mdnum.references.conformance.catalog import catalog, gas
+from mdnum.references.conformance.crowds import crowds
+from mdnum.references.conformance.lists import Limits, Session
+from mdnum.references.conformance.load import from_object, installed, known, load
+from mdnum.references.conformance.movers import movers
+from mdnum.references.conformance.remote import RemoteSession
+from mdnum.references.conformance.strategies import PLACES, SHAPES, SIZES
+from mdnum.references.conformance.suite import Examiner, drawn, examine, questions
+
+_PLANTED = str(Path(planted_lists.__file__))
+
+
+class TestAdopted(NeighborListConformance):
+    """How a library runs the suite in its own tests."""
+
+    pairs = staticmethod(planted_lists.planted(""))
+    cases = 20
+
+
+class TestAdoptedKept(NeighborListConformance):
+    pairs = planted_lists.kept("")
+    cases = 5
+
+    def asked(self, tested, area):
+        # the rest is asked of the list above
+        return super().asked(tested, area) if area in ("few", "motion", "strain") else []
+
+
+def test_an_adopted_suite_fails_with_a_script():
+    class Broken(NeighborListConformance):
+        pairs = staticmethod(planted_lists.planted("half trimmed from full"))
+        full = True
+
+    with pytest.raises(pytest.fail.Exception, match=r"(?s)MISSING.*This reproduces the first.*import numpy"):
+        Broken().test_neighbor_list("few")
+    with pytest.raises(pytest.skip.Exception, match="no list"):
+        NeighborListConformance().test_neighbor_list("few")
+    with pytest.raises(pytest.skip.Exception, match="kept"):
+        Broken().test_neighbor_list("motion")
+
+
+@pytest.mark.parametrize("name", ["vesin-half", "scipy", "mdnum", "mdnum-verlet", "ase-primitive"])
+def test_a_list_that_people_use(name: str):
+    """Named cases that are quick, and a few drawn at random."""
+    tested = load(name)
+    areas = ("few", "boxes", "axes", "outside", "ties", "coincident", "reuse", "wrapping")
+    cases = [
+        case
+        for case in questions(tested, 10, 1, False)
+        # far from the origin vesin takes seconds for some of these
+        if case.area in areas and case.atoms < 60 and "thousand" not in case.name
+    ]
+    report = examine(tested, asked=cases, shrink=False)
+    assert not report.failed, [(one.code, one.case.name, one.worst.text) for one in report.failed]
+    assert report.asked > 50
+    assert report.how.full == (name not in ("vesin-half", "scipy"))
+
+
+def test_questions_are_what_they_were():
+    """The same seed draws the same; every area has questions; names tell them apart."""
+    assert [one.stills[0].positions.tobytes() for one in drawn(30, 3)] == [
+        one.stills[0].positions.tobytes() for one in drawn(30, 3)
+    ]
+    assert drawn(5, 3)[4].stills[0].positions.tobytes() != drawn(5, 4)[4].stills[0].positions.tobytes()
+    named = [*catalog(), *crowds(), *movers()]
+    assert {case.area for case in named} | {"large", "random"} == set(AREAS)
+    assert len({case.name for case in named}) > 150
+    kinds = "; ".join(case.name for case in drawn(300, 0))
+    assert [word for word in (*SHAPES, *SIZES, *PLACES) if word not in kinds] == []
+
+
+def test_limits_are_not_asked_and_are_counted():
+    tested = replace(load("scipy"), limits=Limits(minimum_image=True, along_axes=True, wrapped=True, atoms=1))
+    report = examine(tested, asked=catalog(), shrink=False)
+    assert report.conforms
+    assert sum(tally.refused for tally in report.areas.values()) <= 1
+    assert report.areas["outside"].skipped > 15
+    assert report.areas["few"].why["at least 1 atom"] == 2
+    assert "cells along x, y and z only" in report.areas["boxes"].why
+
+
+@pytest.mark.parametrize(
+    ("limits", "case", "why"),
+    [
+        (Limits(all_axes=True), one("", "axes", gas(3, 4.0, 0), 4.0, (True, False, True)), "axis by axis"),
+        (Limits(periodic=True), one("", "few", gas(3, 4.0, 0)), "no free atoms"),
+        (Limits(free=True), one("", "few", gas(3, 4.0, 0), 4.0), "free atoms only"),
+        (
+            Limits(right_handed=True),
+            one("", "boxes", gas(3, 4.0, 0), np.eye(3)[[1, 0, 2]] * 4),
+            "left-handed",
+        ),
+        (Limits(lower=True), one("", "boxes", gas(3, 4.0, 0), np.triu(np.ones((3, 3))) * 4), "lower"),
+        (
+            Limits(orthorhombic=True),
+            one("", "boxes", gas(3, 4.0, 0), np.tril(np.ones((3, 3)))),
+            "right angles",
+        ),
+        (Limits(whole_cell=True), one("", "few", gas(3, 4.0, 0)), "lacks a vector"),
+        (Limits(most_atoms=2), one("", "few", gas(3, 4.0, 0), 4.0), "at most 2"),
+        (Limits(least_cutoff=2.0), one("", "few", gas(3, 4.0, 0), 4.0), "no cutoff below 2"),
+        (Limits(roomy=10.0), one("", "boxes", gas(3, 4.0, 0), 4.0), "cells"),
+        (
+            Limits(fixed_cell=True),
+            script("", "strain", [(gas(3, 4.0, 0), edge * np.eye(3)) for edge in (4, 3.9)], 4.0),
+            "box that changes",
+        ),
+    ],
+)
+def test_each_limit_refuses_what_it_says(limits: Limits, case, why: str):
+    assert why in str(limits.refusal(case))
+    assert (
+        limits.refusal(one("", "few", gas(2, 2.0, 0) + 1.0, 4.0, r_cut=2.0)) is None
+        or limits.free
+        or limits.roomy
+    )
+
+
+def _plain(positions, cell, pbc, r_cut):
+    rows = planted_lists.search(positions, cell, pbc, r_cut)
+    return rows["i"], rows["j"]
+
+
+def test_what_a_call_does_is_told_whatever_it_is():
+    def raises(positions, cell, pbc, r_cut):
+        raise IndexError("index 4 is out of bounds")
+
+    def refuses(positions, cell, pbc, r_cut):
+        raise ValueError("cells below two cutoffs cannot be done")
+
+    def writes(positions, cell, pbc, r_cut):
+        found = _plain(positions, cell, pbc, r_cut)
+        positions += 1.0
+        return found
+
+    def forgets(positions, cell, pbc, r_cut):
+        return None
+
+    case = one("two", "few", [[0.0, 0, 0], [0.5, 0, 0]], 4.0)
+    for function, code in ((raises, "RAISED"), (writes, "CHANGED_INPUT"), (forgets, "MALFORMED")):
+        report = examine(from_object(function), asked=[case], shrink=False)
+        assert [failed.code for failed in report.failed] == [code]
+        assert not report.conforms
+    report = examine(from_object(refuses), asked=[case], shrink=False)
+    assert not report.failed and report.areas["few"].refused == 1
+    assert not report.conforms  # it has answered nothing
+
+
+def test_single_precision_is_found_out_and_ties_are_counted():
+    def coarse(positions, cell, pbc, r_cut):
+        i, j = np.triu_indices(len(positions), 1)
+        apart = (positions[j] - positions[i]).astype(np.float32)
+        apart -= np.where(pbc, np.rint(apart / np.diag(cell).astype(np.float32)), 0) * np.diag(cell).astype(
+            np.float32
+        )
+        near = np.sqrt((apart**2).sum(axis=1)) < np.float32(r_cut)
+        return i[near], j[near]
+
+    tested = from_object(coarse).with_options(
+        limits=Limits(minimum_image=True, along_axes=True, periodic=True)
+    )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        cases = [case for case in catalog() if "a hair inside" in case.name or case.area == "ties"]
+        report = examine(tested, asked=cases, shrink=False)
+    assert "float32" in report.found_out and report.single is not None
+    assert not report.failed
+    exact = from_object(planted_lists.planted(""))
+    assert examine(exact, asked=[case for case in catalog() if case.area == "ties"]).ties[0] == 0
+
+
+def test_a_process_that_crashes_or_hangs_is_a_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "sick.py").write_text(
+        "import os, signal, sys, time\n"
+        "def crashes(positions, cell, pbc, r_cut):\n"
+        "    if len(positions) == 2:\n"
+        "        print('a word on stdout'); print('bad alloc', file=sys.stderr, flush=True)\n"
+        "        os.kill(os.getpid(), signal.SIGFPE)\n"
+        "    return [], []\n"
+        "def hangs(positions, cell, pbc, r_cut):\n"
+        "    time.sleep(60)\n"
+        "def leaves(positions, cell, pbc, r_cut):\n"
+        "    os._exit(3)\n"
+    )
+    one_atom, two = one("one", "few", [[0.0, 0, 0]], 4.0), one("two", "few", [[0.0, 0, 0], [0.5, 0, 0]], 4.0)
+    session = RemoteSession(load(f"{tmp_path / 'sick.py'}:crashes"))
+    assert session.ask(one_atom)[0].answer is not None
+    crashed = session.ask(two)[0].crashed
+    assert crashed is not None and "SIGFPE" in crashed and crashed.endswith("bad alloc")
+    # and a new process answers the next question
+    assert session.ask(one_atom)[0].answer is not None
+    session.close()
+    report = examine(load(f"{tmp_path / 'sick.py'}:leaves"), asked=[two], apart=True, shrink=False)
+    assert report.failed[0].code == "CRASHED" and "exit code 3" in report.failed[0].worst.text
+    monkeypatch.setattr("mdnum.references.conformance.remote.CALL", 0.5)
+    began = time.perf_counter()
+    session = RemoteSession(load(f"{tmp_path / 'sick.py'}:hangs"))
+    assert session.ask(two)[0].late == "no answer within 0 s"
+    session.close()
+    assert time.perf_counter() - began < 50
+
+
+def test_another_process_gives_the_same_answers():
+    tested = load(f"{_PLANTED}:search")
+    case = one("a gas", "few", gas(30, 4.0, 1), 4.0)
+    session = RemoteSession(tested)
+    here, there = Session(tested).ask(case)[0].answer, session.ask(case)[0].answer
+    session.close()
+    assert here is not None and there is not None and here.same(there)
+
+
+def test_an_object_that_is_kept_is_asked_anew_only_where_it_should_be():
+    calls: list[str] = []
+
+    class Counts(planted_lists.Kept):
+        def allocate(self, *arguments):
+            calls.append("allocate")
+            return super().allocate(*arguments)
+
+        def update(self, *arguments):
+            calls.append("update")
+            return super().update(*arguments)
+
+    examiner = Examiner(from_object(Counts))
+    calls.clear()
+    start = gas(6, 6.0, 0)
+    moving = script("moving", "motion", [start, start + 0.1, start + 0.2], 6.0)
+    assert examiner.failures(moving) == []
+    assert calls == ["allocate", "update", "update"]
+    calls.clear()
+    growing = script("growing", "reuse", [start[:4], start, start], 6.0)
+    assert examiner.failures(growing) == []
+    assert calls == ["allocate", "allocate", "update"]
+    calls.clear()
+    resized = replace(from_object(Counts), limits=Limits(fixed_atoms=False))
+    Session(resized).ask(growing)
+    assert calls == ["allocate", "update"]  # it raises at the second, as this one does
+
+
+def test_lists_are_found_by_name_file_and_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    assert {"ase", "vesin", "scipy", "mdnum", "mdnum-verlet"} <= {one.name for one in installed()}
+    assert len({one.name for one in known()}) == len(known())
+    missing = next((one.name for one in known() if one.version is None), None)
+    if missing is not None:
+        with pytest.raises(InputError, match="not installed"):
+            load(missing)
+    for word, said in (
+        ("vesim", "no list that is known"),
+        ("nowhere.at.all:pairs", "cannot be imported"),
+        (f"{tmp_path}/none.py:pairs", "no such file"),
+        (f"{_PLANTED}:nothing", "has no 'nothing'"),
+        (f"{_PLANTED}:SEARCH_DEFECTS", "neither a function"),
+    ):
+        with pytest.raises(InputError, match=said):
+            load(word)
+    (tmp_path / "lists_of_mine.py").write_text(
+        "from planted_lists import search\ndef pairs(*a):\n    return search(*a)\npairs.full = True\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    found = load("lists_of_mine.py:pairs")
+    assert found.full and not found.kept and found.word and "from lists_of_mine import pairs" in found.source
+    assert load(f"{_PLANTED}:Kept").kept
+    assert os.getcwd() == str(tmp_path)

@@ -1,0 +1,92 @@
+"""`mdnum conform` as a person calls it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from command_line import call, printed
+
+from mdnum.store import RunFolder
+
+_MINE = """
+import numpy as np
+
+def nearest_image(positions, cell, pbc, r_cut):
+    i, j = np.triu_indices(len(positions), 1)
+    apart = positions[j] - positions[i]
+    if pbc.all():
+        apart = apart - np.rint(apart @ np.linalg.inv(cell)) @ cell
+    near = (apart**2).sum(axis=1) < r_cut**2
+    return i[near], j[near]
+"""
+
+
+@pytest.fixture
+def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    (tmp_path / "mine.py").write_text(_MINE)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_a_list_of_ones_own(mine: Path, capsys: pytest.CaptureFixture[str]):
+    """Findings, scripts that reproduce them in another process, a page, and the same page again."""
+    assert call("conform", "mine.py:nearest_image", "--cases", "20", "--no-large") == 1
+    lines = printed(capsys)
+    assert lines[0].startswith("mine:nearest_image failed")
+    assert any(line.startswith("error: pairs inside the cutoff are missing") for line in lines)
+    folder = mine / "runs" / "conform-mine-nearest_image-1"
+    page = (folder / "report.html").read_text()
+    assert "reproduce-1-missing.py" in page and "<svg" in page and "cells narrower than two cutoffs" in page
+    scripts = sorted(folder.glob("reproduce-*.py"))
+    assert scripts
+    done = subprocess.run([sys.executable, scripts[0]], capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and "the list is wrong" in done.stdout, done.stderr
+    summary = RunFolder.open(folder).summary
+    assert not summary["conforms"] and summary["full"] is False and summary["superset"] is False
+    assert RunFolder.open(folder).world == "conform"
+    areas = RunFolder.open(folder).read("areas")
+    assert dict(zip(areas["area"], areas["failed"], strict=True))["images"] > 5
+    assert list(RunFolder.open(folder).read("failures")["script"]) == [path.name for path in scripts]
+    (folder / "report.html").unlink()
+    assert call("report", str(folder)) == 0
+    assert (folder / "report.html").read_text() == page
+
+
+def test_limits_make_it_conform(mine: Path, capsys: pytest.CaptureFixture[str]):
+    limits = "minimum-image,orthorhombic,all-axes"
+    arguments = ("conform", "mine.py:nearest_image", "--cases", "10", "--no-large", "--limits", limits)
+    assert call(*arguments, "--json", "--no-report", "-o", "out") == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["conforms"] and not document["findings"] and document["wrong"] == 0
+    assert sum(row["skipped"] for row in document["areas"]) > 20
+    assert "gave the right pairs in all of" in document["headline"]
+    assert not (mine / "out" / "report.html").exists()
+
+
+def test_names_are_listed(capsys: pytest.CaptureFixture[str]):
+    assert call("conform") == 0
+    said = "\n".join(printed(capsys))
+    assert "vesin" in said and "not installed" in said and "package.module:function" in said
+    assert call("conform", "--json") == 0
+    rows = json.loads(capsys.readouterr().out)["lists"]
+    assert {"list", "version", "kept", "what"} == set(rows[0])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("nowhere:pairs",), "cannot be imported"),
+        (("vesim",), "no list that is known"),
+        (("mine.py:nothing",), "It has nearest_image"),
+        (("mine.py:nearest_image", "--limits", "tilted"), "no limit is called 'tilted'"),
+        (("mine.py:nearest_image", "--precision", "double"), "float64, float32"),
+    ],
+)
+def test_mistakes_are_told(mine: Path, arguments, said: str, capsys: pytest.CaptureFixture[str]):
+    assert call("conform", *arguments) == 2
+    assert said in capsys.readouterr().err
+    assert not (mine / "runs").exists()
