@@ -19,9 +19,6 @@ from mdnum.trajectories.tracker import Tracker
 
 #: Å before and after a crossing at which the energy is asked for.
 _BESIDE = 1e-7
-#: Lowest derivative that jumps, from which the work over a step needs no care: Simpson's rule takes a kink in
-#: the force's slope as it takes the fourth power of the step.
-SMOOTH_ENOUGH = 2
 
 
 class Threshold(Protocol):
@@ -186,6 +183,7 @@ def account(
     step: int,
     crossed: Sequence[Crossing],
     thresholds: Sequence[Threshold],
+    smooth: int = 2,
 ) -> Account:
     """Work of the forces along the straight way of a step, in pieces between its crossings.
 
@@ -196,6 +194,9 @@ def account(
         step: at its end.
         crossed: those of this step, by their share.
         thresholds: as `crossings` was given them.
+        smooth: order from which a threshold is passed without care: 2, for Simpson's rule takes a kink in the
+            force's slope as it takes the fourth power of the step; or 1 where there are too many kinks of the
+            force, which are as often on one side of the middle as on the other.
 
     Error:
         Simpson's rule on the way of one step, fifth power of its length; the calculator's noise.
@@ -212,7 +213,7 @@ def account(
     jumps, rest = [], 0.0
     for one in crossed:
         order = thresholds[one.threshold].order
-        if order >= SMOOTH_ENOUGH:
+        if order >= smooth:
             jumps.append(0.0)
             continue
         below, above = max(one.share - one.slack, left[0]), min(one.share + one.slack, 1.0)

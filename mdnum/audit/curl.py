@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -79,7 +79,7 @@ class Curl:
             if progress is not None:
                 progress(len(loops), len(wanted), {"phase": "curl", "unit": "loops"})
             tried = [around(worker, atoms, u, v, radius, noise, what) for radius in _RADII]
-            loops.append(min(tried, key=lambda one: one.error))
+            loops.append(agreed(tried))
         wrong = [one for one in loops if not one.conservative]
         found = [_finding(wrong, len(loops))] if wrong else []
         return Part(
@@ -97,6 +97,20 @@ class Curl:
             },
             seconds=time.perf_counter() - began,
         )
+
+
+def agreed(tried: Sequence[Loop]) -> Loop:
+    """The loop with the smallest error, which is raised where a loop of another radius says otherwise.
+
+    A curl is the same on every small circle; what a jump of the forces does to the work around one is not.
+
+    Args:
+        tried: the same plane at several radii.
+    """
+    best = min(tried, key=lambda one: one.error)
+    others = [one.curl for one in tried if _SIGNIFICANT * one.error < abs(best.curl)]
+    spread = max((abs(one - best.curl) for one in others), default=0.0)
+    return replace(best, error=max(best.error, spread))
 
 
 Plane = tuple[str, Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"]]
@@ -150,7 +164,7 @@ def around(
         what: the plane in words.
 
     Error:
-        what half of the points give otherwise, and the noise of the forces.
+        what a part of the points gives otherwise, and the noise of the forces.
     """
     angles = 2 * np.pi * np.arange(_POINTS) / _POINTS
     forces = [
@@ -160,15 +174,16 @@ def around(
     along_v = np.array([float(np.sum(force * v)) for force in forces])
     tangential = -np.sin(angles) * along_u + np.cos(angles) * along_v
     work = 2 * np.pi * radius * float(np.mean(tangential))
-    half = 2 * np.pi * radius * max(abs(float(np.mean(tangential[odd::2])) * 1.0 - float(np.mean(tangential)))
-                                    for odd in (0, 1))  # fmt: skip
+    # what a half or a third of the points say: a jump of the forces on the loop sets them apart
+    parts = [np.mean(tangential[first::every]) for every in (2, 3) for first in range(every)]
+    unsure = 2 * np.pi * radius * float(np.max(np.abs(np.array(parts) - np.mean(tangential))))
     # the first harmonics are the derivative of the forces in the plane
     uu = 2 * float(np.mean(along_u * np.cos(angles))) / radius
     vv = 2 * float(np.mean(along_v * np.sin(angles))) / radius
     uv = float(np.mean(along_u * np.sin(angles) + along_v * np.cos(angles))) / radius
     area = np.pi * radius**2
     rounding = noise.force + np.finfo(float).eps * float(np.max(np.abs([along_u, along_v])))
-    error = half + 2 * np.pi * radius * rounding / np.sqrt(_POINTS)
+    error = unsure + 2 * np.pi * radius * rounding / np.sqrt(_POINTS)
     return Loop(what, radius, work, work / area, error / area, float(np.sqrt((uu**2 + vv**2) / 2 + uv**2)))
 
 

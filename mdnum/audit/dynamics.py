@@ -82,7 +82,8 @@ class Dynamics:
         noise = along_a_line(probe, at(start, start.positions), rng)
         told(0, 0, {"phase": "accounting for the energy"})
         ledger = balance(probe, whole, start, limits, rng)
-        finer = crossings(half, start, limits)
+        # the other run's flips count only where they bring energy
+        finer = crossings(half, start, limits) if any(one.order == 0 for one in limits) else []
         stale = _stale(subject, whole, start, noise)
         result = Result(
             subject, whole, half, ledger, by_means(finer, ledger, len(half.potential)), limits, stale, noise

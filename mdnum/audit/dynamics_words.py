@@ -226,7 +226,7 @@ class _Words:
     def skipped(self, unknown: str) -> list[tuple[str, str]]:
         found = [("jumps of flips", unknown)] if unknown else []
         crossed, measured = len(self.result.ledger.crossed), len(self.result.ledger.measured)
-        if measured < crossed:
+        if measured < crossed and any(limit.order == 0 for limit in self.result.limits):
             found.append(
                 (
                     f"jumps of {crossed - measured:,} crossings",

@@ -11,7 +11,7 @@ from ase import Atoms
 from jaxtyping import Float
 
 from mdnum.audit.base import Subject
-from mdnum.audit.crossings import SMOOTH_ENOUGH, Crossing, Threshold, account, crossings
+from mdnum.audit.crossings import Crossing, Threshold, account, crossings
 from mdnum.audit.drift import Drift, drift, wandering
 from mdnum.audit.noise import Noise
 from mdnum.audit.nve import Run
@@ -54,10 +54,10 @@ def balance(
     for place, one in enumerate(crossed):
         by_step.setdefault(one.step, []).append(place)
     # a step without a crossing that needs care costs one call; of the others a sample must do
+    orders = np.array([limits[one.threshold].order for one in crossed], np.int64)
+    smooth = 2 if int((orders < 2).sum()) <= _MEASURED else 1
     careful = {
-        step: count
-        for step, places in by_step.items()
-        if (count := sum(limits[crossed[place].threshold].order < SMOOTH_ENOUGH for place in places))
+        step: count for step, places in by_step.items() if (count := int((orders[places] < smooth).sum()))
     }
     chosen: set[int] = set()
     afforded = 0
@@ -72,7 +72,7 @@ def balance(
         places = by_step.get(step, [])
         if step in careful and step not in chosen:
             continue
-        found = account(probe, whole, like, step, [crossed[place] for place in places], limits)
+        found = account(probe, whole, like, step, [crossed[place] for place in places], limits, smooth)
         rest[step] = found.rest
         measured |= dict(zip(places, found.jumps, strict=True))
     jumps = np.zeros(len(whole.potential))

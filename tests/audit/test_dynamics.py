@@ -18,7 +18,7 @@ from mdnum.audit.nve import fitting_timestep, prepared, run
 from mdnum.audit.rigid import rigid, rigid_bonds
 from mdnum.audit.thresholds import Threshold
 
-STEPS = 160
+STEPS = 120
 
 
 def hard(_=None, order: int = 0) -> list[Threshold]:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from ase import Atoms
+from ase.build import bulk
 from ase.calculators.emt import EMT
 from audit import planted
 from audit.planted import chain, crystal, subject
 from audit.test_invariance import codes
 
-from mdnum.audit.curl import Curl, around
+from mdnum.audit.curl import Curl, Loop, agreed, around
 from mdnum.audit.forces import Forces, slope
 from mdnum.audit.noise import Noise, along_a_line
 
@@ -24,8 +27,6 @@ def test_what_is_right_passes(check, make, atoms: Atoms):
 
 @pytest.mark.parametrize("check", [Forces, Curl])
 def test_ases_emt_passes(check):
-    from ase.build import bulk
-
     assert not check()(subject(EMT, bulk("Cu"))).findings
 
 
@@ -102,6 +103,29 @@ def test_noise_is_measured_within_a_factor(size: float):
 
     found = [along_a_line(subject(Shaken, chain()), chain(), rng).energy for _ in range(12)]
     assert size / 2 < np.median(found) < 2 * size
+
+
+def test_jumps_of_the_force_on_a_loop_are_no_curl():
+    """Hundreds of pairs pass a kink of the force within the loop: work around it is not the field's."""
+
+    class Kinked(planted.Good):
+        def pair(self, distances):
+            u, slope = super().pair(distances)
+            return u + 0.05 * (planted.R_CUT - distances), slope - 0.05
+
+    atoms = bulk("Ar", "sc", a=planted.R_CUT).repeat((3, 3, 2))
+    for seed in range(4):
+        assert not Curl(seed=seed)(subject(Kinked, atoms)).findings
+
+
+def test_a_curl_that_another_radius_denies_is_none():
+    """Small circles have one curl; a smaller error on one of them does not outvote the others."""
+    lucky, other = Loop("", 0.03, 0, 1e-3, 1e-5, 1.0), Loop("", 0.003, 0, 1e-7, 5e-5, 1.0)
+    assert not lucky.conservative and agreed([lucky, other]).conservative
+    same = replace(other, curl=1.01e-3)
+    assert not agreed([lucky, same]).conservative
+    # one that can tell nothing denies nothing
+    assert not agreed([lucky, replace(other, error=1.0)]).conservative
 
 
 def test_curl_of_a_known_field():

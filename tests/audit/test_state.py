@@ -31,6 +31,7 @@ def test_what_is_right_passes(make, atoms: Atoms):
     assert part.numbers["bit_identical"] and part.numbers["structures"] > 20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "make", [EMT, lambda: LennardJones(sigma=3.4, epsilon=0.01, rc=8.5)], ids=["emt", "lj"]
 )
