@@ -16,7 +16,7 @@ from ase.neighborlist import neighbor_list
 
 from mdnum.audit.base import Progress, Subject
 from mdnum.audit.jumps import SMOOTH, Jump, find_jumps, locate, measure
-from mdnum.audit.probes import molecules
+from mdnum.audit.probes import Pair, molecules, whole
 from mdnum.audit.routes import Crossing, Route
 from mdnum.audit.subject import CalculatorError
 from mdnum.audit.thresholds import STEP, Threshold, walk_pairs
@@ -28,6 +28,10 @@ _MOST_CROSSINGS = 2
 """Crossings of one threshold that are measured, each by another atom."""
 
 _CALLS_AT_CROSSING = 170
+_CALLS_ON_ROUTE = 430
+_CUT_OUT = 40
+"""Atoms of the structure that are kept where a calculation of all takes too long."""
+
 _MOST_TRIPLES = 4
 _LENGTH = 0.6
 """Of a route through the structure, length."""
@@ -66,6 +70,7 @@ class Surroundings:
         routes: names of routes that were scanned for unknown ones.
         expected: crossings of known thresholds on those routes.
         skipped: (what, why).
+        atoms: in the structure that was walked through; a part of the subject's where a calculation is slow.
     """
 
     events: tuple[Event, ...]
@@ -73,6 +78,7 @@ class Surroundings:
     routes: tuple[str, ...]
     expected: int
     skipped: tuple[tuple[str, str], ...]
+    atoms: int
 
 
 def walk_surroundings(
@@ -83,17 +89,30 @@ def walk_surroundings(
     Args:
         subject: the calculator and its structure.
         progress: called now and then.
-        seconds: about how long to look for unknown thresholds in the structure; one route is always walked.
+        seconds: about how long to measure known thresholds in the structure, and again to look for others.
     """
     walks = walk_pairs(subject).walks
     thresholds = [one for walk in walks for one in walk.thresholds]
-    groups = _groups(subject, single=bool(walks) and len(walks[0].pair.second) == 1)
-    cost = _cost(subject, groups[0])
+    single = bool(walks) and walks[0].pair.moves == "atom"
+    atoms = subject.atoms
+    groups = _groups(atoms, single)
+    cost = _cost(subject, atoms, groups[0])
     events: list[Event] = []
     skipped: list[tuple[str, str]] = []
-    affordable = max(int(seconds / (cost * _CALLS_AT_CROSSING)), len(thresholds))
-    targeted = _targeted(subject, thresholds, groups)[:affordable]
-    triples = _triples(subject) if walks and len(walks[0].pair.second) == 1 else []
+    if cost * _CALLS_ON_ROUTE > seconds and len(atoms) > _CUT_OUT and walks:
+        atoms = _cut_out(atoms, groups, walks[0].pair)
+        groups = _groups(atoms, single)
+        try:
+            cost = _cost(subject, atoms, groups[0])
+        except CalculatorError as error:
+            skipped.append((f"{_CUT_OUT} atoms cut out of the structure", error.message))
+            atoms, groups = subject.atoms, _groups(subject.atoms, single)
+    affordable = max(int(seconds / (cost * _CALLS_AT_CROSSING)), 1)
+    targeted = _targeted(atoms, thresholds, groups)
+    if len(targeted) > affordable:
+        skipped.append((f"{len(targeted) - affordable} more crossings of known thresholds", "a lack of time"))
+        targeted = targeted[:affordable]
+    triples = _triples(subject) if single else []
     total = len(targeted) + len(triples) + 1
     for k, (route, crossing) in enumerate(targeted):
         if progress:
@@ -104,7 +123,10 @@ def walk_surroundings(
             skipped.append((route.name, error.message))
     scanned: list[str] = []
     expected = 0
-    for k, (route, low, high) in enumerate([*triples, *_random(subject, groups, seconds / cost)]):
+    random = _random(atoms, groups, seconds / cost)
+    if not random:
+        skipped.append(("routes through the structure", f"one calculation takes {cost:.2g} s"))
+    for k, (route, low, high) in enumerate([*triples, *random]):
         if progress:
             progress(min(len(targeted) + k, total - 1), total, {"phase": route.name})
         try:
@@ -115,14 +137,30 @@ def walk_surroundings(
         scanned.append(route.name)
         events += found
         expected += known
-    return Surroundings(tuple(events), len(targeted), tuple(scanned), expected, tuple(skipped))
+    return Surroundings(tuple(events), len(targeted), tuple(scanned), expected, tuple(skipped), len(atoms))
 
 
-def _groups(subject: Subject, single: bool) -> list[np.ndarray]:
+def _groups(atoms: Atoms, single: bool) -> list[np.ndarray]:
     """What moves together: single atoms, or molecules where the calculator takes nothing less."""
     if single:
-        return [np.array([k]) for k in range(len(subject.atoms))]
-    return molecules(subject.atoms)
+        return [np.array([k]) for k in range(len(atoms))]
+    return molecules(atoms)
+
+
+def _cut_out(atoms: Atoms, groups: Sequence[np.ndarray], pair: Pair) -> Atoms:
+    """The groups nearest to the first, in one piece, in the surroundings of a pair; their order is kept."""
+    center = _lead(atoms, groups[0])
+    offsets = atoms.get_distances(center, np.arange(len(atoms)), mic=bool(atoms.pbc.any()), vector=True)
+    nearest = np.argsort([np.linalg.norm(offsets[_lead(atoms, group)]) for group in groups])
+    count = max(_CUT_OUT // max(len(groups[0]), 1), 4)
+    chosen = [groups[k] for k in sorted(nearest[:count])]
+    parts = [whole(atoms, group) for group in chosen]
+    for part, group in zip(parts, chosen, strict=True):
+        part.positions += offsets[_lead(atoms, group)] + pair.box / 2
+    cut = Atoms(cell=[pair.box] * 3 if pair.box else None, pbc=pair.periodic)
+    for part in parts:
+        cut += part
+    return cut
 
 
 def _lead(atoms: Atoms, group: np.ndarray) -> int:
@@ -130,10 +168,9 @@ def _lead(atoms: Atoms, group: np.ndarray) -> int:
 
 
 def _targeted(
-    subject: Subject, thresholds: Sequence[Threshold], groups: Sequence[np.ndarray]
+    atoms: Atoms, thresholds: Sequence[Threshold], groups: Sequence[np.ndarray]
 ) -> list[tuple[Route, Crossing]]:
     """For each threshold, a few pairs of the structure near it, moved through it along their line."""
-    atoms = subject.atoms
     of_lead = {_lead(atoms, group): group for group in groups}
     symbols = np.array(atoms.get_chemical_symbols())
     ranked: list[tuple[int, Route, Crossing]] = []
@@ -224,21 +261,21 @@ def _triples(subject: Subject) -> list[tuple[Route, float, float]]:
     return found
 
 
-def _cost(subject: Subject, group: np.ndarray) -> float:
+def _cost(subject: Subject, atoms: Atoms, group: np.ndarray) -> float:
     """Seconds of a calculation after the first."""
-    subject.forces(subject.atoms)  # whatever is made at the first question is made
+    subject.forces(atoms)  # whatever is made at the first question is made
     begin = time.perf_counter()
     for k in (1, 2, 3):
-        subject.forces(Route("", subject.atoms, group, int(group[0]), np.eye(3)[0]).at(k * 1e-3))
+        subject.forces(Route("", atoms, group, int(group[0]), np.eye(3)[0]).at(k * 1e-3))
     return max((time.perf_counter() - begin) / 3, 1e-5)
 
 
 def _random(
-    subject: Subject, groups: Sequence[np.ndarray], affordable: float
+    atoms: Atoms, groups: Sequence[np.ndarray], affordable: float
 ) -> list[tuple[Route, float, float]]:
     """Routes of some atoms in arbitrary directions, as many as so many calculations allow."""
-    atoms = subject.atoms
-    count = int(np.clip(affordable / (_LENGTH / STEP + 400), 1, 8))
+    # one in any case, unless it alone takes several times what was allowed
+    count = int(np.clip(affordable / _CALLS_ON_ROUTE, affordable > _CALLS_ON_ROUTE / 4, 8))
     rng = np.random.default_rng(0)
     found: list[tuple[Route, float, float]] = []
     for k in rng.permutation(len(groups))[:count]:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations_with_replacement
+from typing import Literal
 
 import numpy as np
 from ase import Atoms
+from jaxtyping import Float
 
 from mdnum.audit.base import Subject
 from mdnum.audit.jumps import Curve
@@ -28,10 +30,10 @@ class Pair:
         species: symbols of the two reference atoms; molecules by the heaviest of their atoms.
         first: the particle that stays, its reference atom at the origin.
         second: the particle that moves along x, its reference atom at the origin.
-        lead: index of second's reference atom.
         box: edge of the cubic cell around them, 0 for none.
         periodic: whether the cell repeats.
         name: formulas of the two.
+        moves: what such a particle is in the structure, an atom or a molecule.
     """
 
     species: tuple[str, str]
@@ -40,6 +42,7 @@ class Pair:
     box: float
     periodic: bool
     name: str
+    moves: Literal["atom", "molecule"] = "atom"
 
     def at(self, distance: float) -> Atoms:
         """The two at a distance (of the reference atoms), which is exact in the last bit."""
@@ -50,6 +53,13 @@ class Pair:
             both.set_cell([self.box] * 3)
         both.pbc = self.periodic
         return both
+
+    def others(self, distance: float) -> Float[np.ndarray, "pairs"]:
+        """Distances between the two of all atoms but the reference atoms, at a distance of those."""
+        between = np.linalg.norm(
+            self.second.positions[None] + [distance, 0.0, 0.0] - self.first.positions[:, None], axis=2
+        )
+        return between.ravel()[1:]
 
     def curve(self, subject: Subject) -> Curve:
         """Energy against distance, and the force that drives the second away from the first."""
@@ -65,7 +75,9 @@ class Pair:
 def pairs(subject: Subject, most: int = 6) -> tuple[list[Pair], list[tuple[str, str]]]:
     """Two of each species of the structure that the calculator answers for, the most frequent first.
 
-    Single atoms where it takes them; where it takes none (rigid water), molecules of the structure.
+    Single atoms where it takes them as near as they come in the structure; where it does not (a bond order
+    may divide by the number of neighbors), each with two companions behind it; where it takes no such atoms
+    at all (rigid water), molecules of the structure.
 
     Returns:
         (pairs, what was left out and why).
@@ -74,13 +86,18 @@ def pairs(subject: Subject, most: int = 6) -> tuple[list[Pair], list[tuple[str, 
     species = sorted(set(symbols), key=lambda one: (-symbols.count(one), one))
     wanted = list(combinations_with_replacement(species, 2))
     wanted.sort(key=lambda two: -symbols.count(two[0]) * symbols.count(two[1]))
+    nearest = _nearest(subject.atoms)
     found: list[Pair] = []
     skipped: list[tuple[str, str]] = []
     for one, other in wanted[:most]:
-        pair, why = _answered(subject, (one, other), Atoms(one, [(0, 0, 0)]), Atoms(other, [(0, 0, 0)]))
+        single, another = (Atoms(symbol, [(0, 0, 0)]) for symbol in (one, other))
+        pair, why = _answered(subject, (one, other), single, another, nearest)
         if pair is None:
-            skipped.append((f"pair {one}-{other}", why))
-        else:
+            skipped.append((f"two atoms {one}-{other} by themselves", why))
+            if nearest:
+                trios = _trio(one, nearest, -1.0), _trio(other, nearest, 1.0)
+                pair, _ = _answered(subject, (one, other), trios[0], trios[1], nearest)
+        if pair is not None:
             found.append(pair)
     skipped += [
         (f"pair {one}-{other}", f"the {most} most frequent pairs were walked") for one, other in wanted[most:]
@@ -90,6 +107,20 @@ def pairs(subject: Subject, most: int = 6) -> tuple[list[Pair], list[tuple[str, 
         if pair is not None:
             return [pair], skipped
     return found, skipped
+
+
+def _nearest(atoms: Atoms) -> float:
+    """Smallest distance of two atoms of a structure; 0 where there is one atom."""
+    if len(atoms) < 2:
+        return 0.0
+    distances = atoms[: min(len(atoms), 500)].get_all_distances(mic=bool(atoms.pbc.any()))
+    return float(distances[~np.eye(len(distances), dtype=bool)].min())
+
+
+def _trio(symbol: str, side: float, way: float) -> Atoms:
+    """An atom at the origin with two companions behind it."""
+    depth = way * side * np.sqrt(0.75)
+    return Atoms([symbol] * 3, [(0, 0, 0), (depth, side / 2, 0), (depth, -side / 2, 0)])
 
 
 def molecules(atoms: Atoms) -> list[np.ndarray]:
@@ -120,8 +151,8 @@ def _molecules(subject: Subject) -> Pair | None:
         return None
     one, other = (whole(subject.atoms, group) for group in _two_alike(subject.atoms, groups))
     leads = [part.get_chemical_symbols()[int(np.argmax(part.get_masses()))] for part in (one, other)]
-    pair, _ = _answered(subject, (leads[0], leads[1]), one, other)
-    return pair
+    pair, _ = _answered(subject, (leads[0], leads[1]), one, other, 0.0)
+    return replace(pair, moves="molecule") if pair else None
 
 
 def _part(atoms: Atoms, indices: np.ndarray) -> Atoms:
@@ -140,7 +171,7 @@ def _two_alike(atoms: Atoms, groups: Sequence[np.ndarray]) -> tuple[np.ndarray, 
 
 
 def _answered(
-    subject: Subject, species: tuple[str, str], first: Atoms, second: Atoms
+    subject: Subject, species: tuple[str, str], first: Atoms, second: Atoms, nearest: float
 ) -> tuple[Pair | None, str]:
     """The simplest surroundings in which the calculator gives energy and forces, or why there are none."""
     why = ""
@@ -148,7 +179,9 @@ def _answered(
         box = 2.5 * FARTHEST if cell else 0.0
         name = "-".join(part.get_chemical_formula() for part in (first, second))
         pair = Pair(species, first, second, box, periodic, name)
-        for distance in (3.0, 6.0):
+        for distance in (nearest, 3.0, 6.0):
+            if not distance:
+                continue
             atoms = pair.at(distance)
             try:
                 with only_trying(subject):

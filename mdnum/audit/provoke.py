@@ -90,7 +90,7 @@ def crowd(
     alike = [
         walk
         for walk in walk_pairs(subject).walks
-        if walk.pair.species[0] == walk.pair.species[1] and len(walk.pair.first) == 1
+        if walk.pair.species[0] == walk.pair.species[1] and walk.pair.moves == "atom"
     ]
     for k, walk in enumerate(alike):
         if progress:

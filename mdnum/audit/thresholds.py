@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -177,11 +177,21 @@ def walk(subject: Subject, pair: Pair, step: float = STEP) -> PairWalk:
         distance = np.append(coarse[(coarse >= near) & (coarse < near + margin)], scanned)
     if edge is not None:
         thresholds = _with_edge(pair, curve, edge, thresholds, near)
+    thresholds = [
+        one for one in thresholds if pair.moves == "molecule" or not _of_others(pair, one, thresholds)
+    ]
     values = curve.many(distance)
     return PairWalk(
         pair, tuple(sorted(thresholds, key=lambda one: one.radius)), distance, values[0] - energy_far,
         values[1], thresholds[-1].radius if edge and thresholds else None, left_out, len(curve.known),
     )  # fmt: skip
+
+
+def _of_others(pair: Pair, threshold: Threshold, thresholds: Sequence[Threshold]) -> bool:
+    """Whether it is companions of the two that pass another threshold there."""
+    others = pair.others(threshold.radius)
+    radii = [one.radius for one in thresholds if one is not threshold]
+    return any(np.abs(others - radius).min() < 1e-5 for radius in radii) if len(others) else False
 
 
 def _coarse(subject: Subject, curve: Curve) -> tuple[Float[np.ndarray, "points"], float]:

@@ -18,12 +18,8 @@ from mdnum.audit.subject import CalculatorSubject
 from mdnum.audit.thresholds import find_thresholds, walk_pairs
 
 COPPER = Path(__file__).parents[2] / "systems" / "copper" / "cu.eam.alloy"
-SILICON = {
-    ("Si", "Si", "Si"): {
-        "m": 3.0, "gamma": 1.0, "lambda3": 0.0, "c": 1.0039e5, "d": 16.217, "h": -0.59825, "n": 0.78734,
-        "beta": 1.1e-6, "lambda2": 1.7322, "B": 471.18, "R": 2.85, "D": 0.15, "lambda1": 2.4799, "A": 1830.8,
-    }
-}  # fmt: skip
+#: J. Tersoff, Phys. Rev. B 38, 9902 (1988), in the order of LAMMPS
+SILICON = "Si Si Si 3 1 0 1.0039e5 16.217 -0.59825 0.78734 1.1e-6 1.7322 471.18 2.85 0.15 2.4799 1830.8\n"
 
 
 def cluster() -> laws.Atoms:
@@ -83,7 +79,7 @@ def test_crossings_on_a_route_are_those_of_a_fine_scan():
 
 
 def test_what_is_said_of_a_hard_cutoff():
-    part = Smoothness(seconds=1.0, neighbors=8)(subject(lambda: Pairwise(laws.hard), cluster()))
+    part = Smoothness(seconds=0.3, neighbors=8)(subject(lambda: Pairwise(laws.hard), cluster()))
     assert codes(part) == {"ENERGY_JUMP": "error"}
     (found,) = part.findings
     assert repr(float(np.nextafter(R_CUT, 0.0))) in found["text"]
@@ -95,7 +91,7 @@ def test_what_is_said_of_a_hard_cutoff():
 
 def test_what_is_said_of_a_shift_and_of_switches():
     said = {
-        name: codes(Smoothness(seconds=1.0, neighbors=8)(subject(lambda law=law: Pairwise(law), cluster())))
+        name: codes(Smoothness(seconds=0.3, neighbors=8)(subject(lambda law=law: Pairwise(law), cluster())))
         for name, law in {
             "shifted": laws.shifted, "once": laws.switched(1), "twice": laws.switched(2),
         }.items()
@@ -118,11 +114,15 @@ def test_what_is_said_of_a_shift_and_of_switches():
         ("ase.calculators.tip4p:TIP4P(rc=5.5, width=1.0)", [(4.5, 2), (5.5, 2)]),
         ("ase.calculators.emt:EMT", [(5.8768, 0)]),
         (f"ase.calculators.eam:EAM(potential={str(COPPER)!r})", [(5.50679, 1)]),
-        (f"ase.calculators.tersoff:Tersoff({SILICON!r})", [(2.7, 2), (3.0, 2)]),
+        ("ase.calculators.tersoff:Tersoff.from_lammps('silicon.tersoff')", [(2.7, 2), (3.0, 2)]),
     ],
     ids=["lj", "lj smooth", "morse", "tip3p", "tip4p", "emt", "eam", "tersoff"],
 )
-def test_ases_own(words: str, expected: list[tuple[float, int]]):
+def test_ases_own(
+    words: str, expected: list[tuple[float, int]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    (tmp_path / "silicon.tersoff").write_text(SILICON)
+    monkeypatch.chdir(tmp_path)
     loaded = load_calculator(words)
     asked = CalculatorSubject(words, loaded.make, default_structure(loaded))
     (walk,) = walk_pairs(asked).walks
