@@ -131,7 +131,9 @@ COLUMNS: Mapping[str, Mapping[str, pa.DataType]] = MappingProxyType(
         ),
         "neighbors": _columns(rule=_SHORT, neighbors=_INT, counted=_INT),
         "residues": _columns(rule=_SHORT, residue=_TEXT, between=_INT, within=_INT),
-        "busiest": _columns(rule=_SHORT, i=_SHORT, j=_SHORT, rank=_SHORT, flips=_INT, inside=_INT),
+        "busiest": _columns(
+            rule=_SHORT, i=_SHORT, j=_SHORT, rank=_SHORT, flips=_INT, inside=_INT, first=_TEXT, second=_TEXT,
+        ),
         "apart": _columns(
             frame=_INT, time=_FLOAT, time_b=_FLOAT, furthest=_FLOAT, typical=_FLOAT, atom=_SHORT,
             pairs_a=_INT, pairs_b=_INT, only_a=_INT, only_b=_INT,

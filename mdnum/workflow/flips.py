@@ -134,7 +134,11 @@ def _look(
         columns = flips_numbers.curves(counted, pairs, steps["interval"])
         folder.append("lifetimes", {"rule": np.full(len(pairs_of(columns)), number), **columns})
         busiest = {name: getattr(counted.busiest, name) for name in counted.busiest.__dataclass_fields__}
-        folder.append("busiest", {"rule": np.full(len(counted.busiest.i), number), **busiest})
+        words = {
+            name: flips_numbers.atom_words(trajectory.table, busiest[of])
+            for name, of in (("first", "i"), ("second", "j"))
+        }
+        folder.append("busiest", {"rule": np.full(len(words["first"]), number), **busiest, **words})
         _append_residues(folder, number, counted, labels)
         rows = {name: values[mine] for name, values in frames.items()}
         told.append(

@@ -82,6 +82,15 @@ def labels(table: Any) -> Labels:
     return Labels(species, coded(table.residue_names), (table.residues, words))
 
 
+def atom_words(table: Any, atoms: np.ndarray) -> list[str]:
+    """What atoms are called: "GLY 12 CA", or their names where there are no residues."""
+    found = []
+    for at in atoms:
+        residue = f"{table.residue_names[at]} {table.residue_ids[at]} " if table.residue_names[at] else ""
+        found.append(f"{residue}{table.names[at]}")
+    return found
+
+
 def histories(folder: RunFolder, rule: int, frames: int) -> Iterator[tuple[int, int, History]]:
     """(part, parts, history of some of the pairs) until every pair of a rule had its turn."""
     streams = {name: TableStream(folder.path, name, folder.world) for name in ("members", "flips")}

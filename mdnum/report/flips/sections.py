@@ -11,7 +11,7 @@ from mdnum.report.browse import Browse, Column, plain_rows
 from mdnum.report.flips.words import duration, length, per_time, rule_words
 from mdnum.report.flips.words import life as life_of
 from mdnum.report.fork.question import Question
-from mdnum.report.words import count, number, percent
+from mdnum.report.words import count, many, number, percent
 
 #: Rows of a table that is not searched.
 _ROWS = 15
@@ -46,7 +46,7 @@ def _numbers(run: Question, one: Mapping[str, Any]) -> Iterator[tuple[str, str]]
     )
     yield (
         "Undecidable",
-        f"{count(one['ambiguous'])} flips; {number(one['near_mean'], 3)} pairs within the file's resolution "
+        f"{many(one['ambiguous'], 'flip')}; {number(one['near_mean'], 3)} pairs within the file's resolution "
         "of "
         "their threshold at an average frame",
     )
@@ -82,14 +82,16 @@ def _lifetimes(run: Question, one: Mapping[str, Any]) -> Iterator[tuple[str, str
             f"{duration(run, life['quarter_gone'])} and {duration(run, life['three_quarters_gone'])}",
         )
     if life["mean"] is not None:
-        cut = "" if life["mean_is_whole"] else f", cut off at {duration(run, life['longest'])}: at least"
-        yield "Mean life (product-limit)", f"{duration(run, life['mean'])}{cut}"
+        told = duration(run, life["mean"])
+        if not life["mean_is_whole"]:
+            told = f"at least {told}: some last longer than they can be followed"
+        yield "Mean life (product-limit)", told
     if life["leaves"]:
         error = duration(run, life["mean_by_rate_error"], 2)
         yield (
             "Mean life (by rate)",
             f"{duration(run, life['mean_by_rate'])} ± {error}: time inside over {count(life['leaves'])} "
-            "leaves",
+            "leaves (the error is that of independent ones)",
         )
     yield (
         "Intermittent contacts",
@@ -146,12 +148,13 @@ def pairs(run: Question) -> Browse | None:
     table = run.tables["busiest"]
     if not len(table["i"]):
         return None
+    words = [f"{a} – {b}" for a, b in zip(table["first"], table["second"], strict=True)]
     several = len(run.summary["rules"]) > 1
     share = table["inside"] / run.summary["frames"]
     ranks = np.concatenate([np.arange(1, n + 1) for n in np.unique(table["rule"], return_counts=True)[1]])
     columns: list[tuple[np.ndarray, int | None]] = [(ranks, None)]
     columns += [(table[name].astype(int), None) for name in ("i", "j", "rank", "flips", "inside")]
-    columns += [(share, 3), (table["rule"].astype(int), None)]
+    columns += [(share, 3), (table["rule"].astype(int), None), (np.array(words, dtype=object), None)]
     names = tuple(one["rule"] for one in run.summary["rules"])
     return Browse(
         name="pairs",
@@ -163,6 +166,7 @@ def pairs(run: Question) -> Browse | None:
             *((Column(7, "rule", kind="word", words=names),) if several else ()),
             Column(1, "pair", kind="pair"),
             *((Column(3, "image", kind="count"),) if table["rank"].any() else ()),
+            Column(8, "of", kind="text"),
             Column(4, "flips", kind="count"),
             Column(5, "frames inside", kind="count"),
             Column(6, "share of frames"),
