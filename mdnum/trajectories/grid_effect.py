@@ -22,6 +22,8 @@ from mdnum.trajectories.source import Trajectory
 _DRAWS = 200_000
 # Displacements are read off where they are this many steps of the grid long, if frames are so far apart.
 _CLEAR = 2.0
+# Displacements are taken as they are where rounding makes up no more than the rest of their variance.
+_MOSTLY = 0.8
 # Pairs are drawn this many standard deviations of a displacement around the cutoff.
 _WIDE = 4.0
 
@@ -94,7 +96,7 @@ def grid_effect(
 
     Error: the two atoms of a pair are taken to move independently and straight on, and pairs to be spread
         evenly around the cutoff; the draws themselves scatter by about 1 % of the shares. In an LJ liquid
-        whose float64 positions were known the shares were right to 0.01 at strides of 0.002 to 0.1 τ
+        whose float64 positions were known the shares were right to 0.01 at strides of 0.0002 to 0.1 τ
         (tests/trajectories/test_resolution.py).
     """
     if len(sample) < 2 or not len(sample[0].positions):
@@ -154,9 +156,32 @@ def _moves(sample: Sequence[Frame], size: float) -> tuple[Float[np.ndarray, "ato
         moves = total - total.mean(axis=0)
         if np.sqrt((moves**2).mean()) >= _CLEAR * size:
             break
-    variance, noise = float((moves**2).mean()), size**2 / 6
-    keep = np.sqrt(max(variance - noise, 0.0) / variance) if variance else 0.0
+    variance = float((moves**2).mean())
+    true = _unrounded(variance, size)
+    if true < _MOSTLY * variance:
+        # most atoms seem to stand still and some to hop: what they do in truth has lost its shape
+        moves = np.random.default_rng(0).normal(scale=np.sqrt(true), size=moves.shape)
+        return moves / max(lag, 1), lag
+    keep = np.sqrt(true / variance) if variance else 0.0
     return moves * (keep / max(lag, 1)), lag
+
+
+def _unrounded(variance: float, size: float) -> float:
+    """Variance of displacements whose ends, rounded to multiples of size, differ with this variance.
+
+    A displacement of f steps beyond a whole number of them gains size² f (1 - f) on average over where it
+    begins. Over displacements with variance v from a normal distribution that is (by its Fourier series)
+    size² (1/6 - sum over k of exp(-2 π² k² v / size²) / (π k)²).
+    """
+    low, high, k = 0.0, variance, np.arange(1, 200)
+    for _ in range(60):
+        middle = (low + high) / 2
+        waves = np.exp(-2 * (np.pi * k) ** 2 * middle / size**2) / (np.pi * k) ** 2
+        if middle + size**2 * (1 / 6 - waves.sum()) > variance:
+            high = middle
+        else:
+            low = middle
+    return low
 
 
 def _shortest(d: Float[np.ndarray, "atoms 3"], box: Box) -> Float[np.ndarray, "atoms 3"]:

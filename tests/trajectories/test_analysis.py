@@ -202,16 +202,25 @@ def moving(frames=6, atoms=20, box=30.0):
 @pytest.mark.parametrize("value", [np.nan, np.inf, 0.0])
 def test_a_spoiled_frame_is_named_and_what_was_before_is_kept(parts, value):
     universe = moving()
-    universe.trajectory.get_array()[4, 3:9] = value
+    universe.trajectory.get_array()[2, 3:9] = value
     analysis = NeighborFlips(universe, 8.0)
-    with pytest.raises(FrameError, match=r"frame 4: atom 3") as caught:
+    with pytest.raises(FrameError, match=r"frame 2: atom 3") as caught:
         analysis.run(n_parts=parts)
-    assert caught.value.frame == 4 and "5 others" in str(caught.value)
-    good = NeighborFlips(moving(), 8.0).run(stop=4)
+    assert caught.value.frame == 2 and "5 others" in str(caught.value)
+    good = NeighborFlips(moving(), 8.0).run(stop=2)
+    assert len(good.results.flips)
     equal(analysis.results.rules[0], good.results.rules[0])
-    assert analysis.frames.tolist() == [0, 1, 2, 3] == good.frames.tolist()
+    assert analysis.frames.tolist() == [0, 1] == good.frames.tolist()
     # an atom that is not looked at spoils nothing
     NeighborFlips(universe.atoms[10:], 8.0).run()
+
+
+def test_an_atom_that_is_far_away_and_not_looked_at_widens_no_bound():
+    far, near = moving(), moving()
+    far.trajectory.get_array()[:, 3] += 1e6
+    bounds = [NeighborFlips(one.atoms[10:], 8.0).run().results.bound for one in (far, near)]
+    np.testing.assert_array_equal(*bounds)
+    assert (bounds[0] < 1e-4).all()
 
 
 def test_a_frame_of_zeros_is_named():

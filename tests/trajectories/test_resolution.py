@@ -98,15 +98,15 @@ def test_floats_are_no_grid_however_few_there_are(seed, atoms):
 
 
 def test_the_sites_of_a_crystal_are_no_resolution():
-    sites = 2.5 * np.stack(np.meshgrid(*[np.arange(4.0)] * 3), -1).reshape(-1, 3)
+    # a wall of 13,824 atoms that stand still, and one that moves
+    wall = 2.5 * np.stack(np.meshgrid(*[np.arange(24.0)] * 3), -1).reshape(-1, 3)
     random = np.random.default_rng(0)
-    frames = [sites, *(sites + random.normal(scale=0.1, size=sites.shape) for _ in range(3))]
-    # the first frame and the frozen wall would look like steps of 0.5
-    for frame in frames:
-        frame[:16] = sites[:16]
-    found = infer_from(frames_of(frames, 10 * np.eye(3)))
+    frames = [wall.copy() for _ in range(5)]
+    for frame in frames[1:]:
+        frame[1] += random.normal(size=3)
+    found = infer_from(frames_of(frames, 60 * np.eye(3)))
     assert found.kind == "float64" and found.moved
-    still = infer_from(frames_of(frames[:1], 10 * np.eye(3)))
+    still = infer_from(frames_of(frames[:1], 60 * np.eye(3)))
     assert still.kind == "grid" and "may be the structure's" in still.words()
 
 
@@ -166,6 +166,15 @@ def test_what_the_grid_of_an_xtc_does_to_flips(stride, timestep):
     assert effect.missed == pytest.approx(missed, abs=0.04)
     assert effect.invented == pytest.approx(invented, abs=0.04)
     assert f"{100 * effect.missed:.2g} %" in effect.words()
+
+
+@pytest.mark.parametrize("speed", [0.0002, 0.001, 0.004, 0.1])
+def test_what_rounding_adds_to_displacements_is_taken_off(speed):
+    random = np.random.default_rng(0)
+    start, velocity = random.uniform(0, 60, (20_000, 3)), speed * random.normal(size=(20_000, 3))
+    frames = frames_of([quantized(start + k * velocity, 0.01) for k in range(8)], 60 * np.eye(3))
+    effect = grid_effect(infer_from(frames), frames, CUTOFF, draws=1000)
+    assert effect is not None and effect.move == pytest.approx(speed, rel=0.02 if speed > 0.001 else 0.05)
 
 
 def test_doubles_hide_nothing():

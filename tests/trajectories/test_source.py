@@ -98,6 +98,16 @@ def test_a_charmm_box_is_turned_as_its_coordinates_are():
     assert other.box.matrix[0, 1] == 0 and abs(other.box.matrix[1, 0]) > 1
 
 
+def test_cosines_near_zero_are_no_symmetric_box(tmp_path):
+    with DCDFile(str(tmp_path / "run.dcd"), "w") as file:
+        file.write_header(remarks="", natoms=2, istart=0, nsavc=1, delta=1.0, is_periodic=1)
+        # lengths, and cosines of the angles between
+        file.write(xyz=np.eye(2, 3, dtype=np.float32), box=np.array([30.0, 0.001, 31.0, 0.0, 0.002, 32.0]))
+    matrix = next(open_trajectory(tmp_path / "run.dcd").frames()).box.matrix
+    np.testing.assert_allclose(np.linalg.norm(matrix, axis=1), [30, 31, 32], rtol=1e-6)
+    assert matrix[0, 1] == 0 and matrix[1, 0] == pytest.approx(31 * 0.001, rel=1e-2)
+
+
 @pytest.mark.parametrize("name", ["GRO", "GRO_velocity", "two_water_gro"])
 def test_gro_keeps_the_digits_of_the_text(name):
     path = getattr(datafiles, name)
@@ -258,11 +268,11 @@ def test_memory_does_not_grow_with_frames(tmp_path):
 
 
 def test_selections_are_one_language(tmp_path):
-    trajectory = open_trajectory(datafiles.XTC, datafiles.GRO)
-    universe = MDAnalysis.Universe(datafiles.GRO, datafiles.XTC)
-    for words in ("name OW", "protein", "resname SOL and around 4 protein"):
-        np.testing.assert_array_equal(select(trajectory, words), universe.select_atoms(words).indices)
-    assert len(select(trajectory, "element O")) == (trajectory.species == "O").sum()
+    for path, topology in ((datafiles.NCDF, datafiles.PRMncdf), (datafiles.XTC, datafiles.GRO)):
+        trajectory, universe = open_trajectory(path, topology), MDAnalysis.Universe(topology, path)
+        for words in ("protein", "name O and around 4 resid 1"):
+            np.testing.assert_array_equal(select(trajectory, words), universe.select_atoms(words).indices)
+        assert len(select(trajectory, "element O")) == (trajectory.species == "O").sum()
     images = [Atoms("NaCl", [[0.2, 0, 0], [2.0, 0, 0]], cell=[5, 5, 5], pbc=True)]
     ase.io.write(tmp_path / "salt.traj", images)
     salt = open_trajectory(tmp_path / "salt.traj")
