@@ -154,7 +154,7 @@ def _conduct(run: Question) -> Iterator[Finding]:
             "TIES",
             "info",
             "pairs at exactly the cutoff are decided one way and the other",
-            f"Whole numbers, whose distances no arithmetic rounds: {_ties(ties)}.",
+            f"Whole numbers, whose distances need no rounding: {_ties(ties)}.",
             "Compare squares of distances, or distances, in one place.",
         )
     if "float32" in summary["found_out"]:
