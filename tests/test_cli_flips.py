@@ -46,7 +46,9 @@ def test_water_around_a_protein(capsys, tmp_path, monkeypatch):
     lines = printed(capsys)
     assert "47,681 atoms, 4 frames 100 ps apart" in lines[1]
     assert any("multiple of 0.01 Å" in line for line in lines)
-    assert any(line.startswith("warning: most contacts that begin are over by the next frame") for line in lines)
+    assert any(
+        line.startswith("warning: most contacts that begin are over by the next frame") for line in lines
+    )
     assert lines[-1] == "wrote runs/flips-adk_oplsaa-1"
     assert call("flips", f"{XTC}@:4", "-s", GRO, *words, "--json") == 1
     told = json.loads(capsys.readouterr().out)
@@ -102,3 +104,20 @@ def test_a_file_that_breaks_off_is_kept_as_far_as_it_goes(capsys, tmp_path):
     if told["status"] == "stopped":
         assert told["findings"][0]["code"] == "STOPPED" and f"frame {told['frames']}" in told["stopped"]
     assert 3 <= told["frames"] <= 5 and (tmp_path / "f" / "flips.parquet").exists()
+
+
+def test_the_library_gives_the_ledger_that_the_verb_writes(capsys, tmp_path):
+    import MDAnalysis
+
+    from mdnum.store import RunFolder
+    from mdnum.trajectories import NeighborFlips
+
+    words = ("-s", PSF, "--cutoff", "8", "--between", "name CA", "name CA", "-o", str(tmp_path / "f"))
+    call("flips", DCD, *words, "--no-report")
+    capsys.readouterr()
+    universe = MDAnalysis.Universe(PSF, DCD)
+    found = NeighborFlips(universe.select_atoms("name CA"), r_cut=8.0).run()
+    written = RunFolder.open(tmp_path / "f").read("flips")
+    assert len(written["frame"]) == len(found.results.flips) > 4_000
+    for name in ("frame", "i", "j", "rank", "entered", "distance", "margin", "before"):
+        np.testing.assert_array_equal(written[name], getattr(found.results.flips, name))
