@@ -185,7 +185,7 @@ def square_of(x, i, j, s0, s1, s2, vectors):
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def rounded_image(x, i, j, inverse, periodic):
-    """Lattice vector to add to j that brings it near i, by rounding: the nearest where that is near enough."""
+    """Lattice vector to add to j that brings it near i, by rounding: nearest where that is near enough."""
     y0, y1, y2 = x[j, 0] - x[i, 0], x[j, 1] - x[i, 1], x[j, 2] - x[i, 2]
     n0, n1, n2 = 0, 0, 0
     if periodic[0]:

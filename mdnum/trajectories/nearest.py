@@ -1,4 +1,4 @@
-"""Directed neighbors: the nearest few of each atom, and how far each decision is from coming out otherwise."""
+"""Directed neighbors: the nearest few of each atom, and how far each decision is from being another."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ import numba
 import numpy as np
 from jaxtyping import Float
 
+from mdnum.trajectories.candidates import DIRECTED
 from mdnum.trajectories.lattice import Lattice, own_images
-from mdnum.trajectories.pairs import DIRECTED, Rows, Sides, rows_of, search
+from mdnum.trajectories.pairs import Rows, Sides, rows_of, search
 from mdnum.trajectories.rules import Capped, Nearest
 
 

@@ -20,8 +20,10 @@ import numba
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from mdnum.trajectories.bins import lattice_vector
+from mdnum.trajectories.candidates import BAND
 from mdnum.trajectories.lattice import Lattice
-from mdnum.trajectories.pairs import BAND, Found, Sides, exact_square, lattice_vector, search
+from mdnum.trajectories.pairs import Found, Sides, exact_square, search
 
 #: a skin is meant to last this many frames; shorter than the least, a fresh search is as good
 FRAMES, FEWEST = 16.0, 4.0
@@ -111,7 +113,7 @@ def displaced(
     home: Int[np.ndarray, "atoms 3"],
     radius: float,
 ) -> float:
-    """How much nearer or further any two atoms at most `radius` apart can have come between two frames, length.
+    """How much nearer or further two atoms at most `radius` apart can have come between two frames, length.
 
     Args:
         home: lattice vectors taken off each atom; those that atoms were moved by in between are added.
@@ -156,7 +158,7 @@ def listed(
     clear: float,
     room: int = 0,
 ) -> Superset:
-    """A list made at this frame; arguments as of `pairs.search`, and what it must hold at any time, length."""
+    """A list made at this frame; arguments as of `pairs.search`, and what it must always hold, length."""
     found = search(
         positions, lattice, sides, radii, BAND,
         band=skin, bound=bound, guard=guard, narrow=clear, open_room=room,
@@ -197,8 +199,8 @@ def _group(i_in, j_in, code_in, value, skin, start, i, j, code, due, inside):
 
 @numba.njit(cache=True, nogil=True)
 def _evaluate(
-    x, home, vectors, species, radius, square, i, j, code, due, inside, start, earliest, gone, limit, bound, slack,
-    chosen, flip, tally, smallest,
+    x, home, vectors, species, radius, square, i, j, code, due, inside, start, earliest,
+    gone, limit, bound, slack, chosen, flip, tally, smallest,
 ):  # fmt: skip
     """Look at the pairs that are due; flips go into `flip`, counts into tally = (flips, close, looked at)."""
     block = chosen.shape[0]
@@ -266,16 +268,16 @@ def look(
     chosen, tally = np.empty(1024, np.int64), np.zeros(3, np.int64)
     square, slack = np.where(radii >= 0, radii * radii, -1.0), 1e-6 * superset.skin
     smallest = np.inf
-    # mostly the pairs at hand hold the nearest of all; where they may not, those that can be nearer are due too
+    # mostly the pairs at hand hold the nearest of all; where they may not, those that can be are due too
     seen = max(bound, 0.02 * superset.last)
     for reach in (seen, max(bound, horizon)):
         if smallest <= seen:
             break
         tally[1] = 0
         smallest = _evaluate(
-            positions, found.home, lattice.vectors, sides.species, radii, square, found.i, found.j, found.code,
-            superset.due, superset.inside, superset.start, superset.earliest, superset.gone, superset.gone + min(smallest, reach), bound, slack,
-            chosen, flip, tally, smallest,
+            positions, found.home, lattice.vectors, sides.species, radii, square,
+            found.i, found.j, found.code, superset.due, superset.inside, superset.start, superset.earliest,
+            superset.gone, superset.gone + min(smallest, reach), bound, slack, chosen, flip, tally, smallest,
         )  # fmt: skip
     k = flip[: int(tally[0])]
     return Looked(

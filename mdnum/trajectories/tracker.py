@@ -9,12 +9,14 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mdnum.errors import InputError
+from mdnum.trajectories.candidates import INSIDE
 from mdnum.trajectories.changes import compared, image_distances
 from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.lattice import Lattice, lattice_of, own_images
 from mdnum.trajectories.nearest import chosen
-from mdnum.trajectories.pairs import INSIDE, Rows, Sides, ordered, ranks, rows_of, search
-from mdnum.trajectories.rules import Capped, Cutoff, Nearest, Rule, SpeciesCutoffs
+from mdnum.trajectories.pairs import Rows, ordered, ranks, rows_of, search
+from mdnum.trajectories.participants import Participants, indices, participants
+from mdnum.trajectories.rules import Capped, Nearest, Rule
 from mdnum.trajectories.superset import Superset, displaced, listed, look, skin_for
 from mdnum.trajectories.table import Flips, Members
 
@@ -79,7 +81,7 @@ class Tracker:
             first, second = second, None
         self.rule = rule
         self.bound = float(bound)
-        self._first, self._second = _indices(first, "first"), _indices(second, "second")
+        self._first, self._second = indices(first, "first"), indices(second, "second")
         if rule.needs_species and species is None:
             raise InputError(
                 f"{rule.name} needs to know which species the atoms are of",
@@ -90,6 +92,7 @@ class Tracker:
         self._atoms = -1
         self._open, self._room = 0, 0
         self._list: Superset | None = None
+        self._who: Participants
         self._box: Box | None = None
         self._last: Moment | None = None
         self.frames = 0
@@ -137,7 +140,7 @@ class Tracker:
         i, j = i[order], j[order]
         rank = ranks(i, j)
         distance = self._distances(now, i, j, rank)
-        return Members(self._labels[i], self._labels[j], rank, distance)
+        return Members(self._who.labels[i], self._who.labels[j], rank, distance)
 
     # ---- one frame
 
@@ -145,7 +148,7 @@ class Tracker:
         """A frame that can be decided on."""
         positions, largest = self._checked(frame)
         lattice = self._lattice_of(frame)
-        radius = self._radius
+        radius = self._who.radius
         rounding = lattice.rounding(largest, radius if np.isfinite(radius) else 4.0 * largest)
         if np.isfinite(radius) and rounding > 1e-3 * radius:
             raise InputError(
@@ -154,7 +157,9 @@ class Tracker:
                 where=f"frame {frame.index}",
             )
         none = np.zeros(0)
-        return Moment(positions, lattice, rounding, None, np.zeros(len(self._radii), np.int64), none, none)
+        return Moment(
+            positions, lattice, rounding, None, np.zeros(len(self._who.radii), np.int64), none, none
+        )
 
     def _lattice_of(self, frame: Frame) -> Lattice:
         box, last = frame.box, self._box
@@ -172,7 +177,7 @@ class Tracker:
         rule, bound = self.rule, self.bound + now.rounding
         if isinstance(rule, Nearest | Capped):
             made = chosen(
-                positions, lattice, self._sides, rule,
+                positions, lattice, self._who.sides, rule,
                 band=max(bound, HORIZON * rule.reach if np.isfinite(rule.reach) else 0.0, 4 * rounding),
                 bound=bound, guard=rounding,
             )  # fmt: skip
@@ -180,11 +185,11 @@ class Tracker:
             horizon = HORIZON * rule.reach
             self.min_margin = made.rows.smallest if made.rows.smallest <= horizon else np.inf
             return replace(now, rows=made.rows, last_in=made.last_in, first_out=made.first_out)
-        horizon = HORIZON * self._radius
+        horizon = HORIZON * self._who.radius
         rows = self._rows(now)
         own, close, smallest = self._own(lattice, bound)
         smallest = min(rows.smallest, smallest)
-        self.pairs = len(rows.other) + int((own * self._both_count).sum())
+        self.pairs = len(rows.other) + int((own * self._who.own).sum())
         self.near = rows.close + close
         self.min_margin = smallest if smallest <= horizon else np.inf
         return replace(now, rows=rows, own=own)
@@ -193,10 +198,10 @@ class Tracker:
         """The neighbors at a moment; searched for where they have not been listed."""
         if moment.rows is not None:
             return moment.rows
-        bound = self.bound + moment.rounding
+        bound, guard = self.bound + moment.rounding, moment.rounding
         found = search(
-            moment.positions, moment.lattice, self._sides, self._radii, INSIDE,
-            band=max(bound, HORIZON * self._radius, 4 * moment.rounding), bound=bound, guard=moment.rounding,
+            moment.positions, moment.lattice, self._who.sides, self._who.radii, INSIDE,
+            band=max(bound, HORIZON * self._who.radius, 4 * guard), bound=bound, guard=guard,
             room=int(1.1 * (self.pairs + self._open)), open_room=int(1.2 * self._open),
         )  # fmt: skip
         self._open = found.open
@@ -204,22 +209,22 @@ class Tracker:
 
     def _own(self, lattice: Lattice, bound: float) -> tuple[np.ndarray, int, float]:
         """Images of an atom itself that are inside, by species; how many are close; the smallest |margin|."""
-        inside = np.zeros(len(self._radii), np.int64)
+        inside = np.zeros(len(self._who.radii), np.int64)
         close, smallest = 0, np.inf
-        reach = float(self._radii.max(initial=0.0)) * (1.0 + HORIZON) + bound
+        reach = float(self._who.radii.max(initial=0.0)) * (1.0 + HORIZON) + bound
         squares = own_images(lattice, reach)
-        for kind, radius in enumerate(np.diag(self._radii)):
-            if radius < 0 or not self._both_count[kind]:
+        for kind, radius in enumerate(np.diag(self._who.radii)):
+            if radius < 0 or not self._who.own[kind]:
                 continue
             inside[kind] = int((squares < radius * radius).sum())
             margins = np.abs(radius - np.sqrt(squares))
-            close += int((margins <= bound).sum()) * int(self._both_count[kind])
+            close += int((margins <= bound).sum()) * int(self._who.own[kind])
             smallest = min(smallest, float(margins.min(initial=np.inf)))
         return inside, close, smallest
 
     def _own_members(self, moment: Moment) -> np.ndarray:
-        """Each atom as often as images of its own are inside (not those of directed rules, which list them)."""
-        times = np.where(self._both, moment.own[self._kinds], 0)
+        """Each atom as often as images of its own are inside (directed rules list them with the others)."""
+        times = np.where(self._who.both, moment.own[self._who.sides.species], 0)
         return np.repeat(np.arange(len(times)), times)
 
     # ---- two frames
@@ -228,20 +233,20 @@ class Tracker:
         """The flips as the list in use tells them; None where it cannot."""
         held = self._list
         assert held is not None
-        clear = max(self.bound + now.rounding, HORIZON * self._radius)
-        if not held.serves(held.gone, now.lattice, self._radius, clear):
+        clear = max(self.bound + now.rounding, HORIZON * self._who.radius)
+        if not held.serves(held.gone, now.lattice, self._who.radius, clear):
             return None
         came = displaced(
             before.positions, before.lattice, now.positions, now.lattice, held.found.home,
-            self._radius + 2.0 * held.skin,
+            self._who.radius + 2.0 * held.skin,
         )  # fmt: skip
         held.gone += came + 8.0 * max(before.rounding, now.rounding)
         held.last = came
-        if not held.serves(held.gone, now.lattice, self._radius, clear):
+        if not held.serves(held.gone, now.lattice, self._who.radius, clear):
             return None
-        horizon = HORIZON * self._radius
+        horizon = HORIZON * self._who.radius
         seen = look(
-            held, now.positions, now.lattice, self._sides, self._radii,
+            held, now.positions, now.lattice, self._who.sides, self._who.radii,
             bound=self.bound + now.rounding, horizon=horizon,
         )  # fmt: skip
         self.pairs += 2 * int(seen.entered.sum()) - len(seen.entered)
@@ -251,21 +256,21 @@ class Tracker:
     def _keep_list(self, before: Moment, now: Moment) -> None:
         """Make a list at this frame where the one in use will not last another, or there is none yet."""
         held, bound = self._list, self.bound + now.rounding
-        clear = max(bound, HORIZON * self._radius)
+        clear = max(bound, HORIZON * self._who.radius)
         if held is not None:
             came = held.last
-            if held.serves(held.gone + 1.5 * came, now.lattice, self._radius, clear):
+            if held.serves(held.gone + 1.5 * came, now.lattice, self._who.radius, clear):
                 return
         else:
             home = np.zeros((len(now.positions), 3), np.int64)
             came = displaced(
-                before.positions, before.lattice, now.positions, now.lattice, home, 1.5 * self._radius
+                before.positions, before.lattice, now.positions, now.lattice, home, 1.5 * self._who.radius
             )  # fmt: skip
         self._list = None
-        skin = skin_for(came, self._radius, clear, now.lattice)
+        skin = skin_for(came, self._who.radius, clear, now.lattice)
         if skin > 0:
             self._list = listed(
-                now.positions, now.lattice, self._sides, self._radii, skin,
+                now.positions, now.lattice, self._who.sides, self._who.radii, skin,
                 bound=bound, guard=now.rounding, clear=clear, room=int(1.1 * self._room),
             )  # fmt: skip
             self._room = len(self._list.due)
@@ -275,7 +280,7 @@ class Tracker:
         if (before.own != now.own).any():
             parts = [(i, j, rank, entered)]
             for kind in np.flatnonzero(before.own != now.own):
-                atoms = np.flatnonzero(self._both & (self._kinds == kind))
+                atoms = np.flatnonzero(self._who.both & (self._who.sides.species == kind))
                 low, high = sorted((int(before.own[kind]), int(now.own[kind])))
                 a = np.repeat(atoms, high - low)
                 yes = np.full(len(a), bool(now.own[kind] > before.own[kind]))
@@ -287,7 +292,7 @@ class Tracker:
         """The flips as columns, from indices among the atoms that take part."""
         if not self.rule.directed:
             i, j = np.minimum(i, j), np.maximum(i, j)
-        key = i * np.int64(len(self._labels)) + j
+        key = i * np.int64(len(self._who.labels)) + j
         if (key[1:] < key[:-1]).any() or (rank[1:] < rank[:-1]).any():
             order = np.lexsort((rank, key))
             i, j, rank, entered = i[order], j[order], rank[order], entered[order]
@@ -296,11 +301,11 @@ class Tracker:
             margin = np.where(entered, now.last_in[i], now.first_out[i]) - distance
             earlier = np.where(entered, before.first_out[i], before.last_in[i]) - old
         else:
-            radius = self._radii[self._kinds[i], self._kinds[j]]
+            radius = self._who.radii[self._who.sides.species[i], self._who.sides.species[j]]
             margin, earlier = radius - distance, radius - old
         bound = self.bound + max(before.rounding, now.rounding)
         return Flips(
-            np.full(len(i), self.frames, np.int64), self._labels[i], self._labels[j], rank, entered,
+            np.full(len(i), self.frames, np.int64), self._who.labels[i], self._who.labels[j], rank, entered,
             distance, old, margin, earlier, np.full(len(i), bound),
             (np.abs(margin) <= bound) | (np.abs(earlier) <= bound),
         )  # fmt: skip
@@ -317,7 +322,10 @@ class Tracker:
         """Positions of the atoms that take part, and the largest coordinate."""
         atoms = len(frame.positions)
         if self._atoms < 0:
-            self._prepare(atoms)
+            self._atoms, self._who = (
+                atoms,
+                participants(self.rule, self._first, self._second, self._species, atoms),
+            )
         if atoms != self._atoms:
             raise InputError(
                 f"{atoms} atoms, {self._atoms} in the frames before",
@@ -325,72 +333,15 @@ class Tracker:
                 where=f"frame {frame.index}",
             )
         positions = np.asarray(frame.positions, np.float64)
-        if not self._all:
-            positions = positions[self._labels]
+        if not self._who.all:
+            positions = positions[self._who.labels]
         positions = np.array(positions, order="C")
         largest = float(np.abs(positions).max(initial=0.0))
         if not np.isfinite(largest):
             at = int(np.flatnonzero(~np.isfinite(positions).all(axis=1))[0])
             raise InputError(
-                f"atom {int(self._labels[at])} is at {positions[at].tolist()}",
+                f"atom {int(self._who.labels[at])} is at {positions[at].tolist()}",
                 remedy="Stop before this frame (a slice of the file), and find out why the run broke",
                 where=f"frame {frame.index}",
             )
         return positions, largest
-
-    def _prepare(self, atoms: int) -> None:
-        """Number the atoms that take part, once their number is known."""
-        everyone = np.arange(atoms)
-        first = everyone if self._first is None else self._first
-        second = first if self._second is None else self._second
-        for name, chosen_atoms in (("first", first), ("second", second)):
-            if len(chosen_atoms) and chosen_atoms.max() >= atoms:
-                raise InputError(
-                    f"atom {int(chosen_atoms.max())} is selected, but frames have {atoms} atoms (from 0)",
-                    remedy="Select atoms of this trajectory",
-                    where=name,
-                )
-        if self._species is not None and len(self._species) != atoms:
-            raise InputError(
-                f"{len(self._species)} species for frames of {atoms} atoms",
-                remedy="Use the topology that belongs to the trajectory",
-                where="species",
-            )
-        self._atoms = atoms
-        self._labels = np.union1d(first, second).astype(np.int64)
-        self._all = len(self._labels) == atoms
-        centers, others = np.isin(self._labels, first), np.isin(self._labels, second)
-        if (centers == others).all():
-            others = centers
-        kinds, radii = self._kinds_and_radii()
-        self._radius = float(radii.max(initial=0.0))
-        self._kinds, self._radii, self._both = kinds, radii, centers & others
-        self._sides = Sides(centers, others, kinds)
-        self._both_count = np.bincount(kinds[self._both], minlength=len(radii))
-
-    def _kinds_and_radii(self) -> tuple[np.ndarray, np.ndarray]:
-        rule, none = self.rule, np.zeros(len(self._labels), np.int64)
-        if isinstance(rule, SpeciesCutoffs):
-            assert self._species is not None
-            # species of atoms that do not take part count too: a selection may hold none of one
-            kinds, radii = rule.table(list(self._species))
-            return kinds[self._labels], radii
-        if isinstance(rule, Cutoff):
-            return none, np.array([[float(rule.radius)]])
-        return none, np.array([[float(rule.reach)]])
-
-
-def _indices(chosen_atoms, where: str) -> np.ndarray | None:
-    """Sorted atom numbers, each once."""
-    if chosen_atoms is None:
-        return None
-    made = np.asarray(chosen_atoms)
-    if made.size == 0:
-        return np.zeros(0, np.int64)
-    if made.ndim != 1 or made.dtype.kind not in "iu" or made.min() < 0:
-        raise InputError(
-            f"expected whole numbers from 0, got {made.dtype} of shape {made.shape}",
-            remedy="Give the indices of the atoms in the trajectory, from 0",
-            where=where,
-        )
-    return np.unique(made.astype(np.int64))

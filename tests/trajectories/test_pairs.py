@@ -12,9 +12,9 @@ from trajectories import brute_force
 from trajectories.boxes import atoms, boxes
 
 from mdnum.errors import InputError
+from mdnum.trajectories.bins import grid_for
 from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.lattice import image_square, lattice_of, own_images
-from mdnum.trajectories.pairs import grid_for
 from mdnum.trajectories.rules import Cutoff
 from mdnum.trajectories.tracker import HORIZON, Tracker
 

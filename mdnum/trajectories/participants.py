@@ -1,0 +1,110 @@
+"""Which atoms of a trajectory take part in a rule, on which side, and with which radii."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from mdnum.errors import InputError
+from mdnum.trajectories.pairs import Sides
+from mdnum.trajectories.rules import Cutoff, Rule, SpeciesCutoffs
+
+
+@dataclass(frozen=True)
+class Participants:
+    """The atoms that take part, numbered among themselves.
+
+    Attributes:
+        labels: their numbers in the file, ascending.
+        all: whether they are all atoms of the file.
+        sides: who is asked for neighbors, and who can be one.
+        radii: by species, length; negative for pairs that are never inside.
+        both: atoms on both sides: images of themselves can be their neighbors.
+        own: how many of those there are, by species.
+    """
+
+    labels: Int[np.ndarray, "participants"]
+    all: bool
+    sides: Sides
+    radii: Float[np.ndarray, "species species"]
+    both: Bool[np.ndarray, "participants"]
+    own: Int[np.ndarray, "species"]
+
+    @property
+    def radius(self) -> float:
+        """Largest radius, length."""
+        return float(self.radii.max(initial=0.0))
+
+
+def participants(
+    rule: Rule,
+    first: Int[np.ndarray, "first"] | None,
+    second: Int[np.ndarray, "second"] | None,
+    species: np.ndarray | None,
+    atoms: int,
+) -> Participants:
+    """Number the atoms that take part.
+
+    Args:
+        first, second: as of `Tracker`, sorted.
+        species: of each atom of the file.
+        atoms: of the file.
+    Raises:
+        InputError: an atom that is not there; as many species as atoms are expected.
+    """
+    everyone = np.arange(atoms)
+    first = everyone if first is None else first
+    second = first if second is None else second
+    for name, chosen in (("first", first), ("second", second)):
+        if len(chosen) and chosen.max() >= atoms:
+            raise InputError(
+                f"atom {int(chosen.max())} is selected, but frames have {atoms} atoms (from 0)",
+                remedy="Select atoms of this trajectory",
+                where=name,
+            )
+    if species is not None and len(species) != atoms:
+        raise InputError(
+            f"{len(species)} species for frames of {atoms} atoms",
+            remedy="Use the topology that belongs to the trajectory",
+            where="species",
+        )
+    labels = np.union1d(first, second).astype(np.int64)
+    centers, others = np.isin(labels, first), np.isin(labels, second)
+    if (centers == others).all():
+        # the same array: pairs within one set are searched for from one side only
+        others = centers
+    kinds, radii = _kinds_and_radii(rule, labels, species)
+    both = centers & others
+    own = np.bincount(kinds[both], minlength=len(radii))
+    return Participants(labels, len(labels) == atoms, Sides(centers, others, kinds), radii, both, own)
+
+
+def _kinds_and_radii(
+    rule: Rule, labels: np.ndarray, species: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
+    none = np.zeros(len(labels), np.int64)
+    if isinstance(rule, SpeciesCutoffs):
+        assert species is not None
+        # species of atoms that do not take part count too: a selection may hold none of one
+        kinds, radii = rule.table(list(species))
+        return kinds[labels], radii
+    return none, np.array([[float(rule.radius if isinstance(rule, Cutoff) else rule.reach)]])
+
+
+def indices(chosen: Sequence[int] | np.ndarray | None, where: str) -> np.ndarray | None:
+    """Sorted atom numbers, each once."""
+    if chosen is None:
+        return None
+    made = np.asarray(chosen)
+    if made.size == 0:
+        return np.zeros(0, np.int64)
+    if made.ndim != 1 or made.dtype.kind not in "iu" or made.min() < 0:
+        raise InputError(
+            f"expected whole numbers from 0, got {made.dtype} of shape {made.shape}",
+            remedy="Give the indices of the atoms in the trajectory, from 0",
+            where=where,
+        )
+    return np.unique(made.astype(np.int64))
