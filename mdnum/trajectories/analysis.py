@@ -19,10 +19,11 @@ from MDAnalysis.core.groups import AtomGroup, UpdatingAtomGroup
 from MDAnalysis.core.universe import Universe
 
 from mdnum.errors import InputError
+from mdnum.trajectories.boxes import Boxes
 from mdnum.trajectories.checked import FrameError, check_frame
 from mdnum.trajectories.frame import Frame
 from mdnum.trajectories.joined import Part, RuleResult, joined
-from mdnum.trajectories.mdanalysis_source import READING_FAILS, Boxes, first_line, frame_of, table_of
+from mdnum.trajectories.mdanalysis_source import READING_FAILS, first_line, frame_of, table_of
 from mdnum.trajectories.resolution import SAMPLE, Resolution, infer_from
 from mdnum.trajectories.rules import Cutoff, Rule, SpeciesCutoffs
 from mdnum.trajectories.source import UnreadableFrame

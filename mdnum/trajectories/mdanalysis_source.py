@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from mdnum.errors import InputError
-from mdnum.trajectories.frame import Box, Frame
+from mdnum.trajectories.boxes import Boxes
+from mdnum.trajectories.frame import Frame
 from mdnum.trajectories.slices import chosen
 from mdnum.trajectories.source import AtomTable, Trajectory, UnreadableFrame
 
@@ -33,7 +33,7 @@ class MDAnalysisTrajectory(Trajectory):
         with_elements(self._universe, self.table)
         trajectory = self._universe.trajectory
         self.format = str(trajectory.format if isinstance(trajectory.format, str) else trajectory.format[0])
-        self.length = "Å"
+        self.length = _length_of(trajectory)
         self.time = "frame" if _has_no_times(trajectory, said) else "ps"
         self.notes = tuple(notes_on(self.table))
 
@@ -89,39 +89,6 @@ def bytes_left(trajectory: Any) -> int:
     return max(Path(path).stat().st_size - head - first - (int(trajectory.n_frames) - 1) * other, 0)
 
 
-class Boxes:
-    """The boxes of an MDAnalysis trajectory, turned as its coordinates are.
-
-    MDAnalysis keeps lengths and angles, from which a box has its first vector along x. So have the boxes of
-    most programs, but CHARMM's are symmetric matrices (since version 22, and in dcd files), and lengths and
-    angles alone would put images into wrong places.
-
-    Args:
-        trajectory: MDAnalysis's reader.
-    """
-
-    def __init__(self, trajectory: Any):
-        self._dcd: Any = None
-        if "DCD" in trajectory.format and getattr(trajectory, "filename", None) is not None:
-            from MDAnalysis.lib.formats.libdcd import DCDFile
-
-            self._dcd = DCDFile(str(trajectory.filename))
-
-    def box(self, ts: Any, number: int) -> Box:
-        """The box of a timestep that is this frame of the file."""
-        box = box_of(ts.dimensions)
-        if self._dcd is None or not box.periodic or np.count_nonzero(box.matrix) == 3:
-            return box
-        self._dcd.seek(number)
-        xx, xy, yy, xz, yz, zz = np.asarray(self._dcd.read().unitcell, np.float64)
-        symmetric = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        # in these places stand cosines otherwise, or angles, which give other lengths
-        lengths = np.sqrt((symmetric**2).sum(axis=1))
-        cosines = max(abs(xy), abs(xz), abs(yz)) <= 1
-        known = not cosines and np.allclose(lengths, ts.dimensions[:3], rtol=1e-5)
-        return Box(symmetric, box.pbc) if known else box
-
-
 def frame_of(ts: Any, number: int, boxes: Boxes, untimed: bool = False) -> Frame:
     """A frame from an MDAnalysis timestep, copied."""
     return Frame(
@@ -131,30 +98,6 @@ def frame_of(ts: Any, number: int, boxes: Boxes, untimed: bool = False) -> Frame
         box=boxes.box(ts, number),
         velocities=np.array(ts.velocities, np.float64) if ts.has_velocities else None,
     )
-
-
-def box_of(dimensions: Float[np.ndarray, "6"] | None) -> Box:
-    """The box with these lengths and angles: a along x, b in the xy plane, as MDAnalysis has it.
-
-    Args:
-        dimensions: lengths in Å and angles in degrees; None where the frame has no box. An axis of length 0
-            with right angles does not repeat.
-
-    Error: MDAnalysis keeps lengths and angles in float32: lattice vectors are off by 1e-7 of themselves.
-    """
-    from MDAnalysis.lib.mdamath import triclinic_vectors
-
-    if dimensions is None or not np.any(dimensions):
-        return Box()
-    lengths, angles = np.asarray(dimensions[:3], np.float64), np.asarray(dimensions[3:], np.float64)
-    if (lengths == 0).any() and (angles == 90).all():
-        return Box(np.diag(lengths), lengths > 0)
-    with np.errstate(invalid="ignore"):
-        matrix = np.asarray(triclinic_vectors(dimensions, dtype=np.float64), np.float64)
-    if not matrix.any():
-        # lengths and angles that no box has: left for whoever needs the box to refuse
-        matrix = np.full((3, 3), np.nan)
-    return Box(matrix, np.ones(3, bool))
 
 
 def open_universe(
@@ -180,11 +123,21 @@ def open_universe(
                     remedy="Give the topology that the trajectory was written with, or a selection of it",
                     where=str(path),
                 )
-            _opened(path, lambda: universe.load_new(str(path), format=format), path)
+            _opened(path, lambda: _loaded(universe, path, format), path)
         # a topology without coordinates has no trajectory at all
         if not len(getattr(universe, "trajectory", ())):
             raise InputError("the file holds no frame", remedy="Check how it was written", where=str(path))
     return universe, [str(one.message) for one in caught]
+
+
+def _loaded(universe: Any, path: Path, format: str | None) -> None:
+    try:
+        universe.load_new(str(path), format=format)
+    except ValueError as error:
+        # an H5MD file may say nothing of its units
+        if "convert_units" not in str(error):
+            raise
+        universe.load_new(str(path), format=format, convert_units=False)
 
 
 def topology_universe(topology: str | Path) -> Any:
@@ -233,12 +186,14 @@ def atoms_in(path: Path, topology: int, format: str | None = None) -> int | None
     """
     from MDAnalysis.core._get_readers import get_reader_for
 
-    try:
-        reader: Any = get_reader_for(str(path), format=format)
-        return int(reader.parse_n_atoms(str(path), n_atoms=topology))
-    except Exception:
-        # a format without that question, or a file that opening will say more about
-        return None
+    for known in ({"n_atoms": topology}, {}):
+        try:
+            reader: Any = get_reader_for(str(path), format=format)
+            return int(reader.parse_n_atoms(str(path), **known))
+        except Exception:
+            # a format without that question, or a file that opening will say more about
+            continue
+    return None
 
 
 def table_of(atoms: Any) -> AtomTable:
@@ -294,11 +249,23 @@ def _element(name: str, known: dict[str, int]) -> str:
     return found if found in known else ""
 
 
+def _length_of(trajectory: Any) -> str:
+    """Unit of length in words; "" where the file has one of its own (GSD)."""
+    unit = trajectory.units.get("length")
+    if unit is None or getattr(trajectory, "convert_units", True):
+        return "Å" if unit else ""
+    # left as they are, because the file did not name all its units
+    return "Å" if str(unit) in ("A", "Angstrom", "angstrom") else str(unit)
+
+
 def _has_no_times(trajectory: Any, said: list[str]) -> bool:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         _ = trajectory.dt
-    return any("no dt information" in one for one in [*said, *(str(w.message) for w in caught)])
+    # a frame may have its time without a step between frames
+    return "time" not in trajectory.ts.data and any(
+        "no dt information" in one for one in [*said, *(str(w.message) for w in caught)]
+    )
 
 
 def notes_on(table: AtomTable) -> Iterator[str]:

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from mdnum.errors import InputError
+from mdnum.trajectories.boxes import box_of
 from mdnum.trajectories.frame import Frame
-from mdnum.trajectories.mdanalysis_source import box_of, first_line, notes_on
+from mdnum.trajectories.mdanalysis_source import first_line, notes_on
 from mdnum.trajectories.slices import chosen
 from mdnum.trajectories.source import AtomTable, Trajectory, UnreadableFrame, table_of_topology
 from mdnum.trajectories.xtc import XtcFile, XtcFrame

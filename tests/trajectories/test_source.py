@@ -108,6 +108,41 @@ def test_cosines_near_zero_are_no_symmetric_box(tmp_path):
     assert matrix[0, 1] == 0 and matrix[1, 0] == pytest.approx(31 * 0.001, rel=1e-2)
 
 
+def test_the_tilt_of_a_hoomd_box_is_no_cosine(tmp_path):
+    hoomd = pytest.importorskip("gsd.hoomd")
+    with hoomd.open(str(tmp_path / "run.gsd"), "w") as file:
+        for size in (10.0, 10.0, 11.0):
+            frame = hoomd.Frame()
+            frame.particles.N, frame.particles.types = 2, ["A"]
+            frame.particles.position = np.eye(2, 3, dtype=np.float32)
+            frame.configuration.box = [size, 8.0, 9.0, 0.5, -0.25, 0.125]
+            file.append(frame)
+    trajectory = open_trajectory(tmp_path / "run.gsd")
+    assert trajectory.length == "" and trajectory.species.tolist() == ["A", "A"]
+    for frame, size in zip(trajectory.frames(), (10.0, 10.0, 11.0), strict=True):
+        np.testing.assert_array_equal(frame.box.matrix, [[size, 0, 0], [4, 8, 0], [-2.25, 1.125, 9]])
+
+
+def test_the_vectors_of_an_h5md_box_point_where_they_do(tmp_path):
+    h5py = pytest.importorskip("h5py")
+    universe = MDAnalysis.Universe(datafiles.two_water_gro)
+    matrix = np.array([[0.0, 20.0, 1.0], [18.0, 0.0, 0.5], [3.0, 2.0, -22.0]])
+    with MDAnalysis.Writer(str(tmp_path / "run.h5md"), 6) as writer:
+        universe.dimensions = [20, 21, 22, 80, 85, 95]
+        writer.write(universe)
+        writer.write(universe)
+    with h5py.File(tmp_path / "run.h5md", "r+") as file:
+        file["particles/trajectory/box/edges/value"][1] = matrix
+    trajectory = open_trajectory(tmp_path / "run.h5md", datafiles.two_water_gro)
+    # MDAnalysis converts where all units are named, and here that of time is not
+    assert trajectory.length == "nm"
+    frames = list(trajectory.frames())
+    np.testing.assert_allclose(frames[1].box.matrix, matrix, rtol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(frames[0].box.matrix, axis=1), [2.0, 2.1, 2.2], rtol=1e-6)
+    with pytest.raises(InputError, match=r"47,681 atoms and the trajectory 6"):
+        open_trajectory(tmp_path / "run.h5md", datafiles.GRO)
+
+
 @pytest.mark.parametrize("name", ["GRO", "GRO_velocity", "two_water_gro"])
 def test_gro_keeps_the_digits_of_the_text(name):
     path = getattr(datafiles, name)
