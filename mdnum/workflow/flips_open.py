@@ -112,7 +112,9 @@ def sample_of(trajectory: Trajectory) -> list[Frame]:
 def name_of(trajectory: Trajectory) -> str:
     """What a file is called on a page; a run's trajectory by its folder, because all have one name."""
     own = trajectory.path.name == "trajectory.traj"
-    return trajectory.path.resolve().parent.name if own else trajectory.name
+    name = trajectory.path.resolve().parent.name if own else trajectory.name
+    frames = _slice_words(trajectory.slice)
+    return f"{name}@{frames}" if frames else name
 
 
 def about(trajectory: Trajectory, question: str) -> dict[str, Any]:
@@ -145,7 +147,8 @@ def told_resolution(resolution: Resolution, trajectory: Trajectory) -> dict[str,
 def _slice_words(frames: slice) -> str:
     if frames == slice(None):
         return ""
-    return ":".join("" if end is None else str(end) for end in (frames.start, frames.stop, frames.step))
+    ends = [frames.start, frames.stop, *([] if frames.step in (None, 1) else [frames.step])]
+    return ":".join("" if end is None else str(end) for end in ends)
 
 
 def refuse_topology_first(first: str | Path, second: str | Path, topology: str | Path | None) -> None:

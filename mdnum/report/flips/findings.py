@@ -105,6 +105,8 @@ def _stopped(run: Question) -> Iterator[Finding]:
 
 def _times(run: Question) -> Iterator[Finding]:
     summary = run.summary
+    if summary["frames"] < 2:
+        return
     if not summary["has_times"]:
         yield Finding(
             "NO_TIMES",
