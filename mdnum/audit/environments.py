@@ -186,7 +186,7 @@ def _targeted(
             used.add(int(first[k]))
             direction = vector[k] / distance[k]
             route = Route(
-                f"atom {first[k]} ({one}) toward atom {second[k]} ({other})",
+                f"atom {first[k]} ({one}) toward {second[k]} ({other})",
                 atoms, of_lead[int(first[k])], int(first[k]), direction,
             )  # fmt: skip
             crossing = Crossing(float(distance[k] - threshold.radius), int(second[k]), threshold)
@@ -204,7 +204,7 @@ def _at_crossing(subject: Subject, route: Route, crossing: Crossing) -> Event:
     exact = crossing.threshold.order < 2
     if exact:
         low, high = locate(curve, crossing.threshold.order, low, high)
-    jump = measure(curve, low, high, STEP, exact, bend=not exact)
+    jump = measure(curve, low, high, STEP, exact, curved=not exact)
     return _event(subject, route, jump, crossing)
 
 

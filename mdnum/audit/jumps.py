@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from mdnum.audit.curve import Curve, bend, bisect, close, grid, scatter, slope
+
 #: A value is predicted half a spacing beyond the last of four points (Lagrange's cubic).
 _EXTRAPOLATE = np.array([-0.3125, 1.3125, -2.1875, 2.1875])
-#: One-sided first derivative from five points, error fourth power of the spacing.
-_SLOPE = np.array([-25.0, 48.0, -36.0, 16.0, -3.0]) / 12.0
 
 _DIVISIONS = 24
 _NARROWER = 6
@@ -30,37 +30,9 @@ _OUTLIER = 4.0
 _SURE = 6.0
 """A jump this many times what rounding and truncation could make of nothing is one."""
 
-_CLOSER = (3e-9, 1e-7, 1e-6, 1e-5)
-"""Spacings (relative) at which scatter is looked for: a float32 calculator is constant over the first."""
-
-_WIDTHS = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2)
-"""Spacings from which a one-sided slope is taken; the one with the smallest error is kept."""
 
 SMOOTH = 3
 """Order given to a threshold at which neither energy, force nor curvature jumps, and no more is known."""
-
-
-class Curve:
-    """Energy and force along one coordinate, each place evaluated once.
-
-    Args:
-        at: gives (energy, force = -dE/dx) at a coordinate.
-    """
-
-    def __init__(self, at: Callable[[float], tuple[float, float]]):
-        self._at = at
-        self.known: dict[float, tuple[float, float]] = {}
-
-    def __call__(self, x: float) -> tuple[float, float]:
-        """(energy, force) at x."""
-        x = float(x)
-        if x not in self.known:
-            self.known[x] = self._at(x)
-        return self.known[x]
-
-    def many(self, places: Sequence[float] | np.ndarray) -> Float[np.ndarray, "2 points"]:
-        """Energies and forces as rows."""
-        return np.array([self(float(x)) for x in places]).T
 
 
 @dataclass(frozen=True)
@@ -123,30 +95,7 @@ def find_jumps(
     return sorted(found, key=lambda jump: jump.at), max(len(suspects) - most, 0)
 
 
-def grid(low: float, high: float, step: float) -> Float[np.ndarray, "points"]:
-    """Where `find_jumps` looks first."""
-    return np.linspace(low, high, max(int(np.ceil((high - low) / step)), 12) + 1)
-
-
-def bisect(told: Callable[[float], bool], low: float, high: float) -> tuple[float, float]:
-    """Neighboring doubles between which an answer changes.
-
-    Args:
-        told: the question; its answers at low and at high differ.
-        low, high: low < high.
-    """
-    before = told(low)
-    while True:
-        middle = low + 0.5 * (high - low)
-        if not low < middle < high:
-            return low, high
-        if told(middle) == before:
-            low = middle
-        else:
-            high = middle
-
-
-def measure(curve: Curve, low: float, high: float, room: float, exact: bool, bend: bool = True) -> Jump:
+def measure(curve: Curve, low: float, high: float, room: float, exact: bool, curved: bool = True) -> Jump:
     """The jumps between low and high, and how large they could look where there are none.
 
     Energy and force are taken at the last representable coordinates on either side (medians of four, so that
@@ -157,23 +106,25 @@ def measure(curve: Curve, low: float, high: float, room: float, exact: bool, ben
         low, high: the two sides.
         room: how far to either side the curve can be used, coordinate.
         exact: whether low and high are neighboring doubles.
-        bend: whether the curvature is asked for too; nan if not.
+        curved: whether the curvature is asked for too; nan if not.
     """
-    left, right = _close(curve, low, -np.inf), _close(curve, high, np.inf)
+    left, right = close(curve, low, -np.inf), close(curve, high, np.inf)
     values = np.median(right, axis=1) - np.median(left, axis=1)
     floor = scatter(curve, low, high, room).max(axis=0)
     spread = np.maximum(np.ptp(left, axis=1), np.ptp(right, axis=1)) + 4 * floor
     if not exact:  # between the two sides the curve goes its smooth way too
         force = abs(curve(low)[1]) + abs(curve(high)[1])
-        slope_left, _ = _slope(curve, low, -1, room, floor[1])
-        slope_right, _ = _slope(curve, high, 1, room, floor[1])
+        slope_left, _ = slope(curve, low, -1, room, floor[1])
+        slope_right, _ = slope(curve, high, 1, room, floor[1])
         steepest = max(abs(slope_left), abs(slope_right))
         spread = spread + (high - low) * np.array([force, steepest])
     curvature, doubt = np.nan, np.inf
-    if bend:
-        before, doubt_before = _slope(curve, low, -1, room, floor[1])
-        after, doubt_after = _slope(curve, high, 1, room, floor[1])
+    if curved:
+        before, doubt_before = slope(curve, low, -1, room, floor[1])
+        after, doubt_after = slope(curve, high, 1, room, floor[1])
         curvature, doubt = before - after, doubt_before + doubt_after  # E'' is -F'
+        if not exact:
+            doubt += (high - low) * (bend(curve, low, -1, room) + bend(curve, high, 1, room))
     jumps, doubts = (*values, curvature), (*spread, doubt)
     order = SMOOTH
     for k in (2, 1, 0):
@@ -183,24 +134,6 @@ def measure(curve: Curve, low: float, high: float, room: float, exact: bool, ben
         low, high, float(jumps[0]), float(jumps[1]), float(jumps[2]),
         (float(doubts[0]), float(doubts[1]), float(doubts[2])), order, exact,
     )  # fmt: skip
-
-
-def scatter(curve: Curve, low: float, high: float, room: float) -> Float[np.ndarray, "2 2"]:
-    """Scatter of energy and force (columns) from rounding, before low and after high (rows).
-
-    The largest that any of some spacings shows: a calculator in float32 is constant over the smallest.
-    """
-    sides = []
-    for start, sign in ((low, -1.0), (high, 1.0)):
-        worst = np.zeros(2)
-        for relative in _CLOSER:
-            width = max(abs(start), 1.0) * relative
-            if 9 * width > room:
-                break
-            values = curve.many(start + sign * width * np.arange(1, 9))
-            worst = np.maximum(worst, np.abs(np.diff(values, 4, axis=1)).max(axis=1) / np.sqrt(70.0))
-        sides.append(worst)
-    return np.array(sides)
 
 
 def decay_power(curve: Curve, edge: float, room: float) -> float | None:
@@ -276,14 +209,15 @@ def _zoom(curve: Curve, left: float, right: float) -> list[Jump]:
         if len(history) < 2:
             continue
         falls = history[-1] / np.maximum(history[-2], 1e-300)
-        for channel in (0, 1, 2):
+        for channel in (1, 2, 0):
             row = channel % 2  # what the work of the force does not explain is a jump of the energy
             jumped = abs(_level(curve, row, left)(right) - curve(left)[row])
             now = history[-1][channel]
-            if clear[-1][channel] and falls[channel] > 0.5 and 0.7 * jumped < now < 1.4 * jumped:
+            if clear[-1][channel] and 0.8 < falls[channel] < 1.3 and 0.7 * jumped < now < 1.4 * jumped:
                 low, high = locate(curve, row, left, right)
                 jump = measure(curve, low, high, room, exact=True)
-                return [jump] if jump.order < SMOOTH else []
+                if jump.order < 2:
+                    return [jump]
         if len(history) > 2 and (falls < _NARROWER**-2.5).all():
             break
     bends = [row[1] for row, yes in zip(history, clear, strict=True) if yes[1]]
@@ -327,28 +261,6 @@ def _kink(curve: Curve, left: float, right: float, room: float) -> list[Jump]:
         middle, reach = middle + float(near[np.argmin(np.abs(near))]), min(reach, 1e-7)
     jump = measure(curve, middle - reach, middle + reach, room, exact=False)
     return [jump] if jump.order < SMOOTH else []
-
-
-def _slope(curve: Curve, start: float, sign: int, room: float, noise: float) -> tuple[float, float]:
-    """(dF/dx at start from one side, its error) at the spacing that makes the error least."""
-    best = (0.0, np.inf)
-    for relative in _WIDTHS:
-        width = max(abs(start), 1.0) * relative
-        if 8 * width > 2 * room and np.isfinite(best[1]):
-            break
-        fine = curve.many(start + sign * width * np.arange(5))[1] @ _SLOPE * sign / width
-        coarse = curve.many(start + sign * 2 * width * np.arange(5))[1] @ _SLOPE * sign / (2 * width)
-        error = abs(fine - coarse) + 12 * noise / width + 1e-14 * abs(fine)
-        if error < best[1]:
-            best = (float(fine), float(error))
-    return best
-
-
-def _close(curve: Curve, start: float, toward: float) -> Float[np.ndarray, "2 points"]:
-    places = [start]
-    for _ in range(3):
-        places.append(float(np.nextafter(places[-1], toward)))
-    return curve.many(places)
 
 
 def _same(one: Jump, other: Jump) -> float:

@@ -12,7 +12,7 @@ from ase import Atoms
 from jaxtyping import Float
 
 from mdnum.audit.base import Subject
-from mdnum.audit.jumps import Curve
+from mdnum.audit.curve import Curve
 from mdnum.audit.subject import CalculatorError, only_trying
 
 #: What a calculator may want around two atoms, the simplest first: (a cell, periodic).

@@ -11,7 +11,7 @@ from ase import Atoms
 from jaxtyping import Float, Int
 
 from mdnum.audit.base import Subject
-from mdnum.audit.jumps import Curve
+from mdnum.audit.curve import Curve
 from mdnum.audit.thresholds import Threshold
 
 _TIED = 1e-6

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from mdnum.audit import crowd_words
 from mdnum.audit import smoothness_words as words
 from mdnum.audit.base import Curve, Part, Progress, Subject
 from mdnum.audit.environments import Surroundings, walk_surroundings
@@ -44,7 +45,7 @@ class Smoothness:
         walks = walk_pairs(subject, progress)
         around = walk_surroundings(subject, progress, self.seconds)
         crowds = crowd(subject, progress, self.neighbors, self.seconds)
-        units = words.units_of(subject)
+        units = crowd_words.units_of(subject)
         skipped = [*walks.skipped, *around.skipped]
         if not crowds:
             skipped.append(
@@ -67,15 +68,15 @@ SMOOTHNESS_CHECKS = (Smoothness,)
 
 
 def _tables(
-    walks: PairWalks, around: Surroundings, crowds: Sequence[Crowd], kT: float, units: words.Words
+    walks: PairWalks, around: Surroundings, crowds: Sequence[Crowd], kT: float, units: crowd_words.Words
 ) -> dict[str, list[dict[str, Any]]]:
     return {
         "Thresholds found by walking pairs": [
             {
-                "pair": "-".join(one.species),
+                "pair": crowd_words.together("-".join(one.species)),
                 f"distance ({units.length})": words.place(one),
-                "what": words.kind(one),
-                "first to jump": words.ORDERS[one.order],
+                "what": "the end" if one.dies else "a change",
+                "first to jump": crowd_words.together(words.ORDERS[one.order]),
                 f"energy ({units.small})": one.jumps[0] * units.scale if one.order == 0 else 0.0,
                 "in kT": abs(one.jumps[0]) / kT if one.order == 0 else 0.0,
                 f"force ({units.force})": one.jumps[1] if one.order <= 1 else 0.0,
@@ -88,9 +89,9 @@ def _tables(
         ],
         "The same among the others of the structure, and what only shows there": [
             {
-                "moved": one.route,
+                "moved": crowd_words.together(one.route),
                 f"pair distance ({units.length})": f"{one.distance:.10g}" if one.threshold else "none fits",
-                "first to jump": words.ORDERS[one.jump.order],
+                "first to jump": crowd_words.together(words.order_of(one)),
                 f"energy ({units.small})": one.jump.energy * units.scale if one.jump.order == 0 else 0.0,
                 "in kT": abs(one.jump.energy) / kT if one.jump.order == 0 else 0.0,
                 f"largest force ({units.force})": one.force if one.jump.order <= 1 else 0.0,
@@ -139,7 +140,9 @@ def _numbers(walks: PairWalks, around: Surroundings, crowds: Sequence[Crowd], kT
     }
 
 
-def _curves(walks: PairWalks, crowds: Sequence[Crowd], subject: Subject, units: words.Words) -> list[Curve]:
+def _curves(
+    walks: PairWalks, crowds: Sequence[Crowd], subject: Subject, units: crowd_words.Words
+) -> list[Curve]:
     found: list[Curve] = []
     for walk in walks.walks[:_DRAWN]:
         found.append(_energies(walk, subject.kT, units))
@@ -160,7 +163,7 @@ def _curves(walks: PairWalks, crowds: Sequence[Crowd], subject: Subject, units: 
     return found
 
 
-def _energies(walk: PairWalk, kT: float, units: words.Words) -> Curve:
+def _energies(walk: PairWalk, kT: float, units: crowd_words.Words) -> Curve:
     """The energy of two, where it is small enough to see what happens at the thresholds."""
     depth = max(-float(walk.energy.min()), 2 * kT)
     shown = walk.energy < 2 * depth
@@ -178,7 +181,7 @@ def _energies(walk: PairWalk, kT: float, units: words.Words) -> Curve:
     )
 
 
-def _close_up(walk: PairWalk, threshold: Threshold, subject: Subject, units: words.Words) -> Curve:
+def _close_up(walk: PairWalk, threshold: Threshold, subject: Subject, units: crowd_words.Words) -> Curve:
     """Energy or force at the last representable distances before a jump and the first ones beyond it."""
     curve = walk.pair.curve(subject)
     below, above = [threshold.inside], [threshold.outside]

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
-from mdnum.audit.base import Subject
+from mdnum.audit.crowd_words import Words, caps, count, reach
 from mdnum.audit.environments import Event, Surroundings, unexplained
+from mdnum.audit.jumps import SMOOTH
 from mdnum.audit.provoke import Crowd
-from mdnum.audit.thresholds import PairWalk, PairWalks, Threshold
+from mdnum.audit.thresholds import PairWalks, Threshold
 from mdnum.references.findings import finding
-from mdnum.units import METAL
 
 ORDERS = (
     "energy", "force", "curvature", "third derivative", "fourth derivative", "fifth derivative",
@@ -28,37 +27,24 @@ _SMALL = 1e-7
 _SMALL_FORCE = 1e-5
 """A force jump below this many kT per unit of length is told, and no more."""
 
-_STEEP = 5.0
-"""A switch whose curvature is this many times that of the well is what limits the time step."""
-
-
-@dataclass(frozen=True)
-class Words:
-    """Names of units.
-
-    Attributes:
-        scale: from the energy unit to the one that jumps are told in.
-    """
-
-    length: str
-    energy: str
-    small: str
-    scale: float
-    force: str
-    curvature: str
-
-
-def units_of(subject: Subject) -> Words:
-    """How to name what a subject's numbers are in."""
-    units = getattr(subject, "units", METAL)
-    small, scale = ("meV", 1e3) if units.energy == "eV" else (units.energy, 1.0)
-    energy, length = units.energy, units.length
-    return Words(length, energy, small, scale, f"{energy}/{length}", f"{energy}/{length}²")
-
 
 def kind(threshold: Threshold) -> str:
     """What a threshold is, in a few words."""
     return "the interaction ends" if threshold.dies else "the law changes"
+
+
+def order_of(event: Event) -> str:
+    """The lowest derivative that jumps at an event; where none up to the curvature does, that of the pair."""
+    order = event.jump.order
+    if order == SMOOTH and event.threshold:
+        order = max(order, event.threshold.order)
+    return ORDERS[order]
+
+
+def two(threshold: Threshold) -> str:
+    """Who passes a threshold."""
+    one, other = threshold.species
+    return f"two {one} atoms" if one == other else f"{one} and {other}"
 
 
 def place(threshold: Threshold) -> str:
@@ -72,10 +58,10 @@ def place(threshold: Threshold) -> str:
 def summary(walks: PairWalks, around: Surroundings, crowds: Sequence[Crowd], kT: float, units: Words) -> str:
     """One or two sentences with the numbers."""
     thresholds = [one for walk in walks.walks for one in walk.thresholds]
-    found = f"Walking {len(walks.walks)} pairs of species found {_count(len(thresholds), 'threshold')}"
+    found = f"Walking {len(walks.walks)} pairs of species found {count(len(thresholds), 'threshold')}"
     if len(walks.walks) == 1:
         one = walks.walks[0].pair.name.split("-")[0]
-        found = f"Walking two {one} found {_count(len(thresholds), 'threshold')}"
+        found = f"Walking two {one} found {count(len(thresholds), 'threshold')}"
     if not walks.walks:
         found = "No two particles could be walked by themselves"
     cutoffs = sorted({f"{walk.cutoff:.6g}" for walk in walks.walks if walk.cutoff})
@@ -93,9 +79,9 @@ def summary(walks: PairWalks, around: Surroundings, crowds: Sequence[Crowd], kT:
             )
         elif order == 1:
             tail = f"the energy is continuous and the force jumps by up to {force:.3g} {units.force}"
-    caps = [one for one in crowds if one.kept or one.order_from]
-    if caps:
-        kept = min(one.kept or (one.order_from or 1) - 1 for one in caps)
+    capped = [one for one in crowds if one.kept or one.order_from]
+    if capped:
+        kept = min(one.kept or (one.order_from or 1) - 1 for one in capped)
         tail += f"; an atom keeps {kept} neighbors and drops the rest"
     elif crowds:
         tail += f"; {max(one.neighbors for one in crowds)} neighbors at once are all kept"
@@ -120,8 +106,8 @@ def findings(
     """Findings by severity of what they mean for a run and for a derivative."""
     found = [*_pair_findings(walks, around, kT, units)]
     found += _unexplained(around, kT, units)
-    found += [one for crowded in crowds for one in _caps(crowded, kT, units)]
-    found += [one for walk in walks.walks for one in _reach(walk, units)]
+    found += [one for crowded in crowds for one in caps(crowded, kT, units)]
+    found += [one for walk in walks.walks for one in reach(walk, units)]
     return found
 
 
@@ -146,7 +132,7 @@ def _pair_findings(walks: PairWalks, around: Surroundings, kT: float, units: Wor
                 "ENERGY_JUMP",
                 severity,
                 "the energy jumps at a cutoff" if worst.dies else "the energy jumps within the range",
-                f"Two {'-'.join(worst.species)} at {worst.inside!r} and at {worst.outside!r} "
+                f"{_first_up(two(worst))} at {worst.inside!r} and at {worst.outside!r} "
                 f"{units.length}, the "
                 f"next representable distance, differ by {worst.jumps[0] * units.scale:.6g} {units.small} "
                 f"({abs(worst.jumps[0]) / kT:.2g} kT); the force jumps by {worst.jumps[1]:.4g} {units.force}."
@@ -167,7 +153,7 @@ def _pair_findings(walks: PairWalks, around: Surroundings, kT: float, units: Wor
                 "FORCE_JUMP",
                 "warning" if size > _SMALL_FORCE else "info",
                 "the force jumps at a cutoff" if worst.dies else "the force jumps within the range",
-                f"Between two {'-'.join(worst.species)} at {worst.inside!r} and at {worst.outside!r} "
+                f"Between {two(worst)} at {worst.inside!r} and at {worst.outside!r} "
                 f"{units.length} the force jumps by {worst.jumps[1]:.6g} {units.force}, the energy by no "
                 "more than "
                 f"rounding. {_others(bends, worst, units)}A run keeps its energy; a derivative through it "
@@ -185,7 +171,7 @@ def _pair_findings(walks: PairWalks, around: Surroundings, kT: float, units: Wor
                 "CURVATURE_JUMP",
                 "info",
                 "the curvature jumps: energy and force are continuous",
-                f"Between two {'-'.join(worst.species)} at {place(worst)} {units.length} the second "
+                f"Between {two(worst)} at {place(worst)} {units.length} the second "
                 f"derivative of the energy jumps by {worst.jumps[2]:.4g} {units.curvature}. "
                 f"{_others(curved, worst, units)}Runs and first derivatives are fine; vibrations and "
                 "second derivatives are not, and an "
@@ -228,7 +214,7 @@ def _unexplained(around: Surroundings, kT: float, units: Words) -> list[dict[str
                 f"On the way of {worst.route}, at {worst.at:.12g} {units.length}, the energy jumps by "
                 f"{worst.jump.energy * units.scale:.4g} {units.small} and a force by {worst.force:.4g} "
                 f"{units.force}; no distance is at a threshold that two atoms alone show.{tie} "
-                f"{_count(len(sharp), 'such place')} on {_count(len(around.routes), 'route')}.",
+                f"{count(len(sharp), 'such place')} on {count(len(around.routes), 'route')}.",
                 "Look for what depends on three atoms or on a number of neighbors: an angle's own cutoff, "
                 "a cap, "
                 "a choice of the nearest.",
@@ -244,107 +230,12 @@ def _unexplained(around: Surroundings, kT: float, units: Words) -> list[dict[str
                 "the curvature jumps among many atoms where no pair threshold is",
                 f"On the way of {worst.route}, at {worst.at:.8g} {units.length}, by "
                 f"{worst.jump.curvature:.4g} "
-                f"{units.curvature}. {_count(len(bent), 'such place')}.",
+                f"{units.curvature}. {count(len(bent), 'such place')}.",
                 "Nothing to do for runs and first derivatives.",
             )
         )
     return found
 
 
-def _caps(one: Crowd, kT: float, units: Words) -> list[dict[str, str]]:
-    found: list[dict[str, str]] = []
-    if one.kept:
-        found.append(
-            finding(
-                "NEIGHBOR_CAP",
-                "error",
-                f"only the {one.kept} nearest neighbors are kept",
-                f"An atom of {one.species} was given {one.neighbors} neighbors within {one.radius:.6g} "
-                f"{units.length}. When another comes nearer than the {one.kept}-th of them (at "
-                f"{one.distance:.6g} {units.length}), a force jumps by {one.force:.4g} {units.force} and the "
-                f"energy by {one.energy * units.scale:.3g} {units.small} ({one.energy / kT:.2g} kT): "
-                "neighbors "
-                "inside the cutoff are dropped, and which ones changes abruptly.",
-                f"Raise the cap above the most neighbors that ever come within {one.radius:.4g} "
-                f"{units.length}, and "
-                "make exceeding it an error.",
-            )
-        )
-    if one.order_from:
-        found.append(
-            finding(
-                "NEIGHBOR_CAP_BY_ORDER",
-                "error",
-                f"from {one.order_from} neighbors on, the energy depends on the order of the atoms",
-                f"With {one.order_from} atoms of {one.species} around another within {one.radius:.6g} "
-                f"{units.length}, permuting the atoms changes the energy by up to "
-                f"{one.order_energy * units.scale:.4g} {units.small} ({one.order_energy / kT:.2g} kT) and "
-                "a force "
-                f"by {one.order_force:.4g} {units.force}; with {one.order_from - 1} it does not. Some "
-                "neighbors "
-                "are dropped, by their place in a list.",
-                "Raise the largest number of neighbors, and make exceeding it an error.",
-            )
-        )
-    return found
-
-
-def _reach(walk: PairWalk, units: Words) -> list[dict[str, str]]:
-    found: list[dict[str, str]] = []
-    if walk.cutoff is None and np.abs(walk.energy).max() > 0:
-        found.append(
-            finding(
-                "NO_CUTOFF",
-                "info",
-                f"{walk.pair.name} interact at every distance tried",
-                f"At 30 {units.length} the two still feel one another: there is no cutoff to be crossed.",
-            )
-        )
-    steep = _steepness(walk)
-    if steep is not None and steep[0] > _STEEP:
-        found.append(
-            finding(
-                "STEEP_SWITCH",
-                "warning",
-                "the interaction is switched off so steeply that it is nearly a step",
-                f"Near {steep[1]:.4g} {units.length} the curvature of two {walk.pair.name} is "
-                f"{steep[0]:.2g} times "
-                "that at the bottom of their well: atoms that pass there feel a spring that much stiffer, "
-                "and "
-                "forces that no bond explains.",
-                "Switch over a wider range, or choose a time step for this curvature.",
-            )
-        )
-    if walk.left_out:
-        found.append(
-            finding(
-                "MANY_KINKS",
-                "info",
-                "more places stand out than were looked at",
-                f"Along {walk.pair.name}, {walk.left_out} more places stood out of the scan; a table that is "
-                "interpolated with corners looks like this.",
-            )
-        )
-    return found
-
-
-def _steepness(walk: PairWalk) -> tuple[float, float] | None:
-    """(largest curvature beyond the well over that at its bottom, where); None without a well."""
-    curvature = -np.gradient(walk.force, walk.distance)
-    bottom = int(np.argmin(walk.energy))
-    if walk.energy[bottom] >= 0 or bottom < 2 or curvature[bottom] <= 0:
-        return None
-    # at a place where the force jumps, a difference is no curvature
-    sharp = [one.radius for one in walk.thresholds if one.order <= 1]
-    width = 2 * (walk.distance[1] - walk.distance[0])
-    beyond = walk.distance > 1.1 * walk.distance[bottom]
-    for radius in sharp:
-        beyond &= np.abs(walk.distance - radius) > width
-    if not beyond.any():
-        return None
-    worst = int(np.argmax(np.where(beyond, np.abs(curvature), 0.0)))
-    return float(abs(curvature[worst]) / curvature[bottom]), float(walk.distance[worst])
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}" + ("" if number == 1 else "s")
+def _first_up(text: str) -> str:
+    return text[:1].upper() + text[1:]

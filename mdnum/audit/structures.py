@@ -22,6 +22,9 @@ _FEWEST_ATOMS = 32
 _WATER_EDGES = (4, 5, 6, 8)
 """Molecules along an edge: some calculators want a box of two cutoffs."""
 
+_BARELY, _PRESSED = 0.9, 0.6
+"""A nearest distance above this part of the cutoff is made to be that part of it."""
+
 _RATTLE = 0.02
 """Standard deviation, of the nearest distance: in a perfect crystal forces are zero and distances tie."""
 
@@ -139,6 +142,10 @@ def _crystal(subject: CalculatorSubject, pair: Pair, symbol: str) -> Atoms:
     cutoff, least = rough(subject, pair)
     cell, lattice = _unit_cell(symbol)
     scale, relaxed = _least_energy(subject, cell, least)
+    at = "at the calculator's own least energy" if relaxed else "at its tabulated lattice constant"
+    if cutoff and scale * _nearest_distance(cell) > _BARELY * cutoff:
+        # nothing holds it together: a crystal in which nothing is felt would tell nothing
+        scale, at = _PRESSED * cutoff / _nearest_distance(cell), "nothing binds it, so pressed together"
     cell.set_cell(np.asarray(cell.cell) * scale, scale_atoms=True)
     wanted = 2.05 * cutoff if cutoff else 12.0
     edge = float(np.asarray(cell.cell).diagonal().min())
@@ -147,7 +154,6 @@ def _crystal(subject: CalculatorSubject, pair: Pair, symbol: str) -> Atoms:
     atoms = cell.repeat(repeat)
     nearest = _nearest_distance(cell)
     atoms.rattle(_RATTLE * nearest, seed=0)
-    at = "at the calculator's own least energy" if relaxed else "at its tabulated lattice constant"
     return _told(
         atoms,
         f"{len(atoms)} atoms of {symbol}, {lattice}, nearest distance {nearest:.4g} Å ({at}), "

@@ -11,17 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 from mdnum.audit.base import Progress, Subject
-from mdnum.audit.jumps import (
-    SMOOTH,
-    Curve,
-    Jump,
-    bisect,
-    decay_power,
-    find_jumps,
-    grid,
-    measure,
-    scatter,
-)
+from mdnum.audit.curve import Curve, bisect, grid, scatter
+from mdnum.audit.jumps import SMOOTH, Jump, decay_power, find_jumps, measure
 from mdnum.audit.probes import FARTHEST, Pair, pairs
 from mdnum.audit.subject import CalculatorError, only_trying
 

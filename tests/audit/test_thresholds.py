@@ -11,7 +11,8 @@ from audit.laws import R_CUT, R_ON, law, pair_subject
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mdnum.audit.jumps import Curve, bisect, find_jumps
+from mdnum.audit.curve import Curve, bisect
+from mdnum.audit.jumps import find_jumps
 from mdnum.audit.thresholds import STEP, find_thresholds, walk_pairs
 
 BEFORE = float(np.nextafter(R_CUT, 0.0))
