@@ -109,7 +109,8 @@ def set_flips(length: float) -> Callable[[np.ndarray], int]:
     def step(x: np.ndarray) -> int:
         nonlocal before
         pairs = self_capped_distance(x.astype(np.float32), R_CUT, box=edges, return_distances=False)
-        now = set(map(tuple, pairs.tolist()))
+        # in no particular order, which differs from frame to frame
+        now = set(map(tuple, np.sort(pairs, axis=1).tolist()))
         count = len(now - before) + len(before - now)
         before = now
         return count

@@ -22,6 +22,8 @@ def met_once(
 ):  # fmt: skip
     """All pairs of one set of atoms, each met once: from a bin, half of the bins around are looked at."""
     written, left = 0, 0
+    # one species: no need to look it up
+    several = low.shape[0] > 1
     room, runs = most_around(bins, reach, start)
     near, squares = np.empty((3, room)), np.empty(room)
     atom, chosen, run = np.empty(room, np.int32), np.empty(room, np.int32), np.empty(room, np.int32)
@@ -74,7 +76,7 @@ def met_once(
                     for m in range(kept):
                         k = chosen[m]
                         j = order[atom[k]]
-                        sj = species[j]
+                        sj = species[j] if several else 0
                         if squares[k] > high[si, sj] or i == j:
                             continue
                         if squares[k] < low[si, sj] and kind != DIRECTED:
@@ -96,6 +98,8 @@ def met_from_centers(
 ):  # fmt: skip
     """Everything around each center; two atoms that are on both sides are met twice and count once."""
     written, left = 0, 0
+    # one species: no need to look it up
+    several = low.shape[0] > 1
     room, runs = most_around(bins, reach, start)
     near, squares = np.empty((3, room)), np.empty(room)
     atom, chosen, run = np.empty(room, np.int32), np.empty(room, np.int32), np.empty(room, np.int32)
@@ -144,7 +148,7 @@ def met_from_centers(
                     for m in range(kept):
                         k = chosen[m]
                         j = atom[k]
-                        sj = species[j]
+                        sj = species[j] if several else 0
                         if squares[k] > high[si, sj] or i == j or (twice and both[j] and j < i):
                             continue
                         if squares[k] < low[si, sj] and kind != DIRECTED:

@@ -55,7 +55,7 @@ def _choose(
             inside += int(squares[k] < reach * reach)
         kept = min(inside, most)
         # the first outside must have been seen, and all that come as close as it matters
-        if not complete and (length <= kept or kept < most or np.sqrt(squares[order[kept]]) > searched):
+        if not complete and (length <= kept or np.sqrt(squares[order[kept]]) > searched):
             lacking[i] = True
             short += 1
             continue

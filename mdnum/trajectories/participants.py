@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mdnum.errors import InputError
+from mdnum.trajectories.frame import Box
+from mdnum.trajectories.lattice import lattice_of
 from mdnum.trajectories.pairs import Sides
 from mdnum.trajectories.rules import Cutoff, Rule, SpeciesCutoffs
 
@@ -18,8 +20,7 @@ class Participants:
     """The atoms that take part, numbered among themselves.
 
     Attributes:
-        labels: their numbers in the file, ascending.
-        all: whether they are all atoms of the file.
+        labels: their numbers in the file.
         sides: who is asked for neighbors, and who can be one.
         radii: by species, length; negative for pairs that are never inside.
         both: atoms on both sides: images of themselves can be their neighbors.
@@ -27,7 +28,6 @@ class Participants:
     """
 
     labels: Int[np.ndarray, "participants"]
-    all: bool
     sides: Sides
     radii: Float[np.ndarray, "species species"]
     both: Bool[np.ndarray, "participants"]
@@ -46,7 +46,7 @@ def participants(
     species: np.ndarray | None,
     atoms: int,
 ) -> Participants:
-    """Number the atoms that take part.
+    """Number the atoms that take part, in the order of the file.
 
     Args:
         first, second: as of `Tracker`, sorted.
@@ -79,7 +79,29 @@ def participants(
     kinds, radii = _kinds_and_radii(rule, labels, species)
     both = centers & others
     own = np.bincount(kinds[both], minlength=len(radii))
-    return Participants(labels, len(labels) == atoms, Sides(centers, others, kinds), radii, both, own)
+    return Participants(labels, Sides(centers, others, kinds), radii, both, own)
+
+
+def by_place(who: Participants, positions: Float[np.ndarray, "atoms 3"], box: Box) -> Participants:
+    """The same atoms numbered by where they are: what is near in space is near in memory.
+
+    Args:
+        positions: of all atoms of the file, length.
+        box: theirs.
+    Raises:
+        InputError: the box is none.
+    """
+    if not np.isfinite(positions[who.labels]).all() or not who.radius > 0:
+        return who
+    lattice = lattice_of(box)
+    components = positions[who.labels] @ lattice.inverse
+    components -= np.where(lattice.periodic, np.floor(components), 0.0)
+    steps = np.where(lattice.periodic, who.radius / lattice.widths, who.radius)
+    order = np.lexsort(np.floor(components / steps).T[::-1])
+    others = who.sides.others[order]
+    centers = others if who.sides.centers is who.sides.others else who.sides.centers[order]
+    sides = Sides(centers, others, who.sides.species[order])
+    return replace(who, labels=who.labels[order], sides=sides, both=who.both[order])
 
 
 def _kinds_and_radii(

@@ -15,7 +15,7 @@ from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.lattice import Lattice, lattice_of, own_images
 from mdnum.trajectories.nearest import chosen
 from mdnum.trajectories.pairs import Rows, ordered, ranks, rows_of, search
-from mdnum.trajectories.participants import Participants, indices, participants
+from mdnum.trajectories.participants import Participants, by_place, indices, participants
 from mdnum.trajectories.rules import Capped, Nearest, Rule
 from mdnum.trajectories.superset import Superset, displaced, listed, look, skin_for
 from mdnum.trajectories.table import Flips, Members
@@ -113,15 +113,13 @@ class Tracker:
         if bound is not None:
             self.bound = float(bound)
         before, now = self._last, self._moment(frame)
-        flips = self._from_list(before, now) if before is not None and self._list is not None else None
+        flips = None if before is None or self.rule.directed else self._from_list(before, now)
         if flips is None:
             self._list = None
             now = self._decided(now)
             flips = Flips.none() if before is None else self._flips(before, now)
         self._last = now
         self.frames += 1
-        if before is not None and not self.rule.directed:
-            self._keep_list(before, now)
         return flips
 
     def members(self) -> Members:
@@ -132,15 +130,10 @@ class Tracker:
         now = self._last
         i, j = ordered(self._rows(now))
         own = self._own_members(now)
-        # images of an atom itself are its first neighbors in the order of indices, unless rows are directed
         i, j = np.concatenate([i, own]), np.concatenate([j, own])
-        if not self.rule.directed:
-            i, j = np.minimum(i, j), np.maximum(i, j)
-        order = np.lexsort((j, i))
-        i, j = i[order], j[order]
-        rank = ranks(i, j)
-        distance = self._distances(now, i, j, rank)
-        return Members(self._who.labels[i], self._who.labels[j], rank, distance)
+        first, second, order = self._sorted(i, j)
+        rank = ranks(first, second)
+        return Members(first, second, rank, self._distances(now, i[order], j[order], rank))
 
     # ---- one frame
 
@@ -230,50 +223,48 @@ class Tracker:
     # ---- two frames
 
     def _from_list(self, before: Moment, now: Moment) -> Flips | None:
-        """The flips as the list in use tells them; None where it cannot."""
+        """The flips as a list tells them; None where none would be worth its making."""
+        radius, horizon = self._who.radius, HORIZON * self._who.radius
+        bound = self.bound + now.rounding
+        clear = max(bound, horizon)
         held = self._list
-        assert held is not None
-        clear = max(self.bound + now.rounding, HORIZON * self._who.radius)
-        if not held.serves(held.gone, now.lattice, self._who.radius, clear):
+        # what rounding adds to every distance
+        slack = 8.0 * max(before.rounding, now.rounding)
+        if held is not None:
+            came = displaced(before.positions, before.lattice, now.positions, now.lattice, held.found.home,
+                             radius + 2.0 * held.skin)  # fmt: skip
+            held.last, held.gone = came, held.gone + came + slack
+            if not held.serves(held.gone, now.lattice, radius, clear):
+                held = None
+        if held is None:
+            held = self._listed(before, now, clear, slack)
+        self._list = held
+        if held is None:
             return None
-        came = displaced(
-            before.positions, before.lattice, now.positions, now.lattice, held.found.home,
-            self._who.radius + 2.0 * held.skin,
-        )  # fmt: skip
-        held.gone += came + 8.0 * max(before.rounding, now.rounding)
-        held.last = came
-        if not held.serves(held.gone, now.lattice, self._who.radius, clear):
-            return None
-        horizon = HORIZON * self._who.radius
-        seen = look(
-            held, now.positions, now.lattice, self._who.sides, self._who.radii,
-            bound=self.bound + now.rounding, horizon=horizon,
-        )  # fmt: skip
+        seen = look(held, now.positions, now.lattice, self._who.sides, self._who.radii,
+                    bound=bound, horizon=horizon)  # fmt: skip
         self.pairs += 2 * int(seen.entered.sum()) - len(seen.entered)
         self.near, self.min_margin = seen.close, seen.smallest if seen.smallest <= horizon else np.inf
         return self._table(before, now, seen.i, seen.j, np.zeros(len(seen.i), np.int64), seen.entered)
 
-    def _keep_list(self, before: Moment, now: Moment) -> None:
-        """Make a list at this frame where the one in use will not last another, or there is none yet."""
-        held, bound = self._list, self.bound + now.rounding
-        clear = max(bound, HORIZON * self._who.radius)
-        if held is not None:
-            came = held.last
-            if held.serves(held.gone + 1.5 * came, now.lattice, self._who.radius, clear):
-                return
-        else:
-            home = np.zeros((len(now.positions), 3), np.int64)
-            came = displaced(
-                before.positions, before.lattice, now.positions, now.lattice, home, 1.5 * self._who.radius
-            )  # fmt: skip
-        self._list = None
-        skin = skin_for(came, self._who.radius, clear, now.lattice)
-        if skin > 0:
-            self._list = listed(
-                now.positions, now.lattice, self._who.sides, self._who.radii, skin,
-                bound=bound, guard=now.rounding, clear=clear, room=int(1.1 * self._room),
-            )  # fmt: skip
-            self._room = len(self._list.due)
+    def _listed(self, before: Moment, now: Moment, clear: float, slack: float) -> Superset | None:
+        """A list made at the frame before that serves now and will for a while; None where there is none."""
+        radius = self._who.radius
+        home = np.zeros((len(now.positions), 3), np.int64)
+        pace = displaced(before.positions, before.lattice, now.positions, now.lattice, home, 1.5 * radius)
+        skin = skin_for(pace, radius, clear, before.lattice)
+        if not skin > 0:
+            return None
+        guard = before.rounding
+        made = listed(
+            before.positions, before.lattice, self._who.sides, self._who.radii, skin,
+            bound=self.bound + guard, guard=guard, clear=clear, room=int(1.1 * self._room),
+        )  # fmt: skip
+        self._room = len(made.due)
+        came = displaced(before.positions, before.lattice, now.positions, now.lattice, made.found.home,
+                         radius + 2.0 * skin)  # fmt: skip
+        made.last, made.gone = came, came + slack
+        return made if made.serves(made.gone, now.lattice, radius, clear) else None
 
     def _flips(self, before: Moment, now: Moment) -> Flips:
         i, j, rank, entered = compared(self._rows(before), self._rows(now))
@@ -290,12 +281,8 @@ class Tracker:
 
     def _table(self, before: Moment, now: Moment, i, j, rank, entered) -> Flips:
         """The flips as columns, from indices among the atoms that take part."""
-        if not self.rule.directed:
-            i, j = np.minimum(i, j), np.maximum(i, j)
-        key = i * np.int64(len(self._who.labels)) + j
-        if (key[1:] < key[:-1]).any() or (rank[1:] < rank[:-1]).any():
-            order = np.lexsort((rank, key))
-            i, j, rank, entered = i[order], j[order], rank[order], entered[order]
+        first, second, order = self._sorted(i, j, rank)
+        i, j, rank, entered = i[order], j[order], rank[order], entered[order]
         distance, old = self._distances(now, i, j, rank), self._distances(before, i, j, rank)
         if self.rule.directed:
             margin = np.where(entered, now.last_in[i], now.first_out[i]) - distance
@@ -305,10 +292,19 @@ class Tracker:
             margin, earlier = radius - distance, radius - old
         bound = self.bound + max(before.rounding, now.rounding)
         return Flips(
-            np.full(len(i), self.frames, np.int64), self._who.labels[i], self._who.labels[j], rank, entered,
+            np.full(len(i), self.frames, np.int64), first, second, rank, entered,
             distance, old, margin, earlier, np.full(len(i), bound),
             (np.abs(margin) <= bound) | (np.abs(earlier) <= bound),
         )  # fmt: skip
+
+    def _sorted(self, i, j, rank=None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(i, j) in the file's numbers, sorted, and where each row was."""
+        first, second = self._who.labels[i], self._who.labels[j]
+        if not self.rule.directed:
+            first, second = np.minimum(first, second), np.maximum(first, second)
+        key = first * np.int64(max(self._atoms, 1)) + second
+        order = np.argsort(key) if rank is None or not rank.any() else np.lexsort((rank, key))
+        return first[order], second[order], order
 
     def _distances(self, moment: Moment, i, j, rank) -> np.ndarray:
         if self.rule.directed:
@@ -322,10 +318,10 @@ class Tracker:
         """Positions of the atoms that take part, and the largest coordinate."""
         atoms = len(frame.positions)
         if self._atoms < 0:
-            self._atoms, self._who = (
-                atoms,
-                participants(self.rule, self._first, self._second, self._species, atoms),
-            )
+            self._atoms = atoms
+            self._who = participants(self.rule, self._first, self._second, self._species, atoms)
+            if not self.rule.directed:
+                self._who = by_place(self._who, np.asarray(frame.positions, np.float64), frame.box)
         if atoms != self._atoms:
             raise InputError(
                 f"{atoms} atoms, {self._atoms} in the frames before",
@@ -333,12 +329,11 @@ class Tracker:
                 where=f"frame {frame.index}",
             )
         positions = np.asarray(frame.positions, np.float64)
-        if not self._who.all:
-            positions = positions[self._who.labels]
-        positions = np.array(positions, order="C")
+        positions = np.ascontiguousarray(positions[self._who.labels])
         largest = float(np.abs(positions).max(initial=0.0))
         if not np.isfinite(largest):
-            at = int(np.flatnonzero(~np.isfinite(positions).all(axis=1))[0])
+            broken = np.flatnonzero(~np.isfinite(positions).all(axis=1))
+            at = int(broken[np.argmin(self._who.labels[broken])])
             raise InputError(
                 f"atom {int(self._who.labels[at])} is at {positions[at].tolist()}",
                 remedy="Stop before this frame (a slice of the file), and find out why the run broke",

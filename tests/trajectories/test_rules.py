@@ -111,6 +111,17 @@ def test_the_nearest_without_a_radius(periodic):
     assert tracker.pairs == 6 and tracker.min_margin == np.inf
 
 
+def test_a_neighbor_under_a_cap_stays_one_no_further_than_the_radius():
+    # the next outside is beyond the radius, so the radius is what this one has to pass to leave
+    x = np.array([[0.0, 0, 0], [2.5, 0, 0], [0, 2.01, 0]])
+    tracker = Tracker(Capped(2.0, 1), first=[0], second=[1, 2])
+    tracker.step(Frame(0, 0.0, x, Box()))
+    x[1, 0] = 1.5
+    flips = tracker.step(Frame(1, 0.0, x, Box()))
+    assert flips.j.tolist() == [1] and flips.margin == pytest.approx([0.5])
+    assert flips.margin_before == pytest.approx([-0.5])
+
+
 def test_a_tie_for_the_last_place_is_in_doubt():
     x = np.array([[0.0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 2, 0]])
     tracker = Tracker(Capped(5.0, 1), first=[0], second=[1, 2, 3])
