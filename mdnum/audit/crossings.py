@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import Protocol
 
 import numpy as np
 from ase import Atoms
@@ -13,25 +12,13 @@ from jaxtyping import Float
 
 from mdnum.audit.base import Subject
 from mdnum.audit.nve import Run, at
+from mdnum.audit.thresholds import Threshold
 from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.rules import SpeciesCutoffs
 from mdnum.trajectories.tracker import Tracker
 
 #: Å before and after a crossing at which the energy is asked for.
 _BESIDE = 1e-7
-
-
-class Threshold(Protocol):
-    """What is asked of a threshold: see `mdnum.audit.thresholds`."""
-
-    @property
-    def radius(self) -> float: ...
-    @property
-    def species(self) -> tuple[str, str]: ...
-    @property
-    def order(self) -> int: ...
-    @property
-    def located(self) -> float: ...
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,8 @@ _POINTS = 12
 _SIGNIFICANT = 10.0
 #: Antisymmetric over symmetric part of the derivative of the forces: below, it is precision.
 _SMALL = 1e-4
+#: Loops that are looked at however slow the calculator is, and seconds after which no more are.
+_FEWEST, _SECONDS = 4, 20.0
 
 
 @dataclass(frozen=True)
@@ -74,8 +76,12 @@ class Curl:
         worker = subject.fresh()
         atoms, noise = settled(worker, rng, at_least=FEW)
         wanted = list(planes(worker, atoms, rng))
-        loops = []
+        loops: list[Loop] = []
+        skipped: list[tuple[str, str]] = []
         for what, u, v in wanted:
+            if len(loops) >= _FEWEST and time.perf_counter() - began > _SECONDS:
+                skipped.append((f"a loop of {what}", f"{_SECONDS:g} s were used up"))
+                continue
             if progress is not None:
                 progress(len(loops), len(wanted), {"phase": "curl", "unit": "loops"})
             tried = [around(worker, atoms, u, v, radius, noise, what) for radius in _RADII]
@@ -95,6 +101,7 @@ class Curl:
                 "largest_share": max((one.share for one in wrong), default=0.0),
                 "largest_error": max(one.error for one in loops),
             },
+            skipped=skipped,
             seconds=time.perf_counter() - began,
         )
 
@@ -123,8 +130,9 @@ def planes(subject: Subject, atoms: Atoms, rng: np.random.Generator) -> Iterator
         for number in range(3):
             u, v = np.linalg.qr(rng.standard_normal((3 * count, 2)))[0].T
             yield f"all atoms at random, {number + 1}", u.reshape(count, 3), v.reshape(count, 3)
-    for who in rng.permutation(count)[:2]:
-        for first, second in ((0, 1), (1, 2)):
+    few = rng.permutation(count)[:2]
+    for first, second in ((0, 1), (1, 2)):
+        for who in few:
             u, v = np.zeros((2, count, 3))
             u[who, first] = v[who, second] = 1.0
             yield f"atom {who} ({atoms.symbols[who]}) in {'xyz'[first]}{'xyz'[second]}", u, v

@@ -11,16 +11,17 @@ import numpy as np
 from ase import Atoms
 
 from mdnum.audit.base import Part, Progress, Subject
-from mdnum.audit.crossings import Threshold, crossings
+from mdnum.audit.crossings import crossings
 from mdnum.audit.dynamics_words import part
 from mdnum.audit.energy_ledger import Result, balance, by_means, crossing_rows, energy_rows
 from mdnum.audit.noise import FEW, Noise, along_a_line, roomy
 from mdnum.audit.nve import Run, at, fitting_timestep, prepared, run
 from mdnum.audit.rigid import rigid
 from mdnum.audit.subject import CalculatorError, only_trying
+from mdnum.audit.thresholds import Threshold
 from mdnum.references.findings import finding
 
-_MOST_STEPS, _FEWEST_STEPS = 400, 64
+_MOST_STEPS, _FEWEST_STEPS = 400, 40
 #: Seconds that a run may take where nobody says how many steps.
 _SECONDS = 20.0
 #: Calls of the calculator for a step: two in the run of half the time step, warming up, work on the way.

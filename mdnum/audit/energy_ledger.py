@@ -11,10 +11,11 @@ from ase import Atoms
 from jaxtyping import Float
 
 from mdnum.audit.base import Subject
-from mdnum.audit.crossings import Crossing, Threshold, account, crossings
+from mdnum.audit.crossings import Crossing, account, crossings
 from mdnum.audit.drift import Drift, drift, wandering
 from mdnum.audit.noise import Noise
 from mdnum.audit.nve import Run
+from mdnum.audit.thresholds import Threshold
 
 #: Flips whose jumps are measured; the others are told by the mean of these.
 _MEASURED = 240

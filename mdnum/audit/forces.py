@@ -22,6 +22,8 @@ _SIGNIFICANT = 10.0
 #: Of the root mean square force: below, a disagreement is one of tables or precision.
 _SMALL = 1e-4
 _DIRECTIONS, _ATOMS = 3, 4
+#: Directions that are looked at however slow the calculator is, and seconds after which no more are.
+_FEWEST, _SECONDS = 5, 20.0
 
 
 @dataclass(frozen=True)
@@ -77,8 +79,12 @@ class Forces:
         atoms, noise = settled(worker, rng, at_least=FEW)
         forces = worker.forces(atoms)
         scale = float(np.sqrt(np.mean(forces**2)))
-        slopes = []
+        slopes: list[Slope] = []
+        skipped: list[tuple[str, str]] = []
         for what, line in directions(atoms, rng):
+            if len(slopes) >= _FEWEST and time.perf_counter() - began > _SECONDS:
+                skipped.append((f"moving {what}", f"{_SECONDS:g} s were used up"))
+                continue
             if progress is not None:
                 progress(len(slopes), _DIRECTIONS + 3 * _ATOMS, {"phase": "forces", "unit": "directions"})
             slopes.append(slope(worker, atoms, line, forces, noise, what))
@@ -104,6 +110,7 @@ class Forces:
                 "step": worst.step,
                 "noise_energy": noise.energy,
             },
+            skipped=skipped,
             seconds=time.perf_counter() - began,
         )
 

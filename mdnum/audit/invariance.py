@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -22,6 +22,8 @@ from mdnum.references.findings import finding
 _ALLOWED = 40.0
 #: Of kT for the whole structure: a difference below is one of precision rather than of physics.
 _SMALL = 1e-3
+#: Seconds after which only one way of each kind is still looked at.
+_SECONDS = 30.0
 
 #: What it means that two ways of writing down one structure differ, and what to do: title, remedy.
 _MEANING: Mapping[str, tuple[str, str]] = {
@@ -132,11 +134,17 @@ class Invariance:
         atoms, noise = settled(worker, rng)
         differences: list[_Difference] = []
         refused: list[tuple[Same, CalculatorError]] = []
-        ways = list(transformations.all_of(atoms, subject.atoms, rng))
+        ways = _in_turns(transformations.all_of(atoms, subject.atoms, rng))
+        late: list[tuple[str, str]] = []
+        tried: set[str] = set()
         judged = _Judge(subject, worker, atoms, noise, rng)
         for done, same in enumerate(ways):
             if progress is not None:
                 progress(done, len(ways), {"phase": "invariance", "unit": "structures"})
+            if same.code in tried and time.perf_counter() - began > _SECONDS:
+                late.append((same.what, f"{_SECONDS:g} s were used up"))
+                continue
+            tried.add(same.code)
             try:
                 differences.append(judged(same))
             except CalculatorError as error:
@@ -158,7 +166,7 @@ class Invariance:
                 "largest": max((one.energy for one in differences), default=0.0),
                 "largest_force": max((one.force for one in differences), default=0.0),
             },
-            skipped=[(same.what, error.message) for same, error in refused],
+            skipped=[*((same.what, error.message) for same, error in refused), *late],
             seconds=time.perf_counter() - began,
         )
 
@@ -321,6 +329,16 @@ def _refusals(refused: list[tuple[Same, CalculatorError]]) -> Iterator[dict[str,
             f"so.{saved}",
             "Look at coordinates outside the cell and at its faces, and at distances of 0.",
         )
+
+
+def _in_turns(ways: Iterable[Same]) -> list[Same]:
+    """One of each kind, then another of each: a slow calculator is asked all kinds of questions."""
+    seen: dict[str, int] = {}
+    turns = []
+    for same in ways:
+        seen[same.code] = seen.get(same.code, -1) + 1
+        turns.append((seen[same.code], same))
+    return [same for _, same in sorted(turns, key=lambda one: one[0])]
 
 
 def _power(size: float) -> int:

@@ -15,9 +15,9 @@ from mdnum.audit.alone import alone
 from mdnum.audit.answer import Answer, Refusal, ask
 from mdnum.audit.approaches import Asked, approaches
 from mdnum.audit.base import Part, Progress, Subject
-from mdnum.audit.crossings import Threshold
 from mdnum.audit.noise import FEW, Noise, displaced, settled
 from mdnum.audit.subject import CalculatorError, only_trying
+from mdnum.audit.thresholds import Threshold
 from mdnum.references.findings import finding
 
 #: How many times the noise one object may differ from another by: a list that was built elsewhere sums its
@@ -26,6 +26,8 @@ _ALLOWED = 40.0
 _REPEATS = 3
 #: Seconds that a new object and its first answer may take before only the ends of sequences are compared.
 _SLOW = 0.3
+#: Seconds after which no further sequence is begun.
+_SECONDS = 30.0
 
 
 @dataclass
@@ -59,7 +61,11 @@ class State:
         sequences = {word: sequence for word, sequence in sequences.items() if sequence}
         total = sum(map(len, sequences.values()))
         done, rows = 0, []
+        late: list[tuple[str, str]] = []
         for word, sequence in sequences.items():
+            if time.perf_counter() - began > _SECONDS:
+                late.append((f"the sequence “{word}”", f"{_SECONDS:g} s were used up"))
+                continue
             for row in _through(subject, sequence, noise, word):
                 rows.append(row)
                 done += 1
@@ -92,7 +98,12 @@ class State:
                 "bit_identical": repeats["bit-identical"],
                 "bit_identical_objects": repeats["bit-identical between objects"],
             },
-            skipped=[*nothing, *((row["structure"], row["refused"].why) for row in refused), *lonely.skipped],
+            skipped=[
+                *nothing,
+                *late,
+                *((row["structure"], row["refused"].why) for row in refused),
+                *lonely.skipped,
+            ],
             seconds=time.perf_counter() - began,
         )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 from mdnum.ball.demos.base import Plot, Series
 from mdnum.report.fork.findings import Verdict
 from mdnum.report.fork.question import Question, declared, load, verdict, write_page
-from mdnum.report.verdict import restore
+from mdnum.report.verdict import Finding, restore
 from mdnum.report.words import count, heading, number, typeset
 from mdnum.store import RunFolder
 
@@ -64,9 +65,13 @@ def judge(run: Question) -> Verdict:
     return verdict(
         typeset(summary["headline"]),
         [typeset(sentence) for sentence in summary["evidence"]],
-        [restore(one) for one in summary["findings"]],
+        [_typeset(restore(one)) for one in summary["findings"]],
         plain_tone="good",
     )
+
+
+def _typeset(one: Finding) -> Finding:
+    return replace(one, title=typeset(one.title), text=typeset(one.text), remedy=typeset(one.remedy))
 
 
 def _key_figures(run: Question) -> Iterator[tuple[str, str, str]]:
