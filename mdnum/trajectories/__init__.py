@@ -6,7 +6,10 @@
 from __future__ import annotations
 
 import importlib
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mdnum.trajectories.analysis import NeighborFlips
 
 # imported on first use: MDAnalysis takes seconds to import
 _HOMES = {"NeighborFlips": "mdnum.trajectories.analysis"}

@@ -14,6 +14,7 @@ from itertools import islice
 import numpy as np
 from jaxtyping import Float, Int
 
+from mdnum.errors import InputError
 from mdnum.trajectories.frame import Frame
 from mdnum.trajectories.grids import decimal_grid, steps_of
 from mdnum.trajectories.source import Trajectory
@@ -147,8 +148,15 @@ def infer(trajectory: Trajectory, frames: int = SAMPLE) -> Resolution:
     Args:
         trajectory: its frames are read from the first on.
         frames: how many of them at most.
+
+    Raises:
+        InputError: there is none.
     """
     sample = list(islice(trajectory.frames(), frames))
+    if not sample:
+        raise InputError(
+            "no frame is left of what was asked for", remedy="Ask for others", where=str(trajectory.path)
+        )
     return infer_from(sample, trajectory.bits, trajectory.format)
 
 
@@ -167,7 +175,7 @@ def infer_from(sample: Sequence[Frame], bits: int = 64, format: str = "") -> Res
     step, digits = decimal_grid(values, unit * np.abs(values))
     kind = "float32" if bits == 32 or bool((values == values.astype(np.float32)).all()) else "float64"
     kind = "grid" if step else kind
-    if fractions is not None:
+    if fractions is not None and len(values):
         size = max(float(np.abs(frame.box.matrix).max()) for frame in sample)
         # a product of three and a solution of three equations lie between
         slack = 8 * unit * (np.abs(fractions) + np.abs(values).max() / size)

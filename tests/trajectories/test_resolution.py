@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from MDAnalysisTests import datafiles
 from trajectories.liquid import CUTOFF, liquid, memberships, missed_and_invented
 
+from mdnum.errors import InputError
 from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.grid_effect import effect_on, grid_effect
 from mdnum.trajectories.resolution import infer, infer_from
@@ -197,6 +198,13 @@ def test_wrapping_is_no_motion():
     assert one is not None and other is not None
     assert one.move == pytest.approx(other.move, rel=0.01)
     assert one.missed == pytest.approx(other.missed, abs=0.02)
+
+
+def test_nothing_to_find_it_from():
+    assert infer_from(frames_of(np.full((2, 3, 3), np.nan))).kind == "float32"
+    assert infer_from(frames_of(np.zeros((2, 3, 3)))).step == 0.0
+    with pytest.raises(InputError, match="no frame is left"):
+        infer(open_trajectory(datafiles.GRO, slice="5:"))
 
 
 def test_of_a_real_xtc():
