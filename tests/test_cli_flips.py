@@ -23,6 +23,7 @@ TRICLINIC = (str(datafiles.PSF_TRICLINIC), str(datafiles.DCD_TRICLINIC))
         ((DCD, "-s", GRO, "--cutoff", "4"), "47,681 atoms and the trajectory 3,341"),
         ((XTC, "-s", GRO, "--cutoff", "-1"), "expected a positive length"),
         ((XTC, "-s", GRO, "--most", "3"), "Add --cutoff R"),
+        ((XTC, "-s", GRO, "--pairs", "O-Xx=2"), "no atom is of species 'Xx'"),
         ((XTC, "-s", GRO, "--pairs", "O-H"), "is not of the form A-B=LENGTH"),
         ((XTC, "-s", GRO, "--cutoff", "4", "--between", "name OW", "name XX"), "names no atom"),
         ((XTC, "-s", GRO, "--cutoff", "4", "--between", "name OW", "name ("), "is no selection"),
@@ -35,7 +36,8 @@ def test_what_cannot_be_asked_is_refused_in_one_line(arguments, message, capsys,
     assert call("flips", *arguments) == 2
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1
-    assert not list(tmp_path.glob("runs/*/*.parquet"))
+    # and leaves no folder behind
+    assert not list(tmp_path.iterdir())
 
 
 def test_water_around_a_protein(capsys, tmp_path, monkeypatch):

@@ -15,6 +15,7 @@ from mdnum.workflow.flips_open import (
     FlipsResult,
     about,
     default_rules,
+    leave,
     new_folder,
     refuse_topology_first,
     sample_of,
@@ -97,7 +98,7 @@ def flips(
     try:
         return _look(folder, opened, asked, groups, between, window, report, progress)
     except BaseException:
-        folder.close()
+        leave(folder)
         raise
 
 

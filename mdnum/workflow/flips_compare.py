@@ -21,6 +21,7 @@ from mdnum.workflow.flips_open import (
     FlipsResult,
     about,
     default_rules,
+    leave,
     name_of,
     new_folder,
     sample_of,
@@ -112,7 +113,7 @@ def compare(
     try:
         return _look(folder, (a, b), rule, groups, between, report, progress)
     except BaseException:
-        folder.close()
+        leave(folder)
         raise
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -85,6 +86,20 @@ def new_folder(trajectory: Trajectory, world: str, out: str | Path | None) -> Ru
         folder.close()
         raise
     return folder
+
+
+def leave(folder: RunFolder) -> None:
+    """Closes a folder after a mistake, and takes it away where no frame came into it."""
+    folder.close()
+    if any((folder.path / "parts").glob("*.parquet")):
+        return
+    with suppress(OSError):
+        for name in ("provenance.json", "log.txt", ".lock"):
+            (folder.path / name).unlink(missing_ok=True)
+        folder.path.rmdir()
+        # `runs` too, where it was made for this
+        if folder.path.parent == Path("runs"):
+            folder.path.parent.rmdir()
 
 
 def sample_of(trajectory: Trajectory) -> list[Frame]:
