@@ -19,6 +19,7 @@ STUDIES = (
     "ball_sensitivity",
     "benchmark",
     "cutoff_sensitivity",
+    "flips_benchmark",
     "flips_of_a_trajectory",
     "fork_atlas",
     "fork_benchmark",
@@ -151,6 +152,19 @@ def test_the_benchmark_measures_what_it_names(tmp_path: Path) -> None:
     assert all(one["flips"] > 0 for one in made["memory"])
     assert set(made["list_builds_ms"]["500"]) == {"mdnum host", "vesin", "jax-md update"}
     assert made["start_up"]["cpu_seconds"] > 0
+    assert is_png(tmp_path / "b.png")
+
+
+def test_the_benchmark_of_flips_measures_what_it_names(tmp_path: Path) -> None:
+    made = json.loads(study("flips_benchmark", "--quick", "--json", "-o", "b.png", cwd=tmp_path))
+    speeds = {(one["frames"], one["code"]): one for one in made["speeds"]}
+    for frames in ("every step", "every 100th step"):
+        ours, merged = (speeds[frames, code] for code in ("mdnum", "vesin, sorted merge"))
+        # the same pairs, found by two searches that share nothing
+        assert ours["flips"] == merged["flips"] > 0
+        assert ours["cpu_ms"] > 0 and speeds[frames, "MDAnalysis, sets"]["count"] == 4
+    assert len(made["memory"]) == 4
+    assert {one["atoms"] for one in made["many"]} == {1000}
     assert is_png(tmp_path / "b.png")
 
 

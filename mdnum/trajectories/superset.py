@@ -26,11 +26,11 @@ from mdnum.trajectories.lattice import Lattice
 from mdnum.trajectories.pairs import Found, Sides, exact_square, search
 
 #: a skin is meant to last this many frames; shorter than the least, a fresh search is as good
-FRAMES, FEWEST = 16.0, 4.0
+FRAMES, FEWEST = 24.0, 4.0
 #: largest skin, as a share of the radius
 LARGEST = 0.3
 #: groups of pairs by |margin|; a group is passed over until its first pair is due
-GROUPS = 16
+GROUPS = 64
 
 
 @dataclass

@@ -102,7 +102,11 @@ def test_near_the_cutoff_a_decision_is_that_of_exact_arithmetic_or_in_doubt():
     for _ in range(4):
         x = near_the_cutoff(rng, 100, radius, matrix)
         tracker = Tracker(Cutoff(radius))
-        tracker.step(Frame(0, 0.0, x, Box(matrix, PERIODIC)))
+        apart = x + np.repeat([[0.0, 0, 0], [1.0, 1.0, 1.0]], 100, axis=0)
+        tracker.step(Frame(0, 0.0, apart, Box(matrix, PERIODIC)))
+        flips = tracker.step(Frame(1, 0.0, x, Box(matrix, PERIODIC)))
+        mine = flips.j == flips.i + 100
+        assert mine.sum() > 20 and flips.ambiguous[mine].all()
         members = as_dict(tracker.members())
         others = set(itertools.combinations(range(200), 2)) - {(k, 100 + k) for k in range(100)}
         assert not {(i, j) for i, j, _ in members} & others

@@ -183,6 +183,22 @@ def test_a_list_in_use_misses_nothing(mover, bound):
     assert used > 25 and (flipped > 0 or mover is drift or mover is resting)
 
 
+def test_a_box_that_becomes_too_narrow_for_a_list():
+    rng, radius, before, used = np.random.default_rng(5), 2.2, None, []
+    x, everyone = rng.uniform(0, 5, (12, 3)), range(12)
+    x[1] = x[0] + [2.1, 0.1, 0.1]
+    tracker = Tracker(Cutoff(radius))
+    for k in range(16):
+        matrix = np.diag([5.2 if k < 10 else 4.2, 6.0, 7.0])
+        flips = tracker.step(Frame(k, 0.0, x, Box(matrix, PERIODIC)))
+        pairs = brute_force.everything(x, matrix, PERIODIC, everyone, everyone, 1.05 * radius)
+        now = brute_force.members(pairs, lambda i, j: radius)
+        assert rows(flips) == (differences(before, now) if before is not None else [])
+        used.append(tracker._list is not None)
+        before, x = now, x + rng.normal(size=x.shape) * 0.005
+    assert all(used[2:10]) and not any(used[10:]) and any(rank for _, _, rank in now)
+
+
 def test_the_nearest_miss_is_found_though_only_another_pair_is_due():
     # two pairs rest at margins 0.04 and 0.03 while a third atom, far away, turns the odometer
     x = np.array([[0.0, 0, 0], [1.96, 0, 0], [0, 8, 0], [1.97, 8, 0], [6, 5, 5]])
