@@ -81,7 +81,7 @@ class _Words:
             "crossings": len(ledger.crossed),
             "jumps_measured": len(ledger.measured),
             "largest_jump": max((abs(jump) for jump in ledger.measured.values()), default=0.0),
-            "rest_swing": float(np.ptp(np.cumsum(np.nan_to_num(ledger.rest)))) / self.atoms,
+            "rest_swing": float(np.ptp(np.cumsum(ledger.filled))) / self.atoms,
             "stale": self.result.stale[0],
             "mean_kinetic": float(np.mean(one.kinetic)) / self.atoms,
         }
@@ -206,12 +206,11 @@ class _Words:
     def curves(self) -> list[Curve]:
         one, other = self.result.whole, self.result.half
         scale = 1e3 / self.atoms
-        rest = np.nan_to_num(self.result.ledger.rest)
         lines = {
             "energy": (one.total - one.total[0]) * scale,
             "half the time step": (other.total[::2] - other.total[0]) * scale,
             "jumps of flips": np.cumsum(self.result.ledger.jumps) * scale,
-            "forces that are no gradient": np.cumsum(rest) * scale,
+            "forces that are no gradient": np.cumsum(self.result.ledger.filled) * scale,
         }
         return [
             Curve(

@@ -19,6 +19,8 @@ from mdnum.audit.thresholds import Threshold
 
 #: Flips whose jumps are measured; the others are told by the mean of these.
 _MEASURED = 240
+#: Steps with flips that a sample must have.
+_ENOUGH = 30
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,11 @@ class Ledger:
     jumps: Float[np.ndarray, "steps"]
     measured: Mapping[int, float]
     rest: Float[np.ndarray, "steps"]
+
+    @property
+    def filled(self) -> Float[np.ndarray, "steps"]:
+        """The rest, with its mean at steps that were not looked at, eV."""
+        return np.where(np.isnan(self.rest), np.nanmean(self.rest), self.rest)
 
 
 def balance(
@@ -56,7 +63,10 @@ def balance(
         by_step.setdefault(one.step, []).append(place)
     # a step without a crossing that needs care costs one call; of the others a sample must do
     orders = np.array([limits[one.threshold].order for one in crossed], np.int64)
-    smooth = 2 if int((orders < 2).sum()) <= _MEASURED else 1
+    sharp = int((orders < 2).sum())
+    stepped = len({one.step for one, order in zip(crossed, orders, strict=True) if order < 2})
+    # a sample of steps is as good as all, unless it is a handful because each step has so many
+    smooth = 2 if sharp <= _MEASURED or _MEASURED * stepped >= _ENOUGH * sharp else 1
     careful = {
         step: count for step, places in by_step.items() if (count := int((orders[places] < smooth).sum()))
     }
@@ -130,7 +140,7 @@ class Result:
     def shares(self) -> dict[str, Drift]:
         """Drift of all, of flips, of the rest, and of the integrator by either way, eV per internal time."""
         one, other = self.whole, self.half
-        rest = np.where(np.isnan(self.ledger.rest), np.nanmean(self.ledger.rest), self.ledger.rest)
+        rest = self.ledger.filled
         flips = wandering(one.time, self.ledger.jumps)
         left = wandering(one.time, rest)
         half_flips = wandering(other.time, self.half_jumps)

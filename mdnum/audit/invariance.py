@@ -359,8 +359,8 @@ def _says(differences: list[_Difference], wrong: list[_Difference], noise: Noise
         worst = max(wrong, key=lambda one: one.energy)
         return (
             f"{len(wrong)} of {len(differences)} ways of writing the same structure down give another "
-            "answer, "
-            f"by up to {worst.energy:.3g} eV ({worst.same.what}).{tail}"
+            f"answer, by up to {worst.energy:.3g} eV ({worst.same.what}) and "
+            f"{max(one.force for one in wrong):.3g} eV/Å.{tail}"
         )
     return (
         f"{len(differences)} ways of writing the same structure down give the same answer, to within "
