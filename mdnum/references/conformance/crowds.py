@@ -33,6 +33,17 @@ def crowds() -> Iterator[Case]:
     yield one("three atoms with hundreds of images", "crowded", small, 0.9, r_cut=3.5)
 
 
+def vast() -> Iterator[Case]:
+    """Few atoms in so much space that a grid of cells over it has no room in memory, or in 32 bits.
+
+    For lists in a process of their own: those that make such a grid end it.
+    """
+    apart = np.array([[0.0, 0.0, 0.0], [0.5, 0.5, 0.5], [700.0, 2500.0, 2400.0], [700.5, 2500.0, 2400.0]])
+    yield one("two pairs thousands of cutoffs apart, free", "axes", apart)
+    yield one("two pairs thousands of cutoffs apart, along a wire", "axes", apart, 3.0, (False, False, True))
+    yield one("a box of thousands of cutoffs", "boxes", apart + 1.0, 4000.0)
+
+
 def lattice(edge: int, seed: int = 0) -> Case:
     """A cubic lattice of whole numbers with gaps, its atoms in any order and in any image of the box.
 

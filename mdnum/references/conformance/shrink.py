@@ -18,8 +18,9 @@ from mdnum.references.oracle import widths
 if TYPE_CHECKING:
     from mdnum.references.conformance.suite import Examiner, Failed
 
-#: Questions and seconds that a shrink may take.
+#: Questions and seconds that a shrink may take; a slow list has this many questions, and at most so long.
 TRIES, SECONDS = 600, 8.0
+LEAST_TRIES, PATIENCE = 80, 60.0
 _MOST_IMAGES = 3000
 
 
@@ -32,7 +33,7 @@ def shrunk(examiner: Examiner, failed: Failed) -> Failed:
     """
     wanted, kind = failed.code, _kind(failed.worst)
     least = min(1, failed.case.atoms)
-    tries, until = 0, time.perf_counter() + SECONDS
+    tries, began = 0, time.perf_counter()
 
     def still_fails(case: Case) -> bool:
         nonlocal tries
@@ -47,7 +48,8 @@ def shrunk(examiner: Examiner, failed: Failed) -> Failed:
         return any(_kind(failure) == kind for failure in failures)
 
     def spent() -> bool:
-        return tries >= TRIES or time.perf_counter() > until
+        seconds = time.perf_counter() - began
+        return tries >= TRIES or seconds > (SECONDS if tries >= LEAST_TRIES else PATIENCE)
 
     case = failed.case
     if wanted == "NO_ANSWER":

@@ -11,7 +11,7 @@ import numpy as np
 
 from mdnum.references.conformance.case import AREAS, KEPT, Case, one
 from mdnum.references.conformance.catalog import catalog
-from mdnum.references.conformance.crowds import LARGE_EDGE, SMALL_EDGE, crowds, lattice
+from mdnum.references.conformance.crowds import LARGE_EDGE, SMALL_EDGE, crowds, lattice, vast
 from mdnum.references.conformance.judge import CODES, Conventions, Failure, judge, measures_well
 from mdnum.references.conformance.lists import Outcome, PairList, Session
 from mdnum.references.conformance.movers import movers, sequences
@@ -365,6 +365,8 @@ def examine(
     examiner = Examiner(tested, reuse=True, apart=apart)
     report = examiner.report
     every = list(questions(tested, cases, seed, False) if asked is None else asked)
+    if asked is None and apart and tested.word:
+        every += _as_kept(tested, vast())
     total = len(every) + 2 * (large and asked is None)
     seen: set[tuple[str, str]] = set()
 
