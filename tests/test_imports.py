@@ -70,7 +70,17 @@ def test_help_imports_nothing_heavy():
 
 @pytest.mark.parametrize(
     "verb",
-    [["run"], ["ball"], ["fork"], ["check", "pairs"], ["conform"], ["systems"], ["report"], ["doctor"]],
+    [
+        ["run"],
+        ["audit"],
+        ["ball"],
+        ["fork"],
+        ["check", "pairs"],
+        ["conform"],
+        ["systems"],
+        ["report"],
+        ["doctor"],
+    ],
 )
 def test_help_of_a_verb_imports_nothing_that_it_would_run(verb: list[str]):
     """typer itself imports pydantic to read the options of a verb, in some versions."""

@@ -55,7 +55,7 @@ def test_every_verb_and_option_named_is_known():
         )
         assert done.returncode == 0, shlex.join(words)
     known = ""
-    for verb in ("run", "fork", "grad", "flips", "ball", "conform"):
+    for verb in ("run", "fork", "grad", "flips", "ball", "audit", "conform"):
         done = subprocess.run(
             [sys.executable, "-m", "mdnum", verb, "--help"],
             capture_output=True,

@@ -15,6 +15,7 @@ import pytest
 SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
 STUDIES = (
     "ase_comparison",
+    "audit_calculator",
     "ball_benchmark",
     "ball_sensitivity",
     "benchmark",
@@ -306,3 +307,11 @@ def test_fewer_frames_and_fewer_decimals_lose_flips(tmp_path: Path) -> None:
     fine, coarse = (float(row(table, decimals)[2].rstrip("%")) for decimals in ("3", "2"))
     assert 0 < fine < coarse
     assert is_png(tmp_path / "f.png")
+
+
+def test_calculators_side_by_side(tmp_path: Path) -> None:
+    own = "ase.calculators.emt:EMT"
+    told = study("audit_calculator", own, "--checks", "forces,curl", "-o", "a.png", cwd=tmp_path)
+    cells = row(told, "EMT")
+    assert cells[2:5] == ["not asked", "not asked", "-"] and float(cells[5]) < 1e-6
+    assert (tmp_path / "a.png").stat().st_size > 1000
