@@ -67,8 +67,8 @@ class NeighborFlips(AnalysisBase):
 
     After `run`, `results` has for one rule all that `RuleResult` has (`flips`, `pairs`, `near`, `min_margin`,
     `initial`, `last`), and for several the same in each of `results.rules`; `results.resolution` says how
-    finely the file tells where atoms are and `results.bound` what that does to a margin, per frame. `frames`
-    and `times` are those of the frames looked at; `Flips.frame` counts among them.
+    finely the file tells where atoms are and `results.bound` what that does to a distance, per frame.
+    `frames` and `times` are those of the frames looked at; `Flips.frame` counts among them.
 
     When a frame cannot be read or holds what cannot be right, the results of the frames before it are kept
     and the error names it.
@@ -78,7 +78,7 @@ class NeighborFlips(AnalysisBase):
         r_cut: the cutoff, Å; {("O", "H"): 2.5} for pairs of species; a list of them for several at once.
         other: with it, pairs of one atom of each group; atoms may be in both.
         rule: any membership rule or several, in the place of r_cut or beside it.
-        bound: how far a margin can be off, Å; None for what the resolution of the file gives.
+        bound: how far a distance can be off, Å; None for what the resolution of the file gives.
         verbose: show progress.
 
     Raises:
@@ -254,7 +254,8 @@ class NeighborFlips(AnalysisBase):
 
     def _stepped(self, tracker: Tracker, frame: Frame, bound: float) -> Flips:
         try:
-            return tracker.step(frame, bound=bound)
+            # a margin among the nearest is the difference of two distances
+            return tracker.step(frame, bound=bound * (1 + tracker.rule.directed))
         except InputError as error:
             raise FrameError(
                 f"frame {frame.index}: {error.message}", frame=frame.index, remedy=error.remedy or ""

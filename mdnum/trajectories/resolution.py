@@ -66,6 +66,9 @@ class Resolution:
             frame: of the file.
             atoms: those whose distances are meant; None for all.
 
+        A margin to a cutoff is off by as much, one among the nearest neighbors (the difference of two
+        distances) by twice that.
+
         Error: for a pair through one period of the box; further images add as much of the box's part again.
         """
         frame = _of(frame, atoms)

@@ -56,7 +56,8 @@ class _Side:
     bound: float = 0.0
 
     def step(self, frame: Frame) -> Flips:
-        self.bound = self.resolution.bound(frame)
+        # a margin among the nearest is the difference of two distances
+        self.bound = self.resolution.bound(frame) * (1 + self.tracker.rule.directed)
         return self.tracker.step(frame, bound=self.bound)
 
 

@@ -184,7 +184,8 @@ def follow(
                 break
             bound = bound_of(frame)
             # every rule first: a frame that one of them refuses is not in the ledger of another
-            stepped = [one.tracker.step(frame, bound=bound) for one in made]
+            # a margin among the nearest is the difference of two distances
+            stepped = [one.tracker.step(frame, bound=bound * (1 + one.tracker.rule.directed)) for one in made]
         except InputError as error:
             if not found.frames:
                 raise

@@ -13,7 +13,9 @@ from mdnum.errors import InputError
 from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.grid_effect import effect_on, grid_effect
 from mdnum.trajectories.resolution import infer, infer_from
+from mdnum.trajectories.rules import Capped, Cutoff, Nearest
 from mdnum.trajectories.source import open_trajectory
+from mdnum.trajectories.tracker import Tracker
 
 TILTED = np.array([[9.0, 0, 0], [2.3, 8.1, 0], [-1.7, 3.3, 10.9]])
 
@@ -167,6 +169,24 @@ def test_what_the_grid_of_an_xtc_does_to_flips(stride, timestep):
     assert effect.missed == pytest.approx(missed, abs=0.04)
     assert effect.invented == pytest.approx(invented, abs=0.04)
     assert f"{100 * effect.missed:.2g} %" in effect.words()
+
+
+@pytest.mark.parametrize("rule", [Cutoff(CUTOFF), Nearest(4), Capped(CUTOFF, 12)])
+def test_what_the_file_makes_up_is_marked_as_what_it_cannot_tell(rule):
+    positions, length = liquid(20, 0.005, 4)
+    true, kept = (frames_of(x, length * np.eye(3)) for x in (positions, quantized(positions, 0.01)))
+    resolution = infer_from(kept)
+    trackers = Tracker(rule), Tracker(rule)
+    unmarked = invented = 0
+    for one, other in zip(true, kept, strict=True):
+        happened = trackers[0].step(one)
+        seen = trackers[1].step(other, bound=resolution.bound(other) * (1 + rule.directed))
+        known = set(zip(happened.i, happened.j, happened.entered, strict=True))
+        for i, j, entered, ambiguous in zip(seen.i, seen.j, seen.entered, seen.ambiguous, strict=True):
+            if (i, j, entered) not in known:
+                invented += 1
+                unmarked += not ambiguous
+    assert invented > 50 and unmarked == 0
 
 
 @pytest.mark.parametrize("speed", [0.0002, 0.001, 0.004, 0.1])
