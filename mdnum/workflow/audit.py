@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from mdnum.audit.base import Check, Part
     from mdnum.audit.load import Loaded
     from mdnum.audit.subject import CalculatorSubject
+    from mdnum.units import Units
 
 #: Checks in the order in which they are made.
 CHECKS = ("smoothness", "invariance", "forces", "curl", "state", "dynamics")
@@ -95,7 +96,7 @@ def audit(
         pairs: dict[str, Atoms] = {}
         for check in _checks(wanted, subject, timestep, steps):
             told(0, 0, {"phase": check.name})
-            parts.append(_ask(check, subject, told))
+            parts.append(_in_units(_ask(check, subject, told), subject.units))
             pairs |= getattr(check, "structures", {})
             tables: Mapping[str, Any] = getattr(check, "recorded", {})
             for name, columns in tables.items():
@@ -201,6 +202,31 @@ def _checks(
     for name in wanted:
         if name in made:
             yield made[name]()
+
+
+def _in_units(part: Part, units: Units) -> Part:
+    """A part with the words of a unit system: checks say eV and Å, which are ε and σ in reduced units."""
+    if units.energy == "eV":
+        return part
+
+    def told(value: Any) -> Any:
+        if isinstance(value, str):
+            return value.replace("eV", units.energy).replace("Å", units.length)
+        if isinstance(value, Mapping):
+            return {told(key): told(item) for key, item in value.items()}
+        return [told(item) for item in value] if isinstance(value, list | tuple) else value
+
+    curves = [
+        replace(one, title=told(one.title), x_label=told(one.x_label), y_label=told(one.y_label))
+        for one in part.curves
+    ]
+    return replace(
+        part,
+        says=told(part.says),
+        findings=told(list(part.findings)),
+        tables=told(part.tables),
+        curves=curves,
+    )
 
 
 def _internal(timestep: float | None, subject: CalculatorSubject) -> float | None:

@@ -19,7 +19,9 @@ from mdnum.errors import InputError
 from mdnum.references.findings import finding
 from mdnum.report import write
 from mdnum.store import RunFolder
+from mdnum.units import LJ, METAL
 from mdnum.workflow import audit_record
+from mdnum.workflow.audit import _in_units
 
 QUICK = "invariance,forces"
 
@@ -194,6 +196,15 @@ def part(name: str, *found: tuple[str, str]) -> Part:
 def test_findings_add_up_to_two_answers(parts, run, differentiate, words):
     judged = judge("x", parts)
     assert (judged.run, judged.differentiate, judged.headline) == (run, differentiate, words)
+
+
+def test_reduced_units_are_told_as_such():
+    rows = {"Table": [{"curl (eV/Å²)": 1.0, "plane": "x"}]}
+    said = Part("curl", "Curl", "0.1 eV/Å", [finding("CURL", "error", "t", "1 meV", "r")], rows)
+    found = _in_units(said, LJ)
+    assert found.says == "0.1 ε/σ" and found.findings[0]["text"] == "1 mε"
+    assert found.tables["Table"][0] == {"curl (ε/σ²)": 1.0, "plane": "x"}
+    assert _in_units(said, METAL) is said
 
 
 def test_a_summary_is_json_whatever_was_not_finite(bad):
