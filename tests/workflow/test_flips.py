@@ -132,6 +132,14 @@ def test_several_rules_and_selections_at_once(tmp_path: Path) -> None:
     for name in ("frame", "i", "j", "entered", "distance", "margin"):
         np.testing.assert_array_equal(mine[name], flips[name][flips["rule"] == 1])
     assert alone.summary["rules"][0] == told[1]
+    # atoms on both sides: everybody counts its O, and is not counted by them
+    mixed = mdnum.flips(
+        tmp_path / "gas.extxyz", cutoffs=[2.5], between=("all", "element O"), out=tmp_path / "h", report=False
+    )
+    one = mixed.summary["rules"][0]
+    inside_by = {row["first"] + row["second"]: row["inside"] / 30 for row in one["by_species"]}
+    assert set(inside_by) == {"HO", "OO"}
+    assert one["neighbors"]["mean"] == pytest.approx((inside_by["HO"] + 2 * inside_by["OO"]) / 24)
 
 
 def test_the_page_says_what_the_folder_holds(tmp_path: Path) -> None:
