@@ -70,6 +70,10 @@ def find_jumps(
 ) -> tuple[list[Jump], int]:
     """Every jump of energy, force or curvature that stands out of a scan.
 
+    How small a jump that is depends on how the curve bends: measured at a spacing of 0.025 Å, steps of the
+    energy down to 3e-6 eV on a Lennard-Jones wall of ε = 1 eV and down to 1e-8 eV on a soft one; steps of the
+    force down to 1e-8 eV/Å on the soft one, and from 3e-4 eV/Å on in every case on the wall.
+
     Args:
         curve: what is looked at; must be defined a little beyond both ends.
         low, high: where to look.
@@ -209,11 +213,10 @@ def _zoom(curve: Curve, left: float, right: float) -> list[Jump]:
         if len(history) < 2:
             continue
         falls = history[-1] / np.maximum(history[-2], 1e-300)
-        for channel in (1, 2, 0):
-            row = channel % 2  # what the work of the force does not explain is a jump of the energy
+        for row in (1, 0):
             jumped = abs(_level(curve, row, left)(right) - curve(left)[row])
-            now = history[-1][channel]
-            if clear[-1][channel] and 0.8 < falls[channel] < 1.3 and 0.7 * jumped < now < 1.4 * jumped:
+            now = history[-1][row]
+            if clear[-1][row] and 0.8 < falls[row] < 1.3 and 0.7 * jumped < now < 1.4 * jumped:
                 low, high = locate(curve, row, left, right)
                 jump = measure(curve, low, high, room, exact=True)
                 if jump.order < 2:

@@ -10,7 +10,7 @@ from audit.laws import R_CUT, Capped, Pairwise, subject
 from mdnum.audit.probes import Pair
 from mdnum.audit.provoke import _gap, cluster, crowd
 
-NEIGHBORS = 40
+NEIGHBORS = 24
 PAIR = Pair(("Ar", "Ar"), laws.Atoms("Ar"), laws.Atoms("Ar"), 0.0, False, "Ar-Ar")
 
 
@@ -26,7 +26,7 @@ def test_nothing_is_dropped_by_what_drops_nothing():
         assert found.neighbors == NEIGHBORS
 
 
-@pytest.mark.parametrize("most", [5, 32])
+@pytest.mark.parametrize("most", [5, 16])
 def test_a_choice_of_the_nearest_is_found(most: int):
     found = crowded(lambda: Capped(most, "nearest"))
     assert found.kept == most

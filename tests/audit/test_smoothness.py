@@ -89,6 +89,7 @@ def test_what_is_said_of_a_hard_cutoff():
     assert part.numbers["largest_energy_jump"] == pytest.approx(-law(R_CUT)[0], rel=1e-9)
 
 
+@pytest.mark.slow
 def test_what_is_said_of_a_shift_and_of_switches():
     said = {
         name: codes(Smoothness(seconds=0.3, neighbors=8)(subject(lambda law=law: Pairwise(law), cluster())))
