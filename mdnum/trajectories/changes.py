@@ -12,7 +12,7 @@ from mdnum.trajectories.pairs import Rows
 
 @numba.njit(cache=True, nogil=True)
 def _compared(first0, count0, other0, first1, count1, other1, i_out, j_out, rank_out, entered_out):
-    """Write (i, j, rank, entered) sorted by (i, j, rank); rows that do not fit are counted only.
+    """Write (i, j, rank, entered) of what differs; rows that do not fit are counted only.
 
     seen[j] = (images before, images now) while the row of i is looked at.
     """
@@ -24,7 +24,6 @@ def _compared(first0, count0, other0, first1, count1, other1, i_out, j_out, rank
             seen[other0[k], 0] += 1
         for k in range(first1[i], first1[i] + count1[i]):
             seen[other1[k], 1] += 1
-        begin = total
         for side in range(2):
             last = first0[i] + count0[i] if side == 0 else first1[i] + count1[i]
             for k in range(first0[i] if side == 0 else first1[i], last):
@@ -33,22 +32,18 @@ def _compared(first0, count0, other0, first1, count1, other1, i_out, j_out, rank
                 seen[j, 0], seen[j, 1] = 0, 0
                 for rank in range(min(before, now), max(before, now)):
                     if total < room:
-                        # the flips of one atom are few: inserted where they belong
-                        at = total
-                        while at > begin and (
-                            j_out[at - 1] > j or (j_out[at - 1] == j and rank_out[at - 1] > rank)
-                        ):
-                            j_out[at], rank_out[at] = j_out[at - 1], rank_out[at - 1]
-                            entered_out[at] = entered_out[at - 1]
-                            at -= 1
-                        i_out[total] = i
-                        j_out[at], rank_out[at], entered_out[at] = j, rank, now > before
+                        i_out[total], j_out[total] = i, j
+                        rank_out[total], entered_out[total] = rank, now > before
                     total += 1
     return total
 
 
-def compared(before: Rows, now: Rows, room: int = 4096):
-    """(i, j, rank, entered) of every decision that differs, sorted; indices are those of the rows."""
+def compared(before: Rows, now: Rows, room: int):
+    """(i, j, rank, entered) of every decision that differs, in no order; indices are those of the rows.
+
+    Args:
+        room: decisions to make room for.
+    """
     while True:
         i, j, rank = (np.empty(room, np.int64) for _ in range(3))
         entered = np.empty(room, np.bool_)

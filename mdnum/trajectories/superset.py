@@ -29,6 +29,8 @@ from mdnum.trajectories.pairs import Found, Sides, exact_square, search
 FRAMES, FEWEST = 24.0, 4.0
 #: largest skin, as a share of the radius
 LARGEST = 0.3
+#: a list is kept shorter than this, about
+MOST_LISTED = 24_000_000
 #: groups of pairs by |margin|; a group is passed over until its first pair is due
 GROUPS = 64
 
@@ -131,7 +133,7 @@ def displaced(
     return float(np.sqrt(most) + np.sqrt(second)) + radius * stretch
 
 
-def skin_for(inc: float, radius: float, clear: float, lattice: Lattice) -> float:
+def skin_for(inc: float, radius: float, clear: float, lattice: Lattice, pairs: int) -> float:
     """A skin that lasts, length; 0 where none would last long enough to be worth it.
 
     Args:
@@ -139,8 +141,11 @@ def skin_for(inc: float, radius: float, clear: float, lattice: Lattice) -> float
         radius: largest one, length.
         clear: what the list must hold at any time, length.
         lattice: of the frame.
+        pairs: inside.
     """
     room = min(LARGEST * radius, 0.499999 * lattice.narrowest - radius)
+    # a shell of this thickness on either side of the radius holds so many
+    room = min(room, radius * MOST_LISTED / (6.0 * max(pairs, 1)))
     if room < FEWEST * inc + clear:
         return 0.0
     return min(room, max(FRAMES * inc, 0.02 * radius) + clear)

@@ -90,6 +90,7 @@ class Tracker:
             )
         self._species = None if species is None else np.asarray(species, str)
         self._atoms = -1
+        # how many of each there were last time, to make room for as many
         self._open, self._room = 0, 0
         self._list: Superset | None = None
         self._who: Participants
@@ -252,7 +253,7 @@ class Tracker:
         radius = self._who.radius
         home = np.zeros((len(now.positions), 3), np.int64)
         pace = displaced(before.positions, before.lattice, now.positions, now.lattice, home, 1.5 * radius)
-        skin = skin_for(pace, radius, clear, before.lattice)
+        skin = skin_for(pace, radius, clear, before.lattice, self.pairs)
         if not skin > 0:
             return None
         guard = before.rounding
@@ -267,7 +268,7 @@ class Tracker:
         return made if made.serves(made.gone, now.lattice, radius, clear) else None
 
     def _flips(self, before: Moment, now: Moment) -> Flips:
-        i, j, rank, entered = compared(self._rows(before), self._rows(now))
+        i, j, rank, entered = compared(self._rows(before), self._rows(now), self.pairs // 2 + 4096)
         if (before.own != now.own).any():
             parts = [(i, j, rank, entered)]
             for kind in np.flatnonzero(before.own != now.own):
