@@ -52,7 +52,7 @@ def count(number: int, noun: str) -> str:
 def caps(one: Crowd, kT: float, units: Words) -> list[dict[str, str]]:
     found: list[dict[str, str]] = []
     energy = "the energy by nothing"
-    if one.energy > 100 * one.noise[0]:
+    if one.energy:
         energy = f"the energy by {one.energy * units.scale:.3g} {units.small} ({one.energy / kT:.2g} kT)"
     if one.kept:
         found.append(

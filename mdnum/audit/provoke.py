@@ -170,6 +170,8 @@ def _crowded(subject: Subject, pair: Pair, radius: float, count: int, seconds: f
         if energy > _SURE * noise_energy or sure.any():
             over.append((k + 1, energy, float(force[sure].max()) if sure.any() else 0.0))
     kept, energy, force = max(over, key=lambda one: (one[2], one[1])) if over else (None, 0.0, 0.0)
+    if energy <= _SURE * noise_energy:  # the force alone jumped
+        energy = 0.0
     order_from, order_energy, order_force = _order(subject, pair, radius, count)
     return Crowd(
         pair.species[0], radius, count, kept, energy, force,

@@ -43,7 +43,7 @@ def write_report(folder: RunFolder | str | Path) -> Path:
         judge(run),
         "audit/run.html.j2",
         drawn,
-        captions=dict.fromkeys(drawn, ""),
+        captions={curve["name"]: curve["title"] for part in run.summary["parts"] for curve in part["curves"]},
         figures=list(_key_figures(run)),
         parts=[_part(part) for part in run.summary["parts"]],
         what=list(_what(run)),
