@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from mdnum.references.conformance.case import AREAS, KEPT, Case, one
-from mdnum.references.conformance.catalog import catalog
-from mdnum.references.conformance.crowds import LARGE_EDGE, SMALL_EDGE, crowds, lattice, vast
+from mdnum.references.conformance.crowds import LARGE_EDGE, SMALL_EDGE, lattice, vast
 from mdnum.references.conformance.judge import CODES, Conventions, Failure, judge, measures_well
 from mdnum.references.conformance.lists import Outcome, PairList, Session
-from mdnum.references.conformance.movers import movers, sequences
+from mdnum.references.conformance.questions import as_kept, drawn, questions
 from mdnum.references.conformance.remote import RemoteSession
+from mdnum.references.conformance.results import Failed, Report, Tally
 from mdnum.references.conformance.truth import DOUBLE, SINGLE, Truth, truth
 
 Progress = Callable[[int, int, dict[str, Any]], None]
@@ -26,105 +26,6 @@ CASES = 500
 _PATIENCE = 30.0
 #: Failures of one code that are kept for shrinking; the rest are counted.
 _KEPT = 1
-
-
-@dataclass(frozen=True)
-class Failed:
-    """A case that a list failed.
-
-    Attributes:
-        case: as it was asked, up to the step that failed.
-        failures: what was wrong at that step.
-        asked: the case before it was shrunk; the same where it was not.
-        alone: it fails when it is the first that a new process asks; else what was asked before matters.
-    """
-
-    case: Case
-    failures: tuple[Failure, ...]
-    asked: Case
-    alone: bool = True
-
-    @property
-    def worst(self) -> Failure:
-        """The failure that is told."""
-        return min(self.failures, key=lambda one: CODES.index(one.code))
-
-    @property
-    def code(self) -> str:
-        """Its code."""
-        return self.worst.code
-
-
-@dataclass
-class Tally:
-    """What became of the questions of one area.
-
-    Attributes:
-        asked, failed, refused, skipped: cases; refused by the list itself, skipped because of its limits.
-        codes: cases by code of their worst failure.
-        why: reasons of refusing and skipping, with how often.
-    """
-
-    asked: int = 0
-    failed: int = 0
-    refused: int = 0
-    skipped: int = 0
-    codes: dict[str, int] = field(default_factory=dict)
-    why: dict[str, int] = field(default_factory=dict)
-
-    @property
-    def passed(self) -> int:
-        """Cases answered as they should be."""
-        return self.asked - self.failed - self.refused
-
-
-@dataclass
-class Report:
-    """What the suite found out about a list.
-
-    Attributes:
-        tested: the list.
-        how: its conventions, as declared or found out.
-        found_out: which of them were found out rather than declared.
-        single: a case that it decides as float32 does and float64 would not, where that was found out.
-        ties: (counted, not counted) pairs at exactly r_cut.
-        keeps_order: whether the same question gives the same rows in the same order.
-        superset: pairs beyond the cutoff are part of what it gives.
-        shifts: whether it gives the images that pairs are through.
-        areas: tallies by area.
-        failed: the first failure of each kind and area, in the order in which they were met.
-        seconds: in all; asking: of the list itself.
-        large: (atoms, seconds) of its largest question.
-    """
-
-    tested: PairList
-    how: Conventions = field(default_factory=Conventions)
-    found_out: list[str] = field(default_factory=list)
-    single: Case | None = None
-    ties: list[int] = field(default_factory=lambda: [0, 0])
-    keeps_order: bool | None = None
-    superset: bool = False
-    shifts: bool = False
-    areas: dict[str, Tally] = field(default_factory=dict)
-    failed: list[Failed] = field(default_factory=list)
-    seconds: float = 0.0
-    asking: float = 0.0
-    large: tuple[int, float] | None = None
-
-    @property
-    def asked(self) -> int:
-        """Cases that were asked."""
-        return sum(tally.asked for tally in self.areas.values())
-
-    @property
-    def wrong(self) -> int:
-        """Cases that failed."""
-        return sum(tally.failed for tally in self.areas.values())
-
-    @property
-    def conforms(self) -> bool:
-        """Whether it was asked and no case failed."""
-        return self.wrong == 0 and self.asked > sum(tally.refused for tally in self.areas.values())
 
 
 class Examiner:
@@ -279,58 +180,6 @@ def _whole(right: Truth) -> bool:
     return bool((numbers == np.rint(numbers)).all() and np.abs(numbers).max(initial=0.0) < 1e6)
 
 
-def questions(tested: PairList, count: int, seed: int, large: bool = True) -> Iterator[Case]:
-    """The cases that a list is asked, in order.
-
-    Args:
-        count: random cases.
-        seed: of the random cases.
-        large: the 5,000 and the 100,000 atoms, too.
-    """
-    if tested.kept:
-        yield from movers()
-    yield from _as_kept(tested, catalog())
-    if not tested.kept:
-        yield from sequences()
-    yield from _as_kept(tested, crowds())
-    yield from _as_kept(tested, drawn(max(1, round(count * tested.affords)), seed) if count else ())
-    if large:
-        yield lattice(SMALL_EDGE)
-        yield lattice(LARGE_EDGE)
-
-
-def _as_kept(tested: PairList, cases: Iterable[Case]) -> Iterator[Case]:
-    """Questions at one moment, with a skin for a list that is kept."""
-    for case in cases:
-        yield replace(case, skin=0.3 * case.r_cut) if tested.kept else case
-
-
-def drawn(count: int, seed: int) -> list[Case]:
-    """Cases that hypothesis draws, the same for the same seed."""
-    import hypothesis
-
-    from mdnum.references.conformance.strategies import cases
-
-    made: list[Case] = []
-    checks: Any = list(hypothesis.HealthCheck)
-
-    @hypothesis.seed(seed)
-    @hypothesis.settings(
-        max_examples=count,
-        database=None,
-        deadline=None,
-        phases=[hypothesis.Phase.generate],
-        suppress_health_check=checks,
-        derandomize=False,
-    )
-    @hypothesis.given(cases())
-    def draw(case: Case) -> None:
-        made.append(case)
-
-    draw()
-    return made[:count]
-
-
 def examine(
     tested: PairList,
     *,
@@ -366,7 +215,7 @@ def examine(
     report = examiner.report
     every = list(questions(tested, cases, seed, False) if asked is None else asked)
     if asked is None and apart and tested.word:
-        every += _as_kept(tested, vast())
+        every += as_kept(tested, vast())
     total = len(every) + 2 * (large and asked is None)
     seen: set[tuple[str, str]] = set()
 

@@ -1,0 +1,108 @@
+"""What the suite found out about a list: tallies by area, failures, and conventions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from mdnum.references.conformance.case import Case
+from mdnum.references.conformance.judge import CODES, Conventions, Failure
+from mdnum.references.conformance.lists import PairList
+
+
+@dataclass(frozen=True)
+class Failed:
+    """A case that a list failed.
+
+    Attributes:
+        case: as it was asked, up to the step that failed.
+        failures: what was wrong at that step.
+        asked: the case before it was shrunk; the same where it was not.
+        alone: it fails when it is the first that a new process asks; else what was asked before matters.
+    """
+
+    case: Case
+    failures: tuple[Failure, ...]
+    asked: Case
+    alone: bool = True
+
+    @property
+    def worst(self) -> Failure:
+        """The failure that is told."""
+        return min(self.failures, key=lambda one: CODES.index(one.code))
+
+    @property
+    def code(self) -> str:
+        """Its code."""
+        return self.worst.code
+
+
+@dataclass
+class Tally:
+    """What became of the questions of one area.
+
+    Attributes:
+        asked, failed, refused, skipped: cases; refused by the list itself, skipped because of its limits.
+        codes: cases by code of their worst failure.
+        why: reasons of refusing and skipping, with how often.
+    """
+
+    asked: int = 0
+    failed: int = 0
+    refused: int = 0
+    skipped: int = 0
+    codes: dict[str, int] = field(default_factory=dict)
+    why: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def passed(self) -> int:
+        """Cases answered as they should be."""
+        return self.asked - self.failed - self.refused
+
+
+@dataclass
+class Report:
+    """What the suite found out about a list.
+
+    Attributes:
+        tested: the list.
+        how: its conventions, as declared or found out.
+        found_out: which of them were found out rather than declared.
+        single: a case that it decides as float32 does and float64 would not, where that was found out.
+        ties: (counted, not counted) pairs at exactly r_cut.
+        keeps_order: whether the same question gives the same rows in the same order.
+        superset: pairs beyond the cutoff are part of what it gives.
+        shifts: whether it gives the images that pairs are through.
+        areas: tallies by area.
+        failed: the first failure of each kind and area, in the order in which they were met.
+        seconds: in all; asking: of the list itself.
+        large: (atoms, seconds) of its largest question.
+    """
+
+    tested: PairList
+    how: Conventions = field(default_factory=Conventions)
+    found_out: list[str] = field(default_factory=list)
+    single: Case | None = None
+    ties: list[int] = field(default_factory=lambda: [0, 0])
+    keeps_order: bool | None = None
+    superset: bool = False
+    shifts: bool = False
+    areas: dict[str, Tally] = field(default_factory=dict)
+    failed: list[Failed] = field(default_factory=list)
+    seconds: float = 0.0
+    asking: float = 0.0
+    large: tuple[int, float] | None = None
+
+    @property
+    def asked(self) -> int:
+        """Cases that were asked."""
+        return sum(tally.asked for tally in self.areas.values())
+
+    @property
+    def wrong(self) -> int:
+        """Cases that failed."""
+        return sum(tally.failed for tally in self.areas.values())
+
+    @property
+    def conforms(self) -> bool:
+        """Whether it was asked and no case failed."""
+        return self.wrong == 0 and self.asked > sum(tally.refused for tally in self.areas.values())
