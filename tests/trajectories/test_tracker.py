@@ -200,8 +200,8 @@ def test_a_box_that_becomes_too_narrow_for_a_list():
 
 
 def test_the_nearest_miss_is_found_though_only_another_pair_is_due():
-    # two pairs rest at margins 0.04 and 0.03 while a third atom, far away, turns the odometer
-    x = np.array([[0.0, 0, 0], [1.96, 0, 0], [0, 8, 0], [1.97, 8, 0], [6, 5, 5]])
+    # two pairs rest at margins 0.05 and 0.03 while another atom, far away, turns the odometer
+    x = np.array([[0.0, 0, 0], [1.95, 0, 0], [0, 8, 0], [1.97, 8, 0], [6, 5, 5]])
     tracker, used = Tracker(Cutoff(2.0)), 0
     for k in range(40):
         tracker.step(Frame(k, 0.0, x, Box(np.eye(3) * 20.0, PERIODIC)))
