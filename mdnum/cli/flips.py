@@ -78,4 +78,5 @@ def flips(
             progress=progress,
         )
     rows = print_rows if other is None else print_comparison
-    return output.answer(result.folder, result.summary, rows, as_json=as_json)
+    code = output.answer(result.folder, result.summary, rows, as_json=as_json)
+    return output.EXIT_STOPPED if result.summary.get("interrupted") else code

@@ -160,9 +160,10 @@ def _look(
             "rules": told,
             "velocities_odd": bool(found.moved > _TOO_FAR),
             "stopped": None if found.stopped is None else str(found.stopped),
+            "interrupted": found.interrupted,
             "seconds": {"frames": found.seconds, "statistics": time.perf_counter() - began},
             "findings": [],
-            "status": "complete" if found.stopped is None else "stopped",
+            "status": "stopped" if found.stopped is not None or found.interrupted else "complete",
         }
     )
     return FlipsResult(folder.path, finish(folder, report, progress))

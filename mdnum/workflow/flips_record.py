@@ -18,6 +18,7 @@ from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.rules import Capped, Cutoff, SpeciesCutoffs
 from mdnum.trajectories.stride import crossings
 from mdnum.trajectories.tracker import Tracker
+from mdnum.workflow.interrupt import asked_to_stop
 
 if TYPE_CHECKING:
     from mdnum.trajectories.rules import Rule
@@ -136,6 +137,7 @@ class Pass:
         frames: looked at.
         times: of the first and the last one.
         stopped: what was wrong with the frame after the last one, if the file did not come to its end.
+        interrupted: somebody pressed control-C, and the frames after the last one were not looked at.
         moved: root mean square displacement between frames over what the velocities say; nan without.
         seconds: taken.
     """
@@ -144,6 +146,7 @@ class Pass:
     frames: int = 0
     times: tuple[float, float] = (float("nan"), float("nan"))
     stopped: InputError | None = None
+    interrupted: bool = False
     moved: float = float("nan")
     seconds: float = 0.0
 
@@ -159,7 +162,7 @@ def follow(
     """Reads the frames once, writing flips, frames and the first members as they come.
 
     Memory is that of one frame and the trackers', however many frames there are. A frame that cannot be read
-    or used ends it; what came before stays.
+    or used ends it, and so does control-C; what came before stays.
 
     Args:
         groups: indices of the atoms on either side; None for all.
@@ -177,34 +180,38 @@ def follow(
     flips, rows = 0, Rows(folder)
     at = _sampled(trajectory.count)
     frames = iter(checked(trajectory.frames(), atoms, str(trajectory.path)))
-    while True:
-        try:
-            frame = next(frames, None)
-            if frame is None:
+    with asked_to_stop() as stop:
+        while True:
+            if stop() and found.frames:
+                found.interrupted = True
                 break
-            bound = bound_of(frame)
-            # every rule first: a frame that one of them refuses is not in the ledger of another
-            # a margin among the nearest is the difference of two distances
-            stepped = [one.tracker.step(frame, bound=bound * (1 + one.tracker.rule.directed)) for one in made]
-        except InputError as error:
-            if not found.frames:
-                raise
-            found.stopped = _at_frame(error, found.frames)
-            break
-        if found.frames == 0:
-            start = frame
-        elif found.frames == 1:
-            found.moved = _moved(start, frame)
-        for number, (one, new) in enumerate(zip(made, stepped, strict=True)):
-            _write(rows, number, one, new, frame, found.frames, (trajectory.atoms, groups))
-            flips += len(new)
-            if found.frames in at:
-                _measure_flux(one, frame, groups, species)
-        found.times = (frame.time if not found.frames else found.times[0], frame.time)
-        found.frames += 1
-        rows.checkpoint(found.frames)
-        told = {"phase": "run", "unit": "frames", "flips": flips}
-        progress(found.frames, trajectory.count or 0, told)
+            try:
+                frame = next(frames, None)
+                if frame is None:
+                    break
+                bound = bound_of(frame)
+                # every rule first: a frame that one of them refuses is not in the ledger of another; a margin
+                # among the nearest is the difference of two distances
+                stepped = [one.tracker.step(frame, bound=bound * (1 + one.rule.directed)) for one in made]
+            except InputError as error:
+                if not found.frames:
+                    raise
+                found.stopped = _at_frame(error, found.frames)
+                break
+            if found.frames == 0:
+                start = frame
+            elif found.frames == 1:
+                found.moved = _moved(start, frame)
+            for number, (one, new) in enumerate(zip(made, stepped, strict=True)):
+                _write(rows, number, one, new, frame, found.frames, (trajectory.atoms, groups))
+                flips += len(new)
+                if found.frames in at:
+                    _measure_flux(one, frame, groups, species)
+            found.times = (frame.time if not found.frames else found.times[0], frame.time)
+            found.frames += 1
+            rows.checkpoint(found.frames)
+            told = {"phase": "run", "unit": "frames", "flips": flips}
+            progress(found.frames, trajectory.count or 0, told)
     found.seconds = time.perf_counter() - began
     if not found.frames:
         raise InputError(

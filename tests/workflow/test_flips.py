@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 
 import ase
@@ -302,3 +303,24 @@ def test_words_become_rules() -> None:
         rules((), (), (), 5)
     with pytest.raises(InputError, match="twice"):
         rules([2.0, 2.0])
+
+
+def test_control_c_keeps_the_frames_that_were_looked_at(tmp_path: Path) -> None:
+    write(tmp_path / "gas.extxyz", gas())
+
+    def press(done: int, of: int, told: dict) -> None:
+        if done == 7 and told["phase"] == "run":
+            signal.raise_signal(signal.SIGINT)
+
+    result = mdnum.flips(tmp_path / "gas.extxyz", cutoffs=[2.5], out=tmp_path / "f", progress=press)
+    assert result.summary["status"] == "stopped" and result.summary["frames"] == 7
+    assert "INTERRUPTED" in [one["code"] for one in result.summary["findings"]]
+    part = mdnum.flips(tmp_path / "gas.extxyz@:7", cutoffs=[2.5], out=tmp_path / "p", report=False)
+    ours, theirs = (RunFolder.open(one.folder).read("flips") for one in (result, part))
+    assert len(ours["frame"]) > 0
+    for name, values in ours.items():
+        np.testing.assert_array_equal(values, theirs[name])
+    assert (result.folder / "report.html").exists() and report.write(result.folder).exists()
+    # control-C is what it was before
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)

@@ -22,7 +22,7 @@ _TOLD = 3
 
 def judge(run: Question) -> Verdict:
     """Headline, evidence and findings of a trajectory."""
-    found = list(_stopped(run))
+    found = [*_stopped(run), *_interrupted(run)]
     by_rule = [one for place in range(len(run.summary["rules"])) for one in limits.findings(run, place)]
     found += [*_merged(by_rule), *_times(run), *_notes(run)]
     quiet = not any(one.severity != "info" for one in found)
@@ -100,6 +100,17 @@ def _stopped(run: Question) -> Iterator[Finding]:
             f"the file could be used up to frame {last} only",
             f"{run.summary['stopped']} Everything here is about the {frames} before it.",
             "Check how the file was written; a run that was killed leaves a last frame that is not whole.",
+        )
+
+
+def _interrupted(run: Question) -> Iterator[Finding]:
+    if run.summary.get("interrupted"):
+        yield Finding(
+            "INTERRUPTED",
+            "warning",
+            f"stopped by hand after frame {count(int(run.tables['frames']['number'][-1]))}",
+            f"Everything here is about the {many(run.summary['frames'], 'frame')} up to it.",
+            "Look at the rest with a slice of the frames behind the path, or at all of them again.",
         )
 
 

@@ -114,6 +114,9 @@ def _velocities(run: Question, one: Mapping[str, Any]) -> Iterator[Finding]:
     flux = one["flux"]
     if flux is None or flux["lost"] is None or flux["crossed"] < FEW or flux["lost"] <= HIDDEN:
         return
+    # a rate from a handful of frames scatters: what it may be by chance is no finding
+    if flux["rate"] - flux["seen"] <= 2.0 * flux["error"]:
+        return
     rate = f"{number(flux['rate'])} ± {number(flux['error'], 2)} times per {run.summary['time']}"
     yield Finding(
         "FLUX",
