@@ -28,6 +28,7 @@ from mdnum.trajectories.resolution import SAMPLE, Resolution, infer_from
 from mdnum.trajectories.rules import Cutoff, Rule, SpeciesCutoffs
 from mdnum.trajectories.source import UnreadableFrame
 from mdnum.trajectories.table import Flips
+from mdnum.trajectories.tails import left_over, refuse_cut_text
 from mdnum.trajectories.tracker import Tracker
 from mdnum.trajectories.xtc import XtcFile, opened
 
@@ -131,6 +132,7 @@ class NeighborFlips(AnalysisBase):
         self._guard: XtcFile | None = None
         self._opened = False
         self._done, self._reading = 0, True
+        self._to_the_end = False
 
     def run(self, *args: Any, **kwargs: Any) -> NeighborFlips:
         """As MDAnalysis's: start, stop, step, frames, verbose, backend, n_workers, n_parts.
@@ -152,9 +154,18 @@ class NeighborFlips(AnalysisBase):
             )
         return self
 
-    def _setup_computation_groups(self, *args: Any, **kwargs: Any) -> list[np.ndarray]:
+    def _setup_computation_groups(
+        self,
+        n_parts: int,
+        start: int | None = None,
+        stop: int | None = None,
+        step: int | None = None,
+        frames: Any = None,
+    ) -> list[np.ndarray]:
         """MDAnalysis's, and what all parts must agree on: done once, before frames are spread."""
-        groups = super()._setup_computation_groups(*args, **kwargs)
+        groups = super()._setup_computation_groups(n_parts, start, stop, step, frames)
+        # who names the frames gets those
+        self._to_the_end = frames is None and (stop is None or stop > len(self._trajectory))
         self._numbers = np.concatenate([one[:, 1] for one in groups]).astype(np.int64)
         sample = []
         for number in self._numbers[:SAMPLE]:
@@ -181,6 +192,7 @@ class NeighborFlips(AnalysisBase):
             self._opened = True
         if self._guard is not None:
             self._guard.check(number)
+        refuse_cut_text(self._trajectory, number)
         return self._trajectory[number]
 
     def _let_go(self) -> None:
@@ -293,11 +305,19 @@ class NeighborFlips(AnalysisBase):
         bound = np.array([value for one in results.bounds[:kept] for value in one], np.float64)
         for name in ("parts", "bounds", "failures"):
             del results[name]
-        results.failure = failures[failed[0]] if failed else None
+        results.failure = failures[failed[0]] if failed else self._behind_the_last()
         results.rules, results.bound, results.resolution = found, bound, self._resolution
         if len(found) == 1:
             for one in fields(RuleResult):
                 results[one.name] = getattr(found[0], one.name)
+
+    def _behind_the_last(self) -> _Failure | None:
+        """A frame behind the last one that the library has, which it leaves out."""
+        rest = left_over(self._trajectory) if self._to_the_end and len(self._numbers) else None
+        if rest is None:
+            return None
+        count = int(self._trajectory.n_frames)
+        return _Failure(count, f"frame {count} cannot be read ({rest})", True)
 
 
 def _group(atoms: Any, name: str) -> AtomGroup:

@@ -15,6 +15,7 @@ from mdnum.trajectories.boxes import Boxes
 from mdnum.trajectories.frame import Frame
 from mdnum.trajectories.slices import chosen
 from mdnum.trajectories.source import AtomTable, Trajectory, UnreadableFrame
+from mdnum.trajectories.tails import left_over, refuse_cut_text
 
 #: what readers raise on files that end early or hold something else
 READING_FAILS = (OSError, EOFError, ValueError, RuntimeError, StopIteration, IndexError, KeyError, TypeError)
@@ -53,6 +54,7 @@ class MDAnalysisTrajectory(Trajectory):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 try:
+                    refuse_cut_text(trajectory, number)
                     # some formats go forward only, so that the next frame is asked for as the next
                     step = at is not None and number == at + 1 and trajectory.ts.frame == at
                     ts = trajectory.next() if step else trajectory[number]
@@ -65,28 +67,11 @@ class MDAnalysisTrajectory(Trajectory):
                     ) from error
             at = number
             yield frame
-        if self.slice.stop is None and (rest := bytes_left(trajectory)):
-            raise UnreadableFrame(
-                f"frame {trajectory.n_frames} cannot be read (the file ends after {rest:,} bytes of it)",
-                frame=int(trajectory.n_frames),
-                where=str(self.path),
-            )
-
-
-def bytes_left(trajectory: Any) -> int:
-    """Bytes of a dcd file behind its last whole frame, which MDAnalysis leaves out without a word."""
-    path = getattr(trajectory, "filename", None)
-    if "DCD" not in trajectory.format or not isinstance(path, str | Path):
-        return 0
-    from MDAnalysis.lib.formats.libdcd import DCDFile
-
-    with DCDFile(str(path)) as file:
-        sizes = [getattr(file, name, None) for name in ("_header_size", "_firstframesize", "_framesize")]
-    if None in sizes:
-        # another release of MDAnalysis keeps them elsewhere
-        return 0
-    head, first, other = (int(one) for one in sizes if one is not None)
-    return max(Path(path).stat().st_size - head - first - (int(trajectory.n_frames) - 1) * other, 0)
+        count = int(trajectory.n_frames)
+        if at is None or not (self.slice.stop is None or self.slice.stop > count):
+            return
+        if rest := left_over(trajectory):
+            raise UnreadableFrame(f"frame {count} cannot be read ({rest})", frame=count, where=str(self.path))
 
 
 def frame_of(ts: Any, number: int, boxes: Boxes, untimed: bool = False) -> Frame:
@@ -280,4 +265,6 @@ def notes_on(table: AtomTable) -> Iterator[str]:
 def first_line(error: BaseException) -> str:
     """What an error says, in a line."""
     text = str(error).strip().splitlines()
+    if not text and isinstance(error, StopIteration | EOFError):
+        return "the file ends in it"
     return text[0].rstrip(".") if text else type(error).__name__

@@ -154,11 +154,59 @@ def test_a_dcd_that_was_cut_says_so(tmp_path):
     assert read(open_trajectory(datafiles.DCD, datafiles.PSF))[1] is None
 
 
-def test_a_trr_that_was_cut_says_so(tmp_path):
-    with open(datafiles.TRR, "rb") as file:
-        (tmp_path / "cut.trr").write_bytes(file.read(3_000_000))
-    frames, error = read(open_trajectory(tmp_path / "cut.trr", datafiles.GRO))
+def moving_atoms():
+    """Four frames of forty atoms in memory."""
+    universe = MDAnalysis.Universe.empty(40, trajectory=True)
+    x = np.random.default_rng(0).uniform(0, 20, (4, 40, 3)).astype(np.float32)
+    return universe.load_new(x, dimensions=[20, 20, 20, 90, 90, 90])
+
+
+@pytest.mark.parametrize(
+    ("kind", "said"),
+    [
+        ("coordinates", r"frame 2 cannot be read \(the file ends in it\)"),
+        ("head", r"frame 2 cannot be read \(the file ends after 30 bytes of it\)"),
+        ("damaged", r"frame 2 cannot be read \(the .* bytes behind the frame before are no frame\)"),
+    ],
+)
+def test_a_trr_that_was_cut_or_damaged_says_so(tmp_path, kind, said):
+    universe = moving_atoms()
+    universe.atoms.write(str(tmp_path / "whole.trr"), frames="all")
+    data = bytearray((tmp_path / "whole.trr").read_bytes())
+    each = len(data) // 4
+    if kind == "damaged":
+        data[2 * each : 2 * each + 200] = b"\xff" * 200
+    else:
+        del data[2 * each + {"coordinates": 300, "head": 30}[kind] :]
+    path = tmp_path / "bad.trr"
+    path.write_bytes(bytes(data))
+    frames, error = read(open_trajectory(path))
     assert isinstance(error, UnreadableFrame) and error.frame == len(frames) == 2
+    assert re.search(said, str(error)), error
+    # who asks for no more than there is gets it
+    assert read(open_trajectory(f"{path}@:2"))[1] is None
+    assert read(open_trajectory(tmp_path / "whole.trr"))[1] is None
+    universe.load_new(str(path))
+    analysis = NeighborFlips(universe, 5.0)
+    with pytest.raises(UnreadableFrame, match="frame 2 cannot be read"):
+        analysis.run()
+    assert analysis.frames.tolist() == [0, 1] and len(analysis.results.pairs) == 2
+    NeighborFlips(universe, 5.0).run(stop=2)
+
+
+def test_the_analysis_names_the_frame_that_a_dcd_ends_in(tmp_path):
+    with open(datafiles.DCD, "rb") as file:
+        (tmp_path / "cut.dcd").write_bytes(file.read(1_000_000))
+    universe = MDAnalysis.Universe(datafiles.PSF, str(tmp_path / "cut.dcd"))
+    for parts, asked in ((1, {}), (3, {}), (1, {"stop": 25}), (1, {"step": 5})):
+        analysis = NeighborFlips(universe.atoms[:200], 5.0)
+        with pytest.raises(UnreadableFrame, match="frame 24 cannot be read") as caught:
+            analysis.run(n_parts=parts, **asked)
+        assert caught.value.frame == 24
+        assert analysis.frames.tolist() == list(range(0, 24, asked.get("step", 1)))
+        assert len(analysis.results.flips)
+    for asked in ({"stop": 24}, {"frames": [0, 23]}):
+        NeighborFlips(universe.atoms[:200], 5.0).run(**asked)
 
 
 def images():
