@@ -16,8 +16,8 @@ import numpy as np
 from _output import figure, parser, save, say, start, table
 
 from mdnum.references.conformance.case import AREAS
-from mdnum.references.conformance.load import installed, load
-from mdnum.references.conformance.script import script
+from mdnum.references.conformance.loading import installed, load
+from mdnum.references.conformance.reproduction import script
 from mdnum.references.conformance.suite import Report, examine
 
 # compiles for every number of atoms

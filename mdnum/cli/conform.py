@@ -67,7 +67,7 @@ def conform(
 
 def _names(as_json: bool) -> int:
     """The lists that have a name."""
-    from mdnum.references.conformance.load import known
+    from mdnum.references.conformance.loading import known
 
     rows = [
         {"list": one.name, "version": one.version, "kept": one.kept, "what": one.about} for one in known()

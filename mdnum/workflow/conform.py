@@ -110,7 +110,7 @@ def conform(
 
 def _loaded(pairs: Any) -> PairList:
     from mdnum.references.conformance.lists import PairList
-    from mdnum.references.conformance.load import from_object, load
+    from mdnum.references.conformance.loading import from_object, load
 
     if isinstance(pairs, PairList):
         return pairs
@@ -140,7 +140,7 @@ def _slug(name: str) -> str:
 
 def _write(folder: RunFolder, found: Report) -> list[str]:
     """Puts areas and failures into tables, and a script for each failure beside them; their names."""
-    from mdnum.references.conformance.script import script
+    from mdnum.references.conformance.reproduction import script
     from mdnum.store.atomic import write_text
 
     names = ("asked", "passed", "failed", "refused", "skipped")

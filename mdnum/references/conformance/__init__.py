@@ -13,11 +13,12 @@ if TYPE_CHECKING:
     from mdnum.references.conformance.adoption import NeighborListConformance
     from mdnum.references.conformance.case import Case, Still
     from mdnum.references.conformance.lists import KeptList, Limits, PairList
-    from mdnum.references.conformance.load import from_object, installed, known, load
-    from mdnum.references.conformance.script import script
+    from mdnum.references.conformance.loading import from_object, installed, known, load
+    from mdnum.references.conformance.reproduction import script
     from mdnum.references.conformance.strategies import boxes, cases
     from mdnum.references.conformance.suite import Report, examine
 
+# no module here has the name of what is exported: importing it would put the module in its place
 _WHERE = {
     "Case": "case",
     "KeptList": "lists",
@@ -29,11 +30,11 @@ _WHERE = {
     "boxes": "strategies",
     "cases": "strategies",
     "examine": "suite",
-    "from_object": "load",
-    "installed": "load",
-    "known": "load",
-    "load": "load",
-    "script": "script",
+    "from_object": "loading",
+    "installed": "loading",
+    "known": "loading",
+    "load": "loading",
+    "script": "reproduction",
 }
 
 __all__ = [

@@ -20,8 +20,8 @@ import pytest
 from mdnum.references.conformance.case import AREAS, Case
 from mdnum.references.conformance.crowds import LARGE_EDGE, SMALL_EDGE, lattice
 from mdnum.references.conformance.lists import Limits, PairList
-from mdnum.references.conformance.load import from_object, load
-from mdnum.references.conformance.script import script
+from mdnum.references.conformance.loading import from_object, load
+from mdnum.references.conformance.reproduction import script
 from mdnum.references.conformance.suite import examine, questions
 
 

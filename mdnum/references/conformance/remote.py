@@ -159,7 +159,7 @@ def main(word: str) -> None:
     """Answers questions on stdin until there are no more."""
     from dataclasses import replace
 
-    from mdnum.references.conformance.load import load
+    from mdnum.references.conformance.loading import load
 
     # a list may print: what it writes to stdout must not be taken for an answer
     answers = os.fdopen(os.dup(1), "wb")

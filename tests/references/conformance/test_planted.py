@@ -13,8 +13,8 @@ import pytest
 
 from mdnum.references.conformance.case import Still
 from mdnum.references.conformance.crowds import LARGE_EDGE, SMALL_EDGE, lattice
-from mdnum.references.conformance.load import from_object
-from mdnum.references.conformance.script import script
+from mdnum.references.conformance.loading import from_object
+from mdnum.references.conformance.reproduction import script
 from mdnum.references.conformance.suite import Report, drawn, examine, questions
 
 ROOT = Path(__file__).parents[3]

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import importlib
 import os
+import pkgutil
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import planted_lists
@@ -17,7 +20,7 @@ from mdnum.references.conformance.case import AREAS, one, script
 from mdnum.references.conformance.catalog import catalog, gas
 from mdnum.references.conformance.crowds import crowds
 from mdnum.references.conformance.lists import Limits, Session
-from mdnum.references.conformance.load import from_object, installed, known, load
+from mdnum.references.conformance.loading import from_object, installed, known, load
 from mdnum.references.conformance.movers import movers
 from mdnum.references.conformance.remote import RemoteSession
 from mdnum.references.conformance.strategies import PLACES, SHAPES, SIZES
@@ -40,6 +43,16 @@ class TestAdoptedKept(NeighborListConformance):
     def asked(self, tested, area):
         # the rest is asked of the list above
         return super().asked(tested, area) if area in ("few", "motion", "strain") else []
+
+
+@pytest.mark.parametrize("package", ["mdnum.references", "mdnum.references.conformance"])
+def test_what_is_exported_is_no_module(package: str):
+    """Nor after every module of the package was imported, which puts modules in the places of their names."""
+    home = importlib.import_module(package)
+    for name in home.__all__:
+        assert not isinstance(getattr(home, name), ModuleType), name
+    modules = {found.name for found in pkgutil.iter_modules(home.__path__)}
+    assert not modules & set(home.__all__)
 
 
 def test_an_adopted_suite_fails_with_a_script():
