@@ -15,6 +15,7 @@ from mdnum.errors import InputError
 from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.slices import chosen, counts_from_end
 from mdnum.trajectories.source import AtomTable, Trajectory, UnreadableFrame, table_of_topology
+from mdnum.trajectories.tails import refuse_cut_line
 from mdnum.units import METAL, Units
 from mdnum.units import get as units_named
 
@@ -174,6 +175,7 @@ def _block(lines: Any) -> list[str] | None:
     block = [head, *islice(lines, count + 1)]
     if len(block) != count + 2:
         raise ValueError(f"the file ends after {max(len(block) - 2, 0):,} of {count:,} atoms")
+    refuse_cut_line(block[2:])
     return block
 
 

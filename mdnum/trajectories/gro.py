@@ -16,6 +16,7 @@ from jaxtyping import Float
 from mdnum.trajectories.blocks import TextTrajectory, end_of, whole_number
 from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.source import AtomTable, table_of_topology
+from mdnum.trajectories.tails import refuse_cut_line
 
 _TIME = re.compile(r"\bt=\s*([-+0-9.eE]+)")
 _HEAD = 20
@@ -29,6 +30,8 @@ class GroTrajectory(TextTrajectory):
 
     format = "GRO"
     length = "Å"
+    # numbers of the box in the frame before
+    _box_words = 0
 
     def _told(self, number: int, block: list[str]) -> AtomTable:
         self.time = "ps" if _TIME.search(block[0]) else "frame"
@@ -64,6 +67,12 @@ class GroTrajectory(TextTrajectory):
         box = lines.readline()
         if not box.strip():
             raise ValueError("the file ends before the box")
+        if not box.endswith("\n"):
+            words = _words(box)
+            refuse_cut_line([box], words[:-1])
+            if len(words) < self._box_words:
+                raise ValueError(f"the file ends after {len(words)} numbers of the box")
+        self._box_words = len(_words(box))
         return [title, count, *rows, box]
 
 
@@ -78,9 +87,7 @@ def _columns(rows: list[str], width: int, count: int) -> Float[np.ndarray, "atom
 
 def _box(line: str) -> Box:
     """Three diagonal elements, or nine: v1x v2y v3z v1y v1z v2x v2z v3x v3y; zeros for no box."""
-    # five decimals, which boxes of 10 µm and more leave no room between
-    words = _TOUCHING.findall(line) if max(map(len, line.split())) > _LONG else line.split()
-    values = [float(word) * _NANOMETER for word in words]
+    values = [float(word) * _NANOMETER for word in _words(line)]
     if len(values) not in (3, 9):
         raise ValueError(f"a box of {len(values)} numbers")
     if not any(values):
@@ -88,3 +95,9 @@ def _box(line: str) -> Box:
     xx, yy, zz, xy, xz, yx, yz, zx, zy = values if len(values) == 9 else [*values, *[0.0] * 6]
     matrix = np.array([[xx, xy, xz], [yx, yy, yz], [zx, zy, zz]])
     return Box(matrix, np.array([xx, yy, zz]) != 0)
+
+
+def _words(line: str) -> list[str]:
+    """The numbers of a box, as written."""
+    # five decimals, which boxes of 10 µm and more leave no room between
+    return _TOUCHING.findall(line) if max(map(len, line.split())) > _LONG else line.split()

@@ -15,6 +15,7 @@ from mdnum.errors import InputError
 from mdnum.trajectories.blocks import TextTrajectory, end_of, whole_number
 from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.source import AtomTable
+from mdnum.trajectories.tails import refuse_cut_line
 
 # unit styles (docs.lammps.org/units.html): length, time
 _UNITS = {
@@ -118,6 +119,7 @@ class LammpsDump(TextTrajectory):
                     raise ValueError("atoms before their number")
                 rows = list(islice(lines, atoms))
                 end_of(rows, atoms)
+                refuse_cut_line(rows)
                 return block + rows
         if block:
             raise ValueError("the file ends in the head of a frame")

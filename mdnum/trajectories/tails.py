@@ -158,7 +158,8 @@ def refuse_cut_line(lines: Sequence[str], like: Sequence[str] = ()) -> None:
 
 def _is_cut(word: str, others: Sequence[str]) -> bool:
     mine, rest = _digits(word), [one for one in map(_digits, others) if one is not None]
-    if mine is None or not rest:
+    # a mass or a charge stands in other rows too
+    if mine is None or not rest or word in others:
         return False
     decimals, significant, exponent = mine
     if 0 <= exponent < 2:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 import warnings
+from typing import Any
 
 import ase.io
 import MDAnalysis
@@ -154,9 +155,9 @@ def test_a_dcd_that_was_cut_says_so(tmp_path):
     assert read(open_trajectory(datafiles.DCD, datafiles.PSF))[1] is None
 
 
-def moving_atoms():
+def moving_atoms() -> Any:
     """Four frames of forty atoms in memory."""
-    universe = MDAnalysis.Universe.empty(40, trajectory=True)
+    universe: Any = MDAnalysis.Universe.empty(40, trajectory=True)
     x = np.random.default_rng(0).uniform(0, 20, (4, 40, 3)).astype(np.float32)
     return universe.load_new(x, dimensions=[20, 20, 20, 90, 90, 90])
 
@@ -197,7 +198,7 @@ def test_a_trr_that_was_cut_or_damaged_says_so(tmp_path, kind, said):
 def test_the_analysis_names_the_frame_that_a_dcd_ends_in(tmp_path):
     with open(datafiles.DCD, "rb") as file:
         (tmp_path / "cut.dcd").write_bytes(file.read(1_000_000))
-    universe = MDAnalysis.Universe(datafiles.PSF, str(tmp_path / "cut.dcd"))
+    universe: Any = MDAnalysis.Universe(datafiles.PSF, str(tmp_path / "cut.dcd"))
     for parts, asked in ((1, {}), (3, {}), (1, {"stop": 25}), (1, {"step": 5})):
         analysis = NeighborFlips(universe.atoms[:200], 5.0)
         with pytest.raises(UnreadableFrame, match="frame 24 cannot be read") as caught:
@@ -245,6 +246,69 @@ def test_text_is_read_up_to_where_it_goes_wrong(tmp_path, kind, damage):
     frames, error = read(open_trajectory(path))
     assert isinstance(error, UnreadableFrame), error
     assert error.frame == len(frames) == 2 and "frame 2" in str(error) and "@:2" in str(error)
+
+
+WRITTEN = {
+    # as programs write the last column: so many decimals, so many digits in all, with exponents
+    "extxyz": lambda x: f"{x:16.8f}",
+    "lammpstrj": lambda x: f"{x:g}",
+    "gro": lambda x: f"{x:10.5f}",
+    "xyz": lambda x: f"{x:9.4f}",
+    "exponents": lambda x: f"{x:.8e}",
+}
+
+
+def text_of(kind, name):
+    """Five frames of nine atoms as words, the last column as `WRITTEN` has it."""
+    word = WRITTEN[name]
+    text = ""
+    for k, atoms in enumerate(images()):
+        rows = [[word(one) for one in row] for row in atoms.positions]
+        if kind == "lammpstrj":
+            head = LAMMPS.format(k=k).replace("ATOMS\n2\n", "ATOMS\n9\n").partition("1 1 1.5")[0]
+            text += head + "".join(f"{i + 1} 1 {' '.join(row)}\n" for i, row in enumerate(rows))
+        elif kind == "gro":
+            atom = "    1SOL     OW    1   0.100   0.200   0.300\n"
+            text += f"frame {k}\n    9\n" + 9 * atom + 3 * word(1.25 + 0.1 * k) + "\n"
+        else:
+            comment = (
+                'Lattice="9 0 0 0 9 0 0 0 9" Properties=species:S:1:pos:R:3' if kind == "extxyz" else "x"
+            )
+            text += f"9\n{box if kind == 'extxyz' else 'none'}\n" + "".join(
+                f"Ar {' '.join(row)}\n" for row in rows
+            )
+    return text
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [(kind, kind) for kind in ("extxyz", "lammpstrj", "gro", "xyz")]
+    + [("extxyz", "exponents"), ("lammpstrj", "exponents"), ("extxyz", "lammpstrj")],
+)
+def test_a_number_that_was_cut_is_not_read_as_another(tmp_path, kind, name):
+    text = text_of(kind, name).rstrip("\n")
+    path = tmp_path / f"run.{kind}"
+    last = len(text.split()[-1])
+    for cut in range(last + 1):
+        path.write_text(text[: len(text) - cut])
+        for old in tmp_path.glob(".run*"):
+            old.unlink()
+        frames, error = read(open_trajectory(path))
+        if cut == 0:
+            # whole, only the end of the line is missing
+            assert error is None and len(frames) == 5
+        else:
+            assert isinstance(error, UnreadableFrame) and error.frame == len(frames) == 4, (cut, error)
+
+
+def test_a_box_that_was_cut_to_three_numbers_is_not_a_rectangular_one(tmp_path):
+    text = GRO.replace("1.00000\n", "1.00000   0.00000   0.00000   0.50000   0.00000   0.50000   0.50000\n")
+    text = (text.format(k=0) + text.format(k=1)).rstrip("\n")
+    (tmp_path / "run.gro").write_text(text)
+    assert read(open_trajectory(tmp_path / "run.gro"))[1] is None
+    (tmp_path / "run.gro").write_text(text[:-60])
+    frames, error = read(open_trajectory(tmp_path / "run.gro"))
+    assert isinstance(error, UnreadableFrame) and len(frames) == 1 and "3 numbers of the box" in str(error)
 
 
 def test_a_traj_that_was_cut_is_read_as_far_as_it_goes(tmp_path):
