@@ -271,12 +271,9 @@ def text_of(kind, name):
             atom = "    1SOL     OW    1   0.100   0.200   0.300\n"
             text += f"frame {k}\n    9\n" + 9 * atom + 3 * word(1.25 + 0.1 * k) + "\n"
         else:
-            comment = (
-                'Lattice="9 0 0 0 9 0 0 0 9" Properties=species:S:1:pos:R:3' if kind == "extxyz" else "x"
-            )
-            text += f"9\n{box if kind == 'extxyz' else 'none'}\n" + "".join(
-                f"Ar {' '.join(row)}\n" for row in rows
-            )
+            box = 'Lattice="9 0 0 0 9 0 0 0 9" Properties=species:S:1:pos:R:3'
+            text += f"9\n{box if kind == 'extxyz' else ''}\n"
+            text += "".join(f"Ar {' '.join(row)}\n" for row in rows)
     return text
 
 
