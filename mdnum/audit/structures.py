@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 from ase import Atoms
 
 from mdnum.audit.load import Loaded
-from mdnum.audit.probes import Pair, pairs
+from mdnum.audit.probes import FARTHEST, Pair, pairs
 from mdnum.audit.subject import CalculatorError, CalculatorSubject, only_trying
 from mdnum.audit.thresholds import rough
 from mdnum.errors import InputError
@@ -21,6 +22,9 @@ _MOST_ATOMS = 500
 _FEWEST_ATOMS = 32
 _WATER_EDGES = (4, 5, 6, 8)
 """Molecules along an edge: some calculators want a box of two cutoffs."""
+
+_DENSITIES = (1.0, 0.85, 0.72, 0.6, 0.5, 1.2)
+"""Factors on a lattice constant at which a crystal is tried: a calculator may fail where nothing is near."""
 
 _BARELY, _PRESSED = 0.9, 0.6
 """A nearest distance above this part of the cutoff is made to be that part of it."""
@@ -69,35 +73,59 @@ def default_structure(loaded: Loaded) -> Atoms:
     """A structure for a calculator: its own, or a crystal of an element it takes, or rigid water.
 
     The crystal is the element's, with the lattice at the calculator's own least energy, repeated until two
-    cutoffs fit in (at most 500 atoms), its atoms displaced a little. `info["origin"]` says so in words.
+    cutoffs fit in (at most 500 atoms), its atoms displaced a little. `info["origin"]` says so in words. A
+    calculator that fails on atoms without neighbors is looked for a denser crystal: that it fails is a
+    finding, and no reason not to look.
 
     Raises:
-        InputError: the calculator answers for no element and not for water.
+        InputError: the calculator answers for no element and not for water; where it was asked about water,
+            that is saved.
     """
     if loaded.atoms is not None:
         return _told(loaded.atoms, f"{len(loaded.atoms)} atoms of {loaded.name}")
     calculator = loaded.make()
-    for symbol in _symbols(calculator):
-        subject = CalculatorSubject(loaded.name, lambda: calculator, Atoms(symbol, [(0, 0, 0)]), kT=1.0)
-        with only_trying(subject):
-            found, _ = pairs(subject)
-            if found:
-                return _crystal(subject, found[0], symbol)
-    why = ""
-    for edge in _WATER_EDGES:
-        subject = CalculatorSubject(loaded.name, lambda: calculator, water(edge), kT=1.0)
-        with only_trying(subject):
-            try:
-                subject.energy(subject.atoms)
-            except CalculatorError as error:
-                why = error.message
-            else:
-                return _told(subject.atoms, f"{edge**3} molecules of water, on a grid, turned at random")
+
+    def about(atoms: Atoms) -> CalculatorSubject:
+        return CalculatorSubject(loaded.name, lambda: calculator, atoms, kT=1.0)
+
+    likely, others = _symbols(calculator)
+    made = _first_crystal(about, likely)
+    why, saved = "", None
+    for edge in _WATER_EDGES if made is None else ():
+        subject = about(water(edge))
+        subject.saving = edge == _WATER_EDGES[-1]
+        try:
+            subject.energy(subject.atoms)
+        except CalculatorError as error:
+            why, saved = error.message, error.structure
+        else:
+            return _told(subject.atoms, f"{edge**3} molecules of water, on a grid, turned at random")
+    if made is None:
+        made = _first_crystal(about, others)
+    if made is None:
+        # after water, since a calculator of molecules may take any atoms in threes for them
+        made = _first_crystal(about, likely, paired=False)
+    if made is not None:
+        return made
     raise InputError(
-        f"the calculator answers neither for two atoms of any element nor for water ({why})",
+        f"the calculator answers neither for atoms of any element nor for water ({why}; saved in {saved})",
         where=loaded.name,
         remedy="Give a structure that it is made for: --structure FILE",
     )
+
+
+def _first_crystal(
+    about: Callable[[Atoms], CalculatorSubject], symbols: Sequence[str], paired: bool = True
+) -> Atoms | None:
+    """The crystal of the first element that is answered for, two atoms first unless they are not asked."""
+    for symbol in symbols:
+        subject = about(Atoms(symbol, [(0, 0, 0)]))
+        with only_trying(subject):
+            found = pairs(subject)[0][:1] if paired else [None]
+            made = [_crystal(subject, pair, symbol) for pair in found]
+        if made and made[0] is not None:
+            return made[0]
+    return None
 
 
 def _told(atoms: Atoms, says: str) -> Atoms:
@@ -125,8 +153,8 @@ def water(edge: int = 4, spacing: float = 3.1) -> Atoms:
     return Atoms("OH2" * edge**3, positions, cell=[edge * spacing] * 3, pbc=True)
 
 
-def _symbols(calculator: object) -> list[str]:
-    """Elements to try: those the calculator names, then the usual ones, then all."""
+def _symbols(calculator: object) -> tuple[list[str], list[str]]:
+    """Elements to try: those the calculator names and the usual ones, and all others."""
     from ase.data import chemical_symbols
 
     named: list[str] = []
@@ -135,14 +163,53 @@ def _symbols(calculator: object) -> list[str]:
         if isinstance(value, dict | list | tuple | set):
             words = [word for key in value for word in (key if isinstance(key, tuple) else (key,))]
             named += [word for word in words if isinstance(word, str) and word in chemical_symbols[1:]]
-    return list(dict.fromkeys([*named, *_FIRST, *chemical_symbols[1:_LAST_ELEMENT]]))
+    likely = list(dict.fromkeys([*named, *_FIRST]))
+    return likely, [one for one in chemical_symbols[1:_LAST_ELEMENT] if one not in likely]
 
 
-def _crystal(subject: CalculatorSubject, pair: Pair, symbol: str) -> Atoms:
-    cutoff, least = rough(subject, pair)
+def _crystal(subject: CalculatorSubject, pair: Pair | None, symbol: str) -> Atoms | None:
+    """The element's crystal, None where the calculator answers for it at no density."""
+    cutoff, least = (None, None) if pair is None else _felt(subject, pair)
     cell, lattice = _unit_cell(symbol)
-    scale, relaxed = _least_energy(subject, cell, least)
-    at = "at the calculator's own least energy" if relaxed else "at its tabulated lattice constant"
+    start = next((scale for scale in _DENSITIES if _answers(subject, _small(cell, scale))), None)
+    if start is None:
+        return None
+    scale, relaxed = _least_energy(subject, cell, least, start)
+    made = _filled(cell, lattice, scale, relaxed, cutoff, symbol)
+    if not _answers(subject, made):
+        made = _filled(cell, lattice, start, False, cutoff, symbol)
+    return made if _answers(subject, made) else None
+
+
+def _felt(subject: CalculatorSubject, pair: Pair) -> tuple[float | None, float | None]:
+    """As `rough`; of a calculator that fails on atoms without neighbors, the distance at which it does."""
+    try:
+        return rough(subject, pair)
+    except CalculatorError:
+        curve = pair.curve(subject)
+        for distance in np.arange(3.0, FARTHEST, 0.25):
+            try:
+                curve(float(distance))
+            except CalculatorError:
+                return float(distance), None
+        return None, None
+
+
+def _answers(subject: CalculatorSubject, atoms: Atoms) -> bool:
+    try:
+        subject.energy(atoms)
+        subject.forces(atoms)
+    except CalculatorError:
+        return False
+    return True
+
+
+def _filled(
+    cell: Atoms, lattice: str, scale: float, relaxed: bool, cutoff: float | None, symbol: str
+) -> Atoms:
+    """The crystal with its lattice scaled, repeated to two cutoffs, its atoms displaced a little."""
+    cell = cell.copy()
+    at = "at the calculator's own least energy" if relaxed else _tabulated(scale)
     if cutoff and scale * _nearest_distance(cell) > _BARELY * cutoff:
         # nothing holds it together: a crystal in which nothing is felt would tell nothing
         scale, at = _PRESSED * cutoff / _nearest_distance(cell), "nothing binds it, so pressed together"
@@ -180,19 +247,18 @@ def _nearest_distance(cell: Atoms) -> float:
     return float(distances[distances > 1e-6].min())
 
 
-def _least_energy(subject: CalculatorSubject, cell: Atoms, least: float | None) -> tuple[float, bool]:
-    """(factor on the lattice at which its energy is least, whether there was one)."""
-    small = cell.repeat(max(int(np.ceil((_FEWEST_ATOMS / len(cell)) ** (1 / 3))), 1))
+def _least_energy(
+    subject: CalculatorSubject, cell: Atoms, least: float | None, start: float
+) -> tuple[float, bool]:
+    """(factor on the lattice at which its energy is least, whether there was one), from a start on."""
 
     def energy(scale: float) -> float:
-        scaled = small.copy()
-        scaled.set_cell(np.asarray(small.cell) * scale, scale_atoms=True)
         try:
-            return subject.energy(scaled)
+            return subject.energy(_small(cell, scale))
         except CalculatorError:
             return np.inf
 
-    scale, factor = 1.0, 1.03
+    scale, factor = start, 1.03
     if least is not None and abs(energy(1.01) - energy(1.0)) < 1e-9:
         scale = least / _nearest_distance(cell)  # too far apart to feel one another: start at two atoms' own
     here = energy(scale)
@@ -205,3 +271,14 @@ def _least_energy(subject: CalculatorSubject, cell: Atoms, least: float | None) 
             scale, here = scale * direction, there
     ended = np.isfinite(here) and 0.2 < scale / start < 5.0
     return (scale, True) if ended and np.isfinite(here) else (start, False)
+
+
+def _small(cell: Atoms, scale: float) -> Atoms:
+    """A few atoms of a crystal whose lattice is scaled."""
+    small = cell.repeat(max(int(np.ceil((_FEWEST_ATOMS / len(cell)) ** (1 / 3))), 1))
+    small.set_cell(np.asarray(small.cell) * scale, scale_atoms=True)
+    return small
+
+
+def _tabulated(scale: float) -> str:
+    return "at its tabulated lattice constant" + ("" if scale == 1.0 else f" times {scale:.4g}")

@@ -13,8 +13,11 @@ from ase.calculators.calculator import Calculator, all_changes
 from ase.calculators.emt import EMT
 from ase.calculators.lj import LennardJones
 from audit.laws import subject
+from scipy.spatial import KDTree
 
-from mdnum.audit.load import load_calculator
+from mdnum.audit.alone import alone
+from mdnum.audit.load import Loaded, load_calculator
+from mdnum.audit.noise import Noise
 from mdnum.audit.structures import default_structure, read_structure
 from mdnum.audit.subject import CalculatorError, CalculatorSubject, only_trying
 from mdnum.errors import InputError
@@ -181,6 +184,37 @@ def test_default_structures():
     assert default_structure(load_calculator("ase.calculators.emt:EMT")).symbols[0] == "Cu"
     water = default_structure(load_calculator("ase.calculators.tip3p:TIP3P(rc=4.5)"))
     assert water.get_chemical_symbols()[:4] == ["O", "H", "H", "O"]
+
+
+@pytest.mark.parametrize(
+    ("answer", "raises", "cutoff", "code"),
+    [(float("nan"), None, 6.3, "LONELY_NOT_FINITE"), (0.0, ValueError("min()"), 3.4, "LONELY_FAILS")],
+)
+def test_who_fails_without_neighbors_gets_a_structure_and_a_finding(answer, raises, cutoff, code: str):
+    """Two atoms that do not feel one another are asked about first, and are what these fail on."""
+
+    class Lonely(Counting):
+        def calculate(self, atoms=None, properties=None, system_changes=all_changes):
+            assert isinstance(atoms, Atoms)
+            nearest = KDTree(atoms.positions).query(atoms.positions, 2)[0][:, 1]
+            self.answer, self.raises = (0.0, None) if (nearest < cutoff).all() else (answer, raises)
+            super().calculate(atoms, properties, system_changes)
+
+    atoms = default_structure(Loaded("lonely", "lonely", Lonely))
+    assert cutoff < 6 or atoms.cell.lengths().min() > 2 * cutoff
+    found = alone(subject(Lonely, atoms), atoms, Noise(1e-12, 1e-12)).findings()
+    assert code in {one["code"] for one in found}
+
+
+def test_who_never_answers_is_told_in_one_line_with_the_structure_saved():
+    def make() -> Counting:
+        return Counting(raises=ValueError("no"))
+
+    with pytest.raises(InputError, match="nor for water") as error:
+        default_structure(Loaded("never", "never", make))
+    assert "--structure" in str(error.value.remedy)
+    saved = ase.io.read(str(error.value).partition("saved in ")[2].partition(")")[0])
+    assert isinstance(saved, Atoms) and set(saved.symbols) == {"O", "H"}
 
 
 def test_structures_from_files(tmp_path: Path):
