@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mdnum.trajectories.changes import image_distances
-from mdnum.trajectories.frame import Frame
+from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.lattice import lattice_of
 from mdnum.trajectories.table import Flips, Members
 
@@ -27,25 +27,52 @@ class Apart:
         furthest: largest displacement, length.
         typical: root mean square displacement, length.
         atom: the one that is displaced furthest.
+        periods: most lattice vectors of one kind between an atom and its nearest image; 0 where none was
+            wrapped in one of the frames only.
     """
 
     furthest: float
     typical: float
     atom: int
+    periods: int = 0
 
 
 def displacements(start: Frame, end: Frame) -> Float[np.ndarray, "atoms 3"]:
     """From one frame to another, up to lattice vectors of the second's box.
 
     The nearest image is found along reduced lattice vectors: for an atom that moved by less than half the
-    width of the box it is the nearest of all.
+    width of the box it is the nearest of all. Where the frames repeat along different axes, only those along
+    which both do have images.
     """
+    return _displaced(start, end)[0]
+
+
+def _displaced(start: Frame, end: Frame) -> tuple[Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"]]:
+    """(displacements, whole lattice vectors taken off)."""
     moved = end.positions - start.positions
-    if not end.box.periodic:
-        return moved
-    lattice = lattice_of(end.box)
+    shared = Box(end.box.matrix, np.asarray(start.box.pbc, bool) & np.asarray(end.box.pbc, bool))
+    if not shared.periodic:
+        return moved, np.zeros_like(moved)
+    lattice = lattice_of(shared)
     whole = np.where(lattice.periodic, np.rint(moved @ lattice.inverse), 0.0)
-    return moved - whole @ lattice.vectors
+    return moved - whole @ lattice.vectors, whole
+
+
+def same_lattice(one: Box, other: Box, tolerance: float) -> bool:
+    """Whether two boxes tile space in the same way, whichever lattice vectors they name.
+
+    Args:
+        tolerance: how far a component of a lattice vector may be off, length.
+    """
+    if (np.asarray(one.pbc, bool) != np.asarray(other.pbc, bool)).any():
+        return False
+    rows = np.asarray(one.pbc, bool)
+    a, b = np.asarray(one.matrix, np.float64)[rows], np.asarray(other.matrix, np.float64)[rows]
+    if np.array_equal(a, b):
+        return True
+    # the vectors of one are whole combinations of the other's, and as many to a cell
+    whole = np.rint(np.linalg.lstsq(a.T, b.T, rcond=None)[0].T)
+    return bool(np.abs(b - whole @ a).max() <= tolerance and abs(round(np.linalg.det(whole))) == 1)
 
 
 def apart(one: Frame, other: Frame, atoms: Int[np.ndarray, "chosen"] | None = None) -> Apart:
@@ -54,11 +81,16 @@ def apart(one: Frame, other: Frame, atoms: Int[np.ndarray, "chosen"] | None = No
     Args:
         atoms: only these; None for all.
     """
-    moved = displacements(one, other)
-    square = np.sum((moved if atoms is None else moved[atoms]) ** 2, axis=1)
+    moved, whole = _displaced(one, other)
+    if atoms is not None:
+        moved, whole = moved[atoms], whole[atoms]
+    square = np.sum(moved**2, axis=1)
     at = int(np.argmax(square))
     return Apart(
-        float(np.sqrt(square[at])), float(np.sqrt(square.mean())), at if atoms is None else int(atoms[at])
+        float(np.sqrt(square[at])),
+        float(np.sqrt(square.mean())),
+        at if atoms is None else int(atoms[at]),
+        int(np.abs(whole).max()),
     )
 
 

@@ -136,6 +136,17 @@ class Tracker:
         rank = ranks(first, second)
         return Members(first, second, rank, self._distances(now, i[order], j[order], rank))
 
+    def thresholds(self) -> tuple[Float[np.ndarray, "atoms"], Float[np.ndarray, "atoms"]]:
+        """Of a directed rule, by atom of the file at the last frame, length; nan for atoms that do not look.
+
+        Returns:
+            (distance under which a neighbor stays one, distance under which another would become one).
+        """
+        found = np.full((2, max(self._atoms, 0)), np.nan)
+        if self._last is not None and self.rule.directed:
+            found[:, self._who.labels] = self._last.last_in, self._last.first_out
+        return found[0], found[1]
+
     # ---- one frame
 
     def _moment(self, frame: Frame) -> Moment:

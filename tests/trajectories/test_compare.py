@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from trajectories.membership import ledger, random_membership
 
-from mdnum.trajectories.compare import Difference, apart, displacements, distances, growth
+from mdnum.trajectories.compare import Difference, apart, displacements, distances, growth, same_lattice
 from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.table import Flips, Members
 
@@ -77,3 +77,29 @@ def test_growth_is_the_rate_of_an_exponential() -> None:
     rate, fit, frames = growth(time, 1e-9 * np.exp(1.7 * time), limit=1e-4) or (0, 0, 0)
     assert rate == pytest.approx(1.7) and fit == pytest.approx(1.0) and frames < 50
     assert growth(time[:4], time[:4], 1.0) is None and growth(time, np.zeros(50), 1.0) is None
+
+
+def test_a_lattice_is_the_same_whichever_vectors_name_it() -> None:
+    matrix = np.array([[10.0, 0, 0], [3.0, 9.0, 0], [-2.0, 1.0, 8.0]])
+    whole = np.array([[1, 2, 0], [0, 1, 0], [-3, 1, 1]])
+    every, slab = np.ones(3, bool), np.array([True, True, False])
+    one = Box(matrix, every)
+    assert same_lattice(one, one, 0.0) and same_lattice(one, Box(whole @ matrix, every), 1e-12)
+    assert same_lattice(one, Box(matrix + 1e-4, every), 2e-4)
+    assert not same_lattice(one, Box(matrix + 1e-4, every), 5e-5)
+    # a cell of twice the volume holds the same vectors and more, or fewer
+    assert not same_lattice(one, Box(np.diag([2, 1, 1]) @ matrix, every), 1e-9)
+    assert not same_lattice(Box(np.diag([2, 1, 1]) @ matrix, every), one, 1e-9)
+    assert not same_lattice(one, Box(matrix, slab), 1.0)
+    # the vector of an axis that does not repeat is not looked at
+    assert same_lattice(Box(matrix, slab), Box(np.vstack([matrix[:2], np.zeros(3)]), slab), 0.0)
+
+
+def test_an_axis_that_repeats_in_one_frame_only_has_no_images() -> None:
+    x = np.array([[1.0, 2.0, 3.0]])
+    every, slab = (Box(np.diag([10.0, 10, 10]), np.array(pbc)) for pbc in ([True] * 3, [True, True, False]))
+    for boxes in ((every, slab), (slab, every)):
+        start, end = Frame(0, 0.0, x, boxes[0]), Frame(0, 0.0, x + np.array([10.0, -20.0, 10.0]), boxes[1])
+        np.testing.assert_array_equal(displacements(start, end), [[0, 0, 10.0]])
+        found = apart(start, end)
+        assert found.furthest == 10.0 and found.periods == 2
