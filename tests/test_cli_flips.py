@@ -91,8 +91,9 @@ def test_two_files_of_one_system(capsys, tmp_path):
     words = ("-s", PSF, "--cutoff", "8", "--between", "name CA", "name CA")
     assert call("flips", f"{DCD}@:6", f"{DCD}@1:7", *words, *out) == 1
     lines = printed(capsys)
-    assert lines[0].startswith("Neighbor sets (r < 8 Å) differ from frame 0 on")
-    assert any(line.startswith("first to differ, frame 0") for line in lines)
+    assert lines[0].startswith("Neighbor sets (r < 8 Å) differ from frame 0 (0 in A’s file, 1 in B’s) on")
+    (title,) = [line for line in lines if line.startswith("first to differ, frame 0 (0 in A’s file")]
+    assert "beyond the files' resolution, frame 0 (" in title
     assert any("a flip that came first is no cause" in line for line in lines)
 
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from mdnum.cli import output
+from mdnum.report.words import many
 
 
 def print_rows(summary: Mapping[str, Any]) -> None:
@@ -37,7 +38,7 @@ def print_rows(summary: Mapping[str, Any]) -> None:
 def print_comparison(summary: Mapping[str, Any]) -> None:
     """What a comparison of two trajectories says below its headline."""
     out = output.console()
-    out.print(f"  {summary['system']} and {summary['other']}, {summary['atoms']:,} atoms", markup=False)
+    out.print(f"  {summary['system']} and {summary['other']}, {many(summary['atoms'], 'atom')}", markup=False)
     for line in summary["concluded"]:
         out.print(f"  {line}", markup=False)
     rows = [
@@ -48,13 +49,14 @@ def print_comparison(summary: Mapping[str, Any]) -> None:
     if rows:
         unit = f" ({summary['length']})" if summary["length"] else ""
         columns = ("pair", "inside in", f"r in A{unit}", "r in B", "margin in A", "margin in B")
-        output.print_table(f"first to differ, frame {summary['first']['frame']}", columns, rows)
+        certain = summary["certain_frame"] or "no frame"
+        title = f"first to differ, {summary['first_frame']}; beyond the files' resolution, {certain}"
+        output.print_table(title, columns, rows)
 
 
 def _file(summary: Mapping[str, Any]) -> str:
-    frames = summary["frames"]
-    size = f"{summary['atoms']:,} atoms, {frames:,} frame{'' if frames == 1 else 's'}"
-    if summary["timed"] and frames > 1:
+    size = f"{many(summary['atoms'], 'atom')}, {many(summary['frames'], 'frame')}"
+    if summary["timed"] and summary["frames"] > 1:
         size += f" {summary['interval']:.6g} {summary['time']} apart"
     return f"{summary['system']} ({summary['format']}, read by {summary['reader']}), {size}"
 

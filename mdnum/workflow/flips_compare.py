@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,10 +12,11 @@ import numpy as np
 from mdnum.errors import InputError
 from mdnum.store import RunFolder
 from mdnum.trajectories.checked import checked
-from mdnum.trajectories.compare import Apart, Difference, Pair, apart, distances, growth
+from mdnum.trajectories.compare import Apart, Difference, apart, growth
 from mdnum.trajectories.resolution import infer_from
-from mdnum.trajectories.rules import Cutoff, SpeciesCutoffs
+from mdnum.trajectories.rules import Cutoff
 from mdnum.trajectories.tracker import Tracker
+from mdnum.workflow.flips_differing import Side, other_box, rows
 from mdnum.workflow.flips_open import (
     FlipsResult,
     about,
@@ -33,10 +33,8 @@ from mdnum.workflow.fork_question import Log, Progress, finish
 
 if TYPE_CHECKING:
     from mdnum.trajectories.frame import Frame
-    from mdnum.trajectories.resolution import Resolution
     from mdnum.trajectories.rules import Rule
     from mdnum.trajectories.source import Trajectory
-    from mdnum.trajectories.table import Flips
     from mdnum.workflow.flips_record import Groups
 
 #: Rows of the table of pairs that come to differ.
@@ -47,34 +45,23 @@ _SAME_TIME = 1e-6
 
 
 @dataclass
-class _Side:
-    """One of the two trajectories."""
-
-    trajectory: Trajectory
-    tracker: Tracker
-    resolution: Resolution
-    bound: float = 0.0
-
-    def step(self, frame: Frame) -> Flips:
-        # a margin among the nearest is the difference of two distances
-        self.bound = self.resolution.bound(frame) * (1 + self.tracker.rule.directed)
-        return self.tracker.step(frame, bound=self.bound)
-
-
-@dataclass
 class _Found:
     """What the frames showed, position by position.
 
     Attributes:
         seed: first frame whose positions differ at all.
+        beyond: first frame at which an atom is further apart than the resolution of the two files explains.
         first: what was seen at the first frame whose sets differ.
         certain: first frame at which a pair differs that no resolution could have moved.
+        other_box: the boxes at the first frame at which they are not the same.
     """
 
     frames: int = 0
     seed: int | None = None
+    beyond: int | None = None
     first: dict[str, Any] | None = None
     certain: int | None = None
+    other_box: dict[str, Any] | None = None
     rows: int = 0
     times_differ: int = 0
     last: Apart = field(default_factory=lambda: Apart(0.0, 0.0, 0))
@@ -129,18 +116,18 @@ def _look(
 ) -> FlipsResult:
     began = time.perf_counter()
     sides = [
-        _Side(
+        Side(
             one,
             Tracker(rule, groups[0], groups[1], [str(word) for word in one.species], 0.0),
             infer_from(sample_of(one), one.bits, one.format),
         )
         for one in both
     ]
-    found = _follow(folder, sides, rule, groups, Log(folder, progress))
+    found = _follow(folder, sides, groups, Log(folder, progress))
     folder.finalize()
     (folder.path / "checkpoint.npz").unlink(missing_ok=True)
     a, b = both
-    table = folder.read("apart", ["time", "furthest", "typical"])
+    table = folder.read("apart", ["time", "furthest", "bound"])
     differing = folder.read("differing", rows=_FIRST)
     folder.write_summary(
         {
@@ -158,6 +145,8 @@ def _look(
             "resolution": told_resolution(sides[0].resolution, a),
             "other_resolution": told_resolution(sides[1].resolution, b),
             "seed": found.seed,
+            "beyond": found.beyond,
+            "other_box": found.other_box,
             "first": found.first,
             "certain": found.certain,
             "first_pairs": _first_pairs(found, differing),
@@ -172,7 +161,7 @@ def _look(
     return FlipsResult(folder.path, finish(folder, report, progress))
 
 
-def _follow(folder: RunFolder, sides: list[_Side], rule: Rule, groups: Groups, progress: Log) -> _Found:
+def _follow(folder: RunFolder, sides: list[Side], groups: Groups, progress: Log) -> _Found:
     """Reads both once, in step."""
     atoms = None
     if groups[0] is not None:
@@ -201,23 +190,26 @@ def _follow(folder: RunFolder, sides: list[_Side], rule: Rule, groups: Groups, p
         now = apart(frames[0], frames[1], atoms)
         if found.seed is None and now.furthest > 0:
             found.seed = found.frames
+        allowed = sum(side.position_bound(now.periods) for side in sides)
+        if found.beyond is None and now.furthest > allowed:
+            found.beyond = found.frames
+        if found.other_box is None and (boxes := other_box(frames, _boxes_bound(sides))) is not None:
+            found.other_box = {"frame": found.frames, **boxes}
         scale = max(abs(frames[0].time), abs(frames[1].time))
         found.times_differ += abs(frames[0].time - frames[1].time) > _SAME_TIME * scale
-        rows = _rows(difference.new[: max(ROWS - found.rows, 1)], difference, sides, frames, flips, rule)
-        if len(difference.new) and found.first is None:
-            found.first = {
-                "frame": found.frames, "number": frames[0].index, "time": frames[0].time,
-                "pairs": len(difference), "furthest": now.furthest, "typical": now.typical,
-                "furthest_before": before.furthest if found.frames else None,
-                "typical_before": before.typical if found.frames else None,
-                "ambiguous": int(np.count_nonzero(rows["ambiguous"])),
-            }  # fmt: skip
-        if found.certain is None and len(rows["i"]) and not rows["ambiguous"].all():
-            found.certain = found.frames
-        if found.rows < ROWS and len(rows["i"]):
-            folder.append("differing", {"frame": np.full(len(rows["i"]), found.frames), **rows})
-            found.rows += len(rows["i"])
-        _append(folder, found.frames, frames, now, difference, sides)
+        if found.certain is None and len(difference):
+            # all that differ: one that came to differ within the resolution may be beyond it by now
+            standing = rows(sorted(difference.only_a | difference.only_b), difference, sides, frames)
+            undecided = int(np.count_nonzero(standing["ambiguous"]))
+            if found.first is None:
+                found.first = _first(found, frames, difference, now, before, undecided)
+            if undecided < len(difference):
+                found.certain = found.frames
+        if new := difference.new[: ROWS - found.rows]:
+            told = rows(new, difference, sides, frames)
+            folder.append("differing", {"frame": np.full(len(new), found.frames), **told})
+            found.rows += len(new)
+        _append(folder, found.frames, frames, now, allowed, difference, sides)
         before, found.last = now, now
         found.frames += 1
         folder.checkpoint({"frames": found.frames})
@@ -228,69 +220,45 @@ def _follow(folder: RunFolder, sides: list[_Side], rule: Rule, groups: Groups, p
     return found
 
 
+def _boxes_bound(sides: list[Side]) -> float:
+    """How far lattice vectors may be apart; formats that round positions may round the box as much."""
+    return sum(side.distance_bound for side in sides)
+
+
+def _first(
+    found: _Found,
+    frames: tuple[Frame, ...],
+    difference: Difference,
+    now: Apart,
+    before: Apart,
+    undecided: int,
+) -> dict[str, Any]:
+    """What summary.json says of the first frame whose sets differ."""
+    return {
+        "frame": found.frames, "number": frames[0].index, "time": frames[0].time,
+        "pairs": len(difference), "furthest": now.furthest, "typical": now.typical,
+        "furthest_before": before.furthest if found.frames else None,
+        "typical_before": before.typical if found.frames else None,
+        "ambiguous": undecided,
+    }  # fmt: skip
+
+
 def _append(
     folder: RunFolder,
     at: int,
     frames: tuple[Frame, ...],
     now: Apart,
+    bound: float,
     difference: Difference,
-    sides: list[_Side],
+    sides: list[Side],
 ) -> None:
     row = {
-        "frame": at, "time": frames[0].time, "time_b": frames[1].time, "furthest": now.furthest,
-        "typical": now.typical, "atom": now.atom, "pairs_a": sides[0].tracker.pairs,
-        "pairs_b": sides[1].tracker.pairs, "only_a": len(difference.only_a),
-        "only_b": len(difference.only_b),
+        "frame": at, "number_a": frames[0].index, "number_b": frames[1].index, "time": frames[0].time,
+        "time_b": frames[1].time, "furthest": now.furthest, "bound": bound, "typical": now.typical,
+        "atom": now.atom, "pairs_a": sides[0].tracker.pairs, "pairs_b": sides[1].tracker.pairs,
+        "only_a": len(difference.only_a), "only_b": len(difference.only_b),
     }  # fmt: skip
     folder.append("apart", {name: [value] for name, value in row.items()})
-
-
-def _rows(
-    pairs: list[Pair],
-    difference: Difference,
-    sides: list[_Side],
-    frames: tuple[Frame, ...],
-    flips: list[Flips],
-    rule: Rule,
-) -> dict[str, np.ndarray]:
-    """Columns on pairs that differ: where each is inside, and by how much."""
-    i, j, rank = (np.array([pair[k] for pair in pairs], np.int64) for k in range(3))
-    apart = [distances(frame, pairs, rule.directed) for frame in frames]
-    margins = [
-        np.array(list(_margins(pairs, distance, flipped, rule, side)))
-        for distance, flipped, side in zip(apart, flips, sides, strict=True)
-    ]
-    bounds = [side.bound for side in sides]
-    close = [np.abs(margin) <= bound for margin, bound in zip(margins, bounds, strict=True)]
-    return {
-        "rule": np.zeros(len(pairs), np.int64),
-        "i": i, "j": j, "rank": rank,
-        "inside": np.array(["A" if pair in difference.only_a else "B" for pair in pairs], dtype=object),
-        "distance_a": apart[0], "distance_b": apart[1], "margin_a": margins[0], "margin_b": margins[1],
-        "bound": np.full(len(pairs), max(bounds)), "ambiguous": np.asarray(close[0] | close[1], bool),
-    }  # fmt: skip
-
-
-def _margins(
-    pairs: list[Pair], distance: np.ndarray, flips: Flips, rule: Rule, side: _Side
-) -> Iterator[float]:
-    """Signed distances to the threshold; nan where a rule without a radius did not flip the pair here."""
-    species = side.trajectory.species
-    told = {
-        pair: margin
-        for *pair_, margin in zip(
-            flips.i.tolist(), flips.j.tolist(), flips.rank.tolist(), flips.margin.tolist(), strict=True
-        )
-        if (pair := (pair_[0], pair_[1], pair_[2])) in set(pairs)
-    } if rule.directed else {}  # fmt: skip
-    for pair, r in zip(pairs, distance.tolist(), strict=True):
-        if isinstance(rule, Cutoff):
-            yield rule.radius - r
-        elif isinstance(rule, SpeciesCutoffs):
-            first, second = str(species[pair[0]]), str(species[pair[1]])
-            yield rule.radii.get((first, second), rule.radii.get((second, first), float("nan"))) - r
-        else:
-            yield told.get(pair, float("nan"))
 
 
 def _first_pairs(found: _Found, rows: dict[str, np.ndarray]) -> list[dict[str, Any]]:
@@ -306,8 +274,10 @@ def _growth(found: _Found, table: dict[str, np.ndarray], rule: Rule) -> dict[str
     """Rates at which the separation grows before the sets differ, and from then on."""
     limit = 0.1 * (rule.radius if isinstance(rule, Cutoff) else float(table["furthest"].max(initial=0.0)))
     cut = found.frames if found.first is None else found.first["frame"]
+    # up to its bound a separation may be made of rounding
+    separation = np.where(table["furthest"] > table["bound"], table["furthest"], 0.0)
     parts = {}
     for name, part in (("before", slice(None, cut + 1)), ("after", slice(cut, None))):
-        line = growth(table["time"][part], table["furthest"][part], limit)
+        line = growth(table["time"][part], separation[part], limit)
         parts[name] = None if line is None else {"rate": line[0], "r2": line[1], "frames": line[2]}
     return parts

@@ -12,7 +12,7 @@ from mdnum.ball.demos.base import Plot, Series
 from mdnum.report.browse import Browse, Column, plain_rows
 from mdnum.report.flips.conclusions import cannot, concluded, findings, headline
 from mdnum.report.flips.html import load
-from mdnum.report.flips.words import length, rule_words
+from mdnum.report.flips.words import frame, length, rule_words
 from mdnum.report.fork.findings import Verdict
 from mdnum.report.fork.question import Question, declared, verdict, write_page
 from mdnum.report.words import count, many, number
@@ -41,8 +41,7 @@ def write_report(folder: RunFolder | str | Path) -> Path:
         {name: declared(plot) for name, plot in drawn.items() if plot is not None},
         captions={
             "separation": "Largest and root mean square distance between an atom in A and the same atom in "
-            "B, "
-            "nearest images.",
+            "B, nearest images; up to the dashed line the files’ resolution explains it.",
             "differing": "Pairs inside in one trajectory only, and all pairs inside in A.",
         },
         figures=list(_key_figures(run)),
@@ -67,7 +66,13 @@ def _judge(run: Question) -> Verdict:
 
 def _with_words(run: Question) -> Question:
     """With what is concluded in the summary, for the command line."""
-    summary = {**run.summary, "concluded": list(concluded(run)), "cannot": list(cannot(run))}
+    told = {"concluded": list(concluded(run)), "cannot": list(cannot(run))}
+    frames = {
+        "first_frame": (run.summary["first"] or {}).get("frame"),
+        "certain_frame": run.summary["certain"],
+    }
+    told |= {name: None if at is None else frame(run, at) for name, at in frames.items()}
+    summary = {**run.summary, **told}
     return Question(run.path, summary, run.system_toml, run.provenance, run.tables)
 
 
@@ -81,8 +86,8 @@ def _axis(run: Question) -> tuple[str, np.ndarray]:
 def _marks(run: Question, x: np.ndarray) -> tuple[tuple[float, str], ...]:
     summary = run.summary
     marks = []
-    if summary["seed"]:
-        marks.append((float(x[summary["seed"]]), "positions differ"))
+    if summary["beyond"]:
+        marks.append((float(x[summary["beyond"]]), "positions differ"))
     if summary["first"] is not None:
         marks.append((float(x[summary["first"]["frame"]]), "sets differ"))
     return tuple(marks)
@@ -97,6 +102,7 @@ def _separation(run: Question) -> Plot | None:
     series = (
         Series("furthest atom", x, table["furthest"]),
         Series("root mean square", x, table["typical"], role="second"),
+        Series("explained by resolution", x, table["bound"], role="muted", dashed=True),
     )
     title = f"separation ({unit})" if unit else "separation"
     return Plot("How far apart the two are", label, title, series, y_scale="log", verticals=_marks(run, x))
@@ -118,9 +124,12 @@ def _differing(run: Question) -> Plot | None:
 def _key_figures(run: Question) -> Iterator[tuple[str, str, str]]:
     summary = run.summary
     first = summary["first"]
-    yield "Positions differ", _frame(summary["seed"]), "first frame"
+    seed = summary["seed"]
+    at_all = "the same bit for bit" if seed is None else f"at all from {frame(run, seed)} on"
+    yield "Positions differ", _frame(summary["beyond"]), f"first frame, beyond resolution; {at_all}"
     yield "Sets differ", "never" if first is None else _frame(first["frame"]), "first frame"
     if first is not None:
+        yield "Sets differ for certain", _frame(summary["certain"]), "first frame, beyond resolution"
         yield "Pairs then", count(first["pairs"]), f"{count(first['ambiguous'])} within the resolution"
         yield "Apart then", length(run, first["furthest"]), "furthest atom"
     yield "Apart at the end", length(run, summary["last"]["furthest"]), "furthest atom"

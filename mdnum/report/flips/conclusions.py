@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from mdnum.report.flips.words import length, rule_words
+from mdnum.report.flips.words import frame, length, rule_words
 from mdnum.report.fork.question import Question
 from mdnum.report.verdict import Finding
-from mdnum.report.words import count, many, number
+from mdnum.report.words import count, listed, many, number, plain
 
 # frames after a flip in which a leap of the separation shows, and how much larger than any before it must be
 _WINDOW, _LEAP = 10, 5.0
@@ -20,39 +20,67 @@ _ALIKE = 1.5
 _FITS = 0.8
 
 
+def shown(run: Question) -> bool:
+    """Whether anything that differs is beyond what the resolution of the two files explains."""
+    return any(run.summary[name] is not None for name in ("beyond", "certain", "other_box"))
+
+
 def headline(run: Question) -> str:
     """The verdict in one sentence."""
     summary = run.summary
     frames, what = many(summary["frames"], "frame"), rule_words(run, summary)
-    if summary["seed"] is None and summary["first"] is None:
-        return f"The two trajectories have the same positions in all of {frames}."
-    first = summary["first"]
+    seed, first, beyond, boxes = (summary[name] for name in ("seed", "first", "beyond", "other_box"))
+    other = "" if boxes is None else ", but not the same box"
+    if seed is None and first is None:
+        return f"The two trajectories have the same positions in all of {frames}{other}."
+    if not shown(run):
+        atoms = f"at most {length(run, _largest(run)[0])} apart, as their files’ resolution explains"
+        text = f"Nothing here shows that the two differ: atoms are {atoms}, in all of {frames}"
+        if first is None:
+            return f"{text}, and neighbor sets ({what}) are the same."
+        pairs = many(first["pairs"], "pair")
+        at = frame(run, first["frame"])
+        return f"{text}; neighbor sets ({what}) differ from {at} on, by {pairs}, all within that resolution."
+    if first is None and beyond is None:
+        return (
+            f"Neighbor sets ({what}) are the same in all of {frames}, and positions up to the files’ "
+            f"resolution{other}."
+        )
     if first is None:
-        return f"Positions differ from frame {count(summary['seed'])} on, neighbor sets ({what}) never do."
+        return f"Positions differ from {frame(run, beyond)} on, neighbor sets ({what}) never do."
     pairs = many(first["pairs"], "pair")
-    text = f"Neighbor sets ({what}) differ from frame {count(first['frame'])} on, first by {pairs}"
+    text = f"Neighbor sets ({what}) differ from {frame(run, first['frame'])} on, first by {pairs}"
     if first["ambiguous"] == first["pairs"]:
-        return f"{text}, all within the files’ resolution: they may have differed earlier, or later."
+        certain = summary["certain"]
+        sure = "never" if certain is None else f"from {frame(run, certain)} on"
+        return f"{text}, all within the files’ resolution; beyond it {sure}."
+    if seed is None:
+        return f"{text}, at the same positions in boxes that differ."
     return f"{text}; atoms are {length(run, first['furthest'])} apart by then."
+
+
+def _largest(run: Question) -> tuple[float, float]:
+    """(largest distance between an atom in A and in B at any frame, what resolution explains then)."""
+    table = run.tables["apart"]
+    at = int(np.argmax(table["furthest"]))
+    return float(table["furthest"][at]), float(table["bound"][at])
 
 
 def concluded(run: Question) -> Iterator[str]:
     """What the frames show."""
     summary = run.summary
-    first, seed = summary["first"], summary["seed"]
-    if seed is not None:
-        start = "the first frame" if seed == 0 else f"frame {count(seed)}"
-        until = "" if seed == 0 else " and are the same bit for bit before"
-        yield f"Positions differ from {start} on{until}."
+    first, seed, beyond = summary["first"], summary["seed"], summary["beyond"]
+    yield from _positions(run)
     if first is None:
-        if seed is not None:
+        if beyond is not None:
             yield (
                 f"The sets are the same in all {many(summary['frames'], 'frame')}, with atoms up to "
                 f"{length(run, summary['last']['furthest'])} apart at the end: no flip seen here made them "
                 "part."
             )
         return
-    yield _order(run, first, seed)
+    yield _certain(run, first)
+    yield _order(run, first)
     yield from _leap(run, first, seed)
     before, after = (summary["growth"][name] for name in ("before", "after"))
     if before is not None and before["r2"] >= _FITS and before["rate"] > 0:
@@ -61,19 +89,71 @@ def concluded(run: Question) -> Iterator[str]:
         yield f"From then on it grows {_rate(run, after)}{_hurried(before, after)}."
 
 
-def _order(run: Question, first: Any, seed: int | None) -> str:
+def _positions(run: Question) -> Iterator[str]:
+    """From when on positions differ, and from when on by more than the files' last digits."""
+    seed, beyond = run.summary["seed"], run.summary["beyond"]
+    if seed is None:
+        if run.summary["first"] is not None:
+            yield "Positions are the same at all frames."
+        return
+    text = f"Positions differ from {'the first frame' if seed == 0 else frame(run, seed)} on"
+    if seed:
+        text += " and are the same bit for bit before"
+    if beyond is None:
+        furthest, explained = _largest(run)
+        yield (
+            f"{text}, by up to {length(run, furthest)}; the resolution of the two files explains up to "
+            f"{length(run, explained)}."
+        )
+    elif beyond == seed:
+        yield f"{text}, at once by more than the resolution of the two files explains."
+    else:
+        yield f"{text}; by more than the resolution of the two files explains from {frame(run, beyond)} on."
+
+
+def _certain(run: Question, first: Any) -> str:
+    """Since when the sets differ whatever the files have rounded."""
+    certain, sure = run.summary["certain"], first["pairs"] - first["ambiguous"]
+    if sure:
+        return (
+            f"Of the {many(first['pairs'], 'pair')} that differ first, {count(sure)} "
+            f"{'is' if sure == 1 else 'are'} further from the threshold, in A and in B, than the files’ "
+            "resolution explains."
+        )
+    if certain is None:
+        return (
+            "Every pair that differs is within the files’ resolution of the threshold, at every frame: "
+            "whether the sets differ cannot be told."
+        )
+    return (
+        "The pairs that differ first are within the files’ resolution of the threshold; beyond it a pair "
+        f"differs first at {frame(run, certain)}."
+    )
+
+
+def _order(run: Question, first: Any) -> str:
     """Whether a difference of positions was there before one of sets."""
-    if seed is None or seed == first["frame"]:
-        if first["frame"] == 0:
-            return "Sets differ at the first frame: the two do not start alike."
+    beyond, certain = run.summary["beyond"], run.summary["certain"]
+    if beyond is not None and beyond < first["frame"]:
+        before = length(run, first["furthest_before"])
+        return (
+            f"At the frame before, no set differed and atoms were already up to {before} apart: the "
+            "difference of the two did not begin with a flip that these frames show."
+        )
+    if run.summary["seed"] is None:
+        return "The sets differ because the boxes do." if run.summary["other_box"] else ""
+    if not shown(run):
+        return "Two ways of writing one and the same run would look like this."
+    if first["frame"] == 0 and 0 in (beyond, certain):
+        return "Sets differ at the first frame: the two do not start alike."
+    if first["frame"] in (beyond, certain):
         return (
             "Positions and sets come to differ between the same two frames: which came first lies between "
             "them."
         )
-    before = length(run, first["furthest_before"])
     return (
-        f"At the frame before, no set differed and atoms were already up to {before} apart: the difference "
-        "of the two did not begin with a flip that these frames show."
+        "Nothing that differs then is beyond the files’ resolution: which came first, a flip or another "
+        "difference, they cannot tell."
     )
 
 
@@ -82,7 +162,10 @@ def _leap(run: Question, first: Any, seed: int | None) -> Iterator[str]:
     furthest, at = run.tables["apart"]["furthest"], int(first["frame"])
     # a difference that has just begun grows fast, whatever began it
     start = max((seed or 0) + _WINDOW, at // 2)
-    if at + _WINDOW >= len(furthest) or start + _WINDOW > at or not furthest[start:].all():
+    if at + _WINDOW >= len(furthest) or start + _WINDOW > at:
+        return
+    # what resolution explains does not grow
+    if not (furthest > run.tables["apart"]["bound"])[start:].all():
         return
     grown = furthest[_WINDOW:] / np.maximum(furthest[:-_WINDOW], np.finfo(float).tiny)
     after, before = float(grown[at]), float(grown[start : at - _WINDOW + 1].max())
@@ -119,7 +202,7 @@ def _hurried(before: Any, after: Any) -> str:
 
 def cannot(run: Question) -> Iterator[str]:
     """What two trajectories cannot say, whatever they hold."""
-    if run.summary["first"] is not None:
+    if run.summary["first"] is not None and shown(run):
         yield (
             "A flip that came first is no cause. Two trajectories part after a flip and through chaos alone "
             "in the same way; only a run that is handed the other's decisions tells the two apart."
@@ -146,7 +229,9 @@ def findings(run: Question) -> Iterator[Finding]:
             f"{summary['stopped']} Everything here is about the {frames} before.",
             "Check how that file was written.",
         )
-    if summary["first"] is not None:
+    yield from _within(run)
+    yield from _boxes(run)
+    if summary["first"] is not None and shown(run):
         yield Finding(
             "NO_CAUSE_FROM_FILES",
             "info",
@@ -180,3 +265,53 @@ def findings(run: Question) -> Iterator[Finding]:
             f"one has {count(min(counts))} frames, the other {count(max(counts))}",
             "Those that both have are compared.",
         )
+
+
+def _within(run: Question) -> Iterator[Finding]:
+    """Sets that differ first by pairs about which the files cannot tell."""
+    first, certain = run.summary["first"], run.summary["certain"]
+    if first is None or certain == first["frame"]:
+        return
+    sure = "No pair ever differs" if certain is None else f"A pair differs first at {frame(run, certain)}"
+    yield Finding(
+        "WITHIN_RESOLUTION",
+        "warning" if shown(run) else "info",
+        "the first pairs that differ are within the files’ resolution",
+        f"At {frame(run, first['frame'])} every pair that is inside in one file only is so close to the "
+        f"threshold that rounding may have put it there. {sure} by more than the resolution explains.",
+        "Take the frame that is certain, or write positions with more digits." if shown(run) else "",
+    )
+
+
+def _boxes(run: Question) -> Iterator[Finding]:
+    """Boxes or axes of repetition that are not the same."""
+    found, beyond = run.summary["other_box"], run.summary["beyond"]
+    if found is None:
+        return
+    # two runs at constant pressure have two boxes once they have parted
+    parted = not found["axes"] and beyond is not None and 0 < beyond <= found["frame"]
+    what = "repeat along different axes" if found["axes"] else "have different boxes"
+    yield Finding(
+        "OTHER_BOX",
+        "info" if parted else "warning",
+        f"the two {what} from {frame(run, found['frame'])} on",
+        f"A: {_box(run, found['a'])}. B: {_box(run, found['b'])}. Each file’s pairs are those of its own "
+        "box; how far atoms are apart is told through the box of B, along axes that both repeat along."
+        + (" The boxes came to differ after the positions did, as with a barostat." if parted else ""),
+        "" if parted else "Check that both files are of one system, and that both keep their boxes.",
+    )
+
+
+def _box(run: Question, box: Any) -> str:
+    """A box in words: lengths, angles where they are not right, and the axes along which it repeats."""
+    matrix, axes = np.array(box["matrix"]), [name for name, yes in zip("abc", box["pbc"], strict=True) if yes]
+    if not axes:
+        return "no box that repeats"
+    sizes = np.linalg.norm(matrix, axis=1)
+    text = f"{' × '.join(plain(float(one), 9) for one in sizes)} {run.summary['length']}".rstrip()
+    with np.errstate(invalid="ignore", divide="ignore"):
+        unit = matrix / sizes[:, None]
+    angles = np.degrees(np.arccos(np.clip([unit[1] @ unit[2], unit[0] @ unit[2], unit[0] @ unit[1]], -1, 1)))
+    if np.isfinite(angles).all() and np.abs(angles - 90).max() > 1e-9:
+        text += f" at {', '.join(plain(float(one), 7) for one in angles)}°"
+    return f"{text}, repeating along {listed(axes)}"

@@ -37,6 +37,16 @@ def length(run: Question, value: float | None, digits: int = 3) -> str:
     return f"{number(value, digits)} {run.summary['length']}".rstrip()
 
 
+def frame(run: Question, at: int) -> str:
+    """A frame of a comparison: its place among those compared, and its numbers in the files if others."""
+    a, b = (int(run.tables["apart"][f"number_{one}"][at]) for one in "ab")
+    if a == b == at:
+        return f"frame {count(at)}"
+    if a == b:
+        return f"frame {count(at)} ({count(a)} in both files)"
+    return f"frame {count(at)} ({count(a)} in A’s file, {count(b)} in B’s)"
+
+
 def per_time(run: Question, per_frame: float | None, digits: int = 3) -> str:
     """A rate per frame as one per time, where the file has times."""
     if per_frame is None:

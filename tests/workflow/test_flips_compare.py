@@ -1,0 +1,196 @@
+"""Two trajectories: what rounding alone makes differ, what is certain, boxes, and numbers of frames."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import ase
+import numpy as np
+import pytest
+from ase.io import write
+
+import mdnum
+from mdnum.store import RunFolder
+from mdnum.trajectories.frame import Box, Frame
+from mdnum.trajectories.rules import Capped, Cutoff, Nearest, Rule
+from mdnum.trajectories.tracker import Tracker
+from mdnum.workflow import flips_compare
+from mdnum.workflow.flips_open import FlipsResult
+
+
+def looked(a: Path, b: Path, out: Path, **options: Any) -> FlipsResult:
+    return mdnum.flips(a, b, **{"cutoffs": [4.2], "report": False, "out": out, **options})
+
+
+def finding(result: FlipsResult, code: str) -> dict[str, Any] | None:
+    return next((one for one in result.summary["findings"] if one["code"] == code), None)
+
+
+def gas(frames: int = 6, atoms: int = 40, side: float = 9.0, pbc: Any = True) -> list[ase.Atoms]:
+    """Atoms that fly straight, unwrapped."""
+    rng = np.random.default_rng(8)
+    start, speed = rng.uniform(0, side, (atoms, 3)), rng.normal(0, 0.4, (atoms, 3))
+    return [
+        ase.Atoms(f"Ar{atoms}", start + n * speed, cell=[side] * 3, pbc=pbc, info={"time": float(n)})
+        for n in range(frames)
+    ]
+
+
+def pairs_at(distances: list[float], more: int = 0) -> list[ase.Atoms]:
+    """Two atoms at these distances and others that only move, on a grid of 0.01."""
+    return [
+        ase.Atoms(
+            f"Ar{4 + 2 * more}",
+            [[0.11, 0.23, 0.37], [0.11, 0.23, round(0.37 + r, 2)], [9.01 + 0.01 * n, 47.13, 5.27],
+             [20.19, 43.41 + 0.03 * n, 8.93]]
+            + [[0.11, 100.13 + 20 * k, z] for k in range(more) for z in (0.37, round(0.37 + r, 2))],
+            info={"time": float(n)},
+        )
+        for n, r in enumerate(distances)
+    ]  # fmt: skip
+
+
+def test_one_run_written_twice_is_not_said_to_differ(tmp_path: Path) -> None:
+    frames = gas()
+    write(tmp_path / "a.traj", frames)
+    write(tmp_path / "digits.extxyz", frames)
+    for one in frames:
+        one.wrap()
+    write(tmp_path / "wrapped.traj", frames)
+    for one in frames:
+        one.positions = np.round(one.positions, 2)
+    write(tmp_path / "coarse.extxyz", frames)
+    for name in ("digits.extxyz", "wrapped.traj", "coarse.extxyz"):
+        found = looked(tmp_path / "a.traj", tmp_path / name, tmp_path / f"f-{name}")
+        summary = found.summary
+        assert summary["seed"] == 0 and summary["beyond"] is None and summary["certain"] is None, name
+        assert summary["headline"].startswith("Nothing here shows that the two differ"), name
+        assert "do not start alike" not in " ".join(summary["concluded"])
+        assert finding(found, "NO_CAUSE_FROM_FILES") is None
+        assert all(one["severity"] == "info" for one in summary["findings"])
+        assert not any("no cause" in one for one in summary["cannot"])
+    # on the coarse grid sets do differ, all of it within the resolution
+    assert summary["first"] is not None and summary["first"]["ambiguous"] == summary["first"]["pairs"]
+    said = finding(found, "WITHIN_RESOLUTION")
+    assert said is not None and "No pair ever differs" in said["text"]
+    # half a step along each axis, and not one more
+    table = RunFolder.open(found.folder).read("apart")
+    assert table["bound"].max() == pytest.approx(np.sqrt(3) * 0.005, rel=1e-3)
+    assert 0.5 < table["furthest"].max() / table["bound"].max() < 1
+
+
+def test_positions_beyond_the_resolution_before_any_set(tmp_path: Path) -> None:
+    write(tmp_path / "a.extxyz", pairs_at([4.0, 4.0, 4.0, 4.1, 4.3]))
+    write(tmp_path / "b.extxyz", pairs_at([4.0, 4.01, 4.05, 4.1, 4.1]))
+    found = looked(tmp_path / "a.extxyz", tmp_path / "b.extxyz", tmp_path / "f").summary
+    assert (found["seed"], found["beyond"], found["first"]["frame"], found["certain"]) == (1, 2, 4, 4)
+    told = " ".join(found["concluded"])
+    assert "Positions differ from frame 1 on and are the same bit for bit before; by more than" in told
+    assert "explains from frame 2 on" in told and "did not begin with a flip" in told
+
+
+def test_what_is_certain_is_found_among_pairs_that_stay_different(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # differs within the resolution at frame 1, and beyond it at frame 2, where no pair is new
+    write(tmp_path / "a.extxyz", pairs_at([4.0, 4.19, 4.0, 4.0]))
+    write(tmp_path / "b.extxyz", pairs_at([4.0, 4.21, 4.6, 4.9]))
+    found = looked(tmp_path / "a.extxyz", tmp_path / "b.extxyz", tmp_path / "f", report=True)
+    summary = found.summary
+    assert summary["first"]["frame"] == 1 and summary["first"]["ambiguous"] == 1
+    assert summary["certain"] == 2 and summary["certain_frame"] == "frame 2"
+    assert "beyond it from frame 2 on" in summary["headline"]
+    said = finding(found, "WITHIN_RESOLUTION")
+    assert said is not None and said["severity"] == "warning" and "frame 2" in said["text"]
+    page = (found.folder / "report.html").read_text(encoding="utf-8")
+    assert "Sets differ for certain" in page
+    # with more pairs than the table has room for, each of them is looked at
+    monkeypatch.setattr(flips_compare, "ROWS", 2)
+    a, b = pairs_at([4.0, 4.0, 4.0], 3), pairs_at([4.0, 4.0, 4.0], 3)
+    for one, r in ((a, 4.19), (b, 4.21)):
+        one[1].positions[[1, 5, 7, 9], 2] = round(0.37 + r, 2)
+    a[1].positions[9, 2], b[1].positions[9, 2] = 4.37, 5.37
+    write(tmp_path / "c.extxyz", a)
+    write(tmp_path / "d.extxyz", b)
+    found = looked(tmp_path / "c.extxyz", tmp_path / "d.extxyz", tmp_path / "g")
+    first = found.summary["first"]
+    assert (first["pairs"], first["ambiguous"], found.summary["certain"]) == (4, 3, 1)
+    assert len(RunFolder.open(found.folder).read("differing")["i"]) == 2
+
+
+@pytest.mark.parametrize("rule", [Nearest(2), Capped(4.0, 2), Cutoff(4.0)])
+def test_thresholds_of_a_directed_rule_tell_neighbors_from_others(rule: Rule) -> None:
+    rng = np.random.default_rng(3)
+    box = Box(np.diag([30.0] * 3), np.ones(3, bool))
+    tracker = Tracker(rule, np.arange(4, 16))
+    tracker.step(Frame(0, 0.0, x := rng.uniform(0, 9, (20, 3)), box))
+    stays, enters = tracker.thresholds()
+    if isinstance(rule, Cutoff):
+        assert np.isnan(stays).all() and np.isnan(enters).all()
+        return
+    assert np.isnan(stays[:4]).all() and np.isnan(enters[16:]).all()
+    members = tracker.members()
+    reach = rule.radius if isinstance(rule, Capped) else np.inf
+    for i in range(4, 16):
+        r = sorted(float(np.linalg.norm(x[j] - x[i])) for j in range(4, 16) if j != i)
+        inside = members.i == i
+        assert (members.distance[inside] < stays[i]).all()
+        assert stays[i] == pytest.approx(min(r[2], reach)) and enters[i] == pytest.approx(min(r[1], reach))
+
+
+def test_nearest_neighbors_that_differ_for_certain(tmp_path: Path) -> None:
+    for name, far in (("a", 3.5), ("b", 2.5)):
+        frames = [
+            ase.Atoms("Ar3", [[0, 0, 0], [3.0 + 0.01 * n, 0, 0], [0, 0, 3.2 if n == 0 else far]])
+            for n in range(3)
+        ]
+        write(tmp_path / f"{name}.traj", frames)
+    found = looked(tmp_path / "a.traj", tmp_path / "b.traj", tmp_path / "f", cutoffs=(), nearest=[1]).summary
+    assert found["first"]["frame"] == 1 and found["certain"] == 1
+    margins = {(one["i"], one["j"]): (one["margin_a"], one["margin_b"]) for one in found["first_pairs"]}
+    # 0 has 1 nearest at 3.01 in A (2 at 3.5), and 2 at 2.5 in B
+    np.testing.assert_allclose(margins[0, 1], [3.5 - 3.01, 2.5 - 3.01], atol=1e-12)
+    np.testing.assert_allclose(margins[0, 2], [3.01 - 3.5, 3.01 - 2.5], atol=1e-12)
+
+
+def test_other_boxes_are_said(tmp_path: Path) -> None:
+    write(tmp_path / "a.traj", gas())
+    write(tmp_path / "slab.traj", gas(pbc=(True, True, False)))
+    found = looked(tmp_path / "a.traj", tmp_path / "slab.traj", tmp_path / "f", report=True)
+    said = finding(found, "OTHER_BOX")
+    assert said is not None and said["severity"] == "warning" and "different axes" in said["title"]
+    assert "repeating along a, b and c" in said["text"] and "repeating along a and b" in said["text"]
+    assert "at the same positions in boxes that differ" in found.summary["headline"]
+    assert found.summary["seed"] is None and found.summary["certain"] == 0
+    wider = gas()
+    for one in wider[2:]:
+        one.set_cell([9.0, 9.0, 9.25])
+    write(tmp_path / "wider.traj", wider)
+    found = looked(tmp_path / "a.traj", tmp_path / "wider.traj", tmp_path / "g", cutoffs=[1e-3])
+    said = finding(found, "OTHER_BOX")
+    assert said is not None and "from frame 2 on" in said["title"]
+    assert "9 × 9 × 9 Å" in said["text"] and "9 × 9 × 9.25 Å" in said["text"]
+    assert "not the same box" in found.summary["headline"]
+    # one lattice by other vectors is one box
+    skewed = gas()
+    for one in skewed:
+        one.set_cell([[9.0, 0, 0], [9.0, 9.0, 0], [-9.0, 18.0, 9.0]])
+    write(tmp_path / "skewed.traj", skewed)
+    found = looked(tmp_path / "a.traj", tmp_path / "skewed.traj", tmp_path / "h")
+    assert finding(found, "OTHER_BOX") is None and found.summary["first"] is None
+
+
+def test_frames_of_a_slice_are_named_by_their_numbers_in_the_files(tmp_path: Path) -> None:
+    frames = gas(12)
+    other = [one.copy() for one in frames[::2]]
+    for one in other[2:]:
+        one.positions[:, 0] += np.random.default_rng(1).normal(0, 0.5, 40)
+    write(tmp_path / "a.traj", frames)
+    write(tmp_path / "b.traj", other)
+    found = looked(Path(f"{tmp_path}/a.traj@::2"), tmp_path / "b.traj", tmp_path / "f").summary
+    words = "frame 2 (4 in A’s file, 2 in B’s)"
+    assert found["first"]["frame"] == 2 and f"differ from {words} on" in found["headline"]
+    assert found["first_frame"] == words and f"Positions differ from {words} on" in found["concluded"][0]
+    found = looked(Path(f"{tmp_path}/a.traj@4:"), Path(f"{tmp_path}/a.traj@4:"), tmp_path / "g").summary
+    assert found["beyond"] is None and found["frames"] == 8
