@@ -7,6 +7,7 @@ float32 (`Trajectory.bits`).
 
 from __future__ import annotations
 
+import json
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -162,14 +163,36 @@ def open_trajectory(
     if file.is_dir() and (file / "trajectory.traj").exists():
         file = file / "trajectory.traj"
     if file.is_dir() and (file / "summary.json").exists():
-        raise InputError(
-            "this run folder has no trajectory",
-            remedy="Run again with --save-every 1 (or another number of steps)",
-            where=str(file),
-        )
+        _refuse_folder(file)
     for one in (file, None if topology is None else Path(topology).expanduser()):
         if one is not None and not one.exists():
             raise InputError("no such file", remedy="Check the path", where=str(one))
+    opened = _opened(file, topology, frames, format)
+    if not opened.atoms:
+        raise InputError("its frames have no atoms", remedy="Check how the file was written", where=str(file))
+    return opened
+
+
+def _refuse_folder(folder: Path) -> None:
+    """Says why a folder that mdnum wrote holds no trajectory."""
+    try:
+        world = json.loads((folder / "summary.json").read_text()).get("world", "md")
+    except (ValueError, AttributeError, OSError):
+        world = "md"
+    if world != "md":
+        raise InputError(
+            "this folder holds results, and no trajectory",
+            remedy=f"Give the trajectory itself; `mdnum report {folder}` shows what the folder holds",
+            where=str(folder),
+        )
+    raise InputError(
+        "this run folder has no trajectory",
+        remedy="Run again with --save-every 1 (or another number of steps)",
+        where=str(folder),
+    )
+
+
+def _opened(file: Path, topology: str | Path | None, frames: slice, format: str | None) -> Trajectory:
     reader = _reader_of(file, format)
     if reader == "ase":
         from mdnum.trajectories.ase_source import AseTrajectory

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import warnings
@@ -321,6 +322,8 @@ def test_atoms_that_come_and_go_are_refused(tmp_path, kind):
     ase.io.write(tmp_path / f"run.{kind}", [*images()[:2], Atoms("Ar8", np.ones((8, 3)))])
     frames, error = read(open_trajectory(tmp_path / f"run.{kind}"))
     assert len(frames) == 2 and "frame 2 has 8 atoms and the first 9" in str(error)
+    # whoever tells of it need not find out where
+    assert isinstance(error, FrameError) and error.frame == 2
 
 
 def test_lammps_atoms_that_are_others_are_refused(tmp_path):
@@ -375,6 +378,47 @@ def test_what_is_fine_is_not_refused():
 def test_a_box_that_leaves_is_named():
     with pytest.raises(FrameError, match="frame 20 has no box, and the first one looked at has a box"):
         list(checked(frames(pbc=lambda k: k != 2)))
+
+
+def test_a_box_without_a_vector_is_named_with_its_frame():
+    some = [
+        Frame(10 * k, 0.0, np.ones((1, 3)), Box(np.diag([9.0, 9.0, 9 - k]), np.ones(3, bool))) for k in (0, 9)
+    ]
+    with pytest.raises(
+        FrameError, match=r"run.traj: frame 90: the box repeats along c, but .* 0.0\]"
+    ) as caught:
+        list(checked(some, where="run.traj"))
+    assert caught.value.frame == 90
+    # a direction that does not repeat needs none
+    slab = Box(np.diag([9.0, 9.0, 0.0]), np.array([True, True, False]))
+    assert len(list(checked([Frame(0, 0.0, np.ones((1, 3)), slab)]))) == 1
+
+
+def test_the_first_frame_cannot_be_left_out():
+    with pytest.raises(FrameError, match="frame 0: atom 4") as caught:
+        list(checked(frames(put(0, slice(4, 5), np.nan))))
+    assert "@:0" not in str(caught.value) and "from the first frame on" in str(caught.value)
+
+
+@pytest.mark.parametrize("kind", ["traj", "extxyz", "lammpstrj"])
+def test_frames_without_atoms_are_refused(tmp_path, kind):
+    path = tmp_path / f"run.{kind}"
+    if kind == "lammpstrj":
+        path.write_text(3 * LAMMPS.partition("1 1 1.5")[0].replace("ATOMS\n2\n", "ATOMS\n0\n").format(k=0))
+    else:
+        ase.io.write(path, [Atoms(cell=[5, 5, 5], pbc=True)] * 3)
+    with pytest.raises(InputError, match=rf"run.{kind}: .*no atoms"):
+        open_trajectory(path)
+
+
+def test_what_is_no_trajectory_is_told_as_what_it_is(tmp_path):
+    (tmp_path / "run.extxyz").write_text("")
+    with pytest.raises(InputError, match=r"run.extxyz: the file is empty"):
+        open_trajectory(tmp_path / "run.extxyz")
+    for world, said in (("flips", "holds results, and no trajectory"), ("md", "--save-every 1")):
+        (tmp_path / "summary.json").write_text(json.dumps({"world": world}))
+        with pytest.raises(InputError, match=said):
+            open_trajectory(tmp_path)
 
 
 def test_nobody_and_nothing(tmp_path):
