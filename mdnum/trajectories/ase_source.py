@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from mdnum.errors import InputError
+from mdnum.trajectories.checked import FrameError
 from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.slices import chosen, counts_from_end
 from mdnum.trajectories.source import AtomTable, Trajectory, UnreadableFrame, table_of_topology
@@ -34,6 +35,8 @@ class AseTrajectory(Trajectory):
 
         self.path, self.slice = path, frames
         self.topology = None if topology is None else Path(topology)
+        if path.is_file() and not path.stat().st_size:
+            raise InputError("the file is empty", remedy="Check how it was written", where=str(path))
         try:
             self.format = format or filetype(str(path))
         except UnknownFileTypeError as error:
@@ -77,10 +80,11 @@ class AseTrajectory(Trajectory):
     def frames(self) -> Iterator[Frame]:
         for number, atoms in self._images(chosen(self.slice, self.in_file)):
             if len(atoms) != self.atoms:
-                raise InputError(
+                raise FrameError(
                     f"frame {number} has {len(atoms):,} atoms and the first {self.atoms:,}",
                     remedy="Leave out the frames with another number of atoms: a flip needs the pair before",
                     where=str(self.path),
+                    frame=number,
                 )
             yield self._frame(number, atoms)
 

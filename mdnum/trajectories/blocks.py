@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import cast
 
 from mdnum.errors import InputError
+from mdnum.trajectories.checked import FrameError
 from mdnum.trajectories.frame import Frame
 from mdnum.trajectories.slices import chosen, counts_from_end
 from mdnum.trajectories.source import AtomTable, Trajectory, UnreadableFrame, table_of_topology
@@ -57,10 +58,11 @@ class TextTrajectory(Trajectory):
             except _NOT_A_FRAME as error:
                 raise self._unreadable(number, error) from error
             if len(frame.positions) != self.atoms:
-                raise InputError(
+                raise FrameError(
                     f"frame {number} has {len(frame.positions):,} atoms and the first {self.atoms:,}",
                     remedy="Leave out the frames with another number: a flip needs the pair before",
                     where=str(self.path),
+                    frame=number,
                 )
             yield frame
 

@@ -34,8 +34,9 @@ def checked(
         where: the file, for messages.
 
     Raises:
-        FrameError: a coordinate is not finite, more than one atom is at exactly 0, 0, 0, or the box repeats
-            along other axes than in the first frame (most often: there is none).
+        FrameError: a coordinate is not finite, more than one atom is at exactly 0, 0, 0, the box repeats
+            along other axes than in the first frame (most often: there is none), or along one without a
+            vector.
     """
     pbc = None
     for frame in frames:
@@ -63,6 +64,15 @@ def check_frame(
             where=where,
         )
     x = frame.positions if atoms is None else frame.positions[atoms]
+    for axis in np.flatnonzero(frame.box.pbc):
+        if not (vector := frame.box.matrix[axis]).any() or not np.isfinite(vector).all():
+            raise FrameError(
+                f"frame {frame.index}: the box repeats along {'abc'[axis]}, but its vector there is "
+                f"{vector.tolist()}",
+                frame=frame.index,
+                remedy="Give the frames a box, or say that this direction does not repeat",
+                where=where,
+            )
     # a sum is finite unless a term is not, or the terms are of no use anyway
     with np.errstate(over="ignore", invalid="ignore"):
         total = x.sum()
@@ -73,7 +83,9 @@ def check_frame(
             f"frame {frame.index}: atom {first} is at ({values}){_and_others(bad.size)}",
             frame=frame.index,
             remedy="The simulation or the writing of it failed there; stop before that frame "
-            f"(@:{frame.index})",
+            f"(@:{frame.index})"
+            if frame.index
+            else "The simulation or the writing of it failed from the first frame on",
             where=where,
         )
     # one atom may well be at the origin; two cannot be at one place

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 
 from mdnum.errors import InputError
 from mdnum.trajectories.blocks import TextTrajectory, end_of, whole_number
+from mdnum.trajectories.checked import FrameError
 from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.source import AtomTable
 from mdnum.trajectories.tails import refuse_cut_line
@@ -67,10 +68,11 @@ class LammpsDump(TextTrajectory):
                     positions = positions @ matrix
                 break
         if positions is None:
-            raise InputError(
+            raise FrameError(
                 f"frame {number} has no positions among its columns ({' '.join(columns)})",
                 remedy="Dump x y z, xu yu zu or xs ys zs",
                 where=str(self.path),
+                frame=number,
             )
         step = whole_number(items["TIMESTEP"][0], "the time step")
         if "TIME" in items and set(_VELOCITIES) <= set(columns):
@@ -92,10 +94,11 @@ class LammpsDump(TextTrajectory):
         if not np.array_equal(known, ids[order]):
             lost = np.setdiff1d(known, ids)
             seen = f"lacks atom {lost[0]}" if len(lost) else "has other atoms"
-            raise InputError(
+            raise FrameError(
                 f"frame {number} {seen} of the first frame: {len(rows):,} atoms, and {len(known):,} there",
                 remedy="Dump one group of atoms that stays the same",
                 where=str(self.path),
+                frame=number,
             )
         return order
 
