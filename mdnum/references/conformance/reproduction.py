@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import base64
 import io
+import json
 import textwrap
 import zlib
 from pprint import pformat
 
 import numpy as np
 
+from mdnum.references.conformance.answer import NAMES
 from mdnum.references.conformance.judge import Conventions
 from mdnum.references.conformance.lists import PairList
 from mdnum.references.conformance.suite import Failed
@@ -43,23 +45,39 @@ def right_pairs(x, cell, reach):
 
 def check(step, x, cell, given):
     """Compares what the list gave with brute force; returns whether it is right."""
+    try:
+        named = as_mapping(given)
+    except NoPairs as error:
+        print(f"step {step}: {error}")
+        return False
     scale = np.abs(x).max(initial=0.0) + np.abs(np.where(PBC[:, None], cell, 0.0)).sum() + R_CUT
     close = TOLERANCE * scale
     right = right_pairs(x, cell, REACH + close)
-    i, j = (np.asarray(given[name]).astype(int).ravel() for name in ("i", "j"))
+    box = np.where(PBC[:, None], cell, 0.0)
+    i, j = (named[name] for name in ("i", "j"))
     bad = [f"row {n}: ({a}, {b}) with {len(x)} atoms" for n, (a, b) in enumerate(zip(i, j))
            if not (0 <= a < len(x) and 0 <= b < len(x))]
-    shift = given.get("shift")
-    listed, named = collections.Counter(), collections.Counter()
+    shift, told, vector = (named.get(name) for name in ("shift", "distance", "vector"))
+    if told is None and shift is None and vector is not None:
+        told = np.linalg.norm(vector, axis=1)
+    lengths = collections.defaultdict(list)
+    for (a, b, _), apart in right.items():
+        lengths[a, b].append(apart)
+    listed = collections.Counter()
     for n, (a, b) in enumerate(zip(i.tolist(), j.tolist()) if not bad else ()):
-        s = (0, 0, 0) if shift is None else tuple(int(v) for v in SIGN * np.asarray(shift)[n])
+        s = (0, 0, 0) if shift is None else tuple(int(v) for v in SIGN * shift[n])
         turned = a > b or (a == b and s < (0, 0, 0))
         key = (b, a, tuple(-v for v in s)) if turned else (a, b, s)
         listed[key if shift is not None else key[:2]] += 1
-        if given.get("distance") is not None and shift is not None and key in right:
-            off = abs(float(np.asarray(given["distance"])[n]) - right[key])
+        near = [right[key]] if key in right else [] if shift is not None else lengths[key[:2]]
+        if told is not None and near:
+            off = min(abs(float(told[n]) - apart) for apart in near)
             if not off <= 2 * close:
                 bad.append(f"{a}-{b}: distance off by {off:.3g}")
+        if vector is not None and shift is not None:
+            off = np.abs(TOWARD * vector[n] - (x[b] - x[a] + np.array(s) @ box)).max()
+            if not off <= 2 * close:
+                bad.append(f"{a}-{b}: vector off by {off:.3g}")
     times = 2 if FULL else 1
     needed, allowed = collections.Counter(), collections.Counter()
     for key, apart in right.items():
@@ -83,7 +101,7 @@ _ONCE = """
 fine = True
 for step, (x, cell, _) in enumerate(STEPS):
     before = x.copy(), cell.copy()
-    given = as_mapping({call}(x, cell, PBC, R_CUT))
+    given = asked({call}, x, cell, PBC, R_CUT)
     if not (np.array_equal(x, before[0]) and np.array_equal(cell, before[1])):
         print(f"step {{step}}: the call wrote to its input")
         fine = False
@@ -94,27 +112,86 @@ _KEPT = """
 fine, kept = True, {call}()
 for step, (x, cell, fresh) in enumerate(STEPS):
     before = x.copy(), cell.copy()
-    given = as_mapping(kept.allocate(x, cell, PBC, R_CUT, SKIN) if fresh else kept.update(x, cell))
+    given = asked(kept.allocate, x, cell, PBC, R_CUT, SKIN) if fresh else asked(kept.update, x, cell)
+    if not (np.array_equal(x, before[0]) and np.array_equal(cell, before[1])):
+        print(f"step {{step}}: the call wrote to its input")
+        fine = False
     fine = check(step, *before, given) and fine
 """
 
 _MAPPING = '''
+def asked(function, *arguments):
+    """What the list returns."""
+    try:
+        return function(*arguments)
+    except SystemExit as error:
+        print(f"it ends the process: SystemExit: {error}")
+        raise SystemExit("the list is wrong")
+
+
+class NoPairs(Exception):
+    """What was returned is no list of pairs."""
+
+
 def as_mapping(given):
-    """The parts of an answer by name: i, j, shift, distance."""
+    """The parts of an answer by name: i, j, shift, distance, vector; arrays with a row for each pair."""
+    rows = isinstance(given, list) and all(isinstance(part, tuple) for part in given)
+    if given is None:
+        raise NoPairs("it returned None")
     if isinstance(given, dict):
-        return given
-    if hasattr(given, "i") and hasattr(given, "j"):
-        return {name: getattr(given, name, None) for name in ("i", "j", "shift", "distance")}
-    if not isinstance(given, (tuple, list)):
-        table = np.asarray(given)
-        return dict(zip("ij", table.T if table.shape[1:] == (2,) else table))
-    parts = [np.asarray(part) for part in given]
-    if len(parts) == 2 and parts[0].ndim == 2:
-        parts = [*parts[0], parts[1]]
-    named = {"i": parts[0], "j": parts[1]}
+        parts = {name: next((given[word] for word in words if word in given), None)
+                 for name, words in NAMES.items()}
+    elif isinstance(given, (tuple, list)) and not rows:
+        parts = in_order([array(part) for part in given])
+    elif hasattr(given, "i") and hasattr(given, "j"):
+        parts = {name: next((getattr(given, word) for word in words if hasattr(given, word)), None)
+                 for name, words in NAMES.items()}
+    else:
+        table = array(given)
+        if table.size and (table.ndim != 2 or table.shape[1] != 2):
+            raise NoPairs(f"it returned {type(given).__name__} of shape {table.shape}, not rows (i, j)")
+        parts = dict(zip("ij", table.reshape(-1, 2).T))
+    if parts.get("i") is None or parts.get("j") is None:
+        raise NoPairs("it has no i and j")
+    named = {name: array(part) for name, part in parts.items() if part is not None}
+    count = named["i"].size
+    for name, part in named.items():
+        shape = (count,) if name in ("i", "j", "distance") else (count, 3)
+        if part.size == 0 and count == 0:
+            named[name] = part = np.zeros(shape, int)
+        if part.shape != shape:
+            raise NoPairs(f"{name} has shape {part.shape} where i has {count} entries")
+        if part.dtype.kind not in ("iu" if name in ("i", "j") else "iuf"):
+            raise NoPairs(f"{name} has dtype {part.dtype}")
+    if "shift" in named and not np.array_equal(np.rint(named["shift"]), named["shift"]):
+        raise NoPairs("shifts are not whole numbers of lattice vectors")
+    return named
+
+
+def array(part):
+    """A part as an array of numbers."""
+    try:
+        made = np.asarray(part)
+    except Exception as error:
+        raise NoPairs(f"a part is no array: {error}")
+    if made.dtype == object:
+        raise NoPairs(f"a part is no array of numbers but {type(part).__name__}")
+    return made
+
+
+def in_order(parts):
+    """Parts by their places and shapes."""
+    if len(parts) == 2 and parts[0].ndim == 2 and len(parts[0]) == 2:
+        return {"i": parts[0][0], "j": parts[0][1], "shift": parts[1]}
+    if not 2 <= len(parts) <= 5:
+        raise NoPairs(f"it returned {len(parts)} parts, not (i, j), (i, j, shift), ...")
+    named = dict(zip("ij", parts))
     for part in parts[2:]:
-        whole = part.ndim == 2 and "shift" not in named and np.array_equal(np.rint(part), part)
-        named["distance" if part.ndim < 2 else "shift" if whole else "vector"] = part
+        whole = "shift" not in named and np.array_equal(np.rint(part), part) if part.ndim > 1 else False
+        name = "distance" if part.ndim < 2 else "shift" if whole else "vector"
+        if name in named or (name == "distance" and part.size and part.dtype.kind in "iu"):
+            raise NoPairs(f"its parts are not i, j, shift, distance, vector: no {name} is looked for")
+        named[name] = part
     return named
 '''
 
@@ -161,6 +238,8 @@ def _numbers(failed: Failed, how: Conventions, reach: float) -> str:
         f"PBC = np.array({list(case.pbc)})",
         f"FULL = {how.full}  # every pair from both of its atoms",
         f"SIGN = {how.sign}  # +1: shifts are added to atom j",
+        f"TOWARD = {how.toward}  # +1: vectors point from i to j",
+        f"NAMES = {json.dumps(NAMES)}",
         f"TOLERANCE = {16 * how.unit!r}  # a decision this close to the cutoff is rounding",
         "STEPS = [  # positions, cell (vectors as rows), whether the list starts anew",
         *stills,

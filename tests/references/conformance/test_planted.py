@@ -12,6 +12,7 @@ import planted_lists
 import pytest
 
 from mdnum.references.conformance.case import Still
+from mdnum.references.conformance.catalog import catalog
 from mdnum.references.conformance.crowds import LARGE_EDGE, SMALL_EDGE, lattice
 from mdnum.references.conformance.loading import from_object
 from mdnum.references.conformance.reproduction import script
@@ -122,6 +123,51 @@ def test_failures_shrink_and_are_reproduced_without_mdnum(defect, area, atoms, s
         )  # fmt: skip
         assert done.returncode == wanted, done.stdout + done.stderr
         assert ("the list is wrong" if wanted else "the list is right") in done.stdout
+
+
+_SPOILED = {
+    "VECTORS": "rows | {'vector': -rows['vector'] * (rows['i'] > 0)[:, None]}",
+    "vectors of whoever": "{name: rows[name] for name in 'ij'} | {'vector': 2 * rows['vector']}",
+    "DISTANCES": "rows | {'distance': rows['distance'] ** 2}",
+    "distances without shifts": "rows['i'], rows['j'], rows['distance'] ** 2",
+    "real indices": "rows | {'i': rows['i'] * 1.0}",
+    "lengths": "rows | {'j': rows['j'][1:]}",
+    "half a lattice vector": "rows | {'shift': rows['shift'] + 0.5}",
+    "nothing": "None",
+    "a generator": "(row for row in zip(rows['i'], rows['j']))",
+    "a matrix": "np.ones((len(x), len(x)), int)",
+    "an object": "object()",
+    "no j": "{'i': rows['i']}",
+    "pairs as lists": "np.column_stack([rows['i'], rows['j']]).tolist()",
+    "alias of another": "{'senders': rows['i'], 'receivers': rows['j'][::-1]}",
+    "exit": "sys.exit(0)",
+}
+
+
+@pytest.mark.parametrize("spoiled", _SPOILED)
+def test_what_is_told_is_reproduced_whatever_is_returned(spoiled: str, capsys: pytest.CaptureFixture[str]):
+    """The script exits with 1 and says that the list is wrong, without an exception of its own."""
+    codes = {"VECTORS": "VECTORS", "DISTANCES": "DISTANCES", "distances without shifts": "DISTANCES",
+             "vectors of whoever": "DISTANCES", "exit": "CRASHED", "alias of another": "MISSING"}  # fmt: skip
+    case = next(one for one in catalog() if one.area == "boxes" and one.atoms > 5)
+    for body, wanted in ((_SPOILED[spoiled], 1), ("rows", 0), ("list(zip(rows['i'], rows['j']))", 0)):
+        source = (
+            "import sys\nimport numpy as np\nfrom planted_lists import search\n"
+            f"def spoiled(*given):\n    x, rows = given[0], search(*given)\n    return {body}\n"
+        )
+        made: dict = {}
+        exec(source, made)
+        if wanted:
+            tested = from_object(made["spoiled"], "spoiled", source).with_options(full=True)
+            report = examine(tested, asked=[case], shrink=False)
+            failed = report.failed[0]
+            assert failed.code == codes.get(spoiled, "MALFORMED"), failed.worst.text
+        lines = script(replace(tested, source=source), failed, report.how, report.superset)
+        with pytest.raises(SystemExit) as ended:
+            exec(compile(lines, "reproduction", "exec"), {"__name__": "__main__"})
+        said = capsys.readouterr().out + str(ended.value.code)
+        assert bool(ended.value.code) == bool(wanted), said
+        assert ("the list is wrong" if wanted else "the list is right") in said
 
 
 @pytest.mark.slow
