@@ -10,13 +10,15 @@ import numpy as np
 from numpy import ndarray
 
 #: Names that the parts of an answer go by in mappings and attributes.
-_NAMES = {
+NAMES = {
     "i": ("i", "first", "centers", "idx_i", "senders"),
     "j": ("j", "second", "neighbors", "idx_j", "receivers"),
     "shift": ("shift", "shifts", "S", "cell_shifts"),
     "distance": ("distance", "distances", "d"),
     "vector": ("vector", "vectors", "D"),
 }
+
+_ROWS = "pairs one by one are to be tuples (i, j) in a list, or rows of an array"
 
 
 class Malformed(Exception):
@@ -63,7 +65,8 @@ def read(given: Any) -> Answer:
     It may return (i, j), (i, j, shift), (i, j, shift, distance), (i, j, shift, distance, vector), or any of
     these without the parts in between: a part of one number a row is a distance, the first of three whole
     numbers a row the shift, another of three the vector. Or a mapping, or an object with attributes, by the
-    names i, j, shift, distance and vector. Or one array with a row (i, j) for each pair.
+    names i, j, shift, distance and vector. Or the pairs one by one: a list of tuples (i, j), or one array
+    with a row (i, j) for each pair. A list of lists is parts, never pairs: some would look like both.
 
     Raises:
         Malformed: it is none of these.
@@ -92,32 +95,41 @@ def _parts(given: Any) -> dict[str, Any]:
     if isinstance(given, Mapping):
         found = {
             name: next((given[word] for word in words if word in given), None)
-            for name, words in _NAMES.items()
+            for name, words in NAMES.items()
         }
-    elif isinstance(given, Sequence) and not isinstance(given, str) and 2 <= len(given) <= 5:
+    elif isinstance(given, list) and all(isinstance(row, tuple) for row in given):
+        return _one_by_one(given)
+    elif isinstance(given, Sequence) and not isinstance(given, str):
         return _in_order([_array(part, f"part {n + 1}") for n, part in enumerate(given)])
     elif hasattr(given, "i") and hasattr(given, "j"):
         found = {
             name: next((getattr(given, word) for word in words if hasattr(given, word)), None)
-            for name, words in _NAMES.items()
+            for name, words in NAMES.items()
         }
     else:
-        table = _array(given, "the answer")
-        if table.ndim == 2 and table.shape[1] == 2:
-            return {"i": table[:, 0], "j": table[:, 1]}
-        if table.ndim == 2 and table.shape[0] == 2:
-            return {"i": table[0], "j": table[1]}
-        raise Malformed(
-            f"it returned {type(given).__name__} of shape {table.shape}, not (i, j), (i, j, shift), ... "
-            "or a mapping with i and j"
-        )
+        return _one_by_one(given)
     if found["i"] is None or found["j"] is None:
         raise Malformed("it has no i and j")
     return found
 
 
+def _one_by_one(given: Any) -> dict[str, Any]:
+    """Rows (i, j); none at all where nothing is given."""
+    table = _array(given, "the answer")
+    if table.size == 0 and table.ndim:
+        return {"i": np.zeros(0, np.int64), "j": np.zeros(0, np.int64)}
+    if table.ndim != 2 or table.shape[1] != 2:
+        raise Malformed(
+            f"it returned {type(given).__name__} of shape {table.shape}, not (i, j), (i, j, shift), ..., a "
+            "mapping with i and j, or a row (i, j) for each pair"
+        )
+    return {"i": table[:, 0], "j": table[:, 1]}
+
+
 def _in_order(parts: list[ndarray]) -> dict[str, Any]:
     """Parts of a tuple by their places and shapes."""
+    if not 2 <= len(parts) <= 5:
+        raise Malformed(f"it returned {len(parts)} parts, not (i, j), (i, j, shift), ...; {_ROWS}")
     found: dict[str, Any] = {"i": parts[0], "j": parts[1]}
     if len(parts) == 2 and parts[0].ndim == 2 and parts[0].shape[0] == 2:
         # an edge index of shape (2, rows) with shifts
@@ -131,6 +143,8 @@ def _in_order(parts: list[ndarray]) -> dict[str, Any]:
             name = "vector"
         if name in found:
             raise Malformed(f"two of its parts look like a {name}; return a mapping with names instead")
+        if name == "distance" and part.size and part.dtype.kind in "iu":
+            raise Malformed(f"the distances are whole numbers; {_ROWS}")
         found[name] = part
     return found
 

@@ -216,6 +216,8 @@ class Session:
         if self._made is None or (self.tested.kept and not self.reuse):
             try:
                 self._made = self.tested.make()
+            except SystemExit as error:
+                return [_left(error)]
             except Exception as error:
                 return [_failed(error, case)]
         outcomes = []
@@ -243,6 +245,8 @@ class Session:
                 given = self._made.allocate(positions, cell, pbc, case.r_cut, case.skin)
             else:
                 given = self._made.update(positions, cell)
+        except SystemExit as error:
+            return _left(error)
         except Exception as error:
             return _failed(error, case)
         try:
@@ -257,6 +261,11 @@ class Session:
             if not np.array_equal(old, new)
         ]
         return Outcome(_copied(answer), changed=changed[0] if changed else None)
+
+
+def _left(error: SystemExit) -> Outcome:
+    """It would have ended the process of whoever called it."""
+    return Outcome(crashed=f"it ends the process: SystemExit: {error}")
 
 
 def _failed(error: Exception, case: Case) -> Outcome:

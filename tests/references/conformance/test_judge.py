@@ -143,6 +143,12 @@ def test_a_lattice_is_known_as_brute_force_finds_it():
         ({"i": [0], "j": [1], "shift": [[0.5, 0, 0]]}, "whole numbers"),
         ({"i": [0], "j": [1], "distance": [1.0, 2.0]}, "distance has shape"),
         (([0], [1], ["far"]), "dtype"),
+        ([[0, 1], [2, 3], [4, 5]], "whole numbers; pairs one by one are to be tuples"),
+        ([[0, 1]] * 6, "6 parts.*pairs one by one are to be tuples"),
+        ([(0, 1, 2)], "row \\(i, j\\) for each pair"),
+        (np.zeros((2, 7), int), "row \\(i, j\\) for each pair"),
+        ((row for row in ((0, 1), (1, 0))), "generator"),
+        (np.array(3), "row \\(i, j\\) for each pair"),
         (([object()], [1]), "no array of numbers"),
     ],
 )
@@ -168,4 +174,14 @@ def test_forms_of_an_answer():
         answer = read(given)
         assert answer.shift is not None and answer.shift.tolist() == shift
     assert read((*rows, [[0.5, 0, 0], [-0.5, 0, 0]])).vector is not None
-    assert len(read(([], []))) == 0
+    for nothing in (([], []), [], np.zeros((0, 2), int), np.array([]), {"i": [], "j": []}):
+        assert len(read(nothing)) == 0
+
+
+@pytest.mark.parametrize("pairs", range(8))
+def test_pairs_one_by_one_are_read_alike_however_many(pairs: int):
+    rows = [(2 * n, 2 * n + 1) for n in range(pairs)]
+    for given in (rows, np.array(rows, int).reshape(-1, 2)):
+        answer = read(given)
+        assert list(zip(answer.i.tolist(), answer.j.tolist(), strict=True)) == rows
+        assert answer.distance is None
