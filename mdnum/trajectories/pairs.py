@@ -6,6 +6,7 @@ is decided again from the coordinates as stored (`lattice.square_of`), so every 
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 
 import numba
@@ -17,8 +18,13 @@ from mdnum.trajectories.bins import MOST_IMAGES, grid_for, lattice_code, lattice
 from mdnum.trajectories.candidates import BAND, DIRECTED, INSIDE, met_from_centers, met_once
 from mdnum.trajectories.lattice import Lattice, square_of
 
-#: more pairs than this would not fit into the memory of a workstation
+#: more pairs than this would take longer than anybody waits
 MOST_PAIRS = 2_000_000_000
+# bytes that a pair takes while members are sorted, as measured
+_BYTES = 95
+# Pairs beyond this many images are an error in the unit, not a wish, where there are so many pairs: every
+# flip among them is looked for among all images of its pair.
+_MOST_IMAGES_EACH, _MOST_REPEATED = 100, 2_000_000
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
@@ -208,7 +214,7 @@ def search(
     total = int(np.prod(grid.bins))
     start, order = sorted_by_bin(bin_of, sides.others, total)
     sorted_x = np.ascontiguousarray(wrapped[order].T)
-    _check_size(lattice, int(sides.centers.sum()), len(order), largest)
+    _check_size(lattice, int(sides.centers.sum()), len(order), float(radii.max(initial=0.0)))
     allowed = radii >= 0
     low = np.where(allowed, np.maximum(radii - band, 0.0) ** 2, np.inf)
     high = np.where(allowed, (radii + band) ** 2, -1.0)
@@ -236,6 +242,7 @@ def search(
         # what is open may come to be inside
         if left <= doubtful and (kind != INSIDE or count + left <= sure):
             break
+        _check_count(count + left, float(radii.max(initial=0.0)))
         sure, doubtful = (int(1.05 * (count + left)) if kind == INSIDE else 0), int(1.05 * left) + 1
     i_open, j_open, code, value = i_open[:left], j_open[:left], code[:left], value[:left]
     smallest = _settle(
@@ -257,16 +264,40 @@ def rows_of(found: Found, atoms: int) -> Rows:
 
 
 def _check_size(lattice: Lattice, centers: int, others: int, radius: float) -> None:
-    """Refuse a radius so large, in a box so small, that the pairs would not fit into memory."""
+    """Refuse a radius so large, in a box so small, that the pairs would not fit into memory or time."""
     if not lattice.periodic.all():
         return
-    pairs = 0.5 * centers * others * (4.0 / 3.0 * np.pi * radius**3) / lattice.volume
-    if pairs > MOST_PAIRS:
+    images = (4.0 / 3.0 * np.pi * radius**3) / lattice.volume
+    pairs = 0.5 * centers * others * images
+    if images > _MOST_IMAGES_EACH and pairs > _MOST_REPEATED:
+        widths = np.round(lattice.widths, 3).tolist()
         raise InputError(
-            f"about {pairs:.1e} pairs within {radius:g} in a box of volume {lattice.volume:g}",
+            f"about {pairs:,.0f} pairs within {radius:.6g}: any two atoms through about {images:,.0f} images "
+            f"in a box of widths {widths}",
             remedy="Check the unit of the cutoff, and the box; or select fewer atoms",
             where="cutoff",
         )
+    _check_count(pairs, radius)
+
+
+def _check_count(pairs: float, radius: float) -> None:
+    """Refuse more pairs than there is memory for."""
+    if pairs <= min(MOST_PAIRS, _memory() / _BYTES):
+        return
+    raise InputError(
+        f"about {pairs:,.0f} pairs within {radius:.6g}, which would take {pairs * _BYTES / 1e9:,.0f} GB of "
+        f"this machine's {_memory() / 1e9:,.0f}",
+        remedy="Check the unit of the cutoff, and the box; or select fewer atoms",
+        where="cutoff",
+    )
+
+
+def _memory() -> float:
+    """Bytes of memory that the machine has; 32 GB where it does not say."""
+    try:
+        return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    except (AttributeError, ValueError, OSError):
+        return 32e9
 
 
 def ordered(rows: Rows) -> tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]]:

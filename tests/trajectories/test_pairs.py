@@ -12,6 +12,7 @@ from trajectories import brute_force
 from trajectories.boxes import atoms, boxes
 
 from mdnum.errors import InputError
+from mdnum.trajectories import pairs
 from mdnum.trajectories.bins import grid_for
 from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.lattice import image_square, lattice_of, own_images
@@ -182,3 +183,28 @@ def test_a_cutoff_that_makes_no_sense_in_its_box_is_refused():
     tracker = Tracker(Cutoff(1.0))
     with pytest.raises(InputError, match="float64 cannot tell"):
         tracker.step(Frame(0, 0.0, np.full((2, 3), 1e14), Box()))
+
+
+def test_more_images_than_anybody_means_are_refused_before_they_are_looked_for():
+    x = np.random.default_rng(0).uniform(0, 15.9, (108, 3))
+    frame = Frame(0, 0.0, x, Box(15.9 * np.eye(3), PERIODIC))
+    # of 4/3 π r³ / V images and half as many pairs as atoms squared
+    with pytest.raises(
+        InputError, match=r"about 759,\d{3},\d{3} pairs within 500: .* about 130,\d{3} images"
+    ):
+        Tracker(Cutoff(500.0), None, None, None, 0.0).step(frame)
+    # a small crystal may be asked for many images of its few atoms
+    few = Tracker(Cutoff(90.0), None, None, None, 0.0)
+    few.step(Frame(0, 0.0, x[:4], frame.box))
+    assert few.pairs == pytest.approx(8 * 4 / 3 * np.pi * (90 / 15.9) ** 3, rel=0.05)
+
+
+@pytest.mark.parametrize("periodic", [True, False])
+def test_pairs_that_do_not_fit_into_memory_are_refused(monkeypatch, periodic):
+    x = np.random.default_rng(0).uniform(0, 15.9, (400, 3))
+    frame = Frame(0, 0.0, x, Box(15.9 * np.eye(3), np.full(3, periodic)))
+    tracker = Tracker(Cutoff(30.0), None, None, None, 0.0)
+    tracker.step(frame)
+    monkeypatch.setattr(pairs, "_memory", lambda: 95.0 * (tracker.pairs - 10_000))
+    with pytest.raises(InputError, match=r"pairs within 30, which would take .* GB of this machine's"):
+        Tracker(Cutoff(30.0), None, None, None, 0.0).step(frame)
