@@ -73,6 +73,8 @@ def summary(walks: PairWalks, around: Surroundings, crowds: Sequence[Crowd], kT:
     else:
         order, energy, force = worst
         tail = f"the lowest derivative that jumps is the {ORDERS[order]}"
+        if order >= SMOOTH:
+            tail += ", at an end (within the range a change is seen up to the curvature)"
         if order == 0:
             tail = (
                 f"the energy jumps by up to {energy * units.scale:.3g} {units.small} ({energy / kT:.2g} kT)"

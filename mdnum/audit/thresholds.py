@@ -254,10 +254,17 @@ def _with_edge(
 
 
 def _root(curve: Curve, edge: float, room: float, power: int) -> float:
-    """Where a force that falls with this power of the distance to its end would vanish."""
-    places = edge - room * np.array([0.02, 0.01])
-    near, nearer = np.abs(curve.many(places)[1]) ** (1.0 / power)
-    if near <= nearer:
+    """Where a force that falls with this power of the distance to its end would vanish.
+
+    The edge itself where it is no further off than such an extrapolation can tell: it falls to the power only
+    in the limit, while the edge is known to the last bit unless the force was lost in rounding before it.
+    """
+    places = edge - room * np.array([0.02, 0.01, 0.005])
+    far, near, nearer = np.abs(curve.many(places)[1]) ** (1.0 / power)
+    if not far > near > nearer:
         return edge
-    root = places[1] + nearer * (places[1] - places[0]) / (near - nearer)
+    first = places[1] + near * (places[1] - places[0]) / (far - near)
+    root = places[2] + nearer * (places[2] - places[1]) / (near - nearer)
+    if abs(root - edge) <= 3 * abs(root - first):
+        return edge
     return float(root) if abs(root - edge) < 1e-3 * max(room, 1.0) else edge

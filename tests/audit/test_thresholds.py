@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from mdnum.audit.curve import Curve, bisect
 from mdnum.audit.jumps import find_jumps
+from mdnum.audit.smoothness_words import place
 from mdnum.audit.thresholds import STEP, find_thresholds, walk_pairs
 
 BEFORE = float(np.nextafter(R_CUT, 0.0))
@@ -66,6 +67,24 @@ def test_orders_and_sizes_of_jumps():
     twice = find_thresholds(pair_subject(laws.switched(2), own=own))
     assert [one.order for one in twice] == [3]
     assert twice[0].radius == pytest.approx(R_CUT, abs=3e-3)
+
+
+def _late(r: float) -> tuple[float, float]:
+    """Switched off with two continuous derivatives, by a form that keeps its digits at the end."""
+    if r >= R_CUT:
+        return 0.0, 0.0
+    energy, force, _ = law(r)
+    width = R_CUT - R_ON
+    left = min((R_CUT - r) / width, 1.0)
+    on = left**3 * (10 - 15 * left + 6 * left**2)
+    return energy * on, force * on + energy * 30 * left**2 * (1 - left) ** 2 / width
+
+
+def test_a_smooth_end_that_is_known_to_the_last_bit_is_not_guessed_at():
+    """Where the force goes with a power only in the limit, its continuation misses the end by 1e-5 Å."""
+    (end,) = find_thresholds(pair_subject(_late))
+    assert (end.inside, end.outside, end.radius, end.order) == (BEFORE, R_CUT, R_CUT, 3)
+    assert place(end) == repr(R_CUT)
 
 
 def test_smoother_ends_have_higher_orders():
