@@ -92,7 +92,7 @@ def grid_effect(
         seed: of the draws.
 
     Returns:
-        None where the frames cannot tell: fewer than two, or nothing moves.
+        None where the frames cannot tell: fewer than two, nothing moves, or every coordinate is 0.
 
     Error: the two atoms of a pair are taken to move independently and straight on, and pairs to be spread
         evenly around the cutoff; the draws themselves scatter by about 1 % of the shares. In an LJ liquid
@@ -103,6 +103,9 @@ def grid_effect(
         return None
     steps = _steps(resolution, sample[0])
     size = float(np.abs(steps).max())
+    if size == 0:
+        # one atom at the origin: nothing says how it is rounded
+        return None
     moves, lag = _moves(sample, size)
     everyone = np.arange(len(moves))
     one, other = moves[everyone if first is None else first], None

@@ -29,6 +29,8 @@ _SLACK, _ROUNDINGS = 3.0, 2.0
 _UNIT = {32: 2.0**-24, 64: 2.0**-53}
 # Formats whose box is written with fewer digits than a float has: lengths in Å, angles in degrees.
 _BOX_STEPS = {"PDB": (1e-3, 1e-2), "ENT": (1e-3, 1e-2), "GRO": (1e-4, 0.0)}
+# Steps of coordinates that formats have as a rule, Å.
+_USUAL_STEPS = {"PDB": 1e-3, "ENT": 1e-3, "GRO": 1e-2, "XTC": 1e-2}
 
 
 @dataclass(frozen=True)
@@ -36,8 +38,8 @@ class Resolution:
     """The resolution of the positions in a file.
 
     Attributes:
-        kind: "grid" (decimals of a length), "fractions" (decimals of the box's vectors), "float32" or
-            "float64".
+        kind: "grid" (decimals of a length), "fractions" (decimals of the box's vectors), "float32",
+            "float64", or "unknown" where every coordinate looked at is 0 (bounds are then those of float32).
         step: of the grid: length for "grid", a pure number for "fractions"; 0 for floats. Where digits are
             counted, that of the largest coordinate it was found from.
         digits: significant digits of every number, where it is these that are fixed; else 0.
@@ -46,6 +48,8 @@ class Resolution:
         moved: whether atoms moved between them. Where none did, the grid may be the structure's and not the
             file's.
         box: step of the box's lengths, length, and of its angles, degrees, where the format rounds them.
+        told: whether the coordinates tell it. Where they are all 0, a grid is that which the format has as a
+            rule.
     """
 
     kind: str
@@ -55,6 +59,7 @@ class Resolution:
     moved: bool = True
     box: tuple[float, float] = (0.0, 0.0)
     digits: int = 0
+    told: bool = True
 
     def bound(self, frame: Frame, atoms: Int[np.ndarray, "chosen"] | None = None) -> float:
         """How far a distance in this frame can be from that of the positions before they were written.
@@ -118,6 +123,9 @@ class Resolution:
             if self.moved
             else " No atom moved between the frames looked at, so this may be the structure's."
         )
+        if not self.told:
+            rule = f"; as a rule the format keeps multiples of {self.step:g}{unit}" if self.step else ""
+            return f"No coordinate looked at is other than 0, which does not tell what the file keeps{rule}."
         of = " of the box" if self.kind == "fractions" else unit
         if self.digits:
             return (
@@ -131,7 +139,7 @@ class Resolution:
 
     @property
     def _narrow(self) -> bool:
-        return self.kind == "float32" or self.bits == 32
+        return self.kind in ("float32", "unknown") or self.bits == 32
 
     def _half(self, frame: Frame) -> float:
         """Half a step along an axis at worst, length."""
@@ -174,6 +182,10 @@ def infer_from(sample: Sequence[Frame], bits: int = 64, format: str = "") -> Res
     moved = _moved(sample)
     values, fractions = _values(sample, moved), _fractions(sample, moved)
     box = _BOX_STEPS.get(format, (0.0, 0.0))
+    if not values.any():
+        usual = _USUAL_STEPS.get(format, 0.0)
+        kind = "grid" if usual else "unknown"
+        return Resolution(kind, usual, bits, len(sample), bool(moved.any()), box, told=False)
     unit = _SLACK * _UNIT[bits]
     step, digits = decimal_grid(values, unit * np.abs(values))
     kind = "float32" if bits == 32 or bool((values == values.astype(np.float32)).all()) else "float64"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -221,10 +223,26 @@ def test_wrapping_is_no_motion():
 
 
 def test_nothing_to_find_it_from():
-    assert infer_from(frames_of(np.full((2, 3, 3), np.nan))).kind == "float32"
+    assert infer_from(frames_of(np.full((2, 3, 3), np.nan))).kind == "unknown"
     assert infer_from(frames_of(np.zeros((2, 3, 3)))).step == 0.0
     with pytest.raises(InputError, match="no frame is left"):
         infer(open_trajectory(datafiles.GRO, slice="5:"))
+
+
+def test_an_atom_at_the_origin_tells_nothing_of_what_a_file_keeps():
+    some = frames_of(np.zeros((4, 1, 3)))
+    found = infer_from(some)
+    assert found.kind == "unknown" and "does not tell" in found.words() and "float32" not in found.words()
+    # no warning either, of a division by a grid of steps of 0
+    breathing = [
+        replace(frame, box=Box((9 + 0.1 * k) * np.eye(3), np.ones(3, bool))) for k, frame in enumerate(some)
+    ]
+    assert grid_effect(found, breathing, 4.0) is None
+    usual = infer(open_trajectory(datafiles.GRO_huge_box))
+    assert (usual.kind, usual.step, usual.told) == ("grid", 0.01, False)
+    assert "as a rule the format keeps multiples of 0.01 Å" in usual.words()
+    # told from numbers where there are any
+    assert infer_from(frames_of(np.eye(3)[None].repeat(2, axis=0)), format="GRO").told
 
 
 def test_of_a_real_xtc():
