@@ -18,6 +18,7 @@ from mdnum.audit.base import Part, Progress, Subject
 from mdnum.audit.noise import FEW, Noise, displaced, settled
 from mdnum.audit.subject import CalculatorError, only_trying
 from mdnum.audit.thresholds import Threshold
+from mdnum.audit.written import written
 from mdnum.references.findings import finding
 
 #: How many times the noise one object may differ from another by: a list that was built elsewhere sums its
@@ -84,6 +85,7 @@ class State:
                 *self._stale(stale),
                 *self._not_finite(refused),
                 *_unsteady(repeats),
+                *written(subject, atoms),
                 *lonely.findings(),
             ],
             tables={

@@ -149,9 +149,26 @@ class CalculatorSubject:
             )
         return forces
 
+    def writes(self, atoms: Atoms) -> list[str]:
+        """Which of positions, numbers, cell and periods differ in the atoms after the calculator had them.
+
+        Raises:
+            CalculatorError: as for `energy`.
+        """
+        self.forget()
+        asked = self._ask(atoms)
+        self._answer(lambda: self._energy(asked), asked, "energy")
+        self._answer(lambda: self.calculator.get_forces(asked), asked, "forces")
+        words = ("positions", "numbers", "cell", "periods")
+        return [
+            word
+            for word, before, after in zip(words, _bits(atoms), _bits(asked), strict=True)
+            if before.tobytes() != after.tobytes()
+        ]
+
     def _ask(self, atoms: Atoms) -> Atoms:
         asked = _bare(atoms)
-        bits = (asked.positions.copy(), asked.numbers.copy(), np.array(asked.cell), asked.pbc.copy())
+        bits = _bits(asked)
         same = self._last is not None and all(
             a.shape == b.shape and a.tobytes() == b.tobytes() for a, b in zip(bits, self._last, strict=True)
         )
@@ -252,6 +269,10 @@ def exact_extxyz(atoms: Atoms) -> str:
     cell = f'Lattice="{lattice}" ' if np.asarray(atoms.cell).any() else ""
     head = f'{cell}Properties={":".join(columns)} pbc="{periodic}"'
     return "\n".join([str(len(atoms)), head, *(" ".join(row) for row in rows)]) + "\n"
+
+
+def _bits(atoms: Atoms) -> tuple[np.ndarray, ...]:
+    return atoms.positions.copy(), atoms.numbers.copy(), np.array(atoms.cell), atoms.pbc.copy()
 
 
 def _bare(atoms: Atoms) -> Atoms:

@@ -349,3 +349,12 @@ class OnlyRectangles(Good):
         if atoms.pbc.any() and np.abs(atoms.cell.array - np.diag(np.diag(atoms.cell.array))).max() > 1e-9:
             raise NotImplementedError("rectangular cells only")
         return super().answer(atoms)
+
+
+class WrapsGiven(Good):
+    """Wraps the atoms that it was handed instead of a copy."""
+
+    def calculate(self, atoms=None, properties=None, system_changes=all_changes):
+        super().calculate(atoms, properties, system_changes)
+        assert isinstance(atoms, Atoms)
+        atoms.wrap()

@@ -15,6 +15,7 @@ from audit.test_invariance import codes
 from mdnum.audit import state
 from mdnum.audit.state import State
 from mdnum.audit.thresholds import Threshold
+from mdnum.audit.written import written
 
 
 def at_cutoff(_) -> list[Threshold]:
@@ -88,6 +89,18 @@ def test_another_order_of_sums_is_not_repeatable_and_no_memory():
 )
 def test_atoms_alone(make, code: str):
     assert code in codes(State(at_cutoff)(subject(make)))
+
+
+def test_writing_to_the_atoms_that_were_given_is_found():
+    asked = subject(planted.WrapsGiven)
+    (found,) = written(asked, crystal())
+    assert found["code"] == "CHANGED_INPUT" and "other positions were in" in found["text"]
+    assert not list(written(subject(planted.Good), crystal()))
+
+
+def test_the_check_of_memory_asks_what_is_written():
+    assert codes(State(at_cutoff)(subject(planted.WrapsGiven, chain()))) == {}
+    assert codes(State(at_cutoff)(subject(planted.WrapsGiven)))["CHANGED_INPUT"] == "error"
 
 
 def test_an_object_that_fails_where_a_new_one_answers():
