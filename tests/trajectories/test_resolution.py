@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -237,7 +238,9 @@ def test_an_atom_at_the_origin_tells_nothing_of_what_a_file_keeps():
     breathing = [
         replace(frame, box=Box((9 + 0.1 * k) * np.eye(3), np.ones(3, bool))) for k, frame in enumerate(some)
     ]
-    assert grid_effect(found, breathing, 4.0) is None
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert grid_effect(found, breathing, 4.0) is None
     usual = infer(open_trajectory(datafiles.GRO_huge_box))
     assert (usual.kind, usual.step, usual.told) == ("grid", 0.01, False)
     assert "as a rule the format keeps multiples of 0.01 Å" in usual.words()
