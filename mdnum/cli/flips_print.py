@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import Any
 
 from mdnum.cli import output
-from mdnum.report.words import many
 
 
 def print_rows(summary: Mapping[str, Any]) -> None:
@@ -37,6 +36,8 @@ def print_rows(summary: Mapping[str, Any]) -> None:
 
 def print_comparison(summary: Mapping[str, Any]) -> None:
     """What a comparison of two trajectories says below its headline."""
+    from mdnum.report.words import many
+
     out = output.console()
     out.print(f"  {summary['system']} and {summary['other']}, {many(summary['atoms'], 'atom')}", markup=False)
     for line in summary["concluded"]:
@@ -55,9 +56,11 @@ def print_comparison(summary: Mapping[str, Any]) -> None:
 
 
 def _file(summary: Mapping[str, Any]) -> str:
+    from mdnum.report.words import many
+
     size = f"{many(summary['atoms'], 'atom')}, {many(summary['frames'], 'frame')}"
     if summary["timed"] and summary["frames"] > 1:
-        size += f" {summary['interval']:.6g} {summary['time']} apart"
+        size += f" {_time(format(summary['interval'], '.6g'), summary)} apart"
     return f"{summary['system']} ({summary['format']}, read by {summary['reader']}), {size}"
 
 
@@ -66,5 +69,10 @@ def _length(frames: float | None, summary: Mapping[str, Any]) -> str:
     if frames is None:
         return "longer than seen"
     if summary["timed"] and summary["interval"] is not None:
-        return f"{frames * summary['interval']:.4g} {summary['time']}"
-    return f"{frames:.4g} frames"
+        return _time(f"{frames * summary['interval']:.4g}", summary)
+    return f"{frames:.4g} frame{'' if frames == 1 else 's'}"
+
+
+def _time(number: str, summary: Mapping[str, Any]) -> str:
+    """With its unit, of which steps have a plural."""
+    return f"{number} {summary['time']}{'s' if summary['time'] == 'step' and number != '1' else ''}"

@@ -14,6 +14,7 @@ from mdnum.store import RunFolder
 from mdnum.workflow.flips_open import (
     FlipsResult,
     about,
+    cut_short,
     default_rules,
     leave,
     new_folder,
@@ -160,6 +161,7 @@ def _look(
             "rules": told,
             "velocities_odd": bool(found.moved > _TOO_FAR),
             "stopped": None if found.stopped is None else str(found.stopped),
+            "cut_short": cut_short(found.stopped, trajectory),
             "interrupted": found.interrupted,
             "seconds": {"frames": found.seconds, "statistics": time.perf_counter() - began},
             "findings": [],

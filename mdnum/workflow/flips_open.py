@@ -149,6 +149,15 @@ def about(trajectory: Trajectory, question: str) -> dict[str, Any]:
     }
 
 
+def cut_short(error: InputError | None, trajectory: Trajectory) -> bool:
+    """Whether reading stopped at a frame that is not whole, the last of the file as far as that is known."""
+    from mdnum.trajectories.source import UnreadableFrame
+
+    if not isinstance(error, UnreadableFrame):
+        return False
+    return trajectory.in_file is None or error.frame >= trajectory.in_file - 1
+
+
 def told_resolution(resolution: Resolution, trajectory: Trajectory) -> dict[str, Any]:
     """What summary.json says of how finely positions are told."""
     return {

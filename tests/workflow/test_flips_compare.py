@@ -93,16 +93,16 @@ def test_positions_beyond_the_resolution_before_any_set(tmp_path: Path) -> None:
 def test_what_is_certain_is_found_among_pairs_that_stay_different(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # differs within the resolution at frame 1, and beyond it at frame 2, where no pair is new
-    write(tmp_path / "a.extxyz", pairs_at([4.0, 4.19, 4.0, 4.0]))
-    write(tmp_path / "b.extxyz", pairs_at([4.0, 4.21, 4.6, 4.9]))
+    # differs within the resolution at frames 1 and 2, and beyond it at frame 3, where no pair is new
+    write(tmp_path / "a.extxyz", pairs_at([4.0, 4.19, 4.19, 4.0]))
+    write(tmp_path / "b.extxyz", pairs_at([4.0, 4.21, 4.21, 4.6]))
     found = looked(tmp_path / "a.extxyz", tmp_path / "b.extxyz", tmp_path / "f", report=True)
     summary = found.summary
     assert summary["first"]["frame"] == 1 and summary["first"]["ambiguous"] == 1
-    assert summary["certain"] == 2 and summary["certain_frame"] == "frame 2"
-    assert "beyond it from frame 2 on" in summary["headline"]
+    assert summary["certain"] == 3 and summary["certain_frame"] == "frame 3"
+    assert "beyond it from frame 3 on" in summary["headline"]
     said = finding(found, "WITHIN_RESOLUTION")
-    assert said is not None and said["severity"] == "warning" and "frame 2" in said["text"]
+    assert said is not None and said["severity"] == "warning" and "frame 3" in said["text"]
     page = (found.folder / "report.html").read_text(encoding="utf-8")
     assert "Sets differ for certain" in page
     # with more pairs than the table has room for, each of them is looked at

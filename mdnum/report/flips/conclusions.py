@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mdnum.report.flips.words import frame, length, rule_words
+from mdnum.report.flips.words import frame, length, of_time, rule_words
 from mdnum.report.fork.question import Question
 from mdnum.report.verdict import Finding
 from mdnum.report.words import count, listed, many, number, plain
@@ -183,8 +183,9 @@ def _leap(run: Question, first: Any, seed: int | None) -> Iterator[str]:
 
 
 def _rate(run: Question, found: Any) -> str:
-    unit = run.summary["time"] if run.summary["timed"] else "frames"
-    return f"by a factor e in {number(1 / found['rate'])} {unit} ({count(found['frames'])} frames)"
+    told = number(1 / found["rate"])
+    told = of_time(run, told) if run.summary["timed"] else f"{told} frames"
+    return f"by a factor e in {told} ({count(found['frames'])} frames)"
 
 
 def _hurried(before: Any, after: Any) -> str:
@@ -262,7 +263,7 @@ def findings(run: Question) -> Iterator[Finding]:
         yield Finding(
             "OTHER_LENGTH",
             "info",
-            f"one has {count(min(counts))} frames, the other {count(max(counts))}",
+            f"one has {many(min(counts), 'frame')}, the other {count(max(counts))}",
             "Those that both have are compared.",
         )
 

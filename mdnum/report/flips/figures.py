@@ -9,6 +9,7 @@ import numpy as np
 from mdnum.ball.demos.base import Plot, Series
 from mdnum.report.flips.words import axis, moment, rule_words
 from mdnum.report.fork.question import Question
+from mdnum.report.words import many
 
 #: Rules that get figures of their own; the others have their rows in the tables.
 SHOWN = 4
@@ -75,7 +76,7 @@ def _lifetimes(run: Question, table: dict[str, np.ndarray]) -> Plot | None:
     window = run.summary["window"]
     lines = (
         ("lifetime (seen to begin)", "survival", "first", False),
-        (f"the same, gaps up to {window} frames overlooked", "intermittent", "first", True),
+        (f"the same, gaps up to {many(window, 'frame')} overlooked", "intermittent", "first", True),
         ("still inside, of those found inside", "residence", "second", False),
         ("inside again or still", "again", "second", True),
     )

@@ -62,13 +62,13 @@ def _headline(run: Question) -> str:
 
 def _hidden(one: Mapping[str, Any]) -> str:
     """How many more there were, by whichever estimate there is; empty where that is few or not known."""
-    flux = (one["flux"] or {}).get("lost")
-    lost = flux if flux is not None and flux > 0 else one["stride"]["lost"]
+    flux = limits.by_velocities(one)
+    lost = flux or one["stride"]["lost"]
     if not lost or lost >= 1 or lost <= limits.HIDDEN:
         return ""
     times = 1 / (1 - lost)
     more = f"{number(times, 2)} times as many" if times >= 2 else f"about {percent(times - 1)} more"
-    return f"by the velocities, {more} happened" if lost == flux else f"{more} happened, between the frames"
+    return f"by the velocities, {more} happened" if flux else f"{more} happened, between the frames"
 
 
 def _evidence(run: Question) -> Iterator[str]:
@@ -99,7 +99,9 @@ def _stopped(run: Question) -> Iterator[Finding]:
             "error",
             f"the file could be used up to frame {last} only",
             f"{run.summary['stopped']} Everything here is about the {frames} before it.",
-            "Check how the file was written; a run that was killed leaves a last frame that is not whole.",
+            "Check how the file was written; a run that was killed leaves a last frame that is not whole."
+            if run.summary["cut_short"]
+            else "Look at that frame of the file, and at what wrote it.",
         )
 
 

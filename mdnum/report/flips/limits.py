@@ -110,18 +110,28 @@ def _between(run: Question, one: Mapping[str, Any]) -> Iterator[Finding]:
         )
 
 
-def _velocities(run: Question, one: Mapping[str, Any]) -> Iterator[Finding]:
+def by_velocities(one: Mapping[str, Any]) -> float | None:
+    """Share of the crossings that velocities show to be missing in the file.
+
+    Returns:
+        0 where what is missing may be so by chance; None where there are too few crossings to tell.
+    """
     flux = one["flux"]
-    if flux is None or flux["lost"] is None or flux["crossed"] < FEW or flux["lost"] <= HIDDEN:
-        return
+    if flux is None or flux["lost"] is None or flux["crossed"] < FEW:
+        return None
     # a rate from a handful of frames scatters: what it may be by chance is no finding
-    if flux["rate"] - flux["seen"] <= 2.0 * flux["error"]:
+    return flux["lost"] if flux["rate"] - flux["seen"] > 2.0 * flux["error"] else 0.0
+
+
+def _velocities(run: Question, one: Mapping[str, Any]) -> Iterator[Finding]:
+    flux, lost = one["flux"], by_velocities(one)
+    if not lost or lost <= HIDDEN:
         return
     rate = f"{number(flux['rate'])} ± {number(flux['error'], 2)} times per {run.summary['time']}"
     yield Finding(
         "FLUX",
         "warning",
-        f"velocities say that {percent(flux['lost'])} of the crossings are not in the file",
+        f"velocities say that {percent(lost)} of the crossings are not in the file",
         f"{rule_words(run, one)}: by the velocities of {many(flux['frames'], 'frame')} pairs cross {rate}, "
         f"and the file shows {number(flux['seen'])}. The difference are pairs that cross and turn back "
         "before the next frame.",

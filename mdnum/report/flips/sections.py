@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from mdnum.report.browse import Browse, Column, plain_rows
+from mdnum.report.flips import limits
 from mdnum.report.flips.words import duration, length, per_time, rule_words
 from mdnum.report.flips.words import life as life_of
 from mdnum.report.fork.question import Question
@@ -42,7 +43,7 @@ def _numbers(run: Question, one: Mapping[str, Any]) -> Iterator[tuple[str, str]]
     yield (
         "Flips",
         f"{count(one['flips'])}: {count(one['entered'])} entered, {count(one['left'])} left; "
-        f"{number(one['flips_per_frame'], 4)} from frame to frame, by {count(one['pairs_flipped'])} pairs",
+        f"{number(one['flips_per_frame'], 4)} from frame to frame, by {many(one['pairs_flipped'], 'pair')}",
     )
     yield (
         "Undecidable",
@@ -59,7 +60,7 @@ def _numbers(run: Question, one: Mapping[str, Any]) -> Iterator[tuple[str, str]]
     chatter = one["chatter"]
     yield (
         "Chatter",
-        f"{count(chatter['undone'])} flips taken back within {chatter['window']} frames "
+        f"{many(chatter['undone'], 'flip')} taken back within {many(chatter['window'], 'frame')} "
         f"({percent(chatter['share'])})",
     )
 
@@ -90,12 +91,12 @@ def _lifetimes(run: Question, one: Mapping[str, Any]) -> Iterator[tuple[str, str
         error = duration(run, life["mean_by_rate_error"], 2)
         yield (
             "Mean life (by rate)",
-            f"{duration(run, life['mean_by_rate'])} ± {error}: time inside over {count(life['leaves'])} "
-            "leaves (the error is that of independent ones)",
+            f"{duration(run, life['mean_by_rate'])} ± {error}: time inside over "
+            f"{many(life['leaves'], 'leave')} (the error is that of independent ones)",
         )
     yield (
         "Intermittent contacts",
-        f"gaps up to {one['chatter']['window']} frames overlooked: median {life_of(run, loose)}"
+        f"gaps up to {many(one['chatter']['window'], 'frame')} overlooked: median {life_of(run, loose)}"
         + (f", by rate {duration(run, loose['mean_by_rate'])}" if loose["leaves"] else ""),
     )
 
@@ -110,8 +111,12 @@ def _between(run: Question, one: Mapping[str, Any]) -> Iterator[tuple[str, str]]
         yield "Lost between frames, by leaving frames out", f"{told} ({found['says']})"
     if flux is not None and flux["crossed"]:
         unit = run.summary["time"]
-        lost = flux["lost"]
-        told = f"{percent(lost)} not in the file" if lost and lost > 0 else "none is missing"
+        lost = limits.by_velocities(one)
+        told = "too few to tell whether some are missing" if lost is None else "no more than by chance"
+        if lost:
+            told = f"{percent(lost)} not in the file"
+        elif lost == 0 and flux["rate"] <= flux["seen"]:
+            told = "none is missing"
         yield (
             "Lost between frames, by velocities",
             f"{number(flux['rate'])} ± {number(flux['error'], 2)} crossings per {unit}, "

@@ -20,8 +20,14 @@ def duration(run: Question, frames: float | None, digits: int = 3, beyond: str =
     if frames is None:
         return beyond
     if timed(run):
-        return f"{number(frames * run.summary['interval'], digits)} {run.summary['time']}"
+        return of_time(run, number(frames * run.summary["interval"], digits))
     return f"{plain(frames, digits)} frame{'' if frames == 1 else 's'}"
+
+
+def of_time(run: Question, text: str) -> str:
+    """A number with the unit of time; steps are counted, units are not."""
+    unit = run.summary["time"]
+    return f"{text} {unit}{'s' if unit == 'step' and text not in ('1', '1.00', '1.0') else ''}"
 
 
 def life(run: Question, found: Mapping[str, Any]) -> str:
@@ -61,7 +67,7 @@ def size(run: Question) -> str:
     summary = run.summary
     text = f"{many(summary['atoms'], 'atom')}, {many(summary['frames'], 'frame')}"
     if timed(run):
-        text += f" {plain(summary['interval'])} {summary['time']} apart"
+        text += f" {of_time(run, plain(summary['interval']))} apart"
     return text
 
 

@@ -1,0 +1,116 @@
+"""What a ledger of flips says in words: velocities, where a file stopped, units and plurals."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import ase
+import numpy as np
+import pytest
+from ase.io import write
+
+import mdnum
+from mdnum.cli import flips_print
+from mdnum.report.flips import findings, html, limits, sections
+from mdnum.report.fork.question import Question
+from mdnum.report.words import percent
+
+
+def gas(frames: int = 12, atoms: int = 24, side: float = 6.0) -> list[ase.Atoms]:
+    rng = np.random.default_rng(0)
+    start, speed = rng.uniform(0, side, (atoms, 3)), rng.normal(0, 0.25, (atoms, 3))
+    return [
+        ase.Atoms(f"Ar{atoms}", start + n * speed, cell=[side] * 3, pbc=True, info={"time": 0.5 * n})
+        for n in range(frames)
+    ]
+
+
+@pytest.fixture(scope="module")
+def looked(tmp_path_factory: pytest.TempPathFactory) -> Question:
+    """A folder whose file has far more than a handful of flips."""
+    path = tmp_path_factory.mktemp("words")
+    write(path / "gas.extxyz", gas())
+    result = mdnum.flips(path / "gas.extxyz", cutoffs=[2.5], out=path / "f", report=False)
+    return html.load(result.folder, "flips")[1]
+
+
+def said(looked: Question, crossed: int, rate: float, error: float) -> tuple[str, str, set[str]]:
+    """(headline, row on velocities, codes) with such a flux beside 10 crossings a time in the file."""
+    summary = copy.deepcopy(dict(looked.summary))
+    one = summary["rules"][0]
+    one["stride"]["lost"] = 0.0
+    one["flux"] = {
+        "rate": rate, "error": error, "seen": 10.0, "crossed": crossed, "frames": 4, "moved": 1.0,
+        "lost": 1 - 10.0 / rate,
+    }  # fmt: skip
+    run = Question(looked.path, summary, looked.system_toml, looked.provenance, looked.tables)
+    (row,) = [words for name, words in sections.rule(run, 0)["between"] if "velocities" in name]
+    judged = findings.judge(run)
+    return judged.headline, row, {one.code for one in judged.findings}
+
+
+def test_headline_row_and_finding_agree_on_what_velocities_show(looked: Question) -> None:
+    headline, row, codes = said(looked, 200, 100.0, 7.0)
+    assert "by the velocities, 10 times as many happened" in headline
+    assert "FLUX" in codes and f"{percent(0.9)} not in the file" in row
+    # ten crossings, and a rate within its scatter, show nothing
+    for crossed, rate, error, words in (
+        (10, 100.0, 32.0, "too few"),
+        (25, 13.0, 2.6, "no more than by chance"),
+    ):
+        headline, row, codes = said(looked, crossed, rate, error)
+        assert "velocities" not in headline and "happened" not in headline
+        assert "FLUX" not in codes and words in row and "not in the file" not in row
+    assert "none is missing" in said(looked, 100, 9.0, 0.9)[1]
+    assert limits.by_velocities({"flux": None}) is None
+
+
+def test_only_a_file_that_breaks_off_is_said_to_break_off(tmp_path: Path) -> None:
+    def remedy(name: str, frames: list[ase.Atoms], keep: float = 1.0) -> str:
+        write(tmp_path / name, frames)
+        whole = (tmp_path / name).read_bytes()
+        (tmp_path / name).write_bytes(whole[: int(keep * len(whole))])
+        out = tmp_path / f"f-{name}"
+        summary = mdnum.flips(tmp_path / name, cutoffs=[2.5], out=out, report=False).summary
+        assert summary["status"] == "stopped"
+        (one,) = [one for one in summary["findings"] if one["code"] == "STOPPED"]
+        return one["remedy"]
+
+    killed = "a run that was killed"
+    assert killed in remedy("cut.extxyz", gas(), keep=0.9)
+    lost, boxless, fewer = gas(), gas(), gas()
+    lost[7].positions[3, 1] = np.nan
+    boxless[7].pbc = False
+    fewer[7] = fewer[7][:-1]
+    for name, frames in (("nan", lost), ("box", boxless), ("atoms", fewer)):
+        told = remedy(f"{name}.extxyz", frames)
+        assert killed not in told and "that frame" in told
+
+
+def test_one_atom_one_frame_and_steps(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def printed(result: Any, show: Any = flips_print.print_rows) -> str:
+        show(result.summary)
+        return capsys.readouterr().out
+
+    write(tmp_path / "one.extxyz", ase.Atoms("Ar", [[0.12, 0.34, 0.56]], cell=[9.0] * 3, pbc=True))
+    one = mdnum.flips(tmp_path / "one.extxyz", cutoffs=[2.5], out=tmp_path / "a", report=False)
+    assert "1 atom, 1 frame" in printed(one)
+    two = (tmp_path / "one.extxyz", tmp_path / "one.extxyz")
+    both = mdnum.flips(*two, cutoffs=[2.5], out=tmp_path / "b", report=False)
+    assert "1 atom\n" in printed(both, flips_print.print_comparison)
+    rows = []
+    for n in range(3):
+        rows += ["ITEM: TIMESTEP", str(20 * n), "ITEM: NUMBER OF ATOMS", "2", "ITEM: BOX BOUNDS pp pp pp"]
+        rows += ["0 20"] * 3 + [
+            "ITEM: ATOMS id type x y z",
+            "1 1 1.5 1.5 1.5",
+            f"2 1 {4.3 - 0.3 * n} 1.5 1.5",
+        ]
+    (tmp_path / "l.lammpstrj").write_text("\n".join(rows) + "\n")
+    steps = mdnum.flips(tmp_path / "l.lammpstrj", cutoffs=[2.5], out=tmp_path / "c")
+    assert steps.summary["rules"][0]["flips"] == 1 and steps.summary["time"] == "step"
+    page = (steps.folder / "report.html").read_text(encoding="utf-8")
+    assert "20 steps apart" in page and "20 step " not in page and "20 steps apart" in printed(steps)
+    assert "by 1 pair" in page and "by 1 pairs" not in page
