@@ -11,6 +11,7 @@ import numpy as np
 from ase import Atoms
 
 from mdnum.audit import transformations
+from mdnum.audit.answer import Refusal, ask
 from mdnum.audit.base import Part, Progress, Subject
 from mdnum.audit.noise import Noise, along_a_line, louder, settled, under_jitter
 from mdnum.audit.subject import CalculatorError
@@ -55,6 +56,10 @@ _MEANING: Mapping[str, tuple[str, str]] = {
     "EXTENSIVE": (
         "a supercell is not the sum of its parts",
         "Look at cells shorter than two cutoffs: more images than the nearest one must be searched.",
+    ),
+    "NARROW_CELL": (
+        "a cell narrower than two cutoffs is wrong",
+        "Search as many images as the cutoff reaches, or refuse cells narrower than two cutoffs.",
     ),
     "LATTICE": (
         "the answer depends on the choice of lattice vectors",
@@ -148,7 +153,11 @@ class Invariance:
             try:
                 differences.append(judged(same))
             except CalculatorError as error:
-                refused.append((same, error))
+                if same.code == "NARROW_CELL" and error.cause is not None:
+                    late.append((same.what, error.message))
+                    judged.narrow_refused(same, error)
+                else:
+                    refused.append((same, error))
         found = [*_refusals(refused), *self._findings(differences, judged, refused)]
         wrong = [one for one in differences if not one.agrees]
         return Part(
@@ -189,6 +198,8 @@ class Invariance:
             self.structures[f"{slug}-before"] = judged.before(worst.same)
             self.structures[f"{slug}-after"] = worst.same.atoms
             severity = "error" if worst.jump_kT > _SMALL or _large(worst, judged) else "warning"
+            if code == "NARROW_CELL":
+                severity = "warning"  # the structure itself is answered for as it should be
             yield finding(
                 code,
                 severity,
@@ -270,6 +281,20 @@ class _Judge:
             # another object, which has seen nothing else: what it remembers is another question
             found = self._compared(self.subject.fresh(), same, energy, forces, allowed)
         return found
+
+    def narrow_refused(self, same: Same, error: CalculatorError) -> None:
+        """Takes note of a calculator that takes four atoms in a wide cell only, which is safe."""
+        if isinstance(ask(self.subject.fresh(), same.atoms), Refusal):
+            return
+        self.notes.append(
+            finding(
+                "NARROW_CELL_REFUSED",
+                "info",
+                "narrow cells are refused",
+                f"Of {same.what}, the small one is not answered for: it {error.message}.",
+                "Nothing to do: repeat a structure before it is asked about.",
+            )
+        )
 
     def _compared(
         self, worker: Subject, same: Same, energy: float, forces: Any, allowed: Noise

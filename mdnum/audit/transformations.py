@@ -13,6 +13,9 @@ from jaxtyping import Float, Int
 #: one that is lost when it is added to a cell's length, and half an ulp of 1.
 _TINY = (1e-52, 1e-17, 2.0**-53)
 
+_MANY = 500
+"""Atoms of which distances to all others are looked at."""
+
 
 @dataclass(frozen=True)
 class Same:
@@ -53,6 +56,7 @@ def all_of(atoms: Atoms, given: Atoms, rng: np.random.Generator) -> Iterator[Sam
     yield from permuted(atoms, rng)
     yield from by_an_ulp(atoms, given)
     yield from repeated(atoms)
+    yield from narrow(atoms, rng)
     yield from skewed(atoms)
     yield from turned(atoms, rng)
     yield from without_periods(atoms)
@@ -207,6 +211,36 @@ def repeated(atoms: Atoms) -> Iterator[Same]:
         order = np.tile(np.arange(len(atoms)), copies)
         what = f"{' x '.join(map(str, counts))} supercell"
         yield Same(what, "EXTENSIVE", there, order, copies=copies, rounding=_ulp(there, atoms))
+
+
+def narrow(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
+    """A cell of four atoms as near to one another as in the structure, beside its supercell.
+
+    A structure with room for two cutoffs never asks for a second image of a pair. Of one species alone: what
+    a calculator makes of others in such a cell is another question.
+    """
+    if not atoms.pbc.all() or len(set(atoms.numbers)) > 1 or len(atoms) < 2:
+        return
+    between = atoms[:_MANY].get_all_distances(mic=True)
+    nearest = float(between[~np.eye(len(between), dtype=bool)].min())
+    if nearest == 0.0:
+        return
+    edge = nearest * np.sqrt(2.0)
+    places = edge * np.array([[0, 0, 0], [0, 0.5, 0.5], [0.5, 0, 0.5], [0.5, 0.5, 0]])
+    # wider by the most that two atoms may approach, so that none is nearer than in the structure
+    places = 1.1 * places + 0.02 * nearest * rng.uniform(-1, 1, (4, 3))
+    few = Atoms([atoms.symbols[0]] * 4, places, cell=[1.1 * edge] * 3, pbc=True)
+    there = few.repeat(3)
+    what = f"a cell of four atoms, {1.1 * edge:.3g} Å wide, repeated three times along each axis"
+    yield Same(
+        what,
+        "NARROW_CELL",
+        there,
+        np.tile(np.arange(4), 27),
+        copies=27,
+        rounding=_ulp(there, few),
+        before=few,
+    )
 
 
 def skewed(atoms: Atoms) -> Iterator[Same]:

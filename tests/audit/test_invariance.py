@@ -52,6 +52,33 @@ def test_a_planted_mistake_of_clusters_is_found(make, code: str):
     assert codes(Invariance()(subject(make, chain()))).get(code) == "error"
 
 
+class Wide(planted.Good):
+    """Refuses what a search for the nearest images would have wrong."""
+
+    def answer(self, atoms):
+        if atoms.pbc.any() and atoms.cell.lengths().min() < 2 * planted.R_CUT:
+            raise ValueError("the cell is narrower than two cutoffs")
+        return super().answer(atoms)
+
+
+def narrow(make) -> dict[str, str]:
+    """Findings about narrow cells, of a structure with room for two cutoffs."""
+    roomy = bulk("Ar", "fcc", a=3.9, cubic=True).repeat(2)
+    asked = subject(make, roomy)
+    check = Invariance()
+    rng = np.random.default_rng(0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(transformations, "all_of", lambda atoms, *_: transformations.narrow(atoms, rng))
+        return codes(check(asked))
+
+
+def test_a_structure_with_room_does_not_hide_the_nearest_image():
+    assert narrow(planted.NearestImage) == {"NARROW_CELL": "warning"}
+    assert narrow(planted.Good) == {}
+    assert narrow(Wide) == {"NARROW_CELL_REFUSED": "info"}
+    assert not list(transformations.narrow(chain(), np.random.default_rng(0)))
+
+
 def test_only_what_is_wrong_is_named():
     """A cap on neighbors does not make faces, images or the dummy cell wrong."""
     found = codes(Invariance()(subject(planted.NearestImage)))
