@@ -15,17 +15,25 @@ from typing import Any
 import numpy as np
 from MDAnalysis.analysis.base import AnalysisBase
 from MDAnalysis.analysis.results import Results, ResultsGroup
-from MDAnalysis.core.groups import AtomGroup, UpdatingAtomGroup
 from MDAnalysis.core.universe import Universe
 
 from mdnum.errors import InputError
+from mdnum.trajectories.asked import (
+    bound_of,
+    group_of,
+    in_any_pair,
+    indices_of,
+    refuse_backward,
+    refuse_strangers,
+    rules_of,
+)
 from mdnum.trajectories.boxes import Boxes
 from mdnum.trajectories.checked import FrameError, check_frame
 from mdnum.trajectories.frame import Frame
 from mdnum.trajectories.joined import Part, RuleResult, joined
 from mdnum.trajectories.mdanalysis_source import READING_FAILS, first_line, frame_of, table_of
 from mdnum.trajectories.resolution import SAMPLE, Resolution, infer_from
-from mdnum.trajectories.rules import Cutoff, Rule, SpeciesCutoffs
+from mdnum.trajectories.rules import Rule
 from mdnum.trajectories.source import UnreadableFrame
 from mdnum.trajectories.table import Flips
 from mdnum.trajectories.tails import left_over, refuse_cut_text
@@ -83,7 +91,8 @@ class NeighborFlips(AnalysisBase):
         verbose: show progress.
 
     Raises:
-        InputError: an empty or changing group, groups of two universes, no rule.
+        InputError: an empty or changing group, groups of two universes, no rule or none that can be, a
+            species that no atom has, a bound below 0.
 
     Error: MDAnalysis hands coordinates over in float32; from there on everything is float64.
     """
@@ -106,23 +115,24 @@ class NeighborFlips(AnalysisBase):
         verbose: bool = False,
     ):
         everything = isinstance(universe_or_atomgroup, Universe)
-        group = _group(universe_or_atomgroup.atoms if everything else universe_or_atomgroup, "atoms")
+        group = group_of(universe_or_atomgroup.atoms if everything else universe_or_atomgroup, "atoms")
         super().__init__(group.universe.trajectory, verbose=verbose)
-        self._first = None if everything and other is None else _indices(group)
+        self._first = None if everything and other is None else indices_of(group)
         self._second = None
         if other is not None:
-            second = _group(other, "other")
+            second = group_of(other, "other")
             if second.universe is not group.universe:
                 raise InputError(
                     "the two groups belong to two universes", remedy="Select both from one universe"
                 )
-            self._second = _indices(second)
-        self.rules = _rules(r_cut, rule)
+            self._second = indices_of(second)
+        self.rules = rules_of(r_cut, rule)
         self._species = None
         if any(one.needs_species for one in self.rules):
             self._species = [str(one) for one in table_of(group.universe.atoms).species]
-        self._seen = _seen(self._first, self._second)
-        self._bound = bound
+            refuse_strangers(self.rules, self._species)
+        self._seen = in_any_pair(self._first, self._second)
+        self._bound = bound_of(bound)
         self._resolution: Resolution | None = None
         self._pbc: np.ndarray | None = None
         self._numbers = np.zeros(0, np.int64)
@@ -138,6 +148,7 @@ class NeighborFlips(AnalysisBase):
         """As MDAnalysis's: start, stop, step, frames, verbose, backend, n_workers, n_parts.
 
         Raises:
+            InputError: the frames asked for go backward or one is there twice.
             UnreadableFrame: a frame cannot be read; `results`, `frames` and `times` have those before it.
             FrameError: likewise, a frame that holds what cannot be right.
         """
@@ -157,9 +168,9 @@ class NeighborFlips(AnalysisBase):
     def _setup_computation_groups(
         self,
         n_parts: int,
-        start: int | None = None,
-        stop: int | None = None,
-        step: int | None = None,
+        start: Any = None,
+        stop: Any = None,
+        step: Any = None,
         frames: Any = None,
     ) -> list[np.ndarray]:
         """MDAnalysis's, and what all parts must agree on: done once, before frames are spread."""
@@ -167,6 +178,7 @@ class NeighborFlips(AnalysisBase):
         # who names the frames gets those
         self._to_the_end = frames is None and (stop is None or stop > len(self._trajectory))
         self._numbers = np.concatenate([one[:, 1] for one in groups]).astype(np.int64)
+        refuse_backward(self._numbers)
         sample = []
         for number in self._numbers[:SAMPLE]:
             try:
@@ -318,46 +330,6 @@ class NeighborFlips(AnalysisBase):
             return None
         count = int(self._trajectory.n_frames)
         return _Failure(count, f"frame {count} cannot be read ({rest})", True)
-
-
-def _group(atoms: Any, name: str) -> AtomGroup:
-    if isinstance(atoms, UpdatingAtomGroup):
-        raise InputError(
-            f"the group {name} changes from frame to frame, and a pair not looked at any more has not left",
-            remedy="Give atoms.select_atoms(...) without updating=True",
-        )
-    if not isinstance(atoms, AtomGroup):
-        raise InputError(
-            f"{type(atoms).__name__} where atoms are expected", remedy="Give a Universe or an AtomGroup"
-        )
-    if len(atoms) == 0:
-        raise InputError(f"the group {name} is empty", remedy="Check the selection")
-    return atoms
-
-
-def _indices(group: AtomGroup) -> np.ndarray:
-    return np.unique(np.asarray(group.indices, np.int64))
-
-
-def _seen(first: np.ndarray | None, second: np.ndarray | None) -> np.ndarray | None:
-    """The atoms that are in any pair; None for all."""
-    if first is None:
-        return None
-    return first if second is None else np.union1d(first, second)
-
-
-def _rules(r_cut: Any, rule: Rule | Sequence[Rule] | None) -> list[Rule]:
-    rules: list[Rule] = []
-    if r_cut is not None:
-        for one in r_cut if isinstance(r_cut, list | tuple | np.ndarray) else [r_cut]:
-            rules.append(SpeciesCutoffs(one) if isinstance(one, dict) else Cutoff(float(one)))
-    if rule is not None:
-        rules.extend(rule if isinstance(rule, Sequence) else [rule])
-    if not rules:
-        raise InputError(
-            "no cutoff", remedy="Give r_cut=8.5 (Å), several as a list, or a rule of mdnum.trajectories.rules"
-        )
-    return rules
 
 
 def _format(trajectory: Any) -> str:

@@ -263,6 +263,38 @@ def test_groups_that_cannot_be_looked_at(water):
         NeighborFlips(water.atoms[:9], {("Xx", "O"): 2.0}).run(stop=1)
 
 
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        ({"r_cut": "x"}, "r_cut = 'x'; expected a length"),
+        ({"r_cut": "8.5"}, "r_cut = '8.5'; expected a length"),
+        ({"r_cut": [4.0, None]}, "r_cut = None; expected a length"),
+        ({"r_cut": {("C", "N"): "x"}}, "expected a length in Å, or lengths by pair"),
+        ({"r_cut": -1.0}, "a radius of -1.0"),
+        ({"r_cut": {("C", "Xx"): 2.5}}, "'Xx'"),
+        ({"r_cut": 4.0, "bound": -1}, "bound = -1; expected"),
+        ({"r_cut": 4.0, "bound": np.nan}, "bound = nan; expected"),
+    ],
+)
+def test_what_cannot_be_asked_is_refused_before_anything_is_read(water, asked, said):
+    with pytest.raises(InputError, match=said):
+        NeighborFlips(water.atoms[:40], **asked)
+
+
+def test_a_number_may_come_as_an_array(water):
+    group = water.atoms[:40]
+    for value in (np.array(3.0), np.float32(3.0), np.array([3.0]), 3):
+        assert NeighborFlips(group, value).rules == [Cutoff(3.0)]
+
+
+def test_frames_that_go_backward_are_refused():
+    for asked in ({"frames": [5, 3]}, {"frames": [1, 3, 3]}, {"step": -1}):
+        with pytest.raises(InputError, match="go backward or stand still"):
+            NeighborFlips(moving(), 4.0).run(**asked)
+    NeighborFlips(moving(), 4.0).run(frames=[1, 3])
+    assert len(NeighborFlips(moving(), 4.0).run(frames=np.arange(6) > 2).frames) == 3
+
+
 def test_a_cutoff_wider_than_half_the_box_finds_every_image():
     universe = moving(atoms=4, box=6.0)
     found = NeighborFlips(universe, rule=Cutoff(7.0)).run()
