@@ -6,10 +6,14 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 from command_line import call, printed
 
+from mdnum.references.conformance.case import one
+from mdnum.report.conform.findings import judge
 from mdnum.store import RunFolder
 
 _MINE = """
@@ -90,3 +94,26 @@ def test_mistakes_are_told(mine: Path, arguments, said: str, capsys: pytest.Capt
     assert call("conform", *arguments) == 2
     assert said in capsys.readouterr().err
     assert not (mine / "runs").exists()
+
+
+def _judged(function, cases):
+    """Verdict on a function that was asked some cases."""
+    from mdnum.references.conformance.loading import from_object
+    from mdnum.references.conformance.suite import examine
+    from mdnum.workflow.conform import _summary
+
+    found = examine(from_object(function, "it"), asked=cases, large=False)
+    names = [f"{number}.py" for number in range(len(found.failed))]
+    return judge(cast(Any, SimpleNamespace(name="it", summary=_summary(found, names, 0))))
+
+
+def test_what_refuses_everything_is_not_called_safe():
+    def refuses(positions, cell, pbc, r_cut):
+        raise RuntimeError("boom")
+
+    two = [[0.0, 0, 0], [0.5, 0, 0]]
+    judged = _judged(refuses, [one("none", "few", []), one("two", "few", two), one("two", "images", two)])
+    assert judged.headline == "it answered no question."
+    codes = {one.code: one for one in judged.findings}
+    assert set(codes) == {"NOTHING_ANSWERED", "RAISED"} and codes["NOTHING_ANSWERED"].severity == "error"
+    assert "boom" in codes["NOTHING_ANSWERED"].text

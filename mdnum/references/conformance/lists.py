@@ -13,6 +13,7 @@ from numpy import ndarray
 
 from mdnum.references.conformance.answer import Answer, Malformed, read
 from mdnum.references.conformance.case import Case
+from mdnum.references.conformance.refusals import meant
 from mdnum.references.oracle import widths
 
 
@@ -183,7 +184,7 @@ class Outcome:
     Attributes:
         answer: the pairs, or None.
         raised: the exception in words, or None.
-        refused: the exception says on purpose that this cannot be done.
+        refused: the exception says on purpose that this cannot be done (`refusals.meant`).
         malformed: why the answer is none, or None.
         changed: the input that the call wrote to, or None.
         crashed: how the process ended that made the call, or None.
@@ -248,7 +249,7 @@ class Session:
         except SystemExit as error:
             return _left(error)
         except Exception as error:
-            return _failed(error, case)
+            return _failed(error, case, self.tested.package)
         try:
             # a copy: a list may hand out the buffer that it fills next time
             answer = read(given)
@@ -268,12 +269,10 @@ def _left(error: SystemExit) -> Outcome:
     return Outcome(crashed=f"it ends the process: SystemExit: {error}")
 
 
-def _failed(error: Exception, case: Case) -> Outcome:
-    # those that compiled code raises on purpose are RuntimeErrors; LinAlgError is a ValueError by accident
-    meant = isinstance(error, ValueError | RuntimeError)
-    meant = meant and not isinstance(error, np.linalg.LinAlgError | RecursionError)
+def _failed(error: Exception, case: Case, package: str | None = None) -> Outcome:
     words = " ".join(str(error).split())
-    refused = bool(words) and meant and case.atoms > 0
+    # without atoms there is nothing that could not be done
+    refused = case.atoms > 0 and meant(error, package)
     return Outcome(raised=f"{type(error).__name__}: {words[:300]}", refused=refused)
 
 

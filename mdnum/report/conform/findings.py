@@ -63,7 +63,7 @@ def judge(run: Question) -> Verdict:
     """Headline, evidence and findings of an examination."""
     found = list(_findings(run))
     summary = run.summary
-    answered = summary["asked"] - sum(row["refused"] for row in summary["areas"])
+    answered = _answered(summary)
     if not answered:
         headline = f"{run.name} answered no question."
     elif not summary["wrong"]:
@@ -71,6 +71,12 @@ def judge(run: Question) -> Verdict:
     else:
         headline = f"{run.name} failed {count(summary['wrong'])} of {many(summary['asked'], 'case')}."
     return verdict(headline, _evidence(run), found, plain_tone="good")
+
+
+def _answered(summary: Mapping[str, Any]) -> int:
+    """Cases that it did anything else in than raise an exception, on purpose or not."""
+    raised = sum(row["refused"] + row["codes"].get("RAISED", 0) for row in summary["areas"])
+    return summary["asked"] - raised
 
 
 def _evidence(run: Question) -> Iterator[str]:
@@ -176,21 +182,25 @@ def _conduct(run: Question) -> Iterator[Finding]:
         )
     refused = [(row, one) for row in summary["areas"] for one in row["why"] if row["refused"]]
     refused = [(row, one) for row, one in refused if ": " in one["why"]]
+    total = sum(area["refused"] for area in summary["areas"])
+    often = ""
     if refused:
         row, one = max(refused, key=lambda each: each[1]["cases"])
-        total = sum(area["refused"] for area in summary["areas"])
-        yield Finding(
-            "REFUSES",
-            "warning" if total > 0.2 * summary["asked"] else "info",
-            f"{many(total, 'case')} refused",
-            f"It says so, which is safe. Most often: {one['why']}, about {row['area']}.",
-        )
-    answered = summary["asked"] - sum(row["refused"] for row in summary["areas"])
-    if not answered:
+        often = f"Most often: {one['why']}, about {row['area']}."
+    if not _answered(summary):
         yield Finding(
             "NOTHING_ANSWERED",
             "error",
             "no question was answered",
-            "Nothing is known about it.",
+            f"Nothing is known about it. {often}".strip(),
             "Ask it about fewer things with --limits, or look at what it raises.",
+        )
+    elif refused:
+        many_of_them = total > 0.2 * summary["asked"]
+        yield Finding(
+            "REFUSES",
+            "warning" if many_of_them else "info",
+            f"{many(total, 'case')} refused",
+            f"It raises an exception of its own there, so nothing is computed with wrong pairs. {often}",
+            "Declare what it does not do with --limits, and the rest is asked." if many_of_them else "",
         )
