@@ -221,7 +221,12 @@ def examine(
 
     def take(case: Case) -> bool:
         """Asks one case; whether to go on."""
+        if case.area == "large" and _too_long(report, case):
+            return True
+        at = time.perf_counter()
         failures = _asked(examiner, case)
+        if case.area == "large" and tested.limits.refusal(case) is None:
+            report.large = (case.atoms, time.perf_counter() - at)
         if failures:
             failed = Failed(case.until(failures[0].step + 1), tuple(failures), case)
             key = (failed.code, case.area)
@@ -241,14 +246,7 @@ def examine(
         _order(examiner)
     if large and asked is None and going:
         for edge in (SMALL_EDGE, LARGE_EDGE):
-            case = lattice(edge)
-            if _too_long(report, case):
-                continue
-            at = time.perf_counter()
-            going = take(case)
-            if tested.limits.refusal(case) is None:
-                report.large = (case.atoms, time.perf_counter() - at)
-            if not going:
+            if not (going := take(lattice(edge))):
                 break
     if shrink:
         examiner.session.reuse = False

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import os
 import pkgutil
+import re
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +19,7 @@ from mdnum.errors import InputError
 from mdnum.references.conformance import NeighborListConformance
 from mdnum.references.conformance.case import AREAS, one, script
 from mdnum.references.conformance.catalog import catalog, gas
-from mdnum.references.conformance.crowds import crowds
+from mdnum.references.conformance.crowds import crowds, lattice
 from mdnum.references.conformance.lists import Limits, Session
 from mdnum.references.conformance.loading import from_object, installed, known, load
 from mdnum.references.conformance.movers import movers
@@ -173,6 +174,105 @@ def test_what_a_call_does_is_told_whatever_it_is():
     report = examine(from_object(refuses), asked=[case], shrink=False)
     assert not report.failed and report.areas["few"].refused == 1
     assert not report.conforms  # it has answered nothing
+
+
+_REFUSALS = """
+import numpy as np
+
+class Kept:
+    def allocate(self, positions, cell, pbc, r_cut, skin):
+        return self.update(positions, cell)
+    def update(self, positions, cell):
+        raise NotImplementedError("free atoms only")
+
+def says_so(positions, cell, pbc, r_cut):
+    raise ValueError("the cell is too small")
+
+def says_so_after(positions, cell, pbc, r_cut):
+    try:
+        {}["cell"]
+    except KeyError as error:
+        raise RuntimeError("the cell is too small") from error
+
+def least_of_none(positions, cell, pbc, r_cut):
+    return min(np.zeros(0))
+
+def shapes(positions, cell, pbc, r_cut):
+    return np.zeros(2) + np.zeros(3)
+
+def joined(positions, cell, pbc, r_cut):
+    return np.stack([])
+
+def looked_up(positions, cell, pbc, r_cut):
+    return [][0]
+
+def number(positions, cell, pbc, r_cut):
+    return float("far")
+
+def singular(positions, cell, pbc, r_cut):
+    return np.linalg.inv(np.zeros((3, 3)))
+
+def standard_library(positions, cell, pbc, r_cut):
+    import statistics
+    return statistics.mean([])
+
+def says_nothing(positions, cell, pbc, r_cut):
+    raise ValueError
+
+def generated(positions, cell, pbc, r_cut):
+    return sum(float(x) for x in ["far"])
+"""
+
+
+@pytest.mark.parametrize("name", re.findall(r"^(?:def|class) (\w+)", _REFUSALS, re.MULTILINE))
+def test_only_an_exception_of_its_own_is_a_refusal(name: str, tmp_path: Path):
+    (tmp_path / "refusals.py").write_text(_REFUSALS)
+    case = one("two", "few", [[0.0, 0, 0], [0.5, 0, 0]], 4.0)
+    (outcome,) = Session(load(f"{tmp_path / 'refusals.py'}:{name}")).ask(case)
+    assert outcome.raised is not None
+    assert outcome.refused == (name in ("Kept", "says_so", "says_so_after"))
+
+
+def test_an_adopted_list_that_refuses_everything_fails():
+    def refuses(positions, cell, pbc, r_cut):
+        raise ValueError("no")
+
+    def refuses_free(positions, cell, pbc, r_cut):
+        if not pbc.any():
+            raise ValueError("free atoms cannot be done")
+        return _plain(positions, cell, pbc, r_cut)
+
+    class Refusing(NeighborListConformance):
+        pairs = staticmethod(refuses)
+
+        def asked(self, tested, area):
+            return [one("two", area, [[0.0, 0, 0], [0.5, 0, 0]])]
+
+    class RefusingFree(Refusing):
+        pairs = staticmethod(refuses_free)
+
+    with pytest.raises(pytest.fail.Exception, match="refuses whatever it is asked: ValueError: no"):
+        Refusing().test_neighbor_list("few")
+    with pytest.raises(pytest.skip.Exception, match="refused: ValueError: free atoms"):
+        RefusingFree().test_neighbor_list("few")
+
+
+def test_large_questions_are_asked_where_they_are_wanted_and_do_not_take_too_long(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    class Large(NeighborListConformance):
+        pairs = staticmethod(_plain)
+        large = True
+
+    with pytest.raises(pytest.skip.Exception, match="set `large`"):
+        TestAdopted().test_neighbor_list("large")
+    for edge in ("SMALL_EDGE", "LARGE_EDGE"):
+        monkeypatch.setattr(f"mdnum.references.conformance.adoption.{edge}", 5)
+    assert [case.atoms for case in Large().asked(from_object(_plain), "large")] == [123, 123]
+    monkeypatch.setattr("mdnum.references.conformance.suite._PATIENCE", 0.0)
+    tally = examine(from_object(_plain), asked=[lattice(5), lattice(5)], large=False).areas["large"]
+    assert (tally.asked, tally.skipped) == (1, 1)
+    assert "would take more than" in next(iter(tally.why))
 
 
 def test_single_precision_is_found_out_and_ties_are_counted():
