@@ -148,6 +148,9 @@ def _look(
             | {"grid": _grid(sample, resolution, one, groups)}
             | flips_numbers.told(counted)
         )
+        for name, coded in (("by_species", labels.species), ("by_residue_name", labels.residue_names)):
+            if coded is not None:
+                told[-1][name] = [_as_asked(row, coded, groups) for row in told[-1][name]]
     folder.finalize()
     (folder.path / "checkpoint.npz").unlink(missing_ok=True)
     folder.write_summary(
@@ -198,6 +201,17 @@ def _steps(frames: Mapping[str, np.ndarray], timed: bool) -> dict[str, Any]:
         "even": even,
         "backward": backward,
     }
+
+
+def _as_asked(row: dict[str, Any], coded: tuple[np.ndarray, Sequence[str]], groups: Groups) -> dict[str, Any]:
+    """A pair of classes in the order of the two selections, where only one order fits them."""
+    if groups[0] is None or groups[1] is None:
+        return row
+    first, second = ({coded[1][at] for at in np.unique(coded[0][group])} for group in groups)
+    a, b = row["first"], row["second"]
+    if (a in first and b in second) or not (b in first and a in second):
+        return row
+    return row | {"first": b, "second": a}
 
 
 def _rule(

@@ -116,7 +116,7 @@ def test_several_rules_and_selections_at_once(tmp_path: Path) -> None:
     assert [one["rule"] for one in told] == ["r < 1.5", "r < 2.5", "O-H < 2", "3 nearest"]
     assert [one["directed"] for one in told] == [False, False, False, True]
     for one in told[:3]:
-        assert [(row["first"], row["second"]) for row in one["by_species"]] == [("H", "O")]
+        assert [(row["first"], row["second"]) for row in one["by_species"]] == [("O", "H")]
     # O looks for H: three each, always
     assert told[3]["pairs_first"] == told[3]["pairs_last"] == 36
     assert told[3]["entered"] == told[3]["left"] and told[3]["neighbors"]["fewest"] == 3
@@ -150,7 +150,7 @@ def test_the_page_says_what_the_folder_holds(tmp_path: Path) -> None:
     )
     one = result.summary["rules"][0]
     text = (result.folder / "report.html").read_text(encoding="utf-8")
-    for words in ("r &lt; 2.5 Å", "“element O” and “element H”", f"{one['flips']} flips of", "H–O"):
+    for words in ("r &lt; 2.5 Å", "“element O” and “element H”", f"{one['flips']} flips of", "O–H"):
         assert words in text
     assert {path.stem for path in (result.folder / "figures").iterdir()} >= {"rule0-pairs", "rule0-lifetimes"}
     _, run = html.load(result.folder, "flips")
