@@ -163,6 +163,11 @@ def test_other_boxes_are_said(tmp_path: Path) -> None:
     assert "repeating along a, b and c" in said["text"] and "repeating along a and b" in said["text"]
     assert "at the same positions in boxes that differ" in found.summary["headline"]
     assert found.summary["seed"] is None and found.summary["certain"] == 0
+    # the same where the file of the other box rounds
+    write(tmp_path / "slab.extxyz", gas(pbc=(True, True, False)))
+    rounded = looked(tmp_path / "a.traj", tmp_path / "slab.extxyz", tmp_path / "r").summary
+    assert rounded["seed"] == 0 and "at the same positions in boxes that differ" in rounded["headline"]
+    assert "because the boxes do" in rounded["concluded"][-1]
     wider = gas()
     for one in wider[2:]:
         one.set_cell([9.0, 9.0, 9.25])

@@ -54,9 +54,16 @@ def headline(run: Question) -> str:
         certain = summary["certain"]
         sure = "never" if certain is None else f"from {frame(run, certain)} on"
         return f"{text}, all within the files’ resolution; beyond it {sure}."
-    if seed is None:
+    if _by_boxes(run, first):
         return f"{text}, at the same positions in boxes that differ."
     return f"{text}; atoms are {length(run, first['furthest'])} apart by then."
+
+
+def _by_boxes(run: Question, first: Any) -> bool:
+    """Whether the boxes differ when the sets come to differ, and positions do not beyond the resolution."""
+    boxes, beyond = run.summary["other_box"], run.summary["beyond"]
+    same = beyond is None or beyond > first["frame"]
+    return boxes is not None and boxes["frame"] <= first["frame"] and same
 
 
 def _largest(run: Question) -> tuple[float, float]:
@@ -140,8 +147,10 @@ def _order(run: Question, first: Any) -> str:
             f"At the frame before, no set differed and atoms were already up to {before} apart: the "
             "difference of the two did not begin with a flip that these frames show."
         )
-    if run.summary["seed"] is None:
-        return "The sets differ because the boxes do." if run.summary["other_box"] else ""
+    if _by_boxes(run, first):
+        return (
+            "Positions are the same then, up to the files’ resolution: the sets differ because the boxes do."
+        )
     if not shown(run):
         return "Two ways of writing one and the same run would look like this."
     if first["frame"] == 0 and 0 in (beyond, certain):
