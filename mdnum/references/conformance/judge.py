@@ -92,7 +92,9 @@ def judge(answer: Answer, truth: Truth, how: Conventions) -> list[Failure]:
         return [Failure("RANGE", text, int(outside.sum()))]
     rows = _Rows(answer, truth, how)
     found = rows.failures()
-    if found and answer.shift is not None and not rows.only_atoms().failures():
+    # nothing that shifts would mend: a pair told once, an atom that is its own neighbor where it stands
+    plain = {failure.code for failure in found} <= {"ONE_SIDED", "SELF"}
+    if found and not plain and answer.shift is not None and not rows.only_atoms().failures():
         hint = _shift_hint(answer, truth, how)
         return [Failure("SHIFTS", f"the atoms are right and the shifts are not: {found[0].text}{hint}")]
     if not found:
@@ -202,7 +204,10 @@ class _Rows:
                     f"{int(allowed[mine[first]])}; {count} rows too many in all"
                 )
             else:
-                text = f"{count} atoms are their own neighbors, first {i}"
+                told = (
+                    "1 atom is its own neighbor" if count == 1 else f"{count} atoms are their own neighbors"
+                )
+                text = f"{told}, first {i}" if count > 1 else f"{told}: {i}"
             found.append(Failure(code, text, count))
         return found
 

@@ -80,6 +80,25 @@ def test_each_fault_has_its_code():
     )
 
 
+def test_what_shifts_cannot_mend_is_not_called_a_shift():
+    """Pairs told from one side, and atoms with themselves, whose atoms alone look right."""
+    edge = one("at the cutoff", "images", [[0.5, 0.5, 0.5]], 1.0, r_cut=1.0 + 2.0**-60)
+    right = truth(edge, 0)
+    assert len(right.i) == 3 and set(right.i) == set(right.j) == {0}
+    zero, i = np.zeros(1, int), np.zeros(7, int)
+    shift = np.vstack([right.shift, -right.shift, np.zeros((1, 3), int)])
+    cases = (
+        (Answer(zero, zero, right.shift[:1]), ["ONE_SIDED"]),
+        (Answer(i[:5], i[:5], shift[:5]), ["ONE_SIDED"]),
+        (Answer(zero, zero, shift[6:]), ["SELF"]),
+        (Answer(i[:6], i[:6], shift[:6]), []),
+    )
+    for answer, codes in cases:
+        found = judge(answer, right, Conventions())
+        assert [failure.code for failure in found] == codes
+    assert judge(cases[2][0], right, Conventions())[0].text == "1 atom is its own neighbor: 0"
+
+
 def test_shifts_of_wrapped_positions_are_told_as_such():
     moved = one(
         "outside", "outside", _CASE.stills[0].positions + [3.0, -6.0, 0.0] * np.arange(20)[:, None], 3.0
