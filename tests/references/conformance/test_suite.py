@@ -297,6 +297,19 @@ def test_single_precision_is_found_out_and_ties_are_counted():
     assert examine(exact, asked=[case for case in catalog() if case.area == "ties"]).ties[0] == 0
 
 
+@pytest.mark.parametrize("kind", ["nothing", "squares"])
+def test_what_is_wrong_otherwise_is_not_taken_for_single_precision(kind: str):
+    def wrong(positions, cell, pbc, r_cut):
+        rows = planted_lists.search(positions, cell, pbc, r_cut)
+        if kind == "nothing":
+            return [], []
+        return rows["i"], rows["j"], rows["shift"], rows["distance"] ** 2
+
+    cases = [case for case in catalog() if case.area in ("few", "outside", "ties") and case.atoms < 9]
+    report = examine(from_object(wrong), asked=cases, shrink=False)
+    assert "float32" not in report.found_out and report.single is None and report.failed
+
+
 def test_a_process_that_crashes_or_hangs_is_a_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "sick.py").write_text(
         "import os, signal, sys, time\n"
