@@ -38,8 +38,8 @@ def test_the_difference_carried_along_is_that_of_the_sets(seed: int, differing: 
 
 def test_sets_that_differ_from_the_start() -> None:
     one, other = (
-        Members(*np.array([[0, 1, 0], [0, 2, 0]]).T, np.ones(2)),
-        Members(*np.array([[0, 2, 0], [1, 1, 3]]).T, np.ones(2)),
+        Members(np.array(i), np.array(j), np.array(rank), np.ones(2))
+        for i, j, rank in (([0, 0], [1, 2], [0, 0]), ([0, 1], [2, 1], [0, 3]))
     )
     found = Difference.of(one, other)
     assert found.only_a == {(0, 1, 0)} and found.only_b == {(1, 1, 3)} and len(found) == 2

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import signal
+from dataclasses import replace
 from pathlib import Path
 
 import ase
 import numpy as np
 import pytest
-from ase.io import write
+from ase.io import iread, write
 
 import mdnum
 from mdnum import report
@@ -157,7 +158,8 @@ def test_the_page_says_what_the_folder_holds(tmp_path: Path) -> None:
     assert findings.judge(run).tone != "error"
     # a planted hole in the ledger is found
     entered = run.tables["frames"]["entered"]
-    run.tables["frames"]["entered"] = entered + (np.arange(len(entered)) == 9)
+    holed = {**run.tables["frames"], "entered": entered + (np.arange(len(entered)) == 9)}
+    run = replace(run, tables={**run.tables, "frames": holed})
     assert findings.judge(run).findings[0].code == "EVENT_ALGEBRA"
 
 
@@ -260,7 +262,7 @@ def test_two_runs_that_differ_in_one_number(crystal: Path, tmp_path: Path) -> No
     text = (found.folder / "report.html").read_text(encoding="utf-8")
     assert "A flip that came first is no cause" in text
     apart = RunFolder.open(found.folder).read("apart")
-    x = [np.array([a.positions for a in ase.io.read(p / "trajectory.traj", ":")]) for p in (crystal, other)]
+    x = [np.array([a.positions for a in iread(p / "trajectory.traj", ":")]) for p in (crystal, other)]
     moved = np.linalg.norm(x[0] - x[1], axis=2)
     # one of the two may have been wrapped a step before the other
     np.testing.assert_allclose(apart["furthest"][:390], moved.max(1)[:390], atol=1e-15)
