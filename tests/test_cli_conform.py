@@ -13,8 +13,11 @@ import pytest
 from command_line import call, printed
 
 from mdnum.references.conformance.case import one
+from mdnum.references.conformance.loading import from_object
+from mdnum.references.conformance.suite import examine
 from mdnum.report.conform.findings import judge
 from mdnum.store import RunFolder
+from mdnum.workflow.conform import _summary
 
 _MINE = """
 import numpy as np
@@ -98,10 +101,6 @@ def test_mistakes_are_told(mine: Path, arguments, said: str, capsys: pytest.Capt
 
 def _judged(function, cases):
     """Verdict on a function that was asked some cases."""
-    from mdnum.references.conformance.loading import from_object
-    from mdnum.references.conformance.suite import examine
-    from mdnum.workflow.conform import _summary
-
     found = examine(from_object(function, "it"), asked=cases, large=False)
     names = [f"{number}.py" for number in range(len(found.failed))]
     return judge(cast(Any, SimpleNamespace(name="it", summary=_summary(found, names, 0))))
@@ -117,3 +116,23 @@ def test_what_refuses_everything_is_not_called_safe():
     codes = {one.code: one for one in judged.findings}
     assert set(codes) == {"NOTHING_ANSWERED", "RAISED"} and codes["NOTHING_ANSWERED"].severity == "error"
     assert "boom" in codes["NOTHING_ANSWERED"].text
+
+
+def test_one_mistake_has_one_script_and_names_all_areas():
+    def leaves(positions, cell, pbc, r_cut):
+        raise SystemExit(3)
+
+    def nothing(positions, cell, pbc, r_cut):
+        return [], []
+
+    two = [[0.0, 0, 0], [0.5, 0, 0]]
+    cases = [one(area, area, [*two, [n, 2.0, 3.0]], 4.0) for n, area in enumerate(("few", "boxes", "ties"))]
+    judged = _judged(leaves, [*cases, one("free", "axes", two)])
+    (crashed,) = (one for one in judged.findings if one.code == "CRASHED")
+    assert crashed.text.startswith("In 4 cases, in every area. ")
+    assert crashed.remedy.startswith("Raise an exception")
+    judged = _judged(nothing, [*cases, one("none", "axes", [[0.0, 0, 0]])])
+    (missing,) = (one for one in judged.findings if one.code == "MISSING")
+    assert missing.text.startswith("In 3 cases, about few, boxes and ties. ")
+    report = examine(from_object(nothing), asked=[*cases, one("images", "images", two, 0.7)], large=False)
+    assert [(failed.code, failed.case.atoms) for failed in report.failed] == [("MISSING", 2), ("MISSING", 1)]

@@ -31,7 +31,7 @@ def shrunk(examiner: Examiner, failed: Failed) -> Failed:
         examiner: asks the list; a new object of a kept list for each try.
         failed: the case as it was met.
     """
-    wanted, kind = failed.code, _kind(failed.worst)
+    wanted, sought = failed.code, kind(failed.worst)
     least = min(1, failed.case.atoms)
     tries, began = 0, time.perf_counter()
 
@@ -45,7 +45,7 @@ def shrunk(examiner: Examiner, failed: Failed) -> Failed:
         if examiner.report.how is not how:  # it passed for float32: the conventions stay as they were
             examiner.report.how, examiner.report.single = how, single
             return False
-        return any(_kind(failure) == kind for failure in failures)
+        return any(kind(failure) == sought for failure in failures)
 
     def spent() -> bool:
         seconds = time.perf_counter() - began
@@ -69,7 +69,7 @@ def shrunk(examiner: Examiner, failed: Failed) -> Failed:
     return replace(failed, case=case.until(found[0].step + 1), failures=found)
 
 
-def _kind(failure: Failure) -> tuple[str, str]:
+def kind(failure: Failure) -> tuple[str, str]:
     """What a smaller case has to show: the code; of an exception or a crash also which, without numbers."""
     said = failure.text if failure.code in ("RAISED", "CRASHED", "MALFORMED") else ""
     return failure.code, re.sub(r"[-+\d.e]+", "#", said)

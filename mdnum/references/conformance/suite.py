@@ -324,21 +324,27 @@ def _too_long(report: Report, case: Case) -> bool:
 
 
 def _distinct(failed: list[Failed]) -> list[Failed]:
-    """Failures without those that shrank to the same case as another."""
+    """The smallest failure of each kind: one mistake is met in many areas, and one script of it is enough.
+
+    Those of a code that need as many atoms, steps and axes that repeat are taken for the same mistake;
+    exceptions and what is no list of pairs, where they say the same but for numbers.
+    """
+    from mdnum.references.conformance.shrink import kind
+
     kept: dict[Any, Failed] = {}
-    for one_failed in failed:
+    for one_failed in sorted(failed, key=_size):
         case = one_failed.case
-        key: Any = (one_failed.code, one_failed.worst.text, case.atoms > 0)
-        if one_failed.code not in ("RAISED", "CRASHED"):
-            key = (
-                one_failed.code,
-                case.pbc,
-                case.r_cut,
-                case.skin,
-                tuple((still.positions.tobytes(), still.cell.tobytes()) for still in case.stills),
-            )
+        key: Any = kind(one_failed.worst)
+        if one_failed.code not in ("RAISED", "CRASHED", "MALFORMED"):
+            # alone or not: what was kept from other questions is a mistake of its own
+            key = (key, min(case.atoms, 3), min(case.steps, 2), any(case.pbc), one_failed.alone)
         kept.setdefault(key, one_failed)
     return sorted(kept.values(), key=lambda one: (CODES.index(one.code), list(AREAS).index(one.case.area)))
+
+
+def _size(failed: Failed) -> tuple[bool, int, int, int]:
+    case = failed.case
+    return not failed.alone, case.atoms, case.steps, sum(case.pbc)
 
 
 __all__ = ["CASES", "KEPT", "Examiner", "Failed", "Report", "Tally", "drawn", "examine", "questions"]

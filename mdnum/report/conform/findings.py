@@ -138,12 +138,23 @@ def _findings(run: Question) -> Iterator[Finding]:
         severity, title, remedy = _CODES[code]
         first = min(rows, key=lambda row: (row["atoms"], row["steps"]))
         total = sum(row["codes"].get(code, 0) for row in summary["areas"])
-        areas = listed(sorted({row["area"] for row in rows}))
-        text = f"In {many(total, 'case')}, about {areas}. {_sentence(first)} Reproduced by {first['script']}."
+        if code == "CRASHED" and any("exit" in row["text"].lower() for row in rows):
+            remedy = "Raise an exception instead: a program that calls it ends with it and loses its run."
+        text = f"In {many(total, 'case')}, {_about(summary, code)}. {_sentence(first)} "
+        text += f"Reproduced by {first['script']}."
         if not first["alone"]:
             text += " It fails only after other questions, so the script alone may not show it."
         yield Finding(code, severity, title, text, remedy)  # type: ignore[arg-type]
     yield from _conduct(run)
+
+
+def _about(summary: Mapping[str, Any], code: str) -> str:
+    """The areas with cases whose worst failure has a code."""
+    areas = [row["area"] for row in summary["areas"] if row["codes"].get(code)]
+    asked = [row for row in summary["areas"] if row["asked"]]
+    if len(areas) == len(asked) > 2:
+        return "in every area"
+    return f"about {listed(areas)}"
 
 
 def _sentence(row: Mapping[str, Any]) -> str:
