@@ -12,6 +12,7 @@ from ase import Atoms
 from jaxtyping import Float
 
 from mdnum.audit.base import Curve, Part, Progress, Subject
+from mdnum.audit.digits import precision
 from mdnum.audit.noise import FEW, Noise, direction, displaced, settled
 from mdnum.references.findings import finding
 
@@ -89,7 +90,11 @@ class Forces:
                 progress(len(slopes), _DIRECTIONS + 3 * _ATOMS, {"phase": "forces", "unit": "directions"})
             slopes.append(slope(worker, atoms, line, forces, noise, what))
         sums = list(_sums(atoms, forces, noise))
-        found = [*_judged(slopes, scale), *_judged_sums(sums, scale)]
+        found = [
+            *_judged(slopes, scale),
+            *_judged_sums(sums, scale),
+            *precision(worker, atoms, noise, np.random.default_rng(self.seed)),
+        ]
         worst = max(slopes, key=lambda one: abs(one.difference - one.force) / one.error)
         return Part(
             name=self.name,

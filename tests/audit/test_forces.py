@@ -14,6 +14,7 @@ from audit.planted import chain, crystal, subject
 from audit.test_invariance import codes
 
 from mdnum.audit.curl import Curl, Loop, agreed, around
+from mdnum.audit.digits import Digits, digits
 from mdnum.audit.forces import Forces, slope
 from mdnum.audit.noise import Noise, along_a_line
 
@@ -22,7 +23,29 @@ from mdnum.audit.noise import Noise, along_a_line
 @pytest.mark.parametrize("atoms", [crystal(), chain()], ids=["crystal", "chain"])
 @pytest.mark.parametrize("make", [planted.Good, planted.Single])
 def test_what_is_right_passes(check, make, atoms: Atoms):
-    assert not check()(subject(make, atoms)).findings
+    found = codes(check()(subject(make, atoms)))
+    # single precision is told, and is no mistake
+    assert found == ({"LOW_PRECISION": "info"} if make is planted.Single and check is Forces else {})
+
+
+def test_digits_are_read_off_the_numbers():
+    rng = np.random.default_rng(0)
+    values = rng.normal(size=50)
+    assert digits(values) == Digits(None, 53)
+    assert digits(np.round(values, 5)).decimals == 5
+    assert digits(values.astype(np.float32)) == Digits(None, 24)
+    assert digits(values.astype(np.float16)).bits == 11
+    # the same few numbers again and again tell nothing
+    assert digits(np.repeat([0.0, 1.0, -2.0, 0.5], 9)) == Digits(None, 53)
+
+
+def test_answers_rounded_to_decimals_are_told_as_such():
+    class Rounded(planted.Good):
+        def extra(self, atoms, energy, forces):
+            return round(energy, 5), np.round(forces, 4)
+
+    (found,) = [one for one in Forces()(subject(Rounded)).findings if one["code"] == "QUANTIZED"]
+    assert "the energy to 5 (1e-05 eV), forces to 4 (1e-04 eV/Å)" in found["text"]
 
 
 @pytest.mark.parametrize("check", [Forces, Curl])
