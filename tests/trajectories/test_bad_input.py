@@ -299,6 +299,15 @@ def test_a_number_that_was_cut_is_not_read_as_another(tmp_path, kind, name):
             assert isinstance(error, UnreadableFrame) and error.frame == len(frames) == 4, (cut, error)
 
 
+@pytest.mark.parametrize("asked", ["", "@::3"])
+def test_lines_behind_the_last_frame_of_a_library_are_a_frame_too(tmp_path, asked):
+    path = tmp_path / "run.xyz"
+    path.write_text("".join(text_of("xyz", "xyz").splitlines(keepends=True)[:-4]))
+    _, error = read(open_trajectory(f"{path}{asked}"))
+    assert isinstance(error, UnreadableFrame) and error.frame == 4 and "after 7 lines of it" in str(error)
+    assert read(open_trajectory(f"{path}@:4"))[1] is None
+
+
 def test_a_box_that_was_cut_to_three_numbers_is_not_a_rectangular_one(tmp_path):
     text = GRO.replace("1.00000\n", "1.00000   0.00000   0.00000   0.50000   0.00000   0.50000   0.50000\n")
     text = (text.format(k=0) + text.format(k=1)).rstrip("\n")
