@@ -43,6 +43,7 @@ def both():
     return [Problem(one, everything(one.atoms), 40) for one in (pairs, function)]
 
 
+@pytest.mark.slow
 def test_any_energy_has_the_derivatives_of_the_closed_forms(both):
     of_pairs, of_function = both
     assert "potential.parameters.size" in names(of_function.simulation)

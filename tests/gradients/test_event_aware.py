@@ -111,7 +111,7 @@ def averages(w: str, time: float) -> dict[str, float]:
     return {name: float(value) for name, value in zip(names, found, strict=True)}
 
 
-@pytest.mark.parametrize("w", ["u", "w"])
+@pytest.mark.parametrize("w", ["u", pytest.param("w", marks=pytest.mark.slow)])
 def test_what_a_loss_sees_jump_moves_with_the_crossing(well, w):
     """Energy and virial jump with the flip: by the radius their averages have no other derivative."""
     simulation, axis = well[0].simulation, well[1]

@@ -104,6 +104,7 @@ def test_the_tape_is_the_run_of_the_rollout(switched):
     assert seen == STEPS + 1
 
 
+@pytest.mark.slow
 def test_langevin_derivatives_are_those_of_differences():
     table = {"kind": "langevin", "timestep": 0.004, "temperature": 1.0, "friction": 2.0, "seed": 3}
     system = make(crystal(), LENNARD_JONES, {"kind": "quintic", "radius": 2.2, "onset": 1.8}, dynamics=table)
