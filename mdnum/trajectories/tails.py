@@ -85,9 +85,13 @@ def _behind_trr(path: Path, trajectory: Any) -> tuple[int, int]:
 
 
 def _behind_text(file: Any) -> str | None:
-    """Lines behind the last frame."""
+    """Lines behind the last frame, without blank ones at the end."""
+    if file is None or file.closed:
+        return None
+    lines = 0
     try:
-        lines = sum(1 for line in file if line.strip()) if file is not None and not file.closed else 0
+        for number, line in enumerate(file):
+            lines = number + 1 if line.strip() else lines
     except (OSError, EOFError, ValueError):
         return None
     return f"the file ends after {lines:,} lines of it" if lines else None
