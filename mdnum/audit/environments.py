@@ -19,7 +19,7 @@ from mdnum.audit.jumps import SMOOTH, Jump, find_jumps, locate, measure
 from mdnum.audit.probes import Pair, molecules, whole
 from mdnum.audit.routes import Crossing, Route
 from mdnum.audit.subject import CalculatorError
-from mdnum.audit.thresholds import STEP, Threshold, walk_pairs
+from mdnum.audit.thresholds import STEP, STEPS, Threshold, walk_pairs
 
 _SIDE = 1e-7
 """Half the stretch around an expected crossing in which it is located, length."""
@@ -93,6 +93,7 @@ def walk_surroundings(
     """
     walks = walk_pairs(subject).walks
     thresholds = [one for walk in walks for one in walk.thresholds]
+    quantum = max((one.quantum for one in walks), default=(0.0, 0.0))
     single = bool(walks) and walks[0].pair.moves == "atom"
     atoms = subject.atoms
     groups = _groups(atoms, single)
@@ -118,7 +119,8 @@ def walk_surroundings(
         if progress:
             progress(k, total, {"phase": "walking through the structure"})
         try:
-            events.append(_at_crossing(subject, route, crossing))
+            event = _at_crossing(subject, route, crossing)
+            events += [] if _rounded(event, quantum) else [event]
         except CalculatorError as error:
             skipped.append((route.name, error.message))
     scanned: list[str] = []
@@ -135,7 +137,7 @@ def walk_surroundings(
             skipped.append((route.name, error.message))
             continue
         scanned.append(route.name)
-        events += found
+        events += [one for one in found if not _rounded(one, quantum)]
         expected += known
     return Surroundings(tuple(events), len(targeted), tuple(scanned), expected, tuple(skipped), len(atoms))
 
@@ -290,3 +292,12 @@ def _random(
 def unexplained(events: Sequence[Event]) -> list[Event]:
     """Events that no pair threshold explains and that jump beyond doubt."""
     return [one for one in events if one.threshold is None and one.jump.order < SMOOTH]
+
+
+def _rounded(event: Event, quantum: tuple[float, float]) -> bool:
+    """Whether an event is no more than a step of answers that are rounded to decimals."""
+    if not any(quantum):
+        return False
+    return event.jump.order > 1 or (
+        abs(event.jump.energy) <= STEPS * quantum[0] and event.force <= STEPS * quantum[1]
+    )

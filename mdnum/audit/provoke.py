@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 from mdnum.audit.base import Progress, Subject
 from mdnum.audit.probes import Pair
 from mdnum.audit.subject import CalculatorError, only_trying
-from mdnum.audit.thresholds import walk_pairs
+from mdnum.audit.thresholds import STEPS, PairWalk, walk_pairs
 
 _MOST = 160
 """Neighbors of the crowded center; radius graphs are cut at 32 by habit, and at 50, 100 or 120 elsewhere."""
@@ -103,7 +103,7 @@ def crowd(
                 with only_trying(subject):
                     if count > most // 8 and _CALLS * _cost(subject, walk.pair, radius, count) > share:
                         continue
-                    found.append(_crowded(subject, walk.pair, radius, count, share))
+                    found.append(_crowded(subject, walk, radius, count, share))
                 break
             except CalculatorError:
                 continue
@@ -144,19 +144,22 @@ def cluster(pair: Pair, radius: float, count: int) -> tuple[Atoms, Float[np.ndar
     return atoms, distance
 
 
-def _crowded(subject: Subject, pair: Pair, radius: float, count: int, seconds: float) -> Crowd:
+def _crowded(subject: Subject, walk: PairWalk, radius: float, count: int, seconds: float) -> Crowd:
     began = time.perf_counter()
+    pair, quantum = walk.pair, walk.quantum
     atoms, distances = cluster(pair, radius, count)
     direction = _gap(atoms)
     side = next((one for one in _SIDES if _resolved(subject, atoms, direction, distances, one)), _SIDES[-1])
     between = 0.5 * (distances[1:] + distances[:-1])
     quiet = [_change(subject, atoms, direction, place, side) for place in between[:: max(count // 10, 1)]]
     cost = (time.perf_counter() - began) / (3 * len(quiet) + 4)
-    noise_energy = max(max(energy for energy, _ in quiet), 1e-14)
+    # a force's change and that of its change are four roundings of each of three components
+    noise_energy = max(max(energy for energy, _ in quiet), 1e-14, 4 * quantum[0] / _SURE)
     # an atom that its neighbors press hard has forces with more rounding in them than another
     forces = np.linalg.norm(subject.forces(_with_walker(atoms, direction, float(between[0]))), axis=1)
     rounding = 2.0**-50 if side == _SIDES[0] else 2.0**-21
     floor = np.maximum(rounding * np.maximum(forces, np.median(forces)), 1e-14)
+    floor = np.maximum(floor, 4 * np.sqrt(3) * quantum[1] / _SURE)
     noise_force = np.maximum(np.max([force for _, force in quiet], axis=0), floor)
     jumps: list[tuple[int, float, float]] = []
     over: list[tuple[int, float, float]] = []
@@ -172,7 +175,7 @@ def _crowded(subject: Subject, pair: Pair, radius: float, count: int, seconds: f
     kept, energy, force = max(over, key=lambda one: (one[2], one[1])) if over else (None, 0.0, 0.0)
     if energy <= _SURE * noise_energy:  # the force alone jumped
         energy = 0.0
-    order_from, order_energy, order_force = _order(subject, pair, radius, count)
+    order_from, order_energy, order_force = _order(subject, walk, radius, count)
     return Crowd(
         pair.species[0], radius, count, kept, energy, force,
         float(distances[kept - 1]) if kept else float("nan"),
@@ -225,12 +228,12 @@ def _gap(atoms: Atoms) -> Float[np.ndarray, "3"]:
     return tried[np.argmin((tried @ units.T).max(axis=1))]
 
 
-def _order(subject: Subject, pair: Pair, radius: float, most: int) -> tuple[int | None, float, float]:
+def _order(subject: Subject, walk: PairWalk, radius: float, most: int) -> tuple[int | None, float, float]:
     """(fewest neighbors at which permuting atoms changes anything, by how much energy, and force)."""
 
     def differs(count: int) -> tuple[bool, float, float]:
-        atoms, _ = cluster(pair, radius, count)
-        return _permuted(subject, atoms)
+        atoms, _ = cluster(walk.pair, radius, count)
+        return _permuted(subject, atoms, walk.quantum)
 
     counts = [count for count in (4, 16, 64) if count < most] + [most]
     low = 1
@@ -251,7 +254,7 @@ def _order(subject: Subject, pair: Pair, radius: float, most: int) -> tuple[int 
     return None, 0.0, 0.0
 
 
-def _permuted(subject: Subject, atoms: Atoms) -> tuple[bool, float, float]:
+def _permuted(subject: Subject, atoms: Atoms, quantum: tuple[float, float]) -> tuple[bool, float, float]:
     """Whether energy or forces change with the order of atoms by more than another order of summation can."""
     energy, forces = subject.energy(atoms), subject.forces(atoms)
     rng = np.random.default_rng(2)
@@ -270,5 +273,5 @@ def _permuted(subject: Subject, atoms: Atoms) -> tuple[bool, float, float]:
     scale = np.array(
         [np.abs(forces).sum() * np.ptp(atoms.positions, axis=0).max() + abs(energy), np.abs(forces).sum()]
     )
-    changed = bool((worst > 1e-6 * scale).any())
+    changed = bool((worst > np.maximum(1e-6 * scale, STEPS * np.array(quantum))).any())
     return changed, float(worst[0]), float(worst[1])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -12,12 +12,16 @@ from jaxtyping import Float
 
 from mdnum.audit.base import Progress, Subject
 from mdnum.audit.curve import Curve, bisect, grid, scatter
+from mdnum.audit.digits import digits
 from mdnum.audit.jumps import SMOOTH, Jump, decay_power, find_jumps, measure
 from mdnum.audit.probes import FARTHEST, Pair, pairs
 from mdnum.audit.subject import CalculatorError, only_trying
 
 STEP = 0.025
 """Spacing of a scan, in the unit of length. Two thresholds closer than this may be told as one."""
+
+STEPS = 2.5
+"""Of answers that are rounded to decimals: a jump of so many steps is more than rounding."""
 
 _NEAREST = 0.3
 _COSTLY = 1000.0
@@ -68,6 +72,8 @@ class PairWalk:
         cutoff: distance beyond which they do not interact; None if they still do at the farthest.
         left_out: places that stood out of the scan and were not looked at closely.
         calls: places at which the calculator was asked.
+        quantum: of energies (eV) and forces (eV/Å) that are rounded to decimals; 0 where they are not. No
+            jump below a few of them is told.
     """
 
     pair: Pair
@@ -78,6 +84,7 @@ class PairWalk:
     cutoff: float | None
     left_out: int
     calls: int
+    quantum: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -172,10 +179,29 @@ def walk(subject: Subject, pair: Pair, step: float = STEP) -> PairWalk:
         one for one in thresholds if pair.moves == "molecule" or not _of_others(pair, one, thresholds)
     ]
     values = curve.many(distance)
+    quantum = _quantum(values, len(pair.second))
+    if any(quantum):
+        # nearly all that stands out of such a curve is a step of rounding
+        thresholds, left_out = [kept for one in thresholds if (kept := _beyond(one, quantum))], 0
     return PairWalk(
         pair, tuple(sorted(thresholds, key=lambda one: one.radius)), distance, values[0] - energy_far,
         values[1], thresholds[-1].radius if edge and thresholds else None, left_out, len(curve.known),
+        quantum,
     )  # fmt: skip
+
+
+def _quantum(values: Float[np.ndarray, "2 points"], summed: int) -> tuple[float, float]:
+    """Steps of energies and of forces that are sums over so many atoms."""
+    return digits(values[0]).quantum, summed * digits(values[1]).quantum
+
+
+def _beyond(threshold: Threshold, quantum: tuple[float, float]) -> Threshold | None:
+    """A threshold at which more jumps than the rounding of answers; of the last one, that it is there."""
+    energy, force, _ = threshold.jumps
+    rounding = STEPS * quantum[0], STEPS * quantum[1]
+    if threshold.order <= 1 and (abs(energy) > rounding[0] or abs(force) > rounding[1]):
+        return threshold
+    return replace(threshold, order=_SMOOTHEST, jumps=(0.0, 0.0, 0.0)) if threshold.dies else None
 
 
 def _of_others(pair: Pair, threshold: Threshold, thresholds: Sequence[Threshold]) -> bool:

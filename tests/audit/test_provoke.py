@@ -40,6 +40,24 @@ def test_a_choice_of_the_nearest_is_found(most: int):
     assert found.order_from is None
 
 
+class Rounded(Capped):
+    """Hands over answers of five decimals."""
+
+    def calculate(self, atoms=None, properties=None, system_changes=("positions",)):
+        super().calculate(atoms, properties, system_changes)
+        self.results = {name: np.round(value, 5) for name, value in self.results.items()}
+
+
+def test_steps_of_rounding_are_no_choice_of_neighbors():
+    found = crowded(lambda: Rounded(10**6, "nearest"))
+    assert (found.kept, found.order_from, found.energy) == (None, None, 0.0)
+
+
+@pytest.mark.slow
+def test_a_choice_of_the_nearest_is_found_beyond_rounding():
+    assert crowded(lambda: Rounded(5, "nearest")).kept == 5
+
+
 def test_a_cap_by_the_order_of_the_atoms_is_found():
     found = crowded(lambda: Capped(12, "first"))
     assert found.order_from == 13

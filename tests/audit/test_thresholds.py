@@ -106,6 +106,31 @@ def test_what_feels_nothing_has_no_threshold():
     assert not walk.energy.any()
 
 
+def rounded(pair):
+    """Two atoms under a law whose answers have five decimals."""
+
+    class Rounded(laws.Pairwise):
+        def calculate(self, atoms=None, properties=None, system_changes=("positions",)):
+            super().calculate(atoms, properties, system_changes)
+            self.results = {name: np.round(value, 5) for name, value in self.results.items()}
+
+    return laws.subject(lambda: Rounded(pair), laws.Atoms("Ar2", [(0, 0, 0), (4, 0, 0)]))
+
+
+def test_rounding_to_decimals_is_not_taken_for_jumps():
+    """Every answer is one of some steps of 1e-5; an end of a smooth law is still told."""
+
+    (end,) = find_thresholds(rounded(laws.force_shifted))
+    assert end.dies and end.order == 6 and end.jumps == (0.0, 0.0, 0.0)
+
+
+@pytest.mark.slow
+def test_a_jump_of_more_than_rounding_is_told_among_rounded_answers():
+    (found,) = find_thresholds(rounded(laws.hard))
+    assert (found.order, found.radius) == (0, R_CUT)
+    assert found.jumps[0] == pytest.approx(-law(R_CUT)[0], abs=1e-5)
+
+
 def test_float32_is_not_taken_for_jumps():
     """What rounds everything has a step at every representable float32; only the real one counts."""
     (found,) = find_thresholds(pair_subject(laws.shifted, single=True))
