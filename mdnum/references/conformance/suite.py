@@ -336,8 +336,10 @@ def _distinct(failed: list[Failed]) -> list[Failed]:
         case = one_failed.case
         key: Any = kind(one_failed.worst)
         if one_failed.code not in ("RAISED", "CRASHED", "MALFORMED"):
-            # alone or not: what was kept from other questions is a mistake of its own
-            key = (key, min(case.atoms, 3), min(case.steps, 2), any(case.pbc), one_failed.alone)
+            key = (key, min(case.atoms, 3), min(case.steps, 2), any(case.pbc))
+            if not one_failed.alone:
+                # what was kept from other questions is a mistake of its own, and its case was not shrunk
+                key = (one_failed.code, "not alone")
         kept.setdefault(key, one_failed)
     return sorted(kept.values(), key=lambda one: (CODES.index(one.code), list(AREAS).index(one.case.area)))
 

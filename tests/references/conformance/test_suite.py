@@ -20,12 +20,14 @@ from mdnum.references.conformance import NeighborListConformance
 from mdnum.references.conformance.case import AREAS, one, script
 from mdnum.references.conformance.catalog import catalog, gas
 from mdnum.references.conformance.crowds import crowds, lattice
+from mdnum.references.conformance.judge import Failure
 from mdnum.references.conformance.lists import Limits, Session
 from mdnum.references.conformance.loading import from_object, installed, known, load
 from mdnum.references.conformance.movers import movers
 from mdnum.references.conformance.remote import RemoteSession
+from mdnum.references.conformance.results import Failed
 from mdnum.references.conformance.strategies import PLACES, SHAPES, SIZES
-from mdnum.references.conformance.suite import Examiner, drawn, examine, questions
+from mdnum.references.conformance.suite import Examiner, _distinct, drawn, examine, questions
 
 _PLANTED = str(Path(planted_lists.__file__))
 
@@ -308,6 +310,15 @@ def test_what_is_wrong_otherwise_is_not_taken_for_single_precision(kind: str):
     cases = [case for case in catalog() if case.area in ("few", "outside", "ties") and case.atoms < 9]
     report = examine(from_object(wrong), asked=cases, shrink=False)
     assert "float32" not in report.found_out and report.single is None and report.failed
+
+
+def test_what_fails_after_other_questions_alone_is_told_once():
+    def failed(atoms: int, alone: bool) -> Failed:
+        case = one(f"{atoms}", "few", gas(atoms, 4.0, 0), 4.0)
+        return Failed(case, (Failure("MISSING", "a pair"),), case, alone)
+
+    kept = _distinct([failed(9, False), failed(2, False), failed(1, False), failed(2, True), failed(7, True)])
+    assert {(found.case.atoms, found.alone) for found in kept} == {(1, False), (2, True), (7, True)}
 
 
 def test_a_process_that_crashes_or_hangs_is_a_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
