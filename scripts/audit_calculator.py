@@ -1,8 +1,8 @@
 """Which calculators are safe to run and to differentiate, and what is wrong with the others?
 
-Audits calculators one after the other (by default ASE's own, each with a structure that is built for it) and
-puts them side by side: two answers, the codes of what was found, and the numbers behind them. Any calculator
-can be named as for `mdnum audit`.
+Audits calculators one after the other (by default three of ASE's own, each with a structure that is built for
+it) and puts them side by side: two answers, the codes of what was found, and the numbers behind them. Any
+calculator can be named as for `mdnum audit`.
 
 How to read it. Jump: of the energy at a threshold of two atoms, the largest. Forces: the largest difference
 from differences of the energy, over the root mean square force. Curl: work around a small loop, as a share of
@@ -23,11 +23,9 @@ import mdnum
 from mdnum.store import RunFolder
 
 OWN = (
-    "ase.calculators.lj:LennardJones(sigma=3.405, epsilon=0.0103, rc=8.5)",
-    "ase.calculators.lj:LennardJones(sigma=3.405, epsilon=0.0103, rc=8.5, smooth=True)",
-    "ase.calculators.morse:MorsePotential",
+    "ase.calculators.lj:LennardJones(sigma=3.405, epsilon=0.0103, rc=6)",
+    "ase.calculators.lj:LennardJones(sigma=3.405, epsilon=0.0103, rc=6, smooth=True)",
     "ase.calculators.emt:EMT",
-    "ase.calculators.tip3p:TIP3P(rc=4.5)",
 )
 
 
@@ -39,7 +37,7 @@ def main() -> None:
         nargs="*",
         default=OWN,
         metavar="CALCULATOR",
-        help="as for `mdnum audit` (default ASE's own)",
+        help="as for `mdnum audit` (default three of ASE's own)",
     )
     options.add_argument(
         "--structure", metavar="FILE", help="one for all (default one that is built for each)"
