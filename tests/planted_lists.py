@@ -81,6 +81,7 @@ KEPT_DEFECTS = {
     "rebuilt from old positions": "",
     "counts of the first": "",
     "volume looked at": "",
+    "the caller's array": "",
 }
 
 _remembered: dict = {}
@@ -362,6 +363,8 @@ class Kept:
     def _build(self, positions, cell):
         self.age = 0
         self.cell, self.reference = np.array(cell), np.array(positions)
+        if self.defect == "the caller's array":
+            self.reference = positions
         self.previous = self.reference
         rows = search(positions, cell, self.pbc, self.r_cut + self.skin)
         if self.defect == "images counted once":

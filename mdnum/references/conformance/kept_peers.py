@@ -86,7 +86,8 @@ class JaxMdList:
         import jax.numpy as jnp
         import numpy as np
 
-        return jnp.asarray(positions @ np.linalg.inv(cell) if self.skewed else positions)
+        # a copy: jax may take numpy's memory for its own, and the next positions are written there
+        return jnp.array(positions @ np.linalg.inv(cell) if self.skewed else positions)
 
     def pairs(self, positions):
         import numpy as np

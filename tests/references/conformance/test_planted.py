@@ -88,6 +88,7 @@ def test_keys_that_overflow_are_found_at_100_000_atoms():
         ("half stencil", "boxes", 2, 1),
         ("drops atoms outside", "outside", 2, 1),
         ("images undercounted", "images", 2, 1),
+        ("the caller's array", "motion", 2, 2),
         ("32 neighbors", "crowded", 35, 1),
         ("whole skin", "motion", 2, 2),
         ("box not looked at", "strain", 2, 2),
