@@ -202,14 +202,11 @@ def _finding(wrong: list[Loop], count: int) -> dict[str, str]:
         "error" if worst.share > _SMALL else "warning",
         "the forces do work around a closed loop",
         f"Around a circle of {worst.radius:g} Å ({worst.what}) the forces do {worst.work:.3g} eV of work: "
-        "the "
-        f"derivative of the forces has an antisymmetric part of {worst.curl:.3g} ± {worst.error:.1g} eV/Å², "
+        f"their derivative has an antisymmetric part of {worst.curl:.3g} ± {worst.error:.1g} eV/Å², "
         f"{worst.share:.1g} of its symmetric part. {len(wrong)} of {count} loops do work. No energy has "
-        "these "
-        "forces: a run gains or loses energy however small its time step.",
+        "these forces: a run gains or loses energy however small its time step.",
         "Derive the forces from the energy. Where they are predicted, do not use them for NVE; where they "
-        "are "
-        "derived, look for a stopped gradient or a neighbor that only one of two atoms counts.",
+        "are derived, look for a stopped gradient or a neighbor that only one of two atoms counts.",
     )
 
 
