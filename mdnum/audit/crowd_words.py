@@ -79,8 +79,7 @@ def caps(one: Crowd, kT: float, units: Words) -> list[dict[str, str]]:
                 f"{one.order_energy * units.scale:.4g} {units.small} ({one.order_energy / kT:.2g} kT) and "
                 "a force "
                 f"by {one.order_force:.4g} {units.force}; with {one.order_from - 1} it does not. Some "
-                "neighbors "
-                "are dropped, by their place in a list.",
+                "neighbors are dropped, by their place in a list.",
                 "Raise the largest number of neighbors, and make exceeding it an error.",
             )
         )
@@ -108,8 +107,7 @@ def reach(walk: PairWalk, units: Words) -> list[dict[str, str]]:
                 f"Near {steep[1]:.4g} {units.length} the curvature of two {walk.pair.name} is "
                 f"{steep[0]:.2g} times "
                 "that at the bottom of their well: atoms that pass there feel a spring that much stiffer, "
-                "and "
-                "forces that no bond explains.",
+                "and forces that no bond explains.",
                 "Switch over a wider range, or choose a time step for this curvature.",
             )
         )

@@ -227,8 +227,7 @@ def _says(loops: list[Loop], wrong: list[Loop]) -> str:
         worst = max(wrong, key=lambda one: one.share)
         return (
             f"Around {len(wrong)} of {len(loops)} small loops the forces do work: the antisymmetric part of "
-            "their "
-            f"derivative is up to {worst.share:.2g} of the symmetric one. No energy has these forces."
+            f"their derivative is up to {worst.share:.2g} of the symmetric one. No energy has these forces."
         )
     limit = max(loops, key=lambda one: (abs(one.curl) + one.error) / max(one.stiffness, 1e-300))
     return (

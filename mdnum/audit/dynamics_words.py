@@ -111,8 +111,7 @@ class _Words:
                 "objects give "
                 f"for the same positions, where noise explains {allowed:.1g}.",
                 "Look at when the neighbor list is rebuilt: all displacements since, twice the largest, and "
-                "the "
-                "strain of the cell must fit into the skin.",
+                "the strain of the cell must fit into the skin.",
             )
         rest = shares["rest"]
         swing = numbers["rest_swing"] / result.subject.kT
@@ -141,8 +140,7 @@ class _Words:
                 f"{numbers['crossings']} crossings in {numbers['time']:.3g} {self.time} brought "
                 f"{flips.slope:+.3g} ± {flips.error:.1g} {self.unit}, by jumps of up to "
                 f"{1e3 * numbers['largest_jump']:.3g} m{self.energy}; their sum wanders by {size:.2g} kT in "
-                "the "
-                f"first {self.time}.",
+                f"the first {self.time}.",
                 "Switch the interaction off smoothly before its cutoff, or shift it to zero there.",
             )
         total, integrator = shares["total"], shares["integrator"]
@@ -153,8 +151,7 @@ class _Words:
                 "the time step is long for this structure",
                 f"{integrator.slope:+.3g} ± {integrator.error:.1g} {self.unit} come from the integrator at "
                 f"{numbers['timestep']:.3g} {self.time} ({shares['integrator, by halving'].slope:+.3g} by "
-                "halving "
-                "it).",
+                "halving it).",
                 "Use a shorter one: --timestep.",
             )
         explained = abs(integrator.slope) > 0.5 * abs(total.slope) or rest.there or flips.there

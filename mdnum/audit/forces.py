@@ -269,8 +269,7 @@ def _says(slopes: list[Slope], worst: Slope, scale: float) -> str:
     return (
         f"Along {len(slopes)} directions the forces are the derivative of the energy to within "
         f"{max(abs(one.difference - one.force) for one in slopes):.1g} eV/Å, which is what the differences "
-        "can "
-        f"tell (their largest error is {max(one.error for one in slopes):.1g} eV/Å)."
+        f"can tell (their largest error is {max(one.error for one in slopes):.1g} eV/Å)."
     )
 
 

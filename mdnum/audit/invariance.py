@@ -35,8 +35,7 @@ _MEANING: Mapping[str, tuple[str, str]] = {
     "IMAGES": (
         "the answer depends on which image of an atom is given",
         "Wrap positions inside the calculator before pairs are searched, or search with shifts for atoms "
-        "that "
-        "are any number of boxes away.",
+        "that are any number of boxes away.",
     ),
     "FACES": (
         "an atom on a face of the cell is treated otherwise than its image",
@@ -50,8 +49,7 @@ _MEANING: Mapping[str, tuple[str, str]] = {
     "CELL_ULP": (
         "the last bit of the cell changes the answer",
         "A pair is found or lost by rounding in the search or in a decision: compute both ends of a pair by "
-        "the "
-        "same arithmetic, and make the potential smooth at its cutoff.",
+        "the same arithmetic, and make the potential smooth at its cutoff.",
     ),
     "EXTENSIVE": (
         "a supercell is not the sum of its parts",
@@ -78,8 +76,7 @@ _MEANING: Mapping[str, tuple[str, str]] = {
     "DUMMY_CELL": (
         "a cell that does not repeat changes the answer",
         "Respect the periodicity of each axis: do not wrap along an axis that does not repeat, and do not "
-        "take "
-        "the cell's length for the extent of the search.",
+        "take the cell's length for the extent of the search.",
     ),
 }
 
@@ -249,8 +246,7 @@ class Invariance:
                 "warning",
                 "a molecule cut by a face of the cell has another energy",
                 f"With {worst.same.what} the energy differs by {worst.energy:.3g} eV; when whole molecules "
-                "are "
-                "moved, by nothing.",
+                "are moved, by nothing.",
                 "Make molecules whole before the calculator sees them: a wrapped trajectory is wrong for it.",
             )
         )

@@ -139,11 +139,9 @@ def _pair_findings(walks: PairWalks, around: Surroundings, kT: float, units: Wor
                 f"next representable distance, differ by {worst.jumps[0] * units.scale:.6g} {units.small} "
                 f"({abs(worst.jumps[0]) / kT:.2g} kT); the force jumps by {worst.jumps[1]:.4g} {units.force}."
                 f"{among} {_others(steps, worst, units)}No force stands for this energy: every crossing "
-                "changes "
-                "the energy of a run, and no derivative through the run sees the crossing.",
+                "changes the energy of a run, and no derivative through the run sees the crossing.",
                 "Shift the energy and the force to zero at the cutoff, or switch the interaction off over "
-                "the "
-                "last part of its range.",
+                "the last part of its range.",
             )
         )
     bends = [one for one in thresholds if one.order == 1]
@@ -159,8 +157,7 @@ def _pair_findings(walks: PairWalks, around: Surroundings, kT: float, units: Wor
                 f"{units.length} the force jumps by {worst.jumps[1]:.6g} {units.force}, the energy by no "
                 "more than "
                 f"rounding. {_others(bends, worst, units)}A run keeps its energy; a derivative through it "
-                "misses "
-                "a term at every crossing, an error that a smaller time step does not lessen.",
+                "misses a term at every crossing, an error that a smaller time step does not lessen.",
                 "Switch the interaction off smoothly, or take derivatives that know of events "
                 "(`mdnum grad` adds the term).",
             )

@@ -136,8 +136,7 @@ class State:
         if worst["refused"] is None:
             differs = (
                 f"differs from a new one by {worst['energy']:.3g} eV and {worst['force']:.3g} eV/Å, where "
-                "rounding "
-                f"explains {worst['allowed']:.1g} eV"
+                f"rounding explains {worst['allowed']:.1g} eV"
             )
         else:
             differs = f"{worst['refused'].why}, while a new one answers"
@@ -147,8 +146,7 @@ class State:
             "the answer depends on what the calculator was asked before",
             f"After the step “{worst['structure']}”, an object that had been in use {differs}. "
             f"{len(stale)} questions were answered so ({', '.join(where)}). The structures before and after "
-            "are "
-            "saved as stale-before and stale-after.",
+            "are saved as stale-before and stale-after.",
             "Look for a neighbor list that is not rebuilt when the cell, the order or the number of atoms "
             "changes "
             "or when atoms have used up half the skin, and for a buffer whose tail keeps old entries.",
@@ -377,7 +375,6 @@ def _says(rows: list[dict[str, Any]], stale: list[dict[str, Any]], repeats: Mapp
     if stale:
         return (
             f"{len(stale)} of {len(rows)} answers of an object in use differ from those of a new one, by up "
-            "to "
-            f"{max(row['energy'] for row in stale):.3g} eV: the calculator remembers. {tail}"
+            f"to {max(row['energy'] for row in stale):.3g} eV: the calculator remembers. {tail}"
         )
     return f"Objects in use answered {len(rows)} questions of {words} as new ones do. {tail}"

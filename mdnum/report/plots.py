@@ -236,7 +236,7 @@ def _outline(inside: np.ndarray, x_edges: np.ndarray, y_edges: np.ndarray) -> Pa
         for run in runs:
             open_runs.setdefault(run, row)
     codes = [Path.MOVETO, Path.LINETO, Path.LINETO, Path.LINETO, Path.CLOSEPOLY]
-    return Path(vertices, codes * (len(vertices) // 5))
+    return Path(np.asarray(vertices, float), codes * (len(vertices) // 5))
 
 
 def _label_lines(axes: Axes, plot: Plot, parts: Sequence[_Part], x_scale: Scale, y_scale: Scale) -> None:

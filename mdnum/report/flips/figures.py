@@ -156,8 +156,7 @@ def captions(run: Question) -> dict[str, str]:
         "neighbors": "Fewest, mean and most over the atoms, at each frame.",
         "distribution": "Over all atoms and frames.",
         "stride": "A flip is lost when the pair flips back before the next frame that is kept. Where the "
-        "line "
-        "still rises at stride 1, more happened between the frames of the file.",
+        "line still rises at stride 1, more happened between the frames of the file.",
         "chatter": "A pair near its threshold flips back and forth.",
     }
     shown = range(min(len(run.summary["rules"]), SHOWN))

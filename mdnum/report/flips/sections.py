@@ -48,8 +48,7 @@ def _numbers(run: Question, one: Mapping[str, Any]) -> Iterator[tuple[str, str]]
     yield (
         "Undecidable",
         f"{many(one['ambiguous'], 'flip')}; {number(one['near_mean'], 3)} pairs within the file's resolution "
-        "of "
-        "their threshold at an average frame",
+        "of their threshold at an average frame",
     )
     if one["min_margin"] is not None:
         yield "Closest decision", f"{length(run, one['min_margin'])} from its threshold"
@@ -70,8 +69,7 @@ def _lifetimes(run: Question, one: Mapping[str, Any]) -> Iterator[tuple[str, str
     yield (
         "Contacts",
         f"{count(seen['seen'])} seen whole; {count(seen['goes_on'])} go on after the last frame (censored on "
-        "the "
-        f"right); {count(seen['older'])} were there at the first frame (censored on the left); "
+        f"the right); {count(seen['older'])} were there at the first frame (censored on the left); "
         f"{count(seen['throughout'])} throughout",
     )
     if not life["followed"]:
