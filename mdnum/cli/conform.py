@@ -19,7 +19,10 @@ def conform(
         help="A name, package.module:function, or file.py:function; without one, the names are listed.",
     ),
     cases: int | None = typer.Option(
-        None, min=0, metavar="N", help="Random cases beside those with a name; 500 by default."
+        None,
+        min=0,
+        metavar="N",
+        help="Random cases beside those with a name; 500 by default, a share of them for slow lists.",
     ),
     seed: int = typer.Option(0, metavar="N", help="Of the random cases."),
     full: bool | None = typer.Option(
