@@ -69,3 +69,35 @@ def test_a_calculator_that_is_not(copper, capsys):
     assert told["folder"] == "out" and not (copper / "out/report.html").exists()
     assert call("audit", "mine.py", "-s", "cu.extxyz", "--checks", "forces", "-o", "out") == 2
     assert "already holds a run" in capsys.readouterr().err
+
+
+def test_control_c_keeps_what_was_found(copper, capsys, monkeypatch):
+    from mdnum.audit.curl import Curl
+
+    def pressed(self, subject, progress=None):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Curl, "__call__", pressed)
+    arguments = ("audit", EMT, "-s", "cu.extxyz", "-o", "out", "--checks")
+    assert call(*arguments, "forces,curl,state") == 130
+    lines = printed(capsys)
+    assert lines[0].startswith(f"Stopped during curl. {EMT}: 1 check found nothing")
+    assert "the check of state stopped" in lines
+    summary = json.loads((copper / "out/summary.json").read_text())
+    assert summary["status"] == "stopped" and [part["name"] for part in summary["parts"]] == ["forces"]
+    assert "Stopped during curl" in (copper / "out/report.html").read_text()
+    # nothing was found yet
+    assert call("audit", EMT, "-s", "cu.extxyz", "-o", "other", "--checks", "curl") == 130
+    assert "stopped" in capsys.readouterr().err
+    assert not (copper / "other/summary.json").exists()
+
+
+def test_one_of_several_structures_of_a_file(copper, capsys):
+    write(copper / "two.extxyz", [bulk("Cu", cubic=True), bulk("Cu", cubic=True).repeat((2, 1, 1))])
+    for words, atoms in (("two.extxyz@0", 4), ("two.extxyz@-1", 8), ("two.extxyz", 8)):
+        assert call("audit", EMT, "-s", words, "--checks", "forces", "--no-report") == 0
+        assert f"{atoms} atoms" in printed(capsys)[1]
+    assert call("audit", EMT, "-s", "two.extxyz@7") == 2
+    assert "two.extxyz@7" in capsys.readouterr().err
+    assert call("audit", EMT, "-s", "two.extxyz@:") == 2
+    assert "one structure" in capsys.readouterr().err

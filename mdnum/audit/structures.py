@@ -36,6 +36,9 @@ _RATTLE = 0.02
 def read_structure(words: str | Path) -> Atoms:
     """A structure from any file that ASE reads; `file@5` is its sixth, otherwise the last is taken.
 
+    What follows the @ is what ASE takes there: a number, from the end if negative, or a choice in a database
+    (`file.db@id=3`), as long as it means one structure.
+
     Raises:
         InputError: no such file, ASE cannot read it, no atoms, numbers that are not finite.
     """
@@ -49,7 +52,7 @@ def read_structure(words: str | Path) -> Atoms:
             "no such structure file", where=str(path), remedy="Correct --structure, or leave it out"
         )
     try:
-        atoms = ase.io.read(path, index=int(which))
+        found = ase.io.read(path, index=which)
     except Exception as error:
         # ase's readers raise whatever their parsing meets; every one of them means the same to the reader
         detail = " ".join(str(error).split()) or "no more detail"
@@ -58,6 +61,14 @@ def read_structure(words: str | Path) -> Atoms:
             where=text,
             remedy="Check that `ase.io.read` opens it; extxyz is the safest format",
         ) from error
+    chosen = found if isinstance(found, list) else [found]
+    if len(chosen) != 1:
+        raise InputError(
+            f"means {len(chosen)} structures, and an audit is about one structure",
+            where=text,
+            remedy="Name one by its number: file@0 is the first, file@-1 the last",
+        )
+    atoms = chosen[0]
     if not isinstance(atoms, Atoms) or len(atoms) == 0:
         raise InputError("holds no atoms", where=text, remedy="Name another file, or another index: file@0")
     bad = ~np.isfinite(atoms.positions).all(axis=1)

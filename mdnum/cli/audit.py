@@ -17,7 +17,11 @@ def audit(
         help="package.module:Class(argument=value), a Python file that makes a calculator, or a SYSTEM.",
     ),
     structure: Path | None = typer.Option(
-        None, "-s", "--structure", metavar="FILE", help="A structure; one is built by default."
+        None,
+        "-s",
+        "--structure",
+        metavar="FILE[@N]",
+        help="A structure, the N-th of a file's (from 0; the last by default); one is built by default.",
     ),
     checks: list[str] | None = typer.Option(
         None,
@@ -38,18 +42,24 @@ def audit(
     as_json: bool = output.JSON_OPTION,
 ) -> int:
     """Ask any ASE calculator: is it smooth, invariant, conservative, forgetful, and does it keep energy?"""
+    from mdnum.workflow.audit import AuditStopped
     from mdnum.workflow.audit import audit as ask
 
+    stopped = False
     with watched() as progress:
-        result = ask(
-            calculator,
-            structure,
-            checks=checks or None,
-            temperature=temperature,
-            timestep=timestep,
-            steps=steps,
-            out=out,
-            report=not no_report,
-            progress=progress,
-        )
-    return output.answer(result.folder, result.summary, print_rows, as_json=as_json)
+        try:
+            result = ask(
+                calculator,
+                structure,
+                checks=checks or None,
+                temperature=temperature,
+                timestep=timestep,
+                steps=steps,
+                out=out,
+                report=not no_report,
+                progress=progress,
+            )
+        except AuditStopped as stop:
+            result, stopped = stop.result, True
+    code = output.answer(result.folder, result.summary, print_rows, as_json=as_json)
+    return output.EXIT_STOPPED if stopped else code

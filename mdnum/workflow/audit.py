@@ -25,6 +25,18 @@ _BOLTZMANN = 8.617333262e-5
 """eV/K (CODATA 2018, exact)."""
 
 
+class AuditStopped(KeyboardInterrupt):
+    """Somebody pressed control-C after a check was done: what had been found is in the folder.
+
+    Args:
+        result: the audit without the checks that were not done.
+    """
+
+    def __init__(self, result: AuditResult):
+        super().__init__("stopped")
+        self.result = result
+
+
 @dataclass(frozen=True)
 class AuditResult:
     """A finished audit.
@@ -75,6 +87,8 @@ def audit(
     Raises:
         InputError: no such calculator, structure or check.
         FolderError: the folder cannot be used.
+        AuditStopped: a KeyboardInterrupt came after a check was done; what was found till then has been
+            written, its page included, and is the exception's `result`.
     """
     from mdnum.audit.verdict import judge
     from mdnum.provenance import surroundings
@@ -94,9 +108,17 @@ def audit(
         told = Log(folder, progress)
         parts: list[Part] = []
         pairs: dict[str, Atoms] = {}
+        during = None
         for check in _checks(wanted, subject, timestep, steps):
             told(0, 0, {"phase": check.name})
-            parts.append(_in_units(_ask(check, subject, told), subject.units))
+            try:
+                part = _in_units(_ask(check, subject, told), subject.units)
+            except KeyboardInterrupt:
+                if not parts:
+                    raise
+                during = check.name
+                break
+            parts.append(part)
             pairs |= getattr(check, "structures", {})
             tables: Mapping[str, Any] = getattr(check, "recorded", {})
             for name, columns in tables.items():
@@ -114,11 +136,17 @@ def audit(
             loaded.name, subject.atoms, subject.kT, units, parts, judge(loaded.name, parts)
         )
         summary |= {"structure": asked.info.get("origin"), "seconds": time.perf_counter() - began}
+        if during is not None:
+            audit_record.stop(summary, during, wanted)
         folder.write_summary(summary)
     except BaseException:
         folder.close()
         raise
-    return AuditResult(folder.path, {part.name: part for part in parts}, finish(folder, report, progress))
+    found = {part.name: part for part in parts}
+    result = AuditResult(folder.path, found, finish(folder, report, progress))
+    if during is not None:
+        raise AuditStopped(result)
+    return result
 
 
 def _wanted(checks: str | Sequence[str] | None) -> tuple[str, ...]:

@@ -110,6 +110,21 @@ def summarize(
     }
 
 
+def stop(summary: dict[str, Any], during: str, wanted: Sequence[str]) -> None:
+    """Makes a summary that of an audit which somebody stopped.
+
+    Args:
+        summary: of the checks that were done; changed in place.
+        during: the check that was not finished.
+        wanted: all checks, in their order.
+    """
+    summary["status"] = "stopped"
+    summary["headline"] = f"Stopped during {during}. {summary['headline']}"
+    missing = wanted[wanted.index(during) :]
+    rest = [{"what": f"the check of {name}", "why": "stopped", "part": name} for name in missing]
+    summary["left_out"] = rest + summary["left_out"]
+
+
 def script(words: str, pairs: Sequence[str]) -> str:
     """A program that shows, with ASE alone, that structures which are the same have different answers.
 
