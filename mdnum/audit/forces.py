@@ -157,19 +157,45 @@ def slope(
     spread = np.abs(np.diff(better))
     rounding = 2 * noise.energy / _LADDER[2:]
     error = spread + rounding + 1e-15 * np.abs(better[1:])
-    best = int(np.argmin(error))
     force = -float(np.sum(forces * line))
+    best, doubt = _best(better[1:] - force, error, rounding)
     return Slope(
         what,
         float(better[best + 1]),
         # a force has its own rounding
-        float(error[best]) + noise.force * float(np.sqrt(np.sum(line**2))),
+        doubt + noise.force * float(np.sqrt(np.sum(line**2))),
         force,
         float(_LADDER[best + 2]),
         _LADDER,
         np.abs(central - force),
         _jump(central - force, noise),
     )
+
+
+def _best(
+    apart: Float[np.ndarray, "steps"], error: Float[np.ndarray, "steps"], rounding: Float[np.ndarray, "steps"]
+) -> tuple[int, float]:
+    """(the step that counts, the error there): the smallest error's, unless others do not bear it out.
+
+    Where the energy jumps at flips, two steps may hold the same jumps by chance, and agree on a wrong slope.
+    A wrong force is as wrong at every step that can tell, and at the shorter ones above all.
+
+    Args:
+        apart: difference minus force at each step, the longest first.
+        error: of the differences, estimated.
+        rounding: the part of it that noise explains.
+    """
+    best = int(np.argmin(error))
+    wrong = abs(apart[best])
+    if wrong <= _SIGNIFICANT * error[best]:
+        return best, float(error[best])
+    shorter = np.arange(len(apart)) > best
+    clears = shorter & (_SIGNIFICANT * rounding < 0.5 * wrong) & (np.abs(apart) < 0.5 * wrong)
+    if clears.any():
+        best = int(np.argmin(np.where(clears, error, np.inf)))
+        return best, float(error[best])
+    same = (np.abs(apart - apart[best]) < 0.2 * wrong) & (_SIGNIFICANT * error < wrong)
+    return best, float(error[best] if same.sum() > 1 else max(error[best], wrong / _SIGNIFICANT))
 
 
 def _jump(apart: Float[np.ndarray, "steps"], noise: Noise) -> float:

@@ -115,6 +115,34 @@ def test_the_error_of_a_difference_covers_its_error(make):
     assert max(sizes) < (1e-4 if make is planted.Single else 1e-9)
 
 
+class Stairs:
+    """One atom whose energy is a smooth curve with steps; the force knows nothing of the steps."""
+
+    def __init__(self, places, heights, wrong: float = 0.0):
+        self.places, self.heights, self.wrong = places, heights, wrong
+
+    def energy(self, atoms: Atoms) -> float:
+        x = float(atoms.positions[0, 0])
+        return np.sin(1.0 + x) + float(np.sum(self.heights[self.places < x]))
+
+    def forces(self, atoms: Atoms) -> np.ndarray:
+        x = float(atoms.positions[0, 0])
+        return np.array([[-np.cos(1.0 + x) - self.wrong, 0.0, 0.0]])
+
+
+@pytest.mark.parametrize("wrong", [0.0, 1e-8])
+def test_steps_of_the_energy_by_chance_are_no_wrong_force(wrong: float):
+    """Each of a few hundred lines crosses thirty flips; only a force that is wrong is told as wrong."""
+    rng, atoms, line = np.random.default_rng(5), Atoms("Ar"), np.array([[1.0, 0.0, 0.0]])
+    told = 0
+    for _ in range(300):
+        places = np.sort(rng.choice([-1, 1], 30) * 10 ** rng.uniform(-4, -1, 30))
+        asked = Stairs(places, 3e-13 * rng.standard_normal(30), wrong)
+        found = slope(asked, atoms, line, asked.forces(atoms), Noise(1e-16, 1e-16))
+        told += not found.agrees
+    assert told == (300 if wrong else 0)
+
+
 @pytest.mark.parametrize("size", [1e-15, 1e-9, 1e-5])
 def test_noise_is_measured_within_a_factor(size: float):
     """What is planted is found, whatever the smooth part does."""
