@@ -118,6 +118,11 @@ def test_the_error_of_a_difference_covers_its_error(make):
 class Stairs:
     """One atom whose energy is a smooth curve with steps; the force knows nothing of the steps."""
 
+    name, kT, atoms = "stairs", 0.025, Atoms("Ar")
+
+    def fresh(self):
+        return self
+
     def __init__(self, places, heights, wrong: float = 0.0):
         self.places, self.heights, self.wrong = places, heights, wrong
 
