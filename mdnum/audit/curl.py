@@ -12,7 +12,7 @@ from ase import Atoms
 from jaxtyping import Float
 
 from mdnum.audit.base import Part, Progress, Subject
-from mdnum.audit.noise import FEW, Noise, displaced, settled
+from mdnum.audit.noise import FEW, Noise, displaced, of_all_kinds, settled
 from mdnum.references.findings import finding
 
 #: Å; the loop with the smaller error counts.
@@ -24,7 +24,7 @@ _SIGNIFICANT = 10.0
 #: Antisymmetric over symmetric part of the derivative of the forces: below, it is precision.
 _SMALL = 1e-4
 #: Loops that are looked at however slow the calculator is, and seconds after which no more are.
-_FEWEST, _SECONDS = 4, 20.0
+_FEWEST, _SECONDS = 2, 20.0
 
 
 @dataclass(frozen=True)
@@ -76,23 +76,24 @@ class Curl:
         worker = subject.fresh()
         atoms, noise = settled(worker, rng, at_least=FEW)
         wanted = list(planes(worker, atoms, rng))
-        loops: list[Loop] = []
+        found: dict[int, Loop] = {}
         skipped: list[tuple[str, str]] = []
-        for what, u, v in wanted:
-            if len(loops) >= _FEWEST and time.perf_counter() - began > _SECONDS:
+        for place in of_all_kinds(len(wanted)):
+            what, u, v = wanted[place]
+            if len(found) >= _FEWEST and time.perf_counter() - began > _SECONDS:
                 skipped.append((f"a loop of {what}", f"{_SECONDS:g} s were used up"))
                 continue
             if progress is not None:
-                progress(len(loops), len(wanted), {"phase": "curl", "unit": "loops"})
+                progress(len(found), len(wanted), {"phase": "curl", "unit": "loops"})
             tried = [around(worker, atoms, u, v, radius, noise, what) for radius in _RADII]
-            loops.append(agreed(tried))
+            found[place] = agreed(tried)
+        loops = [found[place] for place in sorted(found)]
         wrong = [one for one in loops if not one.conservative]
-        found = [_finding(wrong, len(loops))] if wrong else []
         return Part(
             name=self.name,
             title="Curl",
             says=_says(loops, wrong),
-            findings=found,
+            findings=[_finding(wrong, len(loops))] if wrong else [],
             tables={"Work around closed loops": [_row(one) for one in loops]},
             numbers={
                 "loops": len(loops),

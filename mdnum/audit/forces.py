@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from mdnum.audit.base import Curve, Part, Progress, Subject
 from mdnum.audit.digits import precision
-from mdnum.audit.noise import FEW, Noise, direction, displaced, settled
+from mdnum.audit.noise import FEW, Noise, direction, displaced, of_all_kinds, settled
 from mdnum.references.findings import finding
 
 #: Å; each step of the ladder is a quarter of the one before: 0.064 Å down to 1e-6 Å.
@@ -24,7 +24,7 @@ _SIGNIFICANT = 10.0
 _SMALL = 1e-4
 _DIRECTIONS, _ATOMS = 3, 4
 #: Directions that are looked at however slow the calculator is, and seconds after which no more are.
-_FEWEST, _SECONDS = 5, 20.0
+_FEWEST, _SECONDS = 3, 20.0
 
 
 @dataclass(frozen=True)
@@ -80,17 +80,20 @@ class Forces:
         atoms, noise = settled(worker, rng, at_least=FEW)
         forces = worker.forces(atoms)
         scale = float(np.sqrt(np.mean(forces**2)))
-        slopes: list[Slope] = []
+        found: dict[int, Slope] = {}
         skipped: list[tuple[str, str]] = []
-        for what, line in directions(atoms, rng):
-            if len(slopes) >= _FEWEST and time.perf_counter() - began > _SECONDS:
+        wanted = list(directions(atoms, rng))
+        for place in of_all_kinds(len(wanted)):
+            what, line = wanted[place]
+            if len(found) >= _FEWEST and time.perf_counter() - began > _SECONDS:
                 skipped.append((f"moving {what}", f"{_SECONDS:g} s were used up"))
                 continue
             if progress is not None:
-                progress(len(slopes), _DIRECTIONS + 3 * _ATOMS, {"phase": "forces", "unit": "directions"})
-            slopes.append(slope(worker, atoms, line, forces, noise, what))
+                progress(len(found), len(wanted), {"phase": "forces", "unit": "directions"})
+            found[place] = slope(worker, atoms, line, forces, noise, what)
+        slopes = [found[place] for place in sorted(found)]
         sums = list(_sums(atoms, forces, noise))
-        found = [
+        told = [
             *_judged(slopes, scale),
             *_judged_sums(sums, scale),
             *precision(worker, atoms, noise, np.random.default_rng(self.seed)),
@@ -100,7 +103,7 @@ class Forces:
             name=self.name,
             title="Forces",
             says=_says(slopes, worst, scale),
-            findings=found,
+            findings=told,
             tables={
                 "Derivative of the energy along a direction": [_row(one) for one in slopes],
                 "Sums that must vanish": sums,

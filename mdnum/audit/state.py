@@ -25,10 +25,10 @@ from mdnum.references.findings import finding
 #: terms in another order.
 _ALLOWED = 40.0
 _REPEATS = 3
-#: Seconds that a new object and its first answer may take before only the ends of sequences are compared.
-_SLOW = 0.3
-#: Seconds after which no further sequence is begun.
+#: Seconds for all sequences, of which each has its share: what a quick one leaves the others have.
 _SECONDS = 30.0
+#: Questions of a sequence that are compared however long it takes, the last ones.
+_FEWEST = 1
 
 
 @dataclass
@@ -51,27 +51,34 @@ class State:
         began = time.perf_counter()
         rng = np.random.default_rng(self.seed)
         atoms, noise = settled(subject.fresh(), rng, at_least=FEW)
-        sequences = {
+        # two atoms first, which most calculators answer for quickly
+        sequences: dict[str, list[Asked]] = {}
+        nothing = self._approached(subject, sequences)
+        sequences |= {
             "sizes": list(sizes(atoms, rng)),
             "a slow drift": list(drift(atoms, rng)),
             "two atoms head on": list(head_on(atoms)),
             "strain": list(strain(atoms)),
             "wrapping": list(wrapping(atoms, rng)),
         }
-        nothing = self._approached(subject, sequences)
         sequences = {word: sequence for word, sequence in sequences.items() if sequence}
         total = sum(map(len, sequences.values()))
         done, rows = 0, []
         late: list[tuple[str, str]] = []
-        for word, sequence in sequences.items():
-            if time.perf_counter() - began > _SECONDS:
+        for place, (word, sequence) in enumerate(sequences.items()):
+            left = _SECONDS - (time.perf_counter() - began)
+            if left < 0:
                 late.append((f"the sequence “{word}”", f"{_SECONDS:g} s were used up"))
                 continue
-            for row in _through(subject, sequence, noise, word):
+            through = _Through(subject, sequence, noise, word, left / (len(sequences) - place))
+            for row in through():
                 rows.append(row)
-                done += 1
                 if progress is not None:
-                    progress(done, total, {"phase": "state", "unit": "structures"})
+                    progress(done + through.reached, total, {"phase": "state", "unit": "structures"})
+            done += len(sequence)
+            if through.left_out:
+                questions = f"{through.left_out} questions of the sequence “{word}”"
+                late.append((questions, "new objects take long: the others were compared"))
         repeats = _repeated(subject, atoms)
         lonely = alone(subject, atoms, noise)
         self.structures |= lonely.structures
@@ -270,37 +277,65 @@ def _scaled(atoms: Atoms, factor: float) -> Atoms:
     return there
 
 
-def _through(subject: Subject, sequence: list[Asked], noise: Noise, word: str) -> Iterator[dict[str, Any]]:
-    """One object through a sequence; each answer beside that of an object that has seen nothing."""
-    began = time.perf_counter()
-    used = subject.fresh()
-    ask(used, sequence[0].atoms)
-    slow = time.perf_counter() - began > _SLOW
-    before: Atoms | None = None
-    known: dict[int, Answer | Refusal] = {}
-    size = 0.0
-    for place, asked in enumerate(sequence):
-        old = ask(used, asked.atoms)
-        previous, before = before or asked.atoms, asked.atoms
-        if not asked.compared or (slow and place < len(sequence) - 2):
-            continue
-        # structures come again within a sequence, which keeps them, so their ids are theirs
-        if id(asked.atoms) not in known:
-            known[id(asked.atoms)] = ask(subject.fresh(), asked.atoms)
-        new = known[id(asked.atoms)]
-        row: dict[str, Any] = {
-            "sequence": word, "structure": asked.what, "before": previous, "atoms": asked.atoms,
-            "energy": 0.0, "force": 0.0, "allowed": 0.0, "remembers": False, "refused": None,
-        }  # fmt: skip
-        if isinstance(new, Refusal):
-            # what nobody can answer says nothing about memory
-            yield row | {"refused": new}
-        elif isinstance(old, Refusal):
-            yield row | {"remembers": True, "energy": float("inf"), "force": float("inf"), "refused": old}
-        else:
-            size = size or abs(new.energy)
-            share = max(1.0, abs(new.energy) / size) if size else 1.0
-            yield row | _apart(old, new, noise, share)
+class _Through:
+    """One object through a sequence; answers beside those of objects that have seen nothing.
+
+    Args:
+        subject: where objects come from.
+        sequence: what is asked.
+        noise: of the calculator.
+        word: the sequence's name.
+        seconds: that it may take. Where that is not enough every structure is still asked about, and fewer
+            answers are compared, the last ones first.
+    """
+
+    def __init__(self, subject: Subject, sequence: list[Asked], noise: Noise, word: str, seconds: float):
+        self._subject, self._sequence, self._noise, self._word = subject, sequence, noise, word
+        self._ends = time.perf_counter() + seconds
+        #: How far it has come, and how many answers that could be compared were not.
+        self.reached = self.left_out = 0
+
+    def __call__(self) -> Iterator[dict[str, Any]]:
+        """A row for each answer that is compared."""
+        began = time.perf_counter()
+        used = self._subject.fresh()
+        ask(used, self._sequence[0].atoms)
+        compared = self._affordable(time.perf_counter() - began)
+        before: Atoms | None = None
+        known: dict[int, Answer | Refusal] = {}
+        size = 0.0
+        for place, asked in enumerate(self._sequence):
+            old = ask(used, asked.atoms)
+            previous, before = before or asked.atoms, asked.atoms
+            self.reached = place + 1
+            if place not in compared:
+                continue
+            # structures come again within a sequence, which keeps them, so their ids are theirs
+            if id(asked.atoms) not in known:
+                known[id(asked.atoms)] = ask(self._subject.fresh(), asked.atoms)
+            new = known[id(asked.atoms)]
+            row: dict[str, Any] = {
+                "sequence": self._word, "structure": asked.what, "before": previous, "atoms": asked.atoms,
+                "energy": 0.0, "force": 0.0, "allowed": 0.0, "remembers": False, "refused": None,
+            }  # fmt: skip
+            if isinstance(new, Refusal):
+                # what nobody can answer says nothing about memory
+                yield row | {"refused": new}
+            elif isinstance(old, Refusal):
+                yield row | {"remembers": True, "energy": float("inf"), "force": float("inf"), "refused": old}
+            else:
+                size = size or abs(new.energy)
+                share = max(1.0, abs(new.energy) / size) if size else 1.0
+                yield row | _apart(old, new, self._noise, share)
+
+    def _affordable(self, took: float) -> set[int]:
+        """Places that are compared, where a new object and its answer take so many seconds."""
+        places = [place for place, asked in enumerate(self._sequence) if asked.compared]
+        # the one object's own answers come first
+        left = self._ends - time.perf_counter() - 0.3 * took * len(self._sequence)
+        count = max(int(left / took) if took > 0 else len(places), _FEWEST)
+        self.left_out = max(len(places) - count, 0)
+        return set(places[self.left_out :])
 
 
 def _apart(old: Answer, new: Answer, noise: Noise, share: float) -> dict[str, Any]:

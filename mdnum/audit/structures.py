@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from ase import Atoms
@@ -28,6 +30,9 @@ _DENSITIES = (1.0, 0.85, 0.72, 0.6, 0.5, 1.2)
 
 _BARELY, _PRESSED = 0.9, 0.6
 """A nearest distance above this part of the cutoff is made to be that part of it."""
+
+_SLOW = 0.15
+"""Seconds of a calculation above which the crystal is made smaller."""
 
 _RATTLE = 0.02
 """Standard deviation, of the nearest distance: in a perfect crystal forces are zero and distances tie."""
@@ -186,10 +191,37 @@ def _crystal(subject: CalculatorSubject, pair: Pair | None, symbol: str) -> Atom
     if start is None:
         return None
     scale, relaxed = _least_energy(subject, cell, least, start)
-    made = _filled(cell, lattice, scale, relaxed, cutoff, symbol)
-    if not _answers(subject, made):
-        made = _filled(cell, lattice, start, False, cutoff, symbol)
-    return made if _answers(subject, made) else None
+    for factor, least_energy in ((scale, relaxed), (start, False)):
+        made = _filled(cell, lattice, factor, least_energy, cutoff, symbol)
+        if _answers(subject, made):
+            return _affordable(subject, made, (cell, lattice, factor, least_energy, cutoff, symbol))
+    return None
+
+
+def _affordable(subject: CalculatorSubject, made: Atoms, how: tuple[Any, ...]) -> Atoms:
+    """A crystal that is asked about hundreds of times: a small one where a calculation takes long."""
+    took = _took(subject, made)
+    if took <= _SLOW:
+        return made
+    small = _filled(*how, few=True)
+    # narrower than two cutoffs, which not every calculator takes
+    if len(small) >= len(made) or not _answers(subject, small):
+        return made
+    why = f"; of {len(made)} atoms, for two cutoffs, one calculation takes {took:.2g} s"
+    return _told(small, small.info["origin"] + why)
+
+
+def _took(subject: CalculatorSubject, atoms: Atoms) -> float:
+    """Seconds of energy and forces, after the first: of two, since another program may have been busy."""
+    took = []
+    for _ in range(2):
+        atoms = atoms.copy()
+        atoms.positions[0, 0] += 1e-4
+        began = time.perf_counter()
+        subject.energy(atoms)
+        subject.forces(atoms)
+        took.append(time.perf_counter() - began)
+    return min(took)
 
 
 def _felt(subject: CalculatorSubject, pair: Pair) -> tuple[float | None, float | None]:
@@ -216,16 +248,22 @@ def _answers(subject: CalculatorSubject, atoms: Atoms) -> bool:
 
 
 def _filled(
-    cell: Atoms, lattice: str, scale: float, relaxed: bool, cutoff: float | None, symbol: str
+    cell: Atoms,
+    lattice: str,
+    scale: float,
+    relaxed: bool,
+    cutoff: float | None,
+    symbol: str,
+    few: bool = False,
 ) -> Atoms:
-    """The crystal with its lattice scaled, repeated to two cutoffs, its atoms displaced a little."""
+    """The crystal with its lattice scaled, repeated to two cutoffs or a few atoms, and displaced a little."""
     cell = cell.copy()
     at = "at the calculator's own least energy" if relaxed else _tabulated(scale)
     if cutoff and scale * _nearest_distance(cell) > _BARELY * cutoff:
         # nothing holds it together: a crystal in which nothing is felt would tell nothing
         scale, at = _PRESSED * cutoff / _nearest_distance(cell), "nothing binds it, so pressed together"
     cell.set_cell(np.asarray(cell.cell) * scale, scale_atoms=True)
-    wanted = 2.05 * cutoff if cutoff else 12.0
+    wanted = 0.0 if few else 2.05 * cutoff if cutoff else 12.0
     edge = float(np.asarray(cell.cell).diagonal().min())
     repeat = max(int(np.ceil(wanted / edge)), int(np.ceil((_FEWEST_ATOMS / len(cell)) ** (1 / 3))))
     repeat = max(min(repeat, int((_MOST_ATOMS / len(cell)) ** (1 / 3))), 1)

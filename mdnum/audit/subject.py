@@ -73,6 +73,8 @@ class CalculatorSubject:
         units: Units = METAL,
     ):
         self.units = units
+        #: What checks have worked out about the calculator and its structure; new objects know it too.
+        self.known: dict[Any, Any] = {}
         self.name = name
         self.atoms = _bare(atoms)
         self.kT = kT
@@ -96,13 +98,14 @@ class CalculatorSubject:
         other = CalculatorSubject(
             self.name, self._make, self.atoms, kT=self.kT, folder=self.folder, units=self.units
         )
-        other._saved, other.saving = self._saved, self.saving
+        other._saved, other.saving, other.known = self._saved, self.saving, self.known
         return other
 
     def about(self, atoms: Atoms) -> CalculatorSubject:
         """The same calculator object asked about another structure."""
         other = self.fresh()
         other.atoms, other._calculator, other._last = _bare(atoms), self.calculator, self._last
+        other.known = {}
         return other
 
     def forget(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import ase.io
@@ -184,6 +185,21 @@ def test_default_structures():
     assert default_structure(load_calculator("ase.calculators.emt:EMT")).symbols[0] == "Cu"
     water = default_structure(load_calculator("ase.calculators.tip3p:TIP3P(rc=4.5)"))
     assert water.get_chemical_symbols()[:4] == ["O", "H", "H", "O"]
+
+
+def test_a_calculator_that_takes_long_is_asked_about_fewer_atoms():
+    class Slow(LennardJones):
+        def calculate(self, *words, **more):
+            super().calculate(*words, **more)
+            time.sleep(0.0015 * len(self.atoms) if len(self.atoms) > 100 else 0.0)
+
+    quick, slow = (
+        default_structure(Loaded("x", "x", lambda make=make: make(sigma=3.4, epsilon=0.01, rc=8.0)))
+        for make in (LennardJones, Slow)
+    )
+    assert len(slow) == 32 and len(quick) > 100
+    said = slow.info["origin"]
+    assert said.startswith("32 atoms of Ar, fcc") and f"of {len(quick)} atoms, for two cutoffs, one" in said
 
 
 @pytest.mark.parametrize(
