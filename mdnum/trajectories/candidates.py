@@ -15,6 +15,25 @@ from mdnum.trajectories.bins import lattice_code, most_around, run_of_bins
 INSIDE, BAND, DIRECTED = 0, 1, 2
 
 
+# Not inlined, and in loops from 0 over slices: an index that could be negative costs a test for each candidate,
+# and the loop its vector instructions.
+@numba.njit(cache=True, nogil=True, inline="never")
+def _within(near, first, last, x0, x1, x2, largest, squares, flags, chosen):
+    """Squares of near[:, first:last] as seen from x, and which of them, counted from first, are within."""
+    near0, near1, near2 = near[0, first:last], near[1, first:last], near[2, first:last]
+    for k in range(near0.shape[0]):
+        y0, y1, y2 = near0[k] - x0, near1[k] - x1, near2[k] - x2
+        squares[k] = y0 * y0 + y1 * y1 + y2 * y2
+    for k in range(near0.shape[0]):
+        flags[k] = squares[k] <= largest
+    kept = 0
+    # no branch to mispredict: every candidate is written, and overwritten unless it is kept
+    for k in range(near0.shape[0]):
+        chosen[kept] = k
+        kept += flags[k]
+    return kept
+
+
 @numba.njit(cache=True, nogil=True)
 def met_once(
     sorted_x, vectors, free, bins, reach, start, order,
@@ -25,8 +44,8 @@ def met_once(
     # one species: no need to look it up
     several = low.shape[0] > 1
     room, runs = most_around(bins, reach, start)
-    near, squares = np.empty((3, room)), np.empty(room)
-    atom, chosen, run = np.empty(room, np.int32), np.empty(room, np.int32), np.empty(room, np.int32)
+    near, squares, flags = np.empty((3, room)), np.empty(room), np.empty(room, np.uint8)
+    atom, chosen, run = np.empty(room, np.int32), np.empty(room, np.uint32), np.empty(room, np.int32)
     codes = np.zeros(runs, np.int32)
     for b0 in range(bins[0]):
         for b1 in range(bins[1]):
@@ -63,19 +82,12 @@ def met_once(
                             kinds += 1
                 for q in range(own):
                     x0, x1, x2 = near[0, q], near[1, q], near[2, q]
-                    for k in range(q + 1, found):
-                        y0, y1, y2 = near[0, k] - x0, near[1, k] - x1, near[2, k] - x2
-                        squares[k] = y0 * y0 + y1 * y1 + y2 * y2
-                    kept = 0
-                    # no branch to mispredict: every candidate is written, and overwritten unless it is kept
-                    for k in range(q + 1, found):
-                        chosen[kept] = k
-                        kept += int(squares[k] <= largest)
+                    kept = _within(near, q + 1, found, x0, x1, x2, largest, squares, flags, chosen)
                     i = order[start[here] + q]
                     si = species[i]
                     for m in range(kept):
                         k = chosen[m]
-                        j = order[atom[k]]
+                        j = order[atom[q + 1 + k]]
                         sj = species[j] if several else 0
                         if squares[k] > high[si, sj] or i == j:
                             continue
@@ -85,7 +97,7 @@ def met_once(
                             written += 1
                         else:
                             if left < i_open.shape[0]:
-                                i_open[left], j_open[left], code_open[left] = i, j, codes[run[k]]
+                                i_open[left], j_open[left], code_open[left] = i, j, codes[run[q + 1 + k]]
                                 value_open[left] = squares[k]
                             left += 1
     tally[0], tally[1] = written, left
@@ -101,8 +113,8 @@ def met_from_centers(
     # one species: no need to look it up
     several = low.shape[0] > 1
     room, runs = most_around(bins, reach, start)
-    near, squares = np.empty((3, room)), np.empty(room)
-    atom, chosen, run = np.empty(room, np.int32), np.empty(room, np.int32), np.empty(room, np.int32)
+    near, squares, flags = np.empty((3, room)), np.empty(room), np.empty(room, np.uint8)
+    atom, chosen, run = np.empty(room, np.int32), np.empty(room, np.uint32), np.empty(room, np.int32)
     codes = np.zeros(runs, np.int32)
     for b0 in range(bins[0]):
         for b1 in range(bins[1]):
@@ -136,13 +148,7 @@ def met_from_centers(
                 for q in range(center_start[here], center_start[here + 1]):
                     i = center_order[q]
                     x0, x1, x2 = wrapped[i, 0], wrapped[i, 1], wrapped[i, 2]
-                    for k in range(found):
-                        y0, y1, y2 = near[0, k] - x0, near[1, k] - x1, near[2, k] - x2
-                        squares[k] = y0 * y0 + y1 * y1 + y2 * y2
-                    kept = 0
-                    for k in range(found):
-                        chosen[kept] = k
-                        kept += int(squares[k] <= largest)
+                    kept = _within(near, 0, found, x0, x1, x2, largest, squares, flags, chosen)
                     si = species[i]
                     twice = both[i] and kind != DIRECTED
                     for m in range(kept):
