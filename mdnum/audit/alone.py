@@ -12,6 +12,7 @@ from ase import Atoms
 from mdnum.audit.answer import Answer, Refusal, ask
 from mdnum.audit.base import Subject
 from mdnum.audit.noise import Noise
+from mdnum.audit.probes import molecules, whole
 from mdnum.references.findings import finding
 
 #: How many times the noise an energy may be off by.
@@ -140,9 +141,13 @@ def alone(subject: Subject, atoms: Atoms, noise: Noise) -> Alone:
     cluster.pbc = False
     cluster.set_cell([6 * _FAR] * 3)
     near = ask(subject.fresh(), cluster)
-    found.takes_atoms = isinstance(near, Answer)
+    # nor does one that knows whole molecules alone take a cluster of which an atom is gone
+    found.takes_atoms = isinstance(near, Answer) and isinstance(ask(subject.fresh(), cluster[:-1]), Answer)
     if isinstance(near, Refusal):
         found.refused.append((f"a cluster of {len(cluster)} atoms", near))
+        return found
+    if not found.takes_atoms:
+        _molecules(found, subject, atoms, noise)
         return found
     symbol = str(atoms.symbols[0])
     far = cluster.copy()
@@ -153,3 +158,22 @@ def alone(subject: Subject, atoms: Atoms, noise: Noise) -> Alone:
     expected = near.energy + single[symbol] if symbol in single else None
     found.add(f"a {symbol} atom {_FAR:g} Å from a cluster", both, expected, noise, far)
     return found
+
+
+def _molecules(found: Alone, subject: Subject, atoms: Atoms, noise: Noise) -> None:
+    """One molecule alone, and two far apart, for calculators that take nothing less."""
+    groups = molecules(atoms)
+    one = whole(atoms, groups[0])
+    one.positions += [1.0, 2.0, 3.0]
+    one.set_cell([4 * _FAR] * 3)
+    other = one.copy()
+    other.positions[:, 0] += _FAR
+    formula, alone_energy = one.get_chemical_formula(), None
+    for what, there in ((f"one {formula}", one), (f"two {formula} {_FAR:g} Å apart", one + other)):
+        answer = ask(subject.fresh(), there)
+        if isinstance(answer, Answer):
+            # within a molecule there are forces, on it as a whole there is none
+            answer = Answer(answer.energy, answer.forces.reshape(-1, len(one), 3).sum(axis=1))
+            alone_energy = answer.energy if alone_energy is None else alone_energy
+        expected = None if alone_energy is None else alone_energy * len(there) / len(one)
+        found.add(what, answer, expected, noise, there)

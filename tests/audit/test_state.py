@@ -10,12 +10,18 @@ from ase import Atoms
 from ase.build import bulk
 from ase.calculators.emt import EMT
 from ase.calculators.lj import LennardJones
+from ase.calculators.tip3p import TIP3P
+from ase.calculators.tip4p import TIP4P
 from audit import planted
 from audit.planted import chain, crystal, subject
 from audit.test_invariance import codes
 
 from mdnum.audit import state
+from mdnum.audit.alone import alone
+from mdnum.audit.noise import Noise
 from mdnum.audit.state import State
+from mdnum.audit.structures import water
+from mdnum.audit.subject import CalculatorSubject
 from mdnum.audit.thresholds import Threshold
 from mdnum.audit.written import written
 
@@ -91,6 +97,14 @@ def test_another_order_of_sums_is_not_repeatable_and_no_memory():
 )
 def test_atoms_alone(make, code: str):
     assert code in codes(State(at_cutoff)(subject(make)))
+
+
+@pytest.mark.parametrize("make", [TIP3P, TIP4P])
+def test_who_knows_whole_molecules_alone_is_asked_about_molecules_alone(make):
+    asked = CalculatorSubject("water", make, water(4))
+    found = alone(asked, asked.atoms, Noise(1e-13, 1e-13))
+    assert not list(found.findings()) and not found.takes_atoms
+    assert [row["atoms"] for row in found.rows] == ["one H2O", "two H2O 60 Å apart"]
 
 
 def test_writing_to_the_atoms_that_were_given_is_found():
