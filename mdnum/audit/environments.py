@@ -254,6 +254,7 @@ def _triples(subject: Subject) -> list[tuple[Route, float, float]]:
         )
         if walk.pair.box:
             atoms.set_cell([walk.pair.box] * 3)
+            atoms.positions += walk.pair.box / 2  # what lies outside of a box may be lost
         atoms.pbc = walk.pair.periodic
         route = Route(
             f"a third atom ({other}) toward {one}-{other}", atoms, np.array([2]), 2, np.array([1.0, 0.0, 0.0])

@@ -16,7 +16,7 @@ from mdnum.audit.answer import Answer, Refusal, ask
 from mdnum.audit.approaches import Asked, approaches
 from mdnum.audit.base import Part, Progress, Subject
 from mdnum.audit.noise import FEW, Noise, displaced, settled
-from mdnum.audit.subject import CalculatorError, only_trying
+from mdnum.audit.subject import CalculatorError, CalculatorSubject, only_trying
 from mdnum.audit.thresholds import Threshold
 from mdnum.audit.written import written
 from mdnum.references.findings import finding
@@ -82,7 +82,8 @@ class State:
         repeats = _repeated(subject, atoms)
         lonely = alone(subject, atoms, noise)
         self.structures |= lonely.structures
-        stale = [row for row in rows if row["remembers"]]
+        broken = [row for row in rows if row["remembers"] and row["broken"]]
+        stale = [row for row in rows if row["remembers"] and not row["broken"]]
         refused = [row for row in rows if row["refused"] and not row["remembers"]]
         return Part(
             name=self.name,
@@ -90,6 +91,7 @@ class State:
             says=_says(rows, stale, repeats),
             findings=[
                 *self._stale(stale),
+                *_broken(broken),
                 *self._not_finite(refused),
                 *_unsteady(repeats),
                 *written(subject, atoms),
@@ -172,6 +174,19 @@ class State:
             "structure is "
             "saved as not-finite.",
             "Look for a division by a distance or a number of neighbors that can be 0.",
+        )
+
+
+def _broken(broken: list[dict[str, Any]]) -> Iterator[dict[str, str]]:
+    if broken:
+        first = broken[0]
+        yield finding(
+            "BROKEN_BY_FAILURE",
+            "info",
+            "an object that has failed once goes on failing",
+            f"After a structure that it refused, and the step “{first['structure']}”, it "
+            f"{first['refused'].why}, while a new one answers.",
+            "Make a new calculator after an error.",
         )
 
 
@@ -299,13 +314,16 @@ class _Through:
         """A row for each answer that is compared."""
         began = time.perf_counter()
         used = self._subject.fresh()
+        if isinstance(used, CalculatorSubject):
+            used.renews = False  # what an object does after it has failed is a question here
         ask(used, self._sequence[0].atoms)
         compared = self._affordable(time.perf_counter() - began)
         before: Atoms | None = None
         known: dict[int, Answer | Refusal] = {}
-        size = 0.0
+        size, failed = 0.0, False
         for place, asked in enumerate(self._sequence):
             old = ask(used, asked.atoms)
+            was_broken, failed = failed, isinstance(old, Refusal)
             previous, before = before or asked.atoms, asked.atoms
             self.reached = place + 1
             if place not in compared:
@@ -314,9 +332,12 @@ class _Through:
             if id(asked.atoms) not in known:
                 known[id(asked.atoms)] = ask(self._subject.fresh(), asked.atoms)
             new = known[id(asked.atoms)]
+            # broken by a structure that every object refuses, which is another thing than a memory
+            failed = failed and (isinstance(new, Refusal) or was_broken)
             row: dict[str, Any] = {
                 "sequence": self._word, "structure": asked.what, "before": previous, "atoms": asked.atoms,
                 "energy": 0.0, "force": 0.0, "allowed": 0.0, "remembers": False, "refused": None,
+                "broken": was_broken and isinstance(old, Refusal),
             }  # fmt: skip
             if isinstance(new, Refusal):
                 # what nobody can answer says nothing about memory
@@ -408,8 +429,10 @@ def _says(rows: list[dict[str, Any]], stale: list[dict[str, Any]], repeats: Mapp
     tail = f"Repeated calls {bits} bit-identical."
     words = f"{len({row['sequence'] for row in rows})} sequences"
     if stale:
+        sizes = [row["energy"] for row in stale if np.isfinite(row["energy"])]
+        by = f"by up to {max(sizes):.3g} eV" if sizes else "by failing"
         return (
-            f"{len(stale)} of {len(rows)} answers of an object in use differ from those of a new one, by up "
-            f"to {max(row['energy'] for row in stale):.3g} eV: the calculator remembers. {tail}"
+            f"{len(stale)} of {len(rows)} answers of an object in use differ from those of a new one, {by}: "
+            f"the calculator remembers. {tail}"
         )
     return f"Objects in use answered {len(rows)} questions of {words} as new ones do. {tail}"

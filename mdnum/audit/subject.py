@@ -81,6 +81,8 @@ class CalculatorSubject:
         self.folder = None if folder is None else Path(folder)
         self.calls = 0
         self.saving = True
+        #: Make a new object after one that raised: some are of no use afterwards.
+        self.renews = True
         self._make = make
         self._calculator: Any = None
         self._last: tuple[np.ndarray, ...] | None = None
@@ -209,6 +211,8 @@ class CalculatorSubject:
                 return question()
         except Exception as error:  # whatever a calculator raises means the same here
             self._last = None
+            if self.renews:
+                self._calculator = None
             detail = " ".join(str(error).split())[:300] or "no more detail"
             raise self._failed(
                 atoms, f"raised {type(error).__name__} when asked for {what}: {detail}", error

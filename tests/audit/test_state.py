@@ -21,7 +21,7 @@ from mdnum.audit.alone import alone
 from mdnum.audit.noise import Noise
 from mdnum.audit.state import State
 from mdnum.audit.structures import water
-from mdnum.audit.subject import CalculatorSubject
+from mdnum.audit.subject import CalculatorError, CalculatorSubject
 from mdnum.audit.thresholds import Threshold
 from mdnum.audit.written import written
 
@@ -131,6 +131,30 @@ def test_an_object_that_fails_where_a_new_one_answers():
 
     found = [one for one in State(at_cutoff)(subject(Once)).findings if one["code"] == "STALE_STATE"]
     assert "while a new one answers" in found[0]["text"]
+
+
+class Breaks(planted.Good):
+    """Takes no structure without periods, and nothing any more after it was asked about one."""
+
+    broken = False
+
+    def answer(self, atoms):
+        self.broken = self.broken or not atoms.pbc.any()
+        if self.broken:
+            raise RuntimeError("Lost atoms")
+        return super().answer(atoms)
+
+
+def test_an_object_that_stays_broken_is_no_memory():
+    found = codes(State()(subject(Breaks)))
+    assert found["BROKEN_BY_FAILURE"] == "info" and "STALE_STATE" not in found
+
+
+def test_the_other_checks_go_on_with_a_new_object():
+    asked = subject(Breaks)
+    with pytest.raises(CalculatorError, match="Lost atoms"):
+        asked.energy(chain())
+    assert np.isfinite(asked.energy(crystal()))
 
 
 def test_what_nobody_answers_is_no_memory():
