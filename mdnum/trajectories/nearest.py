@@ -8,9 +8,10 @@ import numba
 import numpy as np
 from jaxtyping import Float
 
+from mdnum.trajectories.binned import Sides
 from mdnum.trajectories.candidates import DIRECTED
 from mdnum.trajectories.lattice import Lattice, own_images
-from mdnum.trajectories.pairs import Rows, Sides, rows_of, search
+from mdnum.trajectories.pairs import Rows, rows_of, search
 from mdnum.trajectories.rules import Capped, Nearest
 
 

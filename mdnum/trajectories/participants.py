@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mdnum.errors import InputError
+from mdnum.trajectories.binned import Sides
 from mdnum.trajectories.frame import Box
 from mdnum.trajectories.lattice import lattice_of
-from mdnum.trajectories.pairs import Sides
 from mdnum.trajectories.rules import Cutoff, Rule, SpeciesCutoffs
 
 

@@ -14,16 +14,17 @@ between two frames have not moved far, and the pair's image is followed through 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numba
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 
+from mdnum.trajectories.binned import Limits, Sides, binned
 from mdnum.trajectories.bins import lattice_vector
 from mdnum.trajectories.candidates import BAND
 from mdnum.trajectories.lattice import Lattice
-from mdnum.trajectories.pairs import Found, Sides, exact_square, search
+from mdnum.trajectories.pairs import exact_square
 
 #: a skin is meant to last this many frames; shorter than the least, a fresh search is as good
 FRAMES, FEWEST = 24.0, 4.0
@@ -31,7 +32,7 @@ FRAMES, FEWEST = 24.0, 4.0
 LARGEST = 0.3
 #: a list is kept shorter than this, about
 MOST_LISTED = 24_000_000
-#: groups of pairs by |margin|; a group is passed over until its first pair is due
+#: groups of pairs by |margin|, in each batch of a search; a group is passed over until its first pair is due
 GROUPS = 64
 
 
@@ -41,22 +42,33 @@ class Superset:
 
     Attributes:
         skin: no unlisted pair was nearer to its threshold when the list was made, length.
-        gone: reading of the odometer, length.
-        found: pairs, and the lattice vectors that have been taken off each atom.
-        due: reading at which each pair has to be looked at again.
+        i, j: pairs, batch by batch of the search, and by |margin| within a batch.
+        code: the lattice vector that is added to wrapped j, see `shift_code`.
+        due: reading of the odometer at which each pair has to be looked at again.
         inside: the decision on each pair at the last frame.
-        start: first pair of each group.
+        start: first pair of each group; the last is their number.
         earliest: reading before which no pair of the group is due.
+        home: lattice vectors that have been taken off each atom.
+        gone: reading of the odometer, length.
+        last: what the last frame added to it, length.
     """
 
     skin: float
-    found: Found
-    due: Float[np.ndarray, "pairs"]
-    inside: Bool[np.ndarray, "pairs"]
+    i: Int[np.ndarray, "room"]
+    j: Int[np.ndarray, "room"]
+    code: UInt8[np.ndarray, "room"]
+    due: Float[np.ndarray, "room"]
+    inside: Bool[np.ndarray, "room"]
     start: Int[np.ndarray, "edges"]
     earliest: Float[np.ndarray, "groups"]
+    home: Int[np.ndarray, "atoms 3"]
     gone: float = 0.0
     last: float = field(default=0.0)
+
+    @property
+    def pairs(self) -> int:
+        """How many are listed."""
+        return int(self.start[-1])
 
     def serves(self, reading: float, lattice: Lattice, radius: float, clear: float) -> bool:
         """Whether every pair within `clear` of its threshold is in the list at this reading.
@@ -69,6 +81,12 @@ class Superset:
         """
         # a second image within reach would have a rank, and the list knows the nearest alone
         return reading + clear < self.skin and lattice.narrowest >= 2.0 * (radius + self.skin)
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def shift_code(n0, n1, n2):
+    """Three whole numbers from -1 to 1 as one: no other brings a wrapped atom within half a box's width."""
+    return (n0 + 1) * 9 + (n1 + 1) * 3 + (n2 + 1)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -158,134 +176,94 @@ def listed(
     radii: Float[np.ndarray, "species species"],
     skin: float,
     *,
-    bound: float,
     guard: float,
-    clear: float,
-    room: int = 0,
+    pairs: int,
+    spare: Superset | None = None,
 ) -> Superset:
-    """A list made at this frame; arguments as of `pairs.search`, and what it must always hold, length."""
-    found = search(
-        positions, lattice, sides, radii, BAND,
-        band=skin, bound=bound, guard=guard, narrow=clear, open_room=room,
-    )  # fmt: skip
-    shape = len(found.i)
-    i, j, code = (np.empty(shape, np.int32) for _ in range(3))
-    due, inside, start = (
-        np.empty(shape, np.float32),
-        np.empty(shape, np.bool_),
-        np.zeros(GROUPS + 1, np.int64),
-    )
-    _group(found.i, found.j, found.code, found.value, skin, start, i, j, code, due, inside)
-    found = replace(found, i=i, j=j, code=code, value=found.value[:0])
-    earliest = np.arange(GROUPS) * (skin / GROUPS) - 1e-6 * skin
-    return Superset(skin, found, due, inside, start, earliest)
+    """A list made at this frame; no direction may repeat so soon that a pair has two images in it.
+
+    Args:
+        positions, lattice, sides, radii, guard: as of `pairs.search`.
+        skin: length.
+        pairs: inside, about.
+        spare: a list that is not needed any more: its memory is used again.
+    """
+    radius = float(radii.max(initial=0.0))
+    placed = binned(positions, lattice, sides, radius + skin, guard)
+    limits, square = Limits.of(radii, BAND, skin), np.where(radii >= 0, radii * radii, -1.0)
+    # twice the inner shell: the outer one holds more
+    room = int(pairs * ((1 + skin / radius) ** 3 - (1 - skin / radius) ** 3) * 1.1) + 4096
+    held = [spare.i, spare.j, spare.code, spare.due, spare.inside] if spare is not None else _room(0)
+    if len(held[0]) < room:
+        held = _room(room)
+    batches, none = list(placed.batches()), np.zeros(0, np.int32)
+    start = np.zeros(len(batches) * GROUPS + 1, np.int64)
+    earliest = np.empty(len(batches) * GROUPS)
+    batch, tally = _batch(4096), np.zeros(3, np.int64)
+    for at, bins in enumerate(batches):
+        _, left = placed.met(limits, bins, tally, none, none, *batch)
+        if left > len(batch[0]):
+            batch = _batch(int(1.2 * left))
+            placed.met(limits, bins, tally, none, none, *batch)
+        count = int(start[at * GROUPS])
+        if count + left > len(held[0]):
+            share = (at + 1) / len(batches)
+            larger = _room(int(max(1.5, 1.1 / share) * (count + left)))
+            for old, new in zip(held, larger, strict=True):
+                new[:count] = old[:count]
+            held = larger
+        _store(
+            positions, placed.home, lattice.vectors, sides.species, radii, square, skin, guard, left, *batch,
+            start[at * GROUPS : (at + 1) * GROUPS + 1], earliest[at * GROUPS : (at + 1) * GROUPS], *held,
+        )  # fmt: skip
+    return Superset(skin, *held, start, earliest, placed.home)
+
+
+def _room(pairs: int) -> list[np.ndarray]:
+    return [np.empty(pairs, kind) for kind in (np.int32, np.int32, np.uint8, np.float32, np.bool_)]
+
+
+def _batch(pairs: int) -> list[np.ndarray]:
+    return [np.empty(pairs, kind) for kind in (np.int32, np.int32, np.int32, np.float64)]
 
 
 @numba.njit(cache=True, nogil=True)
-def _group(i_in, j_in, code_in, value, skin, start, i, j, code, due, inside):
-    """Sort pairs by |margin|, coarsely: those in later groups are not due for some time."""
-    groups = start.shape[0] - 1
+def _store(
+    x, home, vectors, species, radius, square, skin, guard, count, i_in, j_in, code_in, value,
+    start, earliest, i, j, code, due, inside,
+):  # fmt: skip
+    """Sort a batch of pairs by |margin|, coarsely: those in later groups are not due for some time.
+
+    value holds squares of wrapped coordinates; start and earliest are those of the batch.
+    """
+    groups = earliest.shape[0]
     scale = groups / skin
-    for k in range(value.shape[0]):
-        start[min(groups - 1, int(abs(value[k]) * scale)) + 1] += 1
+    several = radius.shape[0] > 1
+    cursor = np.zeros(groups + 1, np.int64)
+    for k in range(count):
+        si, sj = (species[i_in[k]], species[j_in[k]]) if several else (0, 0)
+        margin = radius[si, sj] - np.sqrt(value[k])
+        if abs(margin) <= guard:
+            n0, n1, n2 = lattice_vector(code_in[k])
+            real = exact_square(x, home, i_in[k], j_in[k], n0, n1, n2, vectors)
+            # with the sign of the decision, whatever the root rounds to
+            margin = abs(radius[si, sj] - np.sqrt(real))
+            if not real < square[si, sj]:
+                margin = -margin
+        value[k] = margin
+        cursor[min(groups - 1, np.uint32(abs(margin) * scale)) + 1] += 1
+    cursor[0] = start[0]
     for g in range(groups):
-        start[g + 1] += start[g]
-    cursor = start[:-1].copy()
-    for k in range(value.shape[0]):
+        cursor[g + 1] += cursor[g]
+        start[g + 1] = cursor[g + 1]
+        # rounded down, so that a pair is due too early rather than too late
+        earliest[g] = g * (skin / groups) - guard - 1e-6 * skin
+    for k in range(count):
         margin = abs(value[k])
-        g = min(groups - 1, int(margin * scale))
+        g = min(groups - 1, np.uint32(margin * scale))
         at = cursor[g]
         cursor[g] += 1
-        i[at], j[at], code[at] = i_in[k], j_in[k], code_in[k]
-        # rounded down, so that a pair is due too early rather than too late
-        due[at] = margin - 1e-6 * skin
+        n0, n1, n2 = lattice_vector(code_in[k])
+        i[at], j[at], code[at] = i_in[k], j_in[k], shift_code(n0, n1, n2)
+        due[at] = margin - guard - 1e-6 * skin
         inside[at] = not np.signbit(value[k])
-
-
-@numba.njit(cache=True, nogil=True)
-def _evaluate(
-    x, home, vectors, species, radius, square, i, j, code, due, inside, start, earliest,
-    gone, limit, bound, slack, chosen, flip, tally, smallest,
-):  # fmt: skip
-    """Look at the pairs that are due; flips go into `flip`, counts into tally = (flips, close, looked at)."""
-    block = chosen.shape[0]
-    flips, close, looked = tally[0], tally[1], tally[2]
-    for g in range(earliest.shape[0]):
-        if earliest[g] > limit:
-            continue
-        for begin in range(start[g], start[g + 1], block):
-            kept = 0
-            for k in range(begin, min(begin + block, start[g + 1])):
-                chosen[kept] = k
-                kept += int(due[k] <= limit)
-            for m in range(kept):
-                k = chosen[m]
-                a, b = i[k], j[k]
-                n0, n1, n2 = lattice_vector(code[k])
-                real = exact_square(x, home, a, b, n0, n1, n2, vectors)
-                margin = abs(radius[species[a], species[b]] - np.sqrt(real))
-                yes = real < square[species[a], species[b]]
-                smallest = min(smallest, margin)
-                close += int(margin <= bound)
-                due[k] = gone + margin - slack
-                if yes != inside[k]:
-                    inside[k] = yes
-                    flip[flips] = k
-                    flips += 1
-            looked += kept
-    tally[0], tally[1], tally[2] = flips, close, looked
-    return smallest
-
-
-@dataclass(frozen=True)
-class Looked:
-    """What the pairs that were due turned out to be.
-
-    Attributes:
-        i, j: of the pairs that flipped.
-        entered: what they became.
-        close: pairs within the bound of their threshold.
-        smallest: smallest |margin|; at least the horizon where it is not known.
-        count: pairs that were looked at.
-    """
-
-    i: Int[np.ndarray, "flips"]
-    j: Int[np.ndarray, "flips"]
-    entered: Bool[np.ndarray, "flips"]
-    close: int
-    smallest: float
-    count: int
-
-
-def look(
-    superset: Superset,
-    positions: Float[np.ndarray, "atoms 3"],
-    lattice: Lattice,
-    sides: Sides,
-    radii: Float[np.ndarray, "species species"],
-    *,
-    bound: float,
-    horizon: float,
-) -> Looked:
-    """Look at the pairs that are due at the odometer's reading, and at those that can be nearest."""
-    found = superset.found
-    flip = np.empty(len(found.i), np.int64)
-    chosen, tally = np.empty(1024, np.int64), np.zeros(3, np.int64)
-    square, slack = np.where(radii >= 0, radii * radii, -1.0), 1e-6 * superset.skin
-    smallest = np.inf
-    # mostly the pairs at hand hold the nearest of all; where they may not, those that can be are due too
-    seen = max(bound, 0.02 * superset.last)
-    for reach in (seen, max(bound, horizon)):
-        if smallest <= seen:
-            break
-        tally[1] = 0
-        smallest = _evaluate(
-            positions, found.home, lattice.vectors, sides.species, radii, square,
-            found.i, found.j, found.code, superset.due, superset.inside, superset.start, superset.earliest,
-            superset.gone, superset.gone + min(smallest, reach), bound, slack, chosen, flip, tally, smallest,
-        )  # fmt: skip
-    k = flip[: int(tally[0])]
-    return Looked(
-        found.i[k].astype(np.int64), found.j[k].astype(np.int64), superset.inside[k],
-        int(tally[1]), float(smallest), int(tally[2]),
-    )  # fmt: skip

@@ -13,11 +13,12 @@ from mdnum.trajectories.candidates import INSIDE
 from mdnum.trajectories.changes import compared, image_distances
 from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.lattice import Lattice, lattice_of, own_images
+from mdnum.trajectories.looking import look
 from mdnum.trajectories.nearest import chosen
 from mdnum.trajectories.pairs import Rows, ordered, ranks, rows_of, search
 from mdnum.trajectories.participants import Participants, by_place, indices, participants
 from mdnum.trajectories.rules import Capped, Nearest, Rule
-from mdnum.trajectories.superset import Superset, displaced, listed, look, skin_for
+from mdnum.trajectories.superset import Superset, displaced, listed, skin_for
 from mdnum.trajectories.table import Flips, Members
 
 #: `Tracker.min_margin` looks this share of the radius away from it
@@ -90,9 +91,11 @@ class Tracker:
             )
         self._species = None if species is None else np.asarray(species, str)
         self._atoms = -1
-        # how many of each there were last time, to make room for as many
-        self._open, self._room = 0, 0
+        # how many there were last time, to make room for as many
+        self._open = 0
         self._list: Superset | None = None
+        # one that has served, whose memory the next can use
+        self._spare: Superset | None = None
         self._who: Participants
         self._box: Box | None = None
         self._last: Moment | None = None
@@ -243,18 +246,18 @@ class Tracker:
         # what rounding adds to every distance
         slack = 8.0 * max(before.rounding, now.rounding)
         if held is not None:
-            came = displaced(before.positions, before.lattice, now.positions, now.lattice, held.found.home,
+            came = displaced(before.positions, before.lattice, now.positions, now.lattice, held.home,
                              radius + 2.0 * held.skin)  # fmt: skip
             held.last, held.gone = came, held.gone + came + slack
             if not held.serves(held.gone, now.lattice, radius, clear):
-                held = None
+                self._spare, held = held, None
         if held is None:
             held = self._listed(before, now, clear, slack)
         self._list = held
         if held is None:
             return None
         seen = look(held, now.positions, now.lattice, self._who.sides, self._who.radii,
-                    bound=bound, horizon=horizon)  # fmt: skip
+                    bound=bound, horizon=horizon, guard=slack)  # fmt: skip
         self.pairs += 2 * int(seen.entered.sum()) - len(seen.entered)
         self.near, self.min_margin = seen.close, seen.smallest if seen.smallest <= horizon else np.inf
         return self._table(before, now, seen.i, seen.j, np.zeros(len(seen.i), np.int64), seen.entered)
@@ -267,13 +270,12 @@ class Tracker:
         skin = skin_for(pace, radius, clear, before.lattice, self.pairs)
         if not skin > 0:
             return None
-        guard = before.rounding
         made = listed(
             before.positions, before.lattice, self._who.sides, self._who.radii, skin,
-            bound=self.bound + guard, guard=guard, clear=clear, room=int(1.1 * self._room),
+            guard=before.rounding, pairs=self.pairs, spare=self._spare,
         )  # fmt: skip
-        self._room = len(made.due)
-        came = displaced(before.positions, before.lattice, now.positions, now.lattice, made.found.home,
+        self._spare = None
+        came = displaced(before.positions, before.lattice, now.positions, now.lattice, made.home,
                          radius + 2.0 * skin)  # fmt: skip
         made.last, made.gone = came, came + slack
         return made if made.serves(made.gone, now.lattice, radius, clear) else None
