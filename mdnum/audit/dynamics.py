@@ -21,7 +21,7 @@ from mdnum.audit.subject import CalculatorError, only_trying
 from mdnum.audit.thresholds import Threshold
 from mdnum.references.findings import finding
 
-_MOST_STEPS, _FEWEST_STEPS = 400, 40
+_MOST_STEPS, _FEWEST_STEPS = 400, 32
 #: Seconds that a run may take where nobody says how many steps.
 _SECONDS = 20.0
 #: Calls of the calculator for a step: two in the run of half the time step, warming up, work on the way.
@@ -82,7 +82,7 @@ class Dynamics:
         probe = subject.fresh()
         noise = along_a_line(probe, at(start, start.positions), rng)
         told(0, 0, {"phase": "accounting for the energy"})
-        ledger = balance(probe, whole, start, limits, rng)
+        ledger = balance(probe, whole, start, limits, rng, noise.energy)
         # the other run's flips count only where they bring energy
         finer = crossings(half, start, limits) if any(one.order == 0 for one in limits) else []
         stale = _stale(subject, whole, start, noise)

@@ -16,6 +16,8 @@ from mdnum.references.findings import finding
 #: Share of the thermal energy of an atom that may drift away in a ps before a run is not one at constant
 #: energy: within 100 ps all of it.
 _MUCH = 1e-2
+#: Of kT: a sum of jumps that wanders less in a unit of time is not told.
+_WANDERS = 1e-4
 #: Of kT: energy of an atom that may come and go without a flip or the integrator.
 _SWING = 1e-2
 
@@ -81,6 +83,8 @@ class _Words:
             "crossings": len(ledger.crossed),
             "jumps_measured": len(ledger.measured),
             "largest_jump": max((abs(jump) for jump in ledger.measured.values()), default=0.0),
+            "hidden_jumps": len(ledger.hidden.jumps),
+            "largest_hidden_jump": max((abs(one.energy) for one in ledger.hidden.jumps), default=0.0),
             "rest_swing": float(np.ptp(np.cumsum(ledger.filled))) / self.atoms,
             "stale": self.result.stale[0],
             "mean_kinetic": float(np.mean(one.kinetic)) / self.atoms,
@@ -89,7 +93,9 @@ class _Words:
     def says(self, shares: Mapping[str, Drift]) -> str:
         numbers = self.numbers(shares)
         total = shares["total"]
-        parts = ", ".join(f"{shares[word].slope:+.2g} from {words}" for word, words in _SOURCES.items())
+        parts = ", ".join(
+            f"{shares[word].slope:+.2g} from {words}" for word, words in _SOURCES.items() if word in shares
+        )
         return (
             f"In {numbers['time']:.3g} {self.time} at constant energy ({numbers['steps']} steps) the energy "
             f"drifted by {total.slope:+.2g} ± {total.error:.1g} {self.unit}, "
@@ -132,7 +138,7 @@ class _Words:
             )
         flips = shares["flips"]
         size = _wander(result.ledger.jumps) / np.sqrt(numbers["time"]) / result.subject.kT
-        if numbers["largest_jump"] > 100 * result.noise.energy and size > 1e-4:
+        if numbers["largest_jump"] > 100 * result.noise.energy and size > _WANDERS:
             yield finding(
                 "FLIPS_CHANGE_ENERGY",
                 "error" if flips.there and abs(flips.slope) > much else "warning",
@@ -143,6 +149,7 @@ class _Words:
                 f"the first {self.time}.",
                 "Switch the interaction off smoothly before its cutoff, or shift it to zero there.",
             )
+        yield from self._hidden(shares, differs > allowed)
         total, integrator = shares["total"], shares["integrator"]
         if integrator.there and abs(integrator.slope) > much:
             yield finding(
@@ -154,7 +161,8 @@ class _Words:
                 "halving it).",
                 "Use a shorter one: --timestep.",
             )
-        explained = abs(integrator.slope) > 0.5 * abs(total.slope) or rest.there or flips.there
+        sources = [abs(shares[word].slope) for word in _SOURCES if word in shares]
+        explained = max(sources) > 0.5 * abs(total.slope)
         if total.there and abs(total.slope) > much and not explained:
             yield finding(
                 "DRIFT",
@@ -164,6 +172,36 @@ class _Words:
                 "integrator account for most of it.",
                 "Run longer (--steps) to see whether it stays.",
             )
+
+    def _hidden(self, shares: Mapping[str, Drift], stale: bool) -> Iterator[dict[str, str]]:
+        """Jumps that no pair threshold explains; an old list makes some of its own, which are told as such."""
+        hidden, numbers = self.result.ledger.hidden, self.numbers(shares)
+        if not hidden.jumps or stale:
+            return
+        kT = self.result.subject.kT
+        size = _wander(self.result.ledger.elsewhere) / np.sqrt(numbers["time"]) / kT
+        if size <= _WANDERS:
+            return
+        looked = len(hidden.steps or {})
+        tie = ""
+        if hidden.rank is not None and hidden.rank[1] > 0.5 * len(hidden.jumps):
+            k, times = hidden.rank
+            tie = (
+                f" At {times} of the {len(hidden.jumps)} places found, the {k}-th and the next neighbor of "
+                "an atom change places."
+            )
+        one = shares["elsewhere"]
+        yield finding(
+            "HIDDEN_JUMPS",
+            "error" if one.there and abs(one.slope) > 1e3 * _MUCH * kT else "warning",
+            "the energy of a run jumps where no pair threshold is",
+            f"Of {len(hidden.candidates)} steps whose energy does not add up, {looked} were looked into: "
+            f"{100 * hidden.share:.0f} % of what is missing comes at single places of the way, by up to "
+            f"{1e3 * numbers['largest_hidden_jump']:.3g} m{self.energy}, and not at a distance at which two "
+            f"atoms alone show a jump.{tie} Together they bring {one.slope:+.3g} ± {one.error:.1g} "
+            f"{self.unit}; their sum wanders by {size:.2g} kT in the first {self.time}.",
+            "Look for a cap on the number of neighbors, a choice of the nearest, or an angle's own cutoff.",
+        )
 
     def tables(self, shares: Mapping[str, Drift], period: float) -> dict[str, list[dict[str, Any]]]:
         numbers = self.numbers(shares)
@@ -206,7 +244,7 @@ class _Words:
         lines = {
             "energy": (one.total - one.total[0]) * scale,
             "half the time step": (other.total[::2] - other.total[0]) * scale,
-            "jumps of flips": np.cumsum(self.result.ledger.jumps) * scale,
+            "jumps of flips": np.cumsum(self.result.ledger.jumps + self.result.ledger.elsewhere) * scale,
             "forces that are no gradient": np.cumsum(self.result.ledger.filled) * scale,
         }
         return [
@@ -232,7 +270,12 @@ class _Words:
         return found
 
 
-_SOURCES = {"integrator": "the integrator", "flips": "flips", "rest": "neither"}
+_SOURCES = {
+    "integrator": "the integrator",
+    "flips": "flips",
+    "elsewhere": "jumps where no pair threshold is",
+    "rest": "neither",
+}
 
 
 def _answer(value: Any) -> Any:

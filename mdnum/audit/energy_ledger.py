@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -13,12 +14,15 @@ from jaxtyping import Float
 from mdnum.audit.base import Subject
 from mdnum.audit.crossings import Crossing, account, crossings
 from mdnum.audit.drift import Drift, drift, wandering
+from mdnum.audit.hidden import Hidden, hidden_jumps
 from mdnum.audit.noise import Noise
 from mdnum.audit.nve import Run
 from mdnum.audit.thresholds import Threshold
 
 #: Flips whose jumps are measured; the others are told by the mean of these.
 _MEASURED = 240
+#: Seconds in which that is done, and flips that are measured however long it takes.
+_SECONDS, _FEWEST = 16.0, 12
 #: Steps with flips that a sample must have.
 _ENOUGH = 30
 
@@ -32,21 +36,35 @@ class Ledger:
         jumps: energy that the flips of each step brought, measured or by the mean of those measured, eV.
         measured: crossings whose jump was measured, by place in `crossed`, and their jumps, eV.
         rest: what neither flips nor the work of the forces explains; nan at steps not looked at, eV.
+        hidden: jumps in it.
     """
 
     crossed: Sequence[Crossing]
     jumps: Float[np.ndarray, "steps"]
     measured: Mapping[int, float]
     rest: Float[np.ndarray, "steps"]
+    hidden: Hidden = field(default_factory=Hidden)
+
+    @property
+    def elsewhere(self) -> Float[np.ndarray, "steps"]:
+        """Energy that jumps brought where no pair threshold is, by step, eV."""
+        return self.hidden.energies(self.rest)
 
     @property
     def filled(self) -> Float[np.ndarray, "steps"]:
-        """The rest, with its mean at steps that were not looked at, eV."""
-        return np.where(np.isnan(self.rest), np.nanmean(self.rest), self.rest)
+        """The rest without such jumps, with its mean at steps that were not looked at, eV."""
+        left = self.rest - self.elsewhere
+        return np.where(np.isnan(left), np.nanmean(left), left)
 
 
 def balance(
-    probe: Subject, whole: Run, like: Atoms, limits: Sequence[Threshold], rng: np.random.Generator
+    probe: Subject,
+    whole: Run,
+    like: Atoms,
+    limits: Sequence[Threshold],
+    rng: np.random.Generator,
+    noise: float = 0.0,
+    seconds: float = _SECONDS,
 ) -> Ledger:
     """Account for the energy of a run.
 
@@ -56,6 +74,8 @@ def balance(
         like: species and cell.
         limits: where flips happen.
         rng: picks the steps whose flips are measured where there are too many.
+        noise: of the energy, eV.
+        seconds: about how long to measure flips, and half as long again to look for jumps elsewhere.
     """
     crossed = crossings(whole, like, limits)
     by_step: dict[int, list[int]] = {}
@@ -64,6 +84,7 @@ def balance(
     # a step without a crossing that needs care costs one call; of the others a sample must do
     orders = np.array([limits[one.threshold].order for one in crossed], np.int64)
     sharp = int((orders < 2).sum())
+    began = time.perf_counter()
     stepped = len({one.step for one, order in zip(crossed, orders, strict=True) if order < 2})
     # a sample of steps is as good as all, unless it is a handful because each step has so many
     smooth = 2 if sharp <= _MEASURED or _MEASURED * stepped >= _ENOUGH * sharp else 1
@@ -83,6 +104,8 @@ def balance(
         places = by_step.get(step, [])
         if step in careful and step not in chosen:
             continue
+        if step in careful and len(measured) > _FEWEST and time.perf_counter() - began > seconds:
+            continue
         found = account(probe, whole, like, step, [crossed[place] for place in places], limits, smooth)
         rest[step] = found.rest
         measured |= dict(zip(places, found.jumps, strict=True))
@@ -90,7 +113,12 @@ def balance(
     means = mean_jumps(crossed, measured)
     for place, one in enumerate(crossed):
         jumps[one.step] += measured.get(place, _sign(one) * means.get(one.threshold, 0.0))
-    return Ledger(crossed, jumps, measured, rest)
+    known: dict[int, list[float]] = {}
+    for one, order in zip(crossed, orders, strict=True):
+        if order == 0:
+            known.setdefault(one.step, []).append(one.share)
+    hidden = hidden_jumps(probe, whole, like, rest, known, noise, 0.5 * seconds)
+    return Ledger(crossed, jumps, measured, rest, hidden)
 
 
 def mean_jumps(crossed: Sequence[Crossing], measured: Mapping[int, float]) -> dict[int, float]:
@@ -140,20 +168,22 @@ class Result:
     def shares(self) -> dict[str, Drift]:
         """Drift of all, of flips, of the rest, and of the integrator by either way, eV per internal time."""
         one, other = self.whole, self.half
-        rest = self.ledger.filled
+        rest, elsewhere = self.ledger.filled, self.ledger.elsewhere
         flips = wandering(one.time, self.ledger.jumps)
         left = wandering(one.time, rest)
         half_flips = wandering(other.time, self.half_jumps)
         total = _with(drift(one.time, one.total), flips)
         half = _with(drift(other.time, other.total), half_flips)
         # what a run keeps when flips and the rest are taken out of it is the integrator's
-        kept = one.total - np.cumsum(self.ledger.jumps) - np.cumsum(rest)
+        kept = one.total - np.cumsum(self.ledger.jumps + elsewhere) - np.cumsum(rest)
         halved = other.total - np.cumsum(self.half_jumps)
         unflipped = drift(one.time, one.total - np.cumsum(self.ledger.jumps))
+        hidden = {"elsewhere": wandering(one.time, elsewhere)} if self.ledger.hidden.jumps else {}
         return {
             "total": total,
             "total, half the time step": half,
             "flips": flips,
+            **hidden,
             "rest": left,
             "integrator": drift(one.time, kept),
             # second order: three quarters of it go with half the time step
@@ -170,7 +200,12 @@ def energy_rows(result: Result) -> dict[str, Any]:
     """Rows of energies.parquet."""
     parts: list[dict[str, Any]] = []
     for word, run_, jumps, rest in (
-        ("run", result.whole, result.ledger.jumps, result.ledger.rest),
+        (
+            "run",
+            result.whole,
+            result.ledger.jumps + result.ledger.elsewhere,
+            result.ledger.rest - result.ledger.elsewhere,
+        ),
         ("half", result.half, result.half_jumps, np.full(len(result.half.potential), np.nan)),
     ):
         count = len(run_.potential)

@@ -254,6 +254,7 @@ def _in_units(part: Part, units: Units) -> Part:
         findings=told(list(part.findings)),
         tables=told(part.tables),
         curves=curves,
+        skipped=[(told(what), why) for what, why in part.skipped],
     )
 
 

@@ -110,6 +110,48 @@ def test_shares_add_up_and_flips_are_blamed():
     assert numbers["flips_error"] > 100 * abs(numbers["rest"])
 
 
+class Nearest(planted.Good):
+    """Each atom feels the nearest seven of its neighbors, and every second atom is felt more."""
+
+    def answer(self, atoms):
+        i, j, vectors = self.pairs(self.positions(atoms), self.shifts(atoms), atoms)
+        distances = np.linalg.norm(vectors, axis=1)
+        order = np.lexsort((distances, i))
+        rank = np.empty(len(i), int)
+        rank[order] = np.arange(len(i)) - np.searchsorted(i[order], i[order])
+        weight = np.where(rank < 7, 0.5 + 0.25 * (j % 2), 0.0)
+        u, slope = self.pair(distances)
+        along = (weight * slope / distances)[:, None] * vectors
+        forces = np.zeros((len(atoms), 3))
+        np.add.at(forces, i, along)
+        np.add.at(forces, j, -along)
+        return float(np.sum(weight * u)), forces
+
+
+def wide() -> Atoms:
+    """Twenty-seven atoms in a cell of more than two cutoffs."""
+    atoms = bulk("Ar", "sc", a=2.4).repeat((3, 3, 3))
+    atoms.positions += np.random.default_rng(1).uniform(-0.15, 0.15, (27, 3))
+    return atoms
+
+
+def test_a_choice_of_the_nearest_is_found_in_a_run():
+    """Its jumps are where the seventh and the eighth change places, which no pair threshold tells."""
+    part = Dynamics(smooth, steps=24)(subject(Nearest, wide()))
+    (found,) = [one for one in part.findings if one["code"] == "HIDDEN_JUMPS"]
+    assert "the 7-th and the next neighbor of an atom change places" in found["text"]
+    numbers = part.numbers
+    assert numbers["hidden_jumps"] > 5 and "FLIPS_CHANGE_ENERGY" not in codes(part)
+    shares = ("integrator", "flips", "elsewhere", "rest")
+    rows = {row["drift"]: row["meV/atom/ps"] for row in part.tables["Drift, and where it is from"]}
+    assert sum(rows[one] for one in shares) == pytest.approx(rows["total"], rel=1e-9)
+
+
+def test_a_force_without_an_energy_is_no_jump():
+    part = Dynamics(smooth, steps=16)(subject(planted.NoSwitchInForce, wide()))
+    assert part.numbers["hidden_jumps"] == 0
+
+
 def test_a_force_without_an_energy_is_blamed():
     part = Dynamics(smooth, steps=STEPS)(subject(planted.NoSwitchInForce, liquid()))
     assert codes(part)["NOT_CONSERVED"] in ("error", "warning")

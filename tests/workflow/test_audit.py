@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -201,8 +202,10 @@ def test_findings_add_up_to_two_answers(parts, run, differentiate, words):
 def test_reduced_units_are_told_as_such():
     rows = {"Table": [{"curl (eV/Å²)": 1.0, "plane": "x"}]}
     said = Part("curl", "Curl", "0.1 eV/Å", [finding("CURL", "error", "t", "1 meV", "r")], rows)
+    said = replace(said, skipped=[("a cell 1.6 Å wide", "a lack of time")])
     found = _in_units(said, LJ)
     assert found.says == "0.1 ε/σ" and found.findings[0]["text"] == "1 mε"
+    assert found.skipped[0] == ("a cell 1.6 σ wide", "a lack of time")
     assert found.tables["Table"][0] == {"curl (ε/σ²)": 1.0, "plane": "x"}
     assert _in_units(said, METAL) is said
 
