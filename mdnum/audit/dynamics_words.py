@@ -174,7 +174,7 @@ class _Words:
             )
 
     def _hidden(self, shares: Mapping[str, Drift], stale: bool) -> Iterator[dict[str, str]]:
-        """Jumps that no pair threshold explains; an old list makes some of its own, which are told as such."""
+        """Jumps that no pair threshold explains; those that an old list makes are told as such."""
         hidden, numbers = self.result.ledger.hidden, self.numbers(shares)
         if not hidden.jumps or stale:
             return
