@@ -29,6 +29,7 @@ from mdnum.trajectories.asked import (
 )
 from mdnum.trajectories.boxes import Boxes
 from mdnum.trajectories.checked import FrameError, check_frame
+from mdnum.trajectories.far import smallest_radius
 from mdnum.trajectories.frame import Frame
 from mdnum.trajectories.joined import Part, RuleResult, joined
 from mdnum.trajectories.mdanalysis_source import READING_FAILS, first_line, frame_of, table_of
@@ -127,6 +128,7 @@ class NeighborFlips(AnalysisBase):
                 )
             self._second = indices_of(second)
         self.rules = rules_of(r_cut, rule)
+        self._radius = smallest_radius(self.rules)
         self._species = None
         if any(one.needs_species for one in self.rules):
             self._species = [str(one) for one in table_of(group.universe.atoms).species]
@@ -287,7 +289,7 @@ class NeighborFlips(AnalysisBase):
 
     def _checked(self, ts: Any) -> Frame:
         frame = self._frame(ts)
-        check_frame(frame, self._seen, self._pbc)
+        check_frame(frame, self._seen, self._pbc, radius=self._radius, bits=32)
         return frame
 
     def _frame(self, ts: Any) -> Frame:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import tomllib
+import zlib
 from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path
@@ -35,18 +36,22 @@ class AseTrajectory(Trajectory):
 
         self.path, self.slice = path, frames
         self.topology = None if topology is None else Path(topology)
-        if path.is_file() and not path.stat().st_size:
-            raise InputError("the file is empty", remedy="Check how it was written", where=str(path))
         try:
-            self.format = format or filetype(str(path))
+            # by its name, where ASE would look into it first and give up where it is cut
+            plain = path.with_suffix("") if path.suffix in (".gz", ".bz2") else path
+            self.format = format or ("extxyz" if plain.suffix == ".extxyz" else filetype(str(path)))
         except UnknownFileTypeError as error:
             raise InputError(
                 "neither MDAnalysis nor ASE knows this format",
                 remedy="Name the file by its format (.xtc, .dcd, .extxyz, ...), or convert it",
                 where=str(path),
             ) from error
-        except (OSError, UnicodeDecodeError) as error:
-            raise InputError(f"it cannot be read ({error})", where=str(path)) from error
+        except (OSError, EOFError, zlib.error, UnicodeDecodeError) as error:
+            raise InputError(
+                f"it cannot be read ({str(error).rstrip('.')})",
+                remedy="Check that the file is whole and of the kind its name says",
+                where=str(path),
+            ) from error
         self._images: Callable[[Iterator[int]], Iterator[tuple[int, Any]]]
         self._count: int | None = None
         if self.format == "traj":

@@ -6,7 +6,7 @@ otherwise too, and images would be put into wrong places without a word:
 
 - CHARMM's are symmetric matrices (since version 22, in dcd files);
 - HOOMD's have tilt factors, which MDAnalysis takes for the cosines of angles (in gsd files);
-- those of H5MD are vectors in any direction.
+- those of H5MD and of DL_POLY's HISTORY are vectors in any direction.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ class Boxes:
         path = getattr(trajectory, "filename", None)
         if isinstance(path, str | Path):
             words = [trajectory.format] if isinstance(trajectory.format, str) else list(trajectory.format)
-            makers = {"DCD": _charmm, "GSD": _hoomd, "H5MD": _h5md}
+            makers = {"DCD": _charmm, "GSD": _hoomd, "H5MD": _h5md, "HISTORY": _dlpoly}
             make = next((makers[word] for word in words if word in makers), None)
-            self._matrix = make(str(path)) if make else None
+            self._matrix = make(str(path), trajectory) if make else None
 
     def box(self, ts: Any, number: int) -> Box:
         """The box of a timestep that is this frame of the file."""
@@ -72,7 +72,7 @@ def box_of(dimensions: Float[np.ndarray, "6"] | None) -> Box:
     return Box(matrix, np.ones(3, bool))
 
 
-def _charmm(path: str) -> Callable[[int, Any], Matrix | None]:
+def _charmm(path: str, trajectory: Any) -> Callable[[int, Any], Matrix | None]:
     from MDAnalysis.lib.formats.libdcd import DCDFile
 
     file = DCDFile(path)
@@ -92,7 +92,7 @@ def _charmm(path: str) -> Callable[[int, Any], Matrix | None]:
     return matrix
 
 
-def _hoomd(path: str) -> Callable[[int, Any], Matrix | None]:
+def _hoomd(path: str, trajectory: Any) -> Callable[[int, Any], Matrix | None]:
     import gsd.fl  # pyright: ignore[reportMissingImports] -- MDAnalysis needs it for the format
 
     file = gsd.fl.open(path, "r")
@@ -109,7 +109,7 @@ def _hoomd(path: str) -> Callable[[int, Any], Matrix | None]:
     return matrix
 
 
-def _h5md(path: str) -> Callable[[int, Any], Matrix | None]:
+def _h5md(path: str, trajectory: Any) -> Callable[[int, Any], Matrix | None]:
     import h5py  # pyright: ignore[reportMissingImports] -- MDAnalysis needs it for the format
 
     file = h5py.File(path, "r")
@@ -125,5 +125,22 @@ def _h5md(path: str) -> Callable[[int, Any], Matrix | None]:
         # MDAnalysis has converted its lengths to Å
         scale = ts.dimensions[0] / np.linalg.norm(edges[0])
         return edges * float(scale)
+
+    return matrix
+
+
+def _dlpoly(path: str, trajectory: Any) -> Callable[[int, Any], Matrix | None]:
+    # where each frame begins is known once they have been counted
+    offsets = getattr(trajectory, "_offsets", None) if trajectory.n_frames else None
+    file = open(path)  # noqa: SIM115 -- as long as frames are read
+
+    def matrix(number: int, ts: Any) -> Matrix | None:
+        if offsets is None:
+            # another release of MDAnalysis keeps them elsewhere
+            return None
+        file.seek(offsets[number])
+        file.readline()
+        rows = [file.readline().split() for _ in range(3)]
+        return np.array(rows, np.float64)
 
     return matrix

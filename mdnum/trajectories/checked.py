@@ -1,4 +1,4 @@
-"""Frames that hold what no simulation writes: coordinates that are not numbers, or were never written."""
+"""Frames that hold what no simulation writes: coordinates that are no numbers or places, or never written."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from mdnum.errors import InputError
+from mdnum.trajectories.far import far_out
 from mdnum.trajectories.frame import Frame
 
 
@@ -24,7 +25,12 @@ class FrameError(InputError):
 
 
 def checked(
-    frames: Iterable[Frame], atoms: Int[np.ndarray, "chosen"] | None = None, where: str | None = None
+    frames: Iterable[Frame],
+    atoms: Int[np.ndarray, "chosen"] | None = None,
+    where: str | None = None,
+    *,
+    radius: float = np.inf,
+    bits: int = 64,
 ) -> Iterator[Frame]:
     """The frames, each looked at before it is given on.
 
@@ -32,16 +38,18 @@ def checked(
         frames: of a trajectory.
         atoms: the atoms that matter, ascending; None for all.
         where: the file, for messages.
+        radius: the shortest length that distances are compared with.
+        bits: width of a coordinate as it was read.
 
     Raises:
-        FrameError: a coordinate is not finite, more than one atom is at exactly 0, 0, 0, the box repeats
-            along other axes than in the first frame (most often: there is none), or along one without a
-            vector.
+        FrameError: a coordinate is not finite, an atom is further out than any gets or than floats tell
+            distances of that length, more than one atom is at exactly 0, 0, 0, the box repeats along other
+            axes than in the first frame (most often: there is none), or along one without a vector.
     """
     pbc = None
     for frame in frames:
         pbc = frame.box.pbc if pbc is None else pbc
-        check_frame(frame, atoms, pbc, where)
+        check_frame(frame, atoms, pbc, where, radius=radius, bits=bits)
         yield frame
 
 
@@ -50,6 +58,9 @@ def check_frame(
     atoms: Int[np.ndarray, "chosen"] | None = None,
     pbc: Bool[np.ndarray, "3"] | None = None,
     where: str | None = None,
+    *,
+    radius: float = np.inf,
+    bits: int = 64,
 ) -> None:
     """As `checked`, for one frame.
 
@@ -78,14 +89,18 @@ def check_frame(
         total = x.sum()
     if not np.isfinite(total) and (bad := np.flatnonzero(~np.isfinite(x).all(axis=1))).size:
         first = int(bad[0] if atoms is None else atoms[bad[0]])
-        values = ", ".join(f"{value:g}" for value in frame.positions[first])
         raise FrameError(
-            f"frame {frame.index}: atom {first} is at ({values}){_and_others(bad.size)}",
+            f"frame {frame.index}: atom {first} is at {_place(frame, first)}{_and_others(bad.size)}",
             frame=frame.index,
-            remedy="The simulation or the writing of it failed there; stop before that frame "
-            f"(@:{frame.index})"
-            if frame.index
-            else "The simulation or the writing of it failed from the first frame on",
+            remedy=_failed(frame),
+            where=where,
+        )
+    if (found := far_out(frame, atoms, radius, bits)) is not None:
+        atom, many, why = found
+        raise FrameError(
+            f"frame {frame.index}: atom {atom} is at {_place(frame, atom)}, {why}{_and_others(many)}",
+            frame=frame.index,
+            remedy=f"{_failed(frame)}; an atom that did fly off is left out with --between",
             where=where,
         )
     # one atom may well be at the origin; two cannot be at one place
@@ -103,6 +118,16 @@ def check_frame(
             remedy="Leave the frame out with @START:STOP, or the atoms with --between",
             where=where,
         )
+
+
+def _place(frame: Frame, atom: int) -> str:
+    return f"({', '.join(f'{value:g}' for value in frame.positions[atom])})"
+
+
+def _failed(frame: Frame) -> str:
+    if not frame.index:
+        return "The simulation or the writing of it failed from the first frame on"
+    return f"The simulation or the writing of it failed there; stop before that frame (@:{frame.index})"
 
 
 def _repeats(pbc: np.ndarray) -> str:

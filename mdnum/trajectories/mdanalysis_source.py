@@ -110,7 +110,7 @@ def open_universe(
                 )
             _opened(path, lambda: _loaded(universe, path, format), path)
         # a topology without coordinates has no trajectory at all
-        if not len(getattr(universe, "trajectory", ())):
+        if not _opened(path, lambda: len(getattr(universe, "trajectory", ())), path):
             raise InputError("the file holds no frame", remedy="Check how it was written", where=str(path))
     return universe, [str(one.message) for one in caught]
 

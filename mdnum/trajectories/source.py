@@ -8,9 +8,11 @@ float32 (`Trajectory.bits`).
 from __future__ import annotations
 
 import json
+import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -162,11 +164,16 @@ def open_trajectory(
     frames = parse_slice(slice or words, where=str(path))
     if file.is_dir() and (file / "trajectory.traj").exists():
         file = file / "trajectory.traj"
-    if file.is_dir() and (file / "summary.json").exists():
-        _refuse_folder(file)
+    if file.is_dir():
+        if (file / "summary.json").exists():
+            _refuse_folder(file)
+        if file.suffix != ".bundle":
+            raise InputError("it is a folder", remedy="Give the trajectory itself", where=str(file))
     for one in (file, None if topology is None else Path(topology).expanduser()):
         if one is not None and not one.exists():
             raise InputError("no such file", remedy="Check the path", where=str(one))
+        if one is not None and one.is_file() and not one.stat().st_size:
+            raise InputError("the file is empty", remedy="Check how it was written", where=str(one))
     opened = _opened(file, topology, frames, format)
     if not opened.atoms:
         raise InputError("its frames have no atoms", remedy="Check how the file was written", where=str(file))
@@ -206,6 +213,10 @@ def _opened(file: Path, topology: str | Path | None, frames: slice, format: str 
         from mdnum.trajectories.xtc_source import XtcTrajectory
 
         return XtcTrajectory(file, topology, frames)
+    if reader == "netcdf":
+        from mdnum.trajectories.netcdf_source import NetcdfTrajectory
+
+        return NetcdfTrajectory(file, topology, frames)
     if reader == "gro":
         from mdnum.trajectories.gro import GroTrajectory
 
@@ -243,16 +254,20 @@ _ASE_SUFFIXES = frozenset({".traj", ".extxyz", ".json", ".db", ".bundle", ".cast
 
 _OWN = {"lammpsdump": "lammps", "lammpstrj": "lammps", "lammps-dump-text": "lammps"}
 _OWN |= {"gro": "gro", "xtc": "xtc"}
+# Amber's, of which MDAnalysis reads those that are whole
+_NETCDF = frozenset({"nc", "ncdf", "netcdf"})
 
 
 def _reader_of(file: Path, format: str | None) -> str:
-    """Which reader a file gets: "ase", "mdanalysis", or one of mdnum's own: "lammps", "gro", "xtc"."""
+    """Which reader a file gets: "ase", "mdanalysis", or one of mdnum's: "lammps", "gro", "xtc", "netcdf"."""
     suffix = (file.with_suffix("") if file.suffix in (".gz", ".bz2") else file).suffix.lower()
     if format is not None and format.lower() in _OWN:
         return _OWN[format.lower()]
+    if (format or suffix[1:]).lower() in _NETCDF and _is_cut_netcdf(file):
+        return "netcdf"
     if format is not None:
         return "mdanalysis" if format.upper() in _mdanalysis_formats() else "ase"
-    if suffix in _ASE_SUFFIXES:
+    if suffix in _ASE_SUFFIXES or (suffix == ".cif" and find_spec("gemmi") is None):
         return "ase"
     if suffix in (".gro", ".xtc"):
         return suffix[1:]
@@ -263,6 +278,13 @@ def _reader_of(file: Path, format: str | None) -> str:
     if suffix[1:].upper() in _mdanalysis_formats():
         return "mdanalysis"
     return "ase"
+
+
+def _is_cut_netcdf(file: Path) -> bool:
+    from mdnum.trajectories.netcdf import head_of
+
+    head = head_of(file)
+    return head is not None and head.cut
 
 
 def _mdanalysis_formats() -> set[str]:
@@ -284,5 +306,5 @@ def _first_lines(file: Path) -> tuple[str, str]:
     try:
         with open_with_compression(str(file), "r") as lines:
             return lines.readline(1000).lower(), lines.readline(10_000).lower()
-    except (OSError, EOFError, UnicodeDecodeError):
+    except (OSError, EOFError, zlib.error, UnicodeDecodeError):
         return "", ""

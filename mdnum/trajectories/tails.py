@@ -6,12 +6,16 @@ to MDAnalysis's readers of dcd, trr and some text formats. A number cut in the m
 
 from __future__ import annotations
 
+import bz2
+import gzip
 import re
 import struct
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
 from typing import Any
+
+from mdnum.trajectories.netcdf import head_of
 
 # magic, length of the word with its end, length of the word, the word; then thirteen numbers
 _TRR = struct.Struct(">3i12s13i")
@@ -20,6 +24,8 @@ _TRR_MAGIC = 1993
 _LINES = {"XYZ": "xyzfile", "TXYZ": "xyzfile", "ARC": "xyzfile", "TRJ": "trjfile", "MDCRD": "trjfile"}
 # enough of a file's end for some lines
 _LAST_BYTES = 20_000
+_COMPRESSED: dict[str, Any] = {".gz": gzip.open, ".bz2": bz2.open}
+_PART = 1 << 22
 _NUMBER = re.compile(r"[-+]?(\d*)(?:\.(\d*))?(?:[eEdD]([-+]?\d*))?")
 
 
@@ -37,6 +43,10 @@ def left_over(trajectory: Any) -> str | None:
         rest, frame = _behind_dcd(Path(path), int(trajectory.n_frames))
     elif "TRR" in words:
         rest, frame = _behind_trr(Path(path), trajectory)
+    elif "NCDF" in words:
+        # a run that was killed has not always come to saying in the head what it wrote
+        head = head_of(path)
+        rest, frame = (head.rest, head.record) if head is not None else (0, 0)
     elif found := _text(trajectory):
         if trajectory.ts.frame != trajectory.n_frames - 1:
             trajectory[trajectory.n_frames - 1]
@@ -47,6 +57,8 @@ def left_over(trajectory: Any) -> str | None:
         return None
     if rest < frame:
         return f"the file ends after {rest:,} bytes of it"
+    if "NCDF" in words:
+        return f"the file goes on for {rest // frame:,} frames more than its head tells of"
     return f"the {rest:,} bytes behind the frame before are no frame"
 
 
@@ -110,16 +122,25 @@ def refuse_cut_text(trajectory: Any, number: int) -> None:
     if number != trajectory.n_frames - 1 or (found := _text(trajectory)) is None:
         return
     path, word = found
-    if path.suffix in (".gz", ".bz2"):
-        return
-    with path.open("rb") as raw:
-        raw.seek(max(path.stat().st_size - _LAST_BYTES, 0))
-        last = raw.read().decode("latin-1").splitlines(keepends=True)
+    last = _last_bytes(path).decode("latin-1").splitlines(keepends=True)
     if word == "XYZ":
         refuse_cut_line(last[-int(trajectory.n_atoms) :])
     elif word in ("TRJ", "MDCRD") and last:
         # a line of it holds several numbers
         refuse_cut_line(last[-1:], last[-1].split()[:-1])
+
+
+def _last_bytes(path: Path) -> bytes:
+    """The end of a file; of a compressed one, of what is in it, which takes reading all of it."""
+    if path.suffix not in _COMPRESSED:
+        with path.open("rb") as raw:
+            raw.seek(max(path.stat().st_size - _LAST_BYTES, 0))
+            return raw.read()
+    last = b""
+    with _COMPRESSED[path.suffix](path, "rb") as packed:
+        while part := packed.read(_PART):
+            last = (last + part)[-_LAST_BYTES:]
+    return last
 
 
 def _text(trajectory: Any) -> tuple[Path, str] | None:
@@ -156,7 +177,7 @@ def refuse_cut_line(lines: Sequence[str], like: Sequence[str] = ()) -> None:
     if _is_cut(words[-1], others):
         raise ValueError(
             f"the file ends in the middle of a number, {words[-1]!r}: it has fewer digits than those before, "
-            "and its line no end"
+            "and its line no end; if it is whole, end the line"
         )
 
 

@@ -163,6 +163,7 @@ def _look(
             "resolution": told_resolution(resolution, trajectory),
             "rules": told,
             "velocities_odd": bool(found.moved > _TOO_FAR),
+            "leaps": _leaps(found),
             "stopped": None if found.stopped is None else str(found.stopped),
             "cut_short": cut_short(found.stopped, trajectory),
             "interrupted": found.interrupted,
@@ -212,6 +213,14 @@ def _as_asked(row: dict[str, Any], coded: tuple[np.ndarray, Sequence[str]], grou
     if (a in first and b in second) or not (b in first and a in second):
         return row
     return row | {"first": b, "second": a}
+
+
+def _leaps(found: Pass) -> dict[str, Any] | None:
+    """Atoms that are further from one frame to the next than can be; None where none is."""
+    if not found.leaps:
+        return None
+    frame, atom, distance = found.leaps[0]
+    return {"frames": len(found.leaps), "frame": frame, "atom": atom, "distance": distance}
 
 
 def _rule(

@@ -13,6 +13,7 @@ from mdnum.errors import InputError
 from mdnum.store import RunFolder
 from mdnum.trajectories.checked import checked
 from mdnum.trajectories.compare import Apart, Difference, apart, growth
+from mdnum.trajectories.far import smallest_radius
 from mdnum.trajectories.resolution import infer_from
 from mdnum.trajectories.rules import Cutoff
 from mdnum.trajectories.tracker import Tracker
@@ -170,7 +171,11 @@ def _follow(folder: RunFolder, sides: list[Side], groups: Groups, progress: Log)
     before = Apart(0.0, 0.0, 0)
     counts = [one.trajectory.count for one in sides]
     total = min((one for one in counts if one is not None), default=0)
-    first, second = (checked(one.trajectory.frames(), atoms, str(one.trajectory.path)) for one in sides)
+    radius = smallest_radius([sides[0].tracker.rule])
+    first, second = (
+        checked(one.frames(), atoms, str(one.path), radius=radius, bits=one.bits)
+        for one in (side.trajectory for side in sides)
+    )
     pairs_of_frames = zip(first, second, strict=False)
     while True:
         try:

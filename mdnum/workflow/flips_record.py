@@ -14,6 +14,7 @@ from mdnum.errors import InputError
 from mdnum.store import RunFolder
 from mdnum.trajectories.checked import checked
 from mdnum.trajectories.compare import displacements
+from mdnum.trajectories.far import leap, smallest_radius
 from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.rules import Capped, Cutoff, SpeciesCutoffs
 from mdnum.trajectories.stride import crossings
@@ -139,6 +140,7 @@ class Pass:
         stopped: what was wrong with the frame after the last one, if the file did not come to its end.
         interrupted: somebody pressed control-C, and the frames after the last one were not looked at.
         moved: root mean square displacement between frames over what the velocities say; nan without.
+        leaps: (number of the frame, atom, how far) of what no atom does between two frames.
         seconds: taken.
     """
 
@@ -148,6 +150,7 @@ class Pass:
     stopped: InputError | None = None
     interrupted: bool = False
     moved: float = float("nan")
+    leaps: list[tuple[int, int, float]] = field(default_factory=list)
     seconds: float = 0.0
 
 
@@ -179,7 +182,10 @@ def follow(
     )
     flips, rows = 0, Rows(folder)
     at = _sampled(trajectory.count)
-    frames = iter(checked(trajectory.frames(), atoms, str(trajectory.path)))
+    looked = checked(
+        trajectory.frames(), atoms, str(trajectory.path), radius=smallest_radius(rules), bits=trajectory.bits
+    )
+    frames, last = iter(looked), None
     with asked_to_stop() as stop:
         while True:
             if stop() and found.frames:
@@ -202,6 +208,9 @@ def follow(
                 start = frame
             elif found.frames == 1:
                 found.moved = _moved(start, frame)
+            if last is not None and (far := leap(last, frame, atoms)) is not None:
+                found.leaps.append((frame.index, *far))
+            last = frame
             for number, (one, new) in enumerate(zip(made, stepped, strict=True)):
                 _write(rows, number, one, new, frame, found.frames, (trajectory.atoms, groups))
                 flips += len(new)

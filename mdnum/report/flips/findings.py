@@ -24,7 +24,7 @@ def judge(run: Question) -> Verdict:
     """Headline, evidence and findings of a trajectory."""
     found = [*_stopped(run), *_interrupted(run)]
     by_rule = [one for place in range(len(run.summary["rules"])) for one in limits.findings(run, place)]
-    found += [*_merged(by_rule), *_times(run), *_notes(run)]
+    found += [*_merged(by_rule), *_leaps(run), *_times(run), *_notes(run)]
     quiet = not any(one.severity != "info" for one in found)
     return verdict(_headline(run), _evidence(run), found, plain_tone="good" if quiet else "info")
 
@@ -114,6 +114,23 @@ def _interrupted(run: Question) -> Iterator[Finding]:
             f"Everything here is about the {many(run.summary['frames'], 'frame')} up to it.",
             "Look at the rest with a slice of the frames behind the path, or at all of them again.",
         )
+
+
+def _leaps(run: Question) -> Iterator[Finding]:
+    """Atoms that stand where they cannot have come from."""
+    found = run.summary.get("leaps")
+    if not found:
+        return
+    others = "" if found["frames"] == 1 else f" So is an atom at {many(found['frames'] - 1, 'other frame')}."
+    yield Finding(
+        "LEAP",
+        "warning",
+        f"an atom leaps at frame {count(found['frame'])}",
+        f"Atom {found['atom']} is {length(run, found['distance'])} from where it was a frame before, many "
+        f"times the size of the system.{others} Bytes that are damaged look like this. It counts as a place, "
+        "and makes what the file's digits leave undecided larger for all pairs of that frame.",
+        "Look at that frame of the file; leave it out with @START:STOP, or the atom with --between.",
+    )
 
 
 def _times(run: Question) -> Iterator[Finding]:
