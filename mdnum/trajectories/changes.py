@@ -6,7 +6,7 @@ import numba
 import numpy as np
 from jaxtyping import Int
 
-from mdnum.trajectories.lattice import Lattice, image_square, rounded_image, square_of
+from mdnum.trajectories.lattice import Lattice, image_square, near_squares
 from mdnum.trajectories.pairs import Rows
 
 
@@ -58,16 +58,17 @@ def compared(before: Rows, now: Rows, room: int):
 @numba.njit(cache=True, nogil=True)
 def _image_distances(x, vectors, inverse, periodic, widths, i, j, rank, out):
     narrowest = min(widths[0], widths[1], widths[2])
+    near, block = 0.2499 * narrowest * narrowest, 1024
+    y = np.empty((3, block))
+    for begin in range(0, i.shape[0], block):
+        end = begin + block
+        near_squares(x, i[begin:end], j[begin:end], vectors, inverse, y, out[begin:end])
     for k in range(i.shape[0]):
-        a, b = min(i[k], j[k]), max(i[k], j[k])
-        if rank[k] == 0 and a != b:
-            n0, n1, n2 = rounded_image(x, a, b, inverse, periodic)
-            here = square_of(x, a, b, n0, n1, n2, vectors)
-            # any other image is a lattice vector away, and none is shorter than the narrowest width
-            if here < 0.2499 * narrowest * narrowest:
-                out[k] = np.sqrt(here)
-                continue
-        out[k] = np.sqrt(image_square(x, a, b, rank[k], vectors, inverse, periodic, widths))
+        # any other image is a lattice vector away, and none is shorter than the narrowest width
+        if not (out[k] < near and rank[k] == 0 and i[k] != j[k]):
+            a, b = min(i[k], j[k]), max(i[k], j[k])
+            out[k] = image_square(x, a, b, rank[k], vectors, inverse, periodic, widths)
+        out[k] = np.sqrt(out[k])
 
 
 def image_distances(

@@ -197,6 +197,34 @@ def rounded_image(x, i, j, inverse, periodic):
     return n0, n1, n2
 
 
+@numba.njit(cache=True, nogil=True, inline="never")
+def near_squares(x, i, j, vectors, inverse, y, squares):
+    """`square_of` the image that `rounded_image` names, of a block of pairs; y is room for (3, block).
+
+    Without a branch: to add a sum of zeros changes no square, and vectors are zero where a direction does not
+    repeat. Gathered first, so that the rest are vector instructions; what the lattice is, is read once.
+    """
+    y0, y1, y2 = y[0], y[1], y[2]
+    for k in range(i.shape[0]):
+        # unsigned: no test for indices from the end
+        a, b = np.uint32(i[k]), np.uint32(j[k])
+        y0[k], y1[k], y2[k] = x[b, 0] - x[a, 0], x[b, 1] - x[a, 1], x[b, 2] - x[a, 2]
+    v00, v01, v02 = vectors[0, 0], vectors[0, 1], vectors[0, 2]
+    v10, v11, v12 = vectors[1, 0], vectors[1, 1], vectors[1, 2]
+    v20, v21, v22 = vectors[2, 0], vectors[2, 1], vectors[2, 2]
+    r00, r01, r02 = inverse[0, 0], inverse[0, 1], inverse[0, 2]
+    r10, r11, r12 = inverse[1, 0], inverse[1, 1], inverse[1, 2]
+    r20, r21, r22 = inverse[2, 0], inverse[2, 1], inverse[2, 2]
+    for k in range(i.shape[0]):
+        s0 = -np.rint(y0[k] * r00 + y1[k] * r10 + y2[k] * r20)
+        s1 = -np.rint(y0[k] * r01 + y1[k] * r11 + y2[k] * r21)
+        s2 = -np.rint(y0[k] * r02 + y1[k] * r12 + y2[k] * r22)
+        d0 = y0[k] + (s0 * v00 + s1 * v10 + s2 * v20)
+        d1 = y1[k] + (s0 * v01 + s1 * v11 + s2 * v21)
+        d2 = y2[k] + (s0 * v02 + s1 * v12 + s2 * v22)
+        squares[k] = d0 * d0 + d1 * d1 + d2 * d2
+
+
 @numba.njit(cache=True, nogil=True)
 def image_square(x, i, j, rank, vectors, inverse, periodic, widths):
     """Squared distance to the image of j that has `rank` nearer ones; inf where there are not so many.

@@ -107,7 +107,7 @@ def _evaluate(
     """Look at the pairs that are due; flips go into `flip`, counts into tally = (flips, close, looked at)."""
     block = margins.shape[0]
     flips, close, looked = tally[0], tally[1], tally[2]
-    several = radius.shape[0] > 1
+    y = np.empty((4, block))
     # margins up to here are computed from the coordinates as stored: all that are counted or compared
     near = max(bound, smallest) + guard
     for g in range(earliest.shape[0]):
@@ -116,16 +116,9 @@ def _evaluate(
         first_due = np.float32(np.inf)
         for begin in range(start[g], start[g + 1], block):
             end = min(begin + block, start[g + 1])
-            kept = _due(due[begin:end], limit, chosen)
             i_here, j_here, code_here, due_here = i[begin:end], j[begin:end], code[begin:end], due[begin:end]
-            for m in range(kept):
-                k = chosen[m]
-                a, b, s = i_here[k], j_here[k], code_here[k]
-                d0 = followed[b, 0] - followed[a, 0] + shifts[s, 0]
-                d1 = followed[b, 1] - followed[a, 1] + shifts[s, 1]
-                d2 = followed[b, 2] - followed[a, 2] + shifts[s, 2]
-                reach = radius[species[a], species[b]] if several else radius[0, 0]
-                margins[m] = reach - np.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
+            kept = _due(due_here, limit, chosen)
+            _measured(chosen[:kept], i_here, j_here, code_here, followed, shifts, species, radius, y, margins)
             for m in range(kept):
                 k = chosen[m]
                 margin = abs(margins[m])
@@ -159,6 +152,22 @@ def _due(due, limit, chosen):
         chosen[kept] = k
         kept += int(due[k] <= limit)
     return kept
+
+
+@numba.njit(cache=True, nogil=True, inline="never")
+def _measured(chosen, i, j, code, followed, shifts, species, radius, y, margins):
+    """Margins of the chosen pairs in following coordinates; gathered first, so that the rest vectorizes."""
+    y0, y1, y2, reach = y[0], y[1], y[2], y[3]
+    several = radius.shape[0] > 1
+    for m in range(chosen.shape[0]):
+        k = chosen[m]
+        a, b, s = np.uint32(i[k]), np.uint32(j[k]), code[k]
+        y0[m] = followed[b, 0] - followed[a, 0] + shifts[s, 0]
+        y1[m] = followed[b, 1] - followed[a, 1] + shifts[s, 1]
+        y2[m] = followed[b, 2] - followed[a, 2] + shifts[s, 2]
+        reach[m] = radius[species[a], species[b]] if several else radius[0, 0]
+    for m in range(chosen.shape[0]):
+        margins[m] = reach[m] - np.sqrt(y0[m] * y0[m] + y1[m] * y1[m] + y2[m] * y2[m])
 
 
 @numba.njit(cache=True, nogil=True, inline="never")

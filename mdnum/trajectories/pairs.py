@@ -234,16 +234,11 @@ def _memory() -> float:
         return 32e9
 
 
-def ordered(rows: Rows) -> tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]]:
-    """(i, j) of all rows, sorted."""
-    atoms = len(rows.first)
-    i = np.repeat(np.arange(atoms), rows.count)
-    if len(i) == 0:
-        return i, i.copy()
+def pairs_of(rows: Rows) -> tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]]:
+    """(i, j) of all rows, one row after the other."""
+    i = np.repeat(np.arange(len(rows.first)), rows.count)
     inside = np.arange(len(i)) - np.repeat(np.cumsum(rows.count) - rows.count, rows.count)
-    j = rows.other[rows.first[i] + inside].astype(np.int64)
-    order = np.argsort(i * np.int64(atoms) + j, kind="stable")
-    return i[order], j[order]
+    return i, rows.other[rows.first[i] + inside].astype(np.int64)
 
 
 def ranks(i: Int[np.ndarray, "pairs"], j: Int[np.ndarray, "pairs"]) -> Int[np.ndarray, "pairs"]:

@@ -11,11 +11,13 @@ from jaxtyping import Float, Int
 from mdnum.errors import InputError
 from mdnum.trajectories.candidates import INSIDE
 from mdnum.trajectories.changes import compared, image_distances
+from mdnum.trajectories.columns import Changed, Thresholds, ledger, sorted_order
+from mdnum.trajectories.exchanged import exchanged
 from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.lattice import Lattice, lattice_of, own_images
 from mdnum.trajectories.looking import look
 from mdnum.trajectories.nearest import chosen
-from mdnum.trajectories.pairs import Rows, ordered, ranks, rows_of, search
+from mdnum.trajectories.pairs import Found, Rows, pairs_of, ranks, rows_of, search
 from mdnum.trajectories.participants import Participants, by_place, indices, participants
 from mdnum.trajectories.rules import Capped, Nearest, Rule
 from mdnum.trajectories.superset import Superset, displaced, listed, skin_for
@@ -33,7 +35,8 @@ class Moment:
         positions: of the atoms that take part, length.
         lattice: of its box.
         rounding: how far a distance can be off through float64, length.
-        rows: neighbors; None where they have not been listed.
+        found: pairs inside; None where they have not been searched for, or the rule is directed.
+        rows: neighbors, where the rule is directed.
         own: images of an atom itself that are inside, by species.
         last_in, first_out: thresholds of each atom, where the rule is directed.
     """
@@ -41,6 +44,7 @@ class Moment:
     positions: Float[np.ndarray, "atoms 3"]
     lattice: Lattice
     rounding: float
+    found: Found | None
     rows: Rows | None
     own: Int[np.ndarray, "species"]
     last_in: Float[np.ndarray, "limits"]
@@ -132,10 +136,14 @@ class Tracker:
         if self._last is None:
             return Members(none, none, none, np.zeros(0))
         now = self._last
-        i, j = ordered(self._rows(now))
+        i, j = self._inside(now)
         own = self._own_members(now)
         i, j = np.concatenate([i, own]), np.concatenate([j, own])
-        first, second, order = self._sorted(i, j)
+        first, second = self._who.labels[i], self._who.labels[j]
+        if not self.rule.directed:
+            first, second = np.minimum(first, second), np.maximum(first, second)
+        order = sorted_order(first, second, max(self._atoms, 1))
+        first, second = first[order], second[order]
         rank = ranks(first, second)
         return Members(first, second, rank, self._distances(now, i[order], j[order], rank))
 
@@ -166,7 +174,7 @@ class Tracker:
             )
         none = np.zeros(0)
         return Moment(
-            positions, lattice, rounding, None, np.zeros(len(self._who.radii), np.int64), none, none
+            positions, lattice, rounding, None, None, np.zeros(len(self._who.radii), np.int64), none, none
         )
 
     def _lattice_of(self, frame: Frame) -> Lattice:
@@ -193,19 +201,29 @@ class Tracker:
             horizon = HORIZON * rule.reach
             self.min_margin = made.rows.smallest if made.rows.smallest <= horizon else np.inf
             return replace(now, rows=made.rows, last_in=made.last_in, first_out=made.first_out)
-        horizon = HORIZON * self._who.radius
-        rows = self._rows(now)
+        found = self._searched(now)
         own, close, smallest = self._own(lattice, bound)
-        smallest = min(rows.smallest, smallest)
-        self.pairs = len(rows.other) + int((own * self._who.own).sum())
-        self.near = rows.close + close
-        self.min_margin = smallest if smallest <= horizon else np.inf
-        return replace(now, rows=rows, own=own)
+        smallest = min(found.smallest, smallest)
+        self.pairs = len(found.i) + int((own * self._who.own).sum())
+        self.near = found.close + close
+        self.min_margin = smallest if smallest <= HORIZON * self._who.radius else np.inf
+        return replace(now, found=found, own=own)
 
     def _rows(self, moment: Moment) -> Rows:
-        """The neighbors at a moment; searched for where they have not been listed."""
+        """The neighbors at a moment; searched for where they are not known."""
         if moment.rows is not None:
             return moment.rows
+        return rows_of(moment.found or self._searched(moment), len(moment.positions))
+
+    def _inside(self, moment: Moment) -> tuple[np.ndarray, np.ndarray]:
+        """(i, j) of the pairs inside at a moment, in no order."""
+        if self.rule.directed:
+            return pairs_of(self._rows(moment))
+        found = moment.found or self._searched(moment)
+        return found.i.astype(np.int64), found.j.astype(np.int64)
+
+    def _searched(self, moment: Moment) -> Found:
+        """The pairs inside at a moment, found afresh."""
         bound, guard = self.bound + moment.rounding, moment.rounding
         found = search(
             moment.positions, moment.lattice, self._who.sides, self._who.radii, INSIDE,
@@ -213,7 +231,7 @@ class Tracker:
             room=int(1.1 * (self.pairs + self._open)), open_room=int(1.2 * self._open),
         )  # fmt: skip
         self._open = found.open
-        return rows_of(found, len(moment.positions))
+        return found
 
     def _own(self, lattice: Lattice, bound: float) -> tuple[np.ndarray, int, float]:
         """Images of an atom itself that are inside, by species; how many are close; the smallest |margin|."""
@@ -281,6 +299,12 @@ class Tracker:
         return made if made.serves(made.gone, now.lattice, radius, clear) else None
 
     def _flips(self, before: Moment, now: Moment) -> Flips:
+        if not self.rule.directed and self._one_image(before, now):
+            i, j, entered = exchanged(
+                before.found or self._searched(before), now.found or self._searched(now), (before.positions, before.lattice), (now.positions, now.lattice),
+                self._who.sides.species, self._who.radii,
+            )  # fmt: skip
+            return self._table(before, now, i, j, np.zeros(len(i), np.int64), entered)
         i, j, rank, entered = compared(self._rows(before), self._rows(now), self.pairs // 2 + 4096)
         if (before.own != now.own).any():
             parts = [(i, j, rank, entered)]
@@ -293,32 +317,22 @@ class Tracker:
             i, j, rank, entered = (np.concatenate([part[k] for part in parts]) for k in range(4))
         return self._table(before, now, i, j, rank, entered)
 
+    def _one_image(self, *moments: Moment) -> bool:
+        """Whether no pair has two images inside, nor one that rounding could miss."""
+        reach = self._who.radius + 8.0 * max(one.rounding for one in moments)
+        return all(one.lattice.narrowest >= 2.000002 * reach for one in moments)
+
     def _table(self, before: Moment, now: Moment, i, j, rank, entered) -> Flips:
         """The flips as columns, from indices among the atoms that take part."""
-        first, second, order = self._sorted(i, j, rank)
-        i, j, rank, entered = i[order], j[order], rank[order], entered[order]
-        distance, old = self._distances(now, i, j, rank), self._distances(before, i, j, rank)
-        if self.rule.directed:
-            margin = np.where(entered, now.last_in[i], now.first_out[i]) - distance
-            earlier = np.where(entered, before.first_out[i], before.last_in[i]) - old
-        else:
-            radius = self._who.radii[self._who.sides.species[i], self._who.sides.species[j]]
-            margin, earlier = radius - distance, radius - old
-        bound = self.bound + max(before.rounding, now.rounding)
-        return Flips(
-            np.full(len(i), self.frames, np.int64), first, second, rank, entered,
-            distance, old, margin, earlier, np.full(len(i), bound),
-            (np.abs(margin) <= bound) | (np.abs(earlier) <= bound),
+        changed = Changed(
+            i, j, rank, entered, self._distances(now, i, j, rank), self._distances(before, i, j, rank)
+        )
+        thresholds = Thresholds(
+            self.rule.directed, self._who.sides.species, self._who.radii,
+            now.last_in, now.first_out, before.last_in, before.first_out,
         )  # fmt: skip
-
-    def _sorted(self, i, j, rank=None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(i, j) in the file's numbers, sorted, and where each row was."""
-        first, second = self._who.labels[i], self._who.labels[j]
-        if not self.rule.directed:
-            first, second = np.minimum(first, second), np.maximum(first, second)
-        key = first * np.int64(max(self._atoms, 1)) + second
-        order = np.argsort(key) if rank is None or not rank.any() else np.lexsort((rank, key))
-        return first[order], second[order], order
+        bound = self.bound + max(before.rounding, now.rounding)
+        return ledger(self.frames, changed, self._who.labels, self._atoms, thresholds, bound)
 
     def _distances(self, moment: Moment, i, j, rank) -> np.ndarray:
         if self.rule.directed:
