@@ -30,6 +30,7 @@ class Words:
     scale: float
     force: str
     curvature: str
+    third: str
 
 
 def units_of(subject: Subject) -> Words:
@@ -37,7 +38,9 @@ def units_of(subject: Subject) -> Words:
     units = getattr(subject, "units", METAL)
     small, scale = ("meV", 1e3) if units.energy == "eV" else (units.energy, 1.0)
     energy, length = units.energy, units.length
-    return Words(length, energy, small, scale, f"{energy}/{length}", f"{energy}/{length}²")
+    return Words(
+        length, energy, small, scale, f"{energy}/{length}", f"{energy}/{length}²", f"{energy}/{length}³"
+    )
 
 
 def together(text: str) -> str:

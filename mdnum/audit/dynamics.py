@@ -14,6 +14,7 @@ from mdnum.audit.base import Part, Progress, Subject
 from mdnum.audit.crossings import crossings
 from mdnum.audit.dynamics_words import part
 from mdnum.audit.energy_ledger import Result, balance, by_means, crossing_rows, energy_rows
+from mdnum.audit.jumps import SMOOTH
 from mdnum.audit.noise import FEW, Noise, along_a_line, roomy
 from mdnum.audit.nve import Run, at, fitting_timestep, prepared, run
 from mdnum.audit.rigid import rigid
@@ -97,7 +98,8 @@ class Dynamics:
         if self.thresholds is None:
             return [], "no thresholds were looked for"
         try:
-            found = list(self.thresholds(subject))
+            # one at which no more than a third derivative jumps leaves no trace in a run
+            found = [one for one in self.thresholds(subject) if one.order < SMOOTH or one.dies]
         except CalculatorError as error:
             return [], f"looking for thresholds, the calculator {error.message}"
         return found, "" if found else "no threshold was found"

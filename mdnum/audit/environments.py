@@ -92,7 +92,7 @@ def walk_surroundings(
         seconds: about how long to measure known thresholds in the structure, and again to look for others.
     """
     walks = walk_pairs(subject).walks
-    thresholds = [one for walk in walks for one in walk.thresholds]
+    thresholds = [one for walk in walks for one in walk.thresholds if one.order < SMOOTH or one.dies]
     quantum = max((one.quantum for one in walks), default=(0.0, 0.0))
     single = bool(walks) and walks[0].pair.moves == "atom"
     atoms = subject.atoms
@@ -230,7 +230,9 @@ def _scanned(
     # crowded routes in finer steps, so that what lies between two crossings is seen
     step = float(np.clip((high - low) / (10 * len(inside) + 1), STEP / 10, STEP))
     jumps, _ = find_jumps(curve, low, high, step, most=6, expected=[one.at for one in crossings])
-    unknown = [jump for jump in jumps if not any(_explains(one, jump) for one in crossings)]
+    unknown = [
+        jump for jump in jumps if jump.order < SMOOTH and not any(_explains(one, jump) for one in crossings)
+    ]
     return [_event(subject, route, jump, None) for jump in unknown], len(inside)
 
 

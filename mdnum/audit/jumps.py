@@ -9,7 +9,7 @@ the mismatch falls while one zooms in tells what is there, whatever the curve lo
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -26,6 +26,18 @@ _NARROWER = 6
 _LEVELS = 10
 _OUTLIER = 4.0
 """A mismatch this many times those around it is looked at more closely."""
+
+_SQUARE = 0.15
+"""How near to 2 the power is with which a mismatch falls where a second derivative jumps."""
+
+_SEEN = 3
+"""Zooms at which it does so, at least; what cannot be resolved does for one or two."""
+
+_FELT = 1e-13
+"""Of a force a little before an end: below, its decay tells nothing."""
+
+_STEEPEST = 8.0
+"""A power above which two places are enough to tell that no low derivative jumps."""
 
 _SURE = 6.0
 """A jump this many times what rounding and truncation could make of nothing is one."""
@@ -48,6 +60,7 @@ class Jump:
         doubt: how large each of the three could look where nothing jumps.
         order: 0 where the energy jumps, 1 the force, 2 the curvature; 3 where none of them does beyond doubt.
         exact: whether low and high are neighbors among the doubles.
+        third: the same of the third derivative of the energy, where that is the lowest that jumps; else 0.
     """
 
     low: float
@@ -58,6 +71,7 @@ class Jump:
     doubt: tuple[float, float, float]
     order: int
     exact: bool
+    third: float = 0.0
 
     @property
     def at(self) -> float:
@@ -68,7 +82,7 @@ class Jump:
 def find_jumps(
     curve: Curve, low: float, high: float, step: float, most: int = 24, expected: Sequence[float] = ()
 ) -> tuple[list[Jump], int]:
-    """Every jump of energy, force or curvature that stands out of a scan.
+    """Every jump of energy, force, curvature or third derivative that stands out of a scan.
 
     How small a jump that is depends on how the curve bends: measured at a spacing of 0.025 Å, steps of the
     energy down to 3e-6 eV on a Lennard-Jones wall of ε = 1 eV and down to 1e-8 eV on a soft one; steps of the
@@ -151,11 +165,14 @@ def decay_power(curve: Curve, edge: float, room: float) -> float | None:
     distances = room * 0.5 ** np.arange(2, 14)
     forces = np.abs(curve.many(edge - distances)[1])
     floor = max(float(scatter(curve, edge - room / 3, edge, room / 3)[0, 1]), 1e-300)
-    good = forces > 1e3 * floor
-    if good.sum() < 4:
+    # far below what is felt a law may fall to the smallest numbers there are, with no power at all
+    good = forces > max(1e3 * floor, _FELT * float(forces.max()))
+    if good.sum() < 2:
         return None
     x, y = np.log(distances[good]), np.log(forces[good])
     slopes = np.diff(y) / np.diff(x)
+    if good.sum() < 4:
+        return float(slopes.min()) if slopes.min() > _STEEPEST else None
     return float(np.median(slopes[-4:]))
 
 
@@ -199,6 +216,7 @@ def _zoom(curve: Curve, left: float, right: float) -> list[Jump]:
     noise = np.maximum(scatter(curve, left, right, room).max(axis=0), 1e-300)
     history: list[np.ndarray] = []
     clear: list[np.ndarray] = []
+    seconds, place = 0, (left, right)
     for _ in range(_LEVELS):
         width = (right - left) / _DIVISIONS
         mismatch = _mismatch(curve, np.linspace(left - 4 * width, right + 4 * width, _DIVISIONS + 9))
@@ -213,6 +231,9 @@ def _zoom(curve: Curve, left: float, right: float) -> list[Jump]:
         if len(history) < 2:
             continue
         falls = history[-1] / np.maximum(history[-2], 1e-300)
+        # a force whose second derivative jumps: its mismatch falls with the square of the spacing, exactly
+        if clear[-1][1] and abs(np.log(max(falls[1], 1e-300)) / np.log(_NARROWER) + 2) < _SQUARE:
+            seconds, place = seconds + 1, (left, right)
         for row in (1, 0):
             jumped = abs(_level(curve, row, left)(right) - curve(left)[row])
             now = history[-1][row]
@@ -225,7 +246,7 @@ def _zoom(curve: Curve, left: float, right: float) -> list[Jump]:
             break
     bends = [row[1] for row, yes in zip(history, clear, strict=True) if yes[1]]
     if len(bends) < 2 or bends[-1] < bends[-2] / _NARROWER**1.6:
-        return []
+        return _third(curve, *place, room) if seconds >= _SEEN else []
     return _kink(curve, left, right, room)
 
 
@@ -264,6 +285,41 @@ def _kink(curve: Curve, left: float, right: float, room: float) -> list[Jump]:
         middle, reach = middle + float(near[np.argmin(np.abs(near))]), min(reach, 1e-7)
     jump = measure(curve, middle - reach, middle + reach, room, exact=False)
     return [jump] if jump.order < SMOOTH else []
+
+
+def _third(curve: Curve, left: float, right: float, room: float) -> list[Jump]:
+    """A place where the third derivative of the energy jumps: second derivatives of the force from both sides.
+
+    Of several widths of the two pieces, the one at which half of it agrees best counts.
+    """
+    noise = float(scatter(curve, left, right, room)[:, 1].max())
+    reach = 0.5 * (right - left)
+
+    def pieces(middle: float, width: float) -> np.ndarray:
+        """Of the force after minus the force before: powers 2, 1, 0, from seven points on either side."""
+        steps = reach + width * np.arange(7)
+        before = np.polyfit(-steps, curve.many(middle - steps)[1], 4)
+        return (np.polyfit(steps, curve.many(middle + steps)[1], 4) - before)[-3:]
+
+    widths = [room / part for part in (6, 12, 24, 48) if room / part > 4 * reach]
+    middle = 0.5 * (left + right)
+    if widths:
+        # both pieces touch where they part
+        square, line, _ = pieces(middle, widths[-1])
+        shift = -0.5 * line / square if square else np.inf
+        if abs(shift) < 4 * reach:
+            middle += float(shift)
+    values = []
+    for width in widths:
+        whole, half = (2 * float(pieces(middle, part)[0]) for part in (width, width / 2))
+        values.append((whole, abs(whole - half) + 40 * noise / width**2))
+    if not values:
+        return []
+    bent, error = min(values, key=lambda one: one[1])
+    if abs(bent) <= _SURE * error:
+        return []
+    found = measure(curve, middle - reach, middle + reach, room, exact=False)
+    return [replace(found, order=SMOOTH, third=-bent)]
 
 
 def _same(one: Jump, other: Jump) -> float:

@@ -81,6 +81,7 @@ def _tables(
                 "in kT": abs(one.jumps[0]) / kT if one.order == 0 else 0.0,
                 f"force ({units.force})": one.jumps[1] if one.order <= 1 else 0.0,
                 f"curvature ({units.curvature})": one.jumps[2] if one.order <= 2 else 0.0,
+                f"third derivative ({units.third})": one.third or None,
                 "last before": repr(one.inside),
                 "first beyond": repr(one.outside),
             }

@@ -73,14 +73,16 @@ def summary(walks: PairWalks, around: Surroundings, crowds: Sequence[Crowd], kT:
     else:
         order, energy, force = worst
         tail = f"the lowest derivative that jumps is the {ORDERS[order]}"
-        if order >= SMOOTH:
-            tail += ", at an end (within the range a change is seen up to the curvature)"
+        if order > SMOOTH:
+            tail += ", at an end (within the range a change is seen up to the third derivative)"
         if order == 0:
             tail = (
                 f"the energy jumps by up to {energy * units.scale:.3g} {units.small} ({energy / kT:.2g} kT)"
             )
         elif order == 1:
             tail = f"the energy is continuous and the force jumps by up to {force:.3g} {units.force}"
+    if knots := max((walk.knots for walk in walks.walks), default=0):
+        tail += f"; a third derivative jumps at {knots} places or more, as between the points of a table"
     capped = [one for one in crowds if one.kept or one.order_from]
     if capped:
         kept = min(one.kept or (one.order_from or 1) - 1 for one in capped)

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mdnum.audit.base import Progress, Subject
-from mdnum.audit.curve import Curve, bisect, grid, scatter
+from mdnum.audit.curve import Curve, bisect, grid, scatter, slope
 from mdnum.audit.digits import digits
 from mdnum.audit.jumps import SMOOTH, Jump, decay_power, find_jumps, measure
 from mdnum.audit.probes import FARTHEST, Pair, pairs
@@ -26,6 +26,15 @@ STEPS = 2.5
 _NEAREST = 0.3
 _COSTLY = 1000.0
 """Distances are walked down to where two particles cost this many kT."""
+
+_LOST = 0.01
+"""So near to its end a smooth force may be lost in rounding, length."""
+
+_HAIR = 3e-8
+"""Of a distance: a force that would be 0 so little further on is no jump where it ends."""
+
+_KNOTS = 6
+"""More jumps of a third derivative than these are the knots of a table."""
 
 _SMOOTHEST = 6
 """Orders above this are told as this one: that smooth or smoother."""
@@ -46,6 +55,7 @@ class Threshold:
         outside: the first one beyond it; the next double where a value jumps.
         dies: whether the two do not interact beyond it.
         located: how far off radius can be, length.
+        third: jump of the third derivative, eV/Å³, where that is the lowest and was measured; else 0.
     """
 
     radius: float
@@ -57,6 +67,7 @@ class Threshold:
     outside: float
     dies: bool
     located: float
+    third: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -72,6 +83,8 @@ class PairWalk:
         cutoff: distance beyond which they do not interact; None if they still do at the farthest.
         left_out: places that stood out of the scan and were not looked at closely.
         calls: places at which the calculator was asked.
+        knots: places at which the third derivative jumps, where they are so many that they are no thresholds
+            (a table with cubic splines between its points); else 0.
         quantum: of energies (eV) and forces (eV/Å) that are rounded to decimals; 0 where they are not. No
             jump below a few of them is told.
     """
@@ -85,6 +98,7 @@ class PairWalk:
     left_out: int
     calls: int
     quantum: tuple[float, float] = (0.0, 0.0)
+    knots: int = 0
 
 
 @dataclass(frozen=True)
@@ -173,6 +187,10 @@ def walk(subject: Subject, pair: Pair, step: float = STEP) -> PairWalk:
         thresholds = [_threshold(pair, jump) for jump in jumps]
         scanned = grid(near + margin, end + margin, step)
         distance = np.append(coarse[(coarse >= near) & (coarse < near + margin)], scanned)
+    thirds = sum(one.order == SMOOTH for one in thresholds)
+    knots = thirds if thirds > _KNOTS else 0
+    if knots:
+        thresholds, left_out = [one for one in thresholds if one.order < SMOOTH], 0
     if edge is not None:
         thresholds = _with_edge(pair, curve, edge, thresholds, near)
     thresholds = [
@@ -186,7 +204,7 @@ def walk(subject: Subject, pair: Pair, step: float = STEP) -> PairWalk:
     return PairWalk(
         pair, tuple(sorted(thresholds, key=lambda one: one.radius)), distance, values[0] - energy_far,
         values[1], thresholds[-1].radius if edge and thresholds else None, left_out, len(curve.known),
-        quantum,
+        quantum, knots,
     )  # fmt: skip
 
 
@@ -254,7 +272,7 @@ def _threshold(pair: Pair, jump: Jump) -> Threshold:
     return Threshold(
         jump.high if jump.exact else jump.at, pair.species, jump.order,
         (jump.energy, jump.force, jump.curvature), jump.doubt, jump.low, jump.high, False,
-        jump.high - jump.low,
+        jump.high - jump.low, jump.third,
     )  # fmt: skip
 
 
@@ -265,6 +283,8 @@ def _with_edge(
     inner = [one.radius for one in found if one.radius < edge[0] - 1e-3]
     room = min(edge[0] - max([near, *inner]), 0.5)
     jump = measure(curve, *edge, room, exact=True)
+    if jump.order == 1 and _nearly_gone(curve, jump, room):
+        jump = replace(jump, order=2, force=0.0)
     order, radius = jump.order, edge[1]
     power = decay_power(curve, edge[1], room) if order >= 2 else None
     if power is not None:
@@ -272,11 +292,30 @@ def _with_edge(
         if order > SMOOTH - 1:  # it may have been lost in rounding before its end
             radius = max(_root(curve, edge[1], room, round(power)), edge[1])
     jumps = (jump.energy, jump.force, jump.curvature if order <= SMOOTH - 1 else 0.0)
-    last = Threshold(
-        radius, pair.species, order, jumps, jump.doubt, *edge, True, max(radius - edge[0], edge[1] - edge[0])
-    )
+    located = max(radius - edge[0], edge[1] - edge[0])
     # what the scan took for a threshold of its own there is this one
-    return [one for one in found if abs(one.radius - edge[1]) > 1e-3] + [last]
+    same = [one for one in found if abs(one.radius - edge[1]) <= 1e-3]
+    third = 0.0
+    if order >= SMOOTH:
+        # of a third derivative that jumps it knows the place better: the force was lost in rounding before
+        near = [one for one in found if one.order == SMOOTH and -1e-3 < one.radius - edge[1] < _LOST]
+        same += near
+        if near:
+            order, third = SMOOTH, near[-1].third
+        if near and near[-1].radius - edge[1] > near[-1].located:
+            radius, located = near[-1].radius, near[-1].located
+    last = Threshold(radius, pair.species, order, jumps, jump.doubt, *edge, True, located, third)
+    return [one for one in found if one not in same] + [last]
+
+
+def _nearly_gone(curve: Curve, jump: Jump, room: float) -> bool:
+    """Whether a force that falls to nothing is cut a hair before it would get there.
+
+    Where a switch is left out once it rounds to 0, that is the square root of a rounding before its end.
+    """
+    steepness, error = slope(curve, jump.low, -1, room, 0.0)
+    left = abs(jump.force / steepness) if abs(steepness) > error else np.inf
+    return left < _HAIR * max(abs(jump.low), 1.0)
 
 
 def _root(curve: Curve, edge: float, room: float, power: int) -> float:

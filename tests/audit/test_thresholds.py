@@ -10,6 +10,7 @@ from audit import laws
 from audit.laws import R_CUT, R_ON, law, pair_subject
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.interpolate import CubicSpline
 
 from mdnum.audit.curve import Curve, bisect
 from mdnum.audit.jumps import find_jumps
@@ -65,8 +66,19 @@ def test_orders_and_sizes_of_jumps():
     assert end.jumps[2] == pytest.approx(-law(R_CUT)[0] * bend, rel=1e-4)
 
     twice = find_thresholds(pair_subject(laws.switched(2), own=own))
-    assert [one.order for one in twice] == [3]
-    assert twice[0].radius == pytest.approx(R_CUT, abs=3e-3)
+    assert [(one.order, one.dies) for one in twice] == [(3, False), (3, True)]
+    # the third derivative of the switch is -60 over the cube of its width at the onset
+    assert twice[0].radius == pytest.approx(R_ON, abs=3e-6)
+    assert twice[0].third == pytest.approx(-law(R_ON)[0] * 60 / (R_CUT - R_ON) ** 3, rel=1e-3)
+    assert twice[1].radius == pytest.approx(R_CUT, abs=3e-6)
+
+
+def test_knots_of_a_table_are_no_thresholds():
+    """A cubic spline through the points of a law: its third derivative jumps at each of them."""
+    places = np.linspace(2.0, 8.0, 20)
+    spline = CubicSpline(places, [laws.soft(r)[0] for r in places])
+    (walk,) = walk_pairs(pair_subject(lambda r: (float(spline(r)), -float(spline(r, 1))))).walks
+    assert walk.knots > 6 and all(one.order != 3 or one.dies for one in walk.thresholds)
 
 
 def _late(r: float) -> tuple[float, float]:
@@ -82,7 +94,8 @@ def _late(r: float) -> tuple[float, float]:
 
 def test_a_smooth_end_that_is_known_to_the_last_bit_is_not_guessed_at():
     """Where the force goes with a power only in the limit, its continuation misses the end by 1e-5 Å."""
-    (end,) = find_thresholds(pair_subject(_late))
+    onset, end = find_thresholds(pair_subject(_late))
+    assert (onset.order, onset.dies) == (3, False)
     assert (end.inside, end.outside, end.radius, end.order) == (BEFORE, R_CUT, R_CUT, 3)
     assert place(end) == repr(R_CUT)
 
@@ -92,6 +105,36 @@ def test_smoother_ends_have_higher_orders():
     (end,) = find_thresholds(pair_subject(laws.soft))
     assert end.order == 4
     assert end.radius == pytest.approx(R_CUT, abs=1e-3)
+
+
+def _zero_where_rounded(r: float) -> tuple[float, float]:
+    """Switched off by a sine, and left out where the switch rounds to 0: a little before its end."""
+    on = 0.5 * (1 - np.sin(np.pi * (r - 6.1) / 0.4)) if r > 5.9 else 1.0
+    if r >= R_CUT or on == 0.0:
+        return 0.0, 0.0
+    energy, force, _ = law(r)
+    slope = -0.5 * np.pi / 0.4 * np.cos(np.pi * (r - 6.1) / 0.4) if r > 5.9 else 0.0
+    return float(energy * on), float(force * on - energy * slope)
+
+
+def test_a_smooth_end_that_is_cut_where_it_rounds_to_nothing_is_no_jump_of_the_force():
+    onset, end = find_thresholds(pair_subject(_zero_where_rounded))
+    assert (onset.order, end.order, end.dies) == (2, 2, True)
+    assert end.radius == pytest.approx(R_CUT, abs=1e-7)
+
+
+def test_an_end_at_which_every_derivative_vanishes():
+    """exp(a / (r - R)), as Stillinger and Weber end their law: it is gone before R, and with no power."""
+
+    def law(r: float) -> tuple[float, float]:
+        if r >= R_CUT:
+            return 0.0, 0.0
+        energy = -float(np.exp(2.0 / (r - R_CUT)))
+        return energy, 2.0 * energy / (r - R_CUT) ** 2
+
+    (end,) = find_thresholds(pair_subject(law))
+    assert end.order == 6 and end.dies
+    assert end.radius == pytest.approx(R_CUT, abs=5e-3)
 
 
 def test_what_has_no_cutoff_has_no_threshold():
