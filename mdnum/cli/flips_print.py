@@ -42,17 +42,26 @@ def print_comparison(summary: Mapping[str, Any]) -> None:
     out.print(f"  {summary['system']} and {summary['other']}, {many(summary['atoms'], 'atom')}", markup=False)
     for line in summary["concluded"]:
         out.print(f"  {line}", markup=False)
+    for one in summary["rules"]:
+        _print_pairs(summary, one, len(summary["rules"]) > 1)
+
+
+def _print_pairs(summary: Mapping[str, Any], found: Mapping[str, Any], several: bool) -> None:
+    """The pairs of one rule that differ first."""
     rows = [
         (f"{one['i']}-{one['j']}", f"{one['inside']} only", *(f"{one[name]:.10g}" for name in ("distance_a",
          "distance_b")), one["margin_a"], one["margin_b"])
-        for one in summary["first_pairs"]
+        for one in found["first_pairs"]
     ]  # fmt: skip
-    if rows:
-        unit = f" ({summary['length']})" if summary["length"] else ""
-        columns = ("pair", "inside in", f"r in A{unit}", "r in B", "margin in A", "margin in B")
-        certain = summary["certain_frame"] or "no frame"
-        title = f"first to differ, {summary['first_frame']}; beyond the files' resolution, {certain}"
-        output.print_table(title, columns, rows)
+    if not rows:
+        return
+    unit = f" ({summary['length']})" if summary["length"] else ""
+    columns = ("pair", "inside in", f"r in A{unit}", "r in B", "margin in A", "margin in B")
+    certain = found["certain_frame"] or "no frame"
+    shown = f"{len(rows)} of {found['first']['pairs']:,} pairs" if len(rows) < found["first"]["pairs"] else ""
+    title = f"first to differ, {found['first_frame']}; beyond the files' resolution, {certain}"
+    title = "; ".join(one for one in (found["rule"] if several else "", title, shown) if one)
+    output.print_table(title, columns, rows)
 
 
 def _file(summary: Mapping[str, Any]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -46,24 +47,41 @@ _SAME_TIME = 1e-6
 
 
 @dataclass
+class _Sets:
+    """The neighbor sets of one rule in the two trajectories.
+
+    Attributes:
+        number: of the rule among those asked for.
+        first: what was seen at the first frame whose sets differ.
+        certain: first frame at which a pair differs that no resolution could have moved.
+        rows: pairs told in the table of those that come to differ.
+    """
+
+    number: int
+    rule: Rule
+    sides: list[Side]
+    difference: Difference = field(default_factory=Difference)
+    first: dict[str, Any] | None = None
+    certain: int | None = None
+    rows: int = 0
+
+
+@dataclass
 class _Found:
     """What the frames showed, position by position.
 
     Attributes:
+        sets: of every rule.
         seed: first frame whose positions differ at all.
         beyond: first frame at which an atom is further apart than the resolution of the two files explains.
-        first: what was seen at the first frame whose sets differ.
-        certain: first frame at which a pair differs that no resolution could have moved.
         other_box: the boxes at the first frame at which they are not the same.
     """
 
+    sets: list[_Sets]
     frames: int = 0
     seed: int | None = None
     beyond: int | None = None
-    first: dict[str, Any] | None = None
-    certain: int | None = None
     other_box: dict[str, Any] | None = None
-    rows: int = 0
     times_differ: int = 0
     last: Apart = field(default_factory=lambda: Apart(0.0, 0.0, 0))
     stopped: InputError | None = None
@@ -83,7 +101,7 @@ def compare(
     """Where two trajectories part; see `mdnum.workflow.flips.flips`.
 
     Raises:
-        InputError: they are not of the same atoms, or there is more than one rule.
+        InputError: they are not of the same atoms.
     """
     a, b = (source(path, topology, format) for path in paths)
     if a.atoms != b.atoms:
@@ -91,16 +109,11 @@ def compare(
             f"{a.name} has {a.atoms:,} atoms and {b.name} {b.atoms:,}",
             remedy="Compare trajectories of the same atoms",
         )
-    rule, *more = asked or default_rules(a)
-    if more:
-        raise InputError(
-            f"{len(asked)} rules; two trajectories are compared by one",
-            remedy="Keep one of them, and ask again for the others",
-        )
+    asked = asked or default_rules(a)
     groups = selected(a, between)
     folder = new_folder(a, "flips-compare", out)
     try:
-        return _look(folder, (a, b), rule, groups, between, report, progress)
+        return _look(folder, (a, b), asked, groups, between, report, progress)
     except BaseException:
         leave(folder)
         raise
@@ -109,27 +122,38 @@ def compare(
 def _look(
     folder: RunFolder,
     both: tuple[Trajectory, Trajectory],
-    rule: Rule,
+    rules: Sequence[Rule],
     groups: Groups,
     between: tuple[str, str] | None,
     report: bool,
     progress: Progress | None,
 ) -> FlipsResult:
     began = time.perf_counter()
-    sides = [
-        Side(
-            one,
-            Tracker(rule, groups[0], groups[1], [str(word) for word in one.species], 0.0),
-            infer_from(sample_of(one), one.bits, one.format),
-        )
-        for one in both
-    ]
-    found = _follow(folder, sides, groups, Log(folder, progress))
+    resolutions = [infer_from(sample_of(one), one.bits, one.format) for one in both]
+    species = [[str(word) for word in one.species] for one in both]
+    sets = [
+        _Sets(number, rule, [
+            Side(one, Tracker(rule, groups[0], groups[1], words, 0.0), resolution)
+            for one, words, resolution in zip(both, species, resolutions, strict=True)
+        ])
+        for number, rule in enumerate(rules)
+    ]  # fmt: skip
+    found = _follow(folder, sets, groups, Log(folder, progress))
     folder.finalize()
     (folder.path / "checkpoint.npz").unlink(missing_ok=True)
     a, b = both
     table = folder.read("apart", ["time", "furthest", "bound"])
-    differing = folder.read("differing", rows=_FIRST)
+    differing = folder.read("differing")
+    told = [
+        {
+            "rule": one.rule.name,
+            "first": one.first,
+            "certain": one.certain,
+            "first_pairs": _first_pairs(one, differing),
+            "growth": _growth(found.frames, one, table),
+        }
+        for one in sets
+    ]
     folder.write_summary(
         {
             **about(a, "flips-compare"),
@@ -138,20 +162,18 @@ def _look(
             "other_format": b.format,
             "same_species": bool(np.array_equal(a.species.astype(str), b.species.astype(str))),
             "between": None if between is None else list(between),
-            "rule": rule.name,
+            # the first rule, and all of them
+            **told[0],
+            "rules": told,
             "frames": found.frames,
             "in_file": [one.count for one in both],
             "times_differ": found.times_differ,
             "timed": a.time != "frame",
-            "resolution": told_resolution(sides[0].resolution, a),
-            "other_resolution": told_resolution(sides[1].resolution, b),
+            "resolution": told_resolution(resolutions[0], a),
+            "other_resolution": told_resolution(resolutions[1], b),
             "seed": found.seed,
             "beyond": found.beyond,
             "other_box": found.other_box,
-            "first": found.first,
-            "certain": found.certain,
-            "first_pairs": _first_pairs(found, differing),
-            "growth": _growth(found, table, rule),
             "last": {"furthest": found.last.furthest, "typical": found.last.typical},
             "stopped": None if found.stopped is None else str(found.stopped),
             "seconds": time.perf_counter() - began,
@@ -162,16 +184,16 @@ def _look(
     return FlipsResult(folder.path, finish(folder, report, progress))
 
 
-def _follow(folder: RunFolder, sides: list[Side], groups: Groups, progress: Log) -> _Found:
+def _follow(folder: RunFolder, sets: list[_Sets], groups: Groups, progress: Log) -> _Found:
     """Reads both once, in step."""
     atoms = None
     if groups[0] is not None:
         atoms = np.unique(np.concatenate([one for one in groups if one is not None]))
-    found, difference = _Found(), Difference()
+    found, sides = _Found(sets), sets[0].sides
     before = Apart(0.0, 0.0, 0)
     counts = [one.trajectory.count for one in sides]
     total = min((one for one in counts if one is not None), default=0)
-    radius = smallest_radius([sides[0].tracker.rule])
+    radius = smallest_radius([one.rule for one in sets])
     first, second = (
         checked(one.frames(), atoms, str(one.path), radius=radius, bits=one.bits)
         for one in (side.trajectory for side in sides)
@@ -182,16 +204,20 @@ def _follow(folder: RunFolder, sides: list[Side], groups: Groups, progress: Log)
             frames = next(pairs_of_frames, None)
             if frames is None:
                 break
-            flips = [side.step(frame) for side, frame in zip(sides, frames, strict=True)]
+            # every rule first: a frame that one of them refuses is not looked at by another
+            flips = [
+                [side.step(frame) for side, frame in zip(one.sides, frames, strict=True)] for one in sets
+            ]
         except InputError as error:
             if not found.frames:
                 raise
             found.stopped = error
             break
-        if found.frames:
-            difference.step(*flips)
-        else:
-            difference = Difference.of(*(side.tracker.members() for side in sides))
+        for one, new in zip(sets, flips, strict=True):
+            if found.frames:
+                one.difference.step(*new)
+            else:
+                one.difference = Difference.of(*(side.tracker.members() for side in one.sides))
         now = apart(frames[0], frames[1], atoms)
         if found.seed is None and now.furthest > 0:
             found.seed = found.frames
@@ -202,19 +228,9 @@ def _follow(folder: RunFolder, sides: list[Side], groups: Groups, progress: Log)
             found.other_box = {"frame": found.frames, **boxes}
         scale = max(abs(frames[0].time), abs(frames[1].time))
         found.times_differ += abs(frames[0].time - frames[1].time) > _SAME_TIME * scale
-        if found.certain is None and len(difference):
-            # all that differ: one that came to differ within the resolution may be beyond it by now
-            standing = rows(sorted(difference.only_a | difference.only_b), difference, sides, frames)
-            undecided = int(np.count_nonzero(standing["ambiguous"]))
-            if found.first is None:
-                found.first = _first(found, frames, difference, now, before, undecided)
-            if undecided < len(difference):
-                found.certain = found.frames
-        if new := difference.new[: ROWS - found.rows]:
-            told = rows(new, difference, sides, frames)
-            folder.append("differing", {"frame": np.full(len(new), found.frames), **told})
-            found.rows += len(new)
-        _append(folder, found.frames, frames, now, allowed, difference, sides)
+        for one in sets:
+            _sets_at(folder, one, found.frames, frames, now, before)
+        _append(folder, found.frames, frames, now, allowed, sets[0])
         before, found.last = now, now
         found.frames += 1
         folder.checkpoint({"frames": found.frames})
@@ -230,55 +246,57 @@ def _boxes_bound(sides: list[Side]) -> float:
     return sum(side.distance_bound for side in sides)
 
 
-def _first(
-    found: _Found,
-    frames: tuple[Frame, ...],
-    difference: Difference,
-    now: Apart,
-    before: Apart,
-    undecided: int,
-) -> dict[str, Any]:
-    """What summary.json says of the first frame whose sets differ."""
-    return {
-        "frame": found.frames, "number": frames[0].index, "time": frames[0].time,
-        "pairs": len(difference), "furthest": now.furthest, "typical": now.typical,
-        "furthest_before": before.furthest if found.frames else None,
-        "typical_before": before.typical if found.frames else None,
-        "ambiguous": undecided,
-    }  # fmt: skip
+def _sets_at(
+    folder: RunFolder, one: _Sets, at: int, frames: tuple[Frame, ...], now: Apart, before: Apart
+) -> None:
+    """What one rule's sets show at a frame, and the pairs that are new among those that differ."""
+    difference = one.difference
+    if one.certain is None and len(difference):
+        # all that differ: one that came to differ within the resolution may be beyond it by now
+        standing = rows(sorted(difference.only_a | difference.only_b), difference, one.sides, frames)
+        undecided = int(np.count_nonzero(standing["ambiguous"]))
+        if one.first is None:
+            one.first = {
+                "frame": at, "number": frames[0].index, "time": frames[0].time, "pairs": len(difference),
+                "furthest": now.furthest, "typical": now.typical,
+                "furthest_before": before.furthest if at else None,
+                "typical_before": before.typical if at else None, "ambiguous": undecided,
+            }  # fmt: skip
+        if undecided < len(difference):
+            one.certain = at
+    if new := difference.new[: ROWS - one.rows]:
+        told = rows(new, difference, one.sides, frames) | {"rule": np.full(len(new), one.number)}
+        folder.append("differing", {"frame": np.full(len(new), at), **told})
+        one.rows += len(new)
 
 
 def _append(
-    folder: RunFolder,
-    at: int,
-    frames: tuple[Frame, ...],
-    now: Apart,
-    bound: float,
-    difference: Difference,
-    sides: list[Side],
+    folder: RunFolder, at: int, frames: tuple[Frame, ...], now: Apart, bound: float, one: _Sets
 ) -> None:
+    """The row of a frame; pairs are those of the first rule."""
     row = {
         "frame": at, "number_a": frames[0].index, "number_b": frames[1].index, "time": frames[0].time,
         "time_b": frames[1].time, "furthest": now.furthest, "bound": bound, "typical": now.typical,
-        "atom": now.atom, "pairs_a": sides[0].tracker.pairs, "pairs_b": sides[1].tracker.pairs,
-        "only_a": len(difference.only_a), "only_b": len(difference.only_b),
+        "atom": now.atom, "pairs_a": one.sides[0].tracker.pairs, "pairs_b": one.sides[1].tracker.pairs,
+        "only_a": len(one.difference.only_a), "only_b": len(one.difference.only_b),
     }  # fmt: skip
     folder.append("apart", {name: [value] for name, value in row.items()})
 
 
-def _first_pairs(found: _Found, rows: dict[str, np.ndarray]) -> list[dict[str, Any]]:
-    """The pairs of the first frame whose sets differ, as plain values."""
-    if found.first is None:
+def _first_pairs(one: _Sets, rows: dict[str, np.ndarray]) -> list[dict[str, Any]]:
+    """Pairs of the first frame whose sets differ, a few of them, as plain values."""
+    if one.first is None:
         return []
-    mine = np.flatnonzero(rows["frame"] == found.first["frame"])
+    mine = np.flatnonzero((rows["frame"] == one.first["frame"]) & (rows["rule"] == one.number))[:_FIRST]
     return [{name: values[at].item() if hasattr(values[at], "item") else values[at]
              for name, values in rows.items()} for at in mine]  # fmt: skip
 
 
-def _growth(found: _Found, table: dict[str, np.ndarray], rule: Rule) -> dict[str, Any]:
+def _growth(frames: int, one: _Sets, table: dict[str, np.ndarray]) -> dict[str, Any]:
     """Rates at which the separation grows before the sets differ, and from then on."""
+    rule = one.rule
     limit = 0.1 * (rule.radius if isinstance(rule, Cutoff) else float(table["furthest"].max(initial=0.0)))
-    cut = found.frames if found.first is None else found.first["frame"]
+    cut = frames if one.first is None else one.first["frame"]
     # up to its bound a separation may be made of rounding
     separation = np.where(table["furthest"] > table["bound"], table["furthest"], 0.0)
     parts = {}

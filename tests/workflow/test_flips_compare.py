@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,8 @@ import pytest
 from ase.io import write
 
 import mdnum
+from mdnum.errors import FolderError
+from mdnum.report import write as write_page
 from mdnum.store import RunFolder
 from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.rules import Capped, Cutoff, Nearest, Rule
@@ -199,3 +202,51 @@ def test_frames_of_a_slice_are_named_by_their_numbers_in_the_files(tmp_path: Pat
     assert found["first_frame"] == words and f"Positions differ from {words} on" in found["concluded"][0]
     found = looked(Path(f"{tmp_path}/a.traj@4:"), Path(f"{tmp_path}/a.traj@4:"), tmp_path / "g").summary
     assert found["beyond"] is None and found["frames"] == 8
+
+
+def test_several_rules_are_compared_as_each_alone(tmp_path: Path) -> None:
+    a, b = gas(8), gas(8)
+    for one in b[3:]:
+        one.positions[7, 0] += 0.8
+    for name, frames in (("a", a), ("b", b)):
+        write(tmp_path / f"{name}.traj", frames)
+    asked: dict[str, Any] = {"cutoffs": [4.2, 2.0], "nearest": [3], "pairs": ["Ar-Ar=3.1"]}
+    both = tmp_path / "a.traj", tmp_path / "b.traj"
+    found = looked(*both, tmp_path / "all", **asked, report=True)
+    rules = found.summary["rules"]
+    assert [one["rule"] for one in rules] == ["r < 4.2", "r < 2", "Ar-Ar < 3.1", "3 nearest"]
+    table = RunFolder.open(found.folder).read("differing")
+    alone = [{"cutoffs": [4.2]}, {"cutoffs": [2.0]}, {"cutoffs": (), "pairs": ["Ar-Ar=3.1"]},
+             {"cutoffs": (), "nearest": [3]}]  # fmt: skip
+    for place, options in enumerate(alone):
+        single = looked(*both, tmp_path / f"{place}", **options)
+        for name in ("rule", "first", "certain", "growth"):
+            assert rules[place][name] == single.summary[name], (place, name)
+        rows, mine = RunFolder.open(single.folder).read("differing"), table["rule"] == place
+        assert mine.any() and not rows["rule"].any()
+        for name in set(rows) - {"rule"}:
+            np.testing.assert_array_equal(table[name][mine], rows[name])
+    # the first one is what the page is about, the others are named in a sentence each
+    assert found.summary["first"] == rules[0]["first"]
+    assert "Those of r < 2 Å differ from frame" in found.summary["headline"]
+    assert sum(line.startswith(("r < 2 Å: ", "Ar-Ar < 3.1 Å: ", "3 nearest: "))
+               for line in found.summary["concluded"]) == 3  # fmt: skip
+    page = (found.folder / "report.html").read_text(encoding="utf-8")
+    assert "<h2>Rules</h2>" in page and "sets differ from frame" in page
+    assert "<h2>Rules</h2>" not in (write_page(tmp_path / "0")).read_text(encoding="utf-8")
+
+
+def test_a_comparison_of_another_version_is_refused_in_a_line_or_works(tmp_path: Path) -> None:
+    write(tmp_path / "a.traj", gas())
+    found = looked(tmp_path / "a.traj", tmp_path / "a.traj", tmp_path / "f")
+    path = found.folder / "summary.json"
+    summary = json.loads(path.read_text(encoding="utf-8"))
+    # from before there were several rules
+    path.write_text(json.dumps({name: value for name, value in summary.items() if name != "rules"}))
+    write_page(found.folder)
+    # and from before files' resolution was taken into account
+    old = {name: value for name, value in summary.items() if name not in ("rules", "certain", "beyond")}
+    path.write_text(json.dumps(old))
+    with pytest.raises(FolderError, match="lacks certain, beyond") as caught:
+        write_page(found.folder)
+    assert f"Compare again: mdnum flips {tmp_path / 'a.traj'}" in str(caught.value)

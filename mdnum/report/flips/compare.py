@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mdnum.ball.demos.base import Plot, Series
+from mdnum.errors import FolderError
 from mdnum.report.browse import Browse, Column, plain_rows
-from mdnum.report.flips.conclusions import cannot, concluded, findings, headline
+from mdnum.report.flips.conclusions import cannot, concluded, findings, headline, views
 from mdnum.report.flips.html import load
 from mdnum.report.flips.words import frame, length, rule_words
 from mdnum.report.fork.findings import Verdict
@@ -19,6 +20,9 @@ from mdnum.report.words import count, many, number
 from mdnum.store import RunFolder
 
 _TABLES = ("apart", "differing")
+# what summary.json says of each rule, and what else a page cannot be without
+_OF_A_RULE = ("rule", "first", "certain", "first_pairs", "growth")
+_NEEDED = (*_OF_A_RULE, "seed", "beyond", "other_box", "resolution", "other_resolution", "in_file", "last")
 
 
 def write_report(folder: RunFolder | str | Path) -> Path:
@@ -30,7 +34,7 @@ def write_report(folder: RunFolder | str | Path) -> Path:
     Raises:
         FolderError: no finished comparison in the folder, or it cannot be written.
     """
-    folder, run = load(folder, "flips-compare", _TABLES)
+    folder, run = _loaded(folder)
     browsed = _pairs(run)
     drawn = {"separation": _separation(run), "differing": _differing(run)}
     return write_page(
@@ -42,10 +46,11 @@ def write_report(folder: RunFolder | str | Path) -> Path:
         captions={
             "separation": "Largest and root mean square distance between an atom in A and the same atom in "
             "B, nearest images; up to the dashed line the files’ resolution explains it.",
-            "differing": "Pairs inside in one trajectory only, and all pairs inside in A.",
+            "differing": f"Pairs inside in one trajectory only, and all pairs inside in A{_of_first(run)}.",
         },
         figures=list(_key_figures(run)),
         cannot=list(cannot(run)),
+        rules=list(_rules(run)),
         browsed=browsed,
         scripted=browsed is not None,
         what=list(_what(run)),
@@ -54,10 +59,49 @@ def write_report(folder: RunFolder | str | Path) -> Path:
 
 def record(folder: RunFolder | str | Path) -> Verdict:
     """Judges a comparison and writes headline and findings into its summary.json."""
-    folder, run = load(folder, "flips-compare", _TABLES)
+    folder, run = _loaded(folder)
     judged = _judge(run)
     judged.store(folder, _with_words(run).summary)
     return judged
+
+
+def _loaded(folder: RunFolder | str | Path) -> tuple[RunFolder, Question]:
+    """The folder and what a page needs of it.
+
+    Raises:
+        FolderError: nothing in it was finished, or an older mdnum left out what a page needs by now.
+    """
+    folder, run = load(folder, "flips-compare", _TABLES)
+    missing = [name for name in _NEEDED if name not in run.summary]
+    missing += [name for name in ("bound", "time_b") if name not in run.tables["apart"]]
+    if missing:
+        raise FolderError(
+            f"this comparison was written by another version of mdnum and lacks {', '.join(missing)}",
+            remedy=f"Compare again: mdnum flips {run.summary.get('file', 'A')} "
+            f"{run.summary.get('other_file', 'B')}; the report that is there stays as it is",
+            where=str(folder.path),
+        )
+    # one rule was all there was, once
+    summary = run.summary
+    rules = summary.get("rules") or [{name: summary[name] for name in _OF_A_RULE}]
+    return folder, Question(run.path, {**summary, "rules": rules}, "", run.provenance, run.tables)
+
+
+def _of_first(run: Question) -> str:
+    """Which rule a figure is about, where there are several."""
+    return f" ({rule_words(run, run.summary)})" if len(run.summary["rules"]) > 1 else ""
+
+
+def _rules(run: Question) -> Iterator[tuple[str, ...]]:
+    """Rows of the table of rules; none where there is one."""
+    if len(run.summary["rules"]) < 2:
+        return
+    for one in views(run):
+        first, certain = one.summary["first"], one.summary["certain"]
+        pairs = "–" if first is None else count(first["pairs"])
+        undecided = "–" if first is None else count(first["ambiguous"])
+        frames = (_frame(None if first is None else first["frame"]), _frame(certain))
+        yield rule_words(one, one.summary), frames[0], pairs, undecided, frames[1]
 
 
 def _judge(run: Question) -> Verdict:
@@ -66,14 +110,16 @@ def _judge(run: Question) -> Verdict:
 
 def _with_words(run: Question) -> Question:
     """With what is concluded in the summary, for the command line."""
-    told = {"concluded": list(concluded(run)), "cannot": list(cannot(run))}
-    frames = {
-        "first_frame": (run.summary["first"] or {}).get("frame"),
-        "certain_frame": run.summary["certain"],
-    }
-    told |= {name: None if at is None else frame(run, at) for name, at in frames.items()}
-    summary = {**run.summary, **told}
+    rules = [{**one, **_named(run, one)} for one in run.summary["rules"]]
+    told = {"concluded": list(concluded(run)), "cannot": list(cannot(run)), "rules": rules}
+    summary = {**run.summary, **told, **_named(run, run.summary)}
     return Question(run.path, summary, run.system_toml, run.provenance, run.tables)
+
+
+def _named(run: Question, one: Mapping[str, Any]) -> dict[str, str | None]:
+    """The frames at which the sets of a rule come to differ, in words."""
+    frames = {"first_frame": (one["first"] or {}).get("frame"), "certain_frame": one["certain"]}
+    return {name: None if at is None else frame(run, at) for name, at in frames.items()}
 
 
 def _axis(run: Question) -> tuple[str, np.ndarray]:
@@ -127,7 +173,8 @@ def _key_figures(run: Question) -> Iterator[tuple[str, str, str]]:
     seed = summary["seed"]
     at_all = "the same bit for bit" if seed is None else f"at all from {frame(run, seed)} on"
     yield "Positions differ", _frame(summary["beyond"]), f"first frame, beyond resolution; {at_all}"
-    yield "Sets differ", "never" if first is None else _frame(first["frame"]), "first frame"
+    small = f"first frame{_of_first(run)}"
+    yield "Sets differ", "never" if first is None else _frame(first["frame"]), small
     if first is not None:
         yield "Sets differ for certain", _frame(summary["certain"]), "first frame, beyond resolution"
         yield "Pairs then", count(first["pairs"]), f"{count(first['ambiguous'])} within the resolution"
@@ -149,7 +196,10 @@ def _pairs(run: Question) -> Browse | None:
     columns: list[tuple[np.ndarray, int | None]] = [
         (table["frame"].astype(int), None), (table["i"].astype(int), None), (table["j"].astype(int), None),
         (inside, None), *((table[name], 6) for name in names), (table["ambiguous"].astype(int), None),
+        (table["rule"].astype(int), None),
     ]  # fmt: skip
+    several = len(run.summary["rules"]) > 1
+    rules = tuple(rule_words(one, one.summary) for one in views(run))
     unit = run.summary["length"]
     return Browse(
         name="pairs",
@@ -163,6 +213,7 @@ def _pairs(run: Question) -> Browse | None:
             *(Column(4 + at, name.replace("_a", " in A").replace("_b", " in B"), unit, digits=5)
               for at, name in enumerate(names)),
             Column(8, "", kind="word", words=("", "undecidable")),
+            *((Column(9, "rule", kind="word", words=rules),) if several else ()),
         ),
         rows=plain_rows(columns),
         words={"undecidable": (8, 1)},
@@ -179,5 +230,6 @@ def _what(run: Question) -> Iterator[tuple[str, str]]:
     yield "Size", f"{many(summary['atoms'], 'atom')}, {many(summary['frames'], 'frame')} of both"
     if summary["between"]:
         yield "Between", " and ".join(f"“{one}”" for one in summary["between"])
-    yield "Inside", rule_words(run, summary)
+    for one in views(run):
+        yield "Inside", rule_words(one, one.summary)
     yield "Took", f"{number(summary['seconds'], 2)} s"

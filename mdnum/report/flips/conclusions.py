@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mdnum.report.flips.words import frame, length, of_time, rule_words
+from mdnum.report.flips.words import frame, length, merged, of_time, rule_words
 from mdnum.report.fork.question import Question
 from mdnum.report.verdict import Finding
 from mdnum.report.words import count, listed, many, number, plain
@@ -20,13 +20,51 @@ _ALIKE = 1.5
 _FITS = 0.8
 
 
+def views(run: Question) -> list[Question]:
+    """The comparison as each rule sees it, the first one first."""
+    summary, table = run.summary, run.tables["differing"]
+    seen = []
+    for place, one in enumerate(summary["rules"]):
+        mine = table["rule"] == place
+        tables = {**run.tables, "differing": {name: values[mine] for name, values in table.items()}}
+        seen.append(Question(run.path, {**summary, **one}, run.system_toml, run.provenance, tables))
+    return seen
+
+
 def shown(run: Question) -> bool:
     """Whether anything that differs is beyond what the resolution of the two files explains."""
-    return any(run.summary[name] is not None for name in ("beyond", "certain", "other_box"))
+    summary = run.summary
+    certain = any(one["certain"] is not None for one in summary["rules"])
+    return certain or any(summary[name] is not None for name in ("beyond", "other_box"))
 
 
 def headline(run: Question) -> str:
-    """The verdict in one sentence."""
+    """The verdict in one sentence, and where there are several rules one on the others."""
+    first, *others = views(run)
+    text = _headline(first)
+    same = run.summary["seed"] is None and not any(one["first"] for one in run.summary["rules"])
+    return text if same or not others else f"{text} {_capital(listed([_in_short(one) for one in others]))}."
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
+def _in_short(run: Question) -> str:
+    """When the sets of a rule differ, for a sentence."""
+    first, certain = run.summary["first"], run.summary["certain"]
+    what = f"those of {rule_words(run, run.summary)}"
+    if first is None:
+        return f"{what} never do"
+    sure = (
+        ""
+        if certain == first["frame"]
+        else ", within the files’ resolution" + ("" if certain is None else f" before {frame(run, certain)}")
+    )
+    return f"{what} differ from {frame(run, first['frame'])} on{sure}"
+
+
+def _headline(run: Question) -> str:
     summary = run.summary
     frames, what = many(summary["frames"], "frame"), rule_words(run, summary)
     seed, first, beyond, boxes = (summary[name] for name in ("seed", "first", "beyond", "other_box"))
@@ -74,10 +112,25 @@ def _largest(run: Question) -> tuple[float, float]:
 
 
 def concluded(run: Question) -> Iterator[str]:
-    """What the frames show."""
+    """What the frames show: positions, the sets of the first rule, and in short those of the others."""
+    first, *others = views(run)
+    yield from _positions(run)
+    yield from _sets(first)
+    for one in others:
+        found, what = one.summary["first"], rule_words(one, one.summary)
+        if found is None:
+            yield f"{what}: the sets are the same in all {many(one.summary['frames'], 'frame')}."
+        else:
+            pairs = many(found["pairs"], "pair")
+            yield f"{what}: sets differ from {frame(one, found['frame'])} on, first by {pairs}. " + _certain(
+                one, found
+            )
+
+
+def _sets(run: Question) -> Iterator[str]:
+    """What the frames show of one rule's sets."""
     summary = run.summary
     first, seed, beyond = summary["first"], summary["seed"], summary["beyond"]
-    yield from _positions(run)
     if first is None:
         if beyond is not None:
             yield (
@@ -212,7 +265,7 @@ def _hurried(before: Any, after: Any) -> str:
 
 def cannot(run: Question) -> Iterator[str]:
     """What two trajectories cannot say, whatever they hold."""
-    if run.summary["first"] is not None and shown(run):
+    if any(one["first"] is not None for one in run.summary["rules"]) and shown(run):
         yield (
             "A flip that came first is no cause. Two trajectories part after a flip and through chaos alone "
             "in the same way; only a run that is handed the other's decisions tells the two apart."
@@ -239,9 +292,9 @@ def findings(run: Question) -> Iterator[Finding]:
             f"{summary['stopped']} Everything here is about the {frames} before.",
             "Check how that file was written.",
         )
-    yield from _within(run)
+    yield from merged(found for one in views(run) for found in _within(one))
     yield from _boxes(run)
-    if summary["first"] is not None and shown(run):
+    if any(one["first"] is not None for one in summary["rules"]) and shown(run):
         yield Finding(
             "NO_CAUSE_FROM_FILES",
             "info",
@@ -283,12 +336,13 @@ def _within(run: Question) -> Iterator[Finding]:
     if first is None or certain == first["frame"]:
         return
     sure = "No pair ever differs" if certain is None else f"A pair differs first at {frame(run, certain)}"
+    several = f"{rule_words(run, run.summary)}: at " if len(run.summary["rules"]) > 1 else "At "
     yield Finding(
         "WITHIN_RESOLUTION",
         "warning" if shown(run) else "info",
         "the first pairs that differ are within the files’ resolution",
-        f"At {frame(run, first['frame'])} every pair that is inside in one file only is so close to the "
-        f"threshold that rounding may have put it there. {sure} by more than the resolution explains.",
+        f"{several}{frame(run, first['frame'])} every pair that is inside in one file only is so close to "
+        f"the threshold that rounding may have put it there. {sure} by more than the resolution explains.",
         "Take the frame that is certain, or write positions with more digits." if shown(run) else "",
     )
 

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
 from mdnum.report.flips import limits
-from mdnum.report.flips.words import duration, flips_of, length, life, rule_words
+from mdnum.report.flips.words import duration, flips_of, length, life, merged, rule_words
 from mdnum.report.fork.findings import Verdict
 from mdnum.report.fork.question import Question, verdict
 from mdnum.report.verdict import Finding
 from mdnum.report.words import count, many, number, percent
 
-_ORDER = ("error", "warning", "info")
 #: Rules that the verdict tells about one by one.
 _TOLD = 3
 
@@ -24,19 +22,9 @@ def judge(run: Question) -> Verdict:
     """Headline, evidence and findings of a trajectory."""
     found = [*_stopped(run), *_interrupted(run)]
     by_rule = [one for place in range(len(run.summary["rules"])) for one in limits.findings(run, place)]
-    found += [*_merged(by_rule), *_leaps(run), *_times(run), *_notes(run)]
+    found += [*merged(by_rule), *_leaps(run), *_times(run), *_notes(run)]
     quiet = not any(one.severity != "info" for one in found)
     return verdict(_headline(run), _evidence(run), found, plain_tone="good" if quiet else "info")
-
-
-def _merged(found: Iterable[Finding]) -> Iterator[Finding]:
-    """One finding for each code: what several rules have in common is said once."""
-    by_code: dict[str, list[Finding]] = {}
-    for one in found:
-        by_code.setdefault(one.code, []).append(one)
-    for several in by_code.values():
-        worst = min(several, key=lambda one: _ORDER.index(one.severity))
-        yield replace(worst, text=" ".join(one.text for one in several))
 
 
 def _headline(run: Question) -> str:

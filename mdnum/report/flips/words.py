@@ -2,11 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from typing import Any
 
 from mdnum.report.fork.question import Question
+from mdnum.report.verdict import Finding
 from mdnum.report.words import count, many, number, plain
+
+_ORDER = ("error", "warning", "info")
+
+
+def merged(found: Iterable[Finding]) -> Iterator[Finding]:
+    """One finding for each code: what several rules have in common is said once."""
+    by_code: dict[str, list[Finding]] = {}
+    for one in found:
+        by_code.setdefault(one.code, []).append(one)
+    for several in by_code.values():
+        worst = min(several, key=lambda one: _ORDER.index(one.severity))
+        yield replace(worst, text=" ".join(one.text for one in several))
 
 
 def timed(run: Question) -> bool:
