@@ -38,9 +38,8 @@ def units_of(subject: Subject) -> Words:
     units = getattr(subject, "units", METAL)
     small, scale = ("meV", 1e3) if units.energy == "eV" else (units.energy, 1.0)
     energy, length = units.energy, units.length
-    return Words(
-        length, energy, small, scale, f"{energy}/{length}", f"{energy}/{length}²", f"{energy}/{length}³"
-    )
+    force = f"{energy}/{length}"
+    return Words(length, energy, small, scale, force, f"{force}²", f"{force}³")
 
 
 def together(text: str) -> str:

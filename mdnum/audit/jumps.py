@@ -8,6 +8,7 @@ the mismatch falls while one zooms in tells what is there, whatever the curve lo
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -80,7 +81,13 @@ class Jump:
 
 
 def find_jumps(
-    curve: Curve, low: float, high: float, step: float, most: int = 24, expected: Sequence[float] = ()
+    curve: Curve,
+    low: float,
+    high: float,
+    step: float,
+    most: int = 24,
+    expected: Sequence[float] = (),
+    until: float = np.inf,
 ) -> tuple[list[Jump], int]:
     """Every jump of energy, force, curvature or third derivative that stands out of a scan.
 
@@ -94,6 +101,7 @@ def find_jumps(
         step: spacing of the scan. Two thresholds closer together than this may be told as one.
         most: how many places are looked at closely, those that stand out most.
         expected: places that are known to stand out and not to be looked at.
+        until: of `time.perf_counter`, after which only the place that stands out most is looked at.
 
     Returns:
         (jumps by coordinate, how many places that stood out were left out).
@@ -104,13 +112,17 @@ def find_jumps(
         if not any(one[1] - 2.5 * step < place < one[2] + 2.5 * step for place in expected)
     ]
     found: list[Jump] = []
+    looked = 0
     for _, left, right in suspects[:most]:
+        if looked and time.perf_counter() > until:
+            break
+        looked += 1
         if any(jump.low >= left and jump.high <= right for jump in found):
             continue
         for jump in _zoom(curve, left, right):
             if not any(abs(jump.at - other.at) <= _same(jump, other) for other in found):
                 found.append(jump)
-    return sorted(found, key=lambda jump: jump.at), max(len(suspects) - most, 0)
+    return sorted(found, key=lambda jump: jump.at), len(suspects) - looked
 
 
 def measure(curve: Curve, low: float, high: float, room: float, exact: bool, curved: bool = True) -> Jump:
@@ -288,7 +300,7 @@ def _kink(curve: Curve, left: float, right: float, room: float) -> list[Jump]:
 
 
 def _third(curve: Curve, left: float, right: float, room: float) -> list[Jump]:
-    """A place where the third derivative of the energy jumps: second derivatives of the force from both sides.
+    """A place where the third derivative of the energy jumps, by the force's second from both sides.
 
     Of several widths of the two pieces, the one at which half of it agrees best counts.
     """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -19,6 +20,12 @@ from mdnum.audit.subject import CalculatorError, only_trying
 
 STEP = 0.025
 """Spacing of a scan, in the unit of length. Two thresholds closer than this may be told as one."""
+
+_WIDEST = 0.08
+"""Spacing of a scan at most, however long a calculation takes."""
+
+_SECONDS = 45.0
+"""For walking all pairs, each of which has its share."""
 
 STEPS = 2.5
 """Of answers that are rounded to decimals: a jump of so many steps is more than rounding."""
@@ -132,11 +139,16 @@ def walk_pairs(subject: Subject, progress: Progress | None = None) -> PairWalks:
     if subject not in _known:
         found, skipped = pairs(subject)
         walks = []
+        began = time.perf_counter()
         for k, pair in enumerate(found):
+            left = _SECONDS - (time.perf_counter() - began)
+            if left < 0:
+                skipped.append((f"pair {pair.name}", f"{_SECONDS:g} s were used up by other pairs"))
+                continue
             if progress:
-                progress(k, len(found), {"phase": f"walking {pair.name}"})
+                progress(k, len(found), {"phase": f"walking {pair.name}", "unit": "pairs"})
             try:
-                walks.append(walk(subject, pair))
+                walks.append(walk(subject, pair, seconds=left / (len(found) - k)))
             except CalculatorError as error:
                 skipped.append((f"pair {pair.name}", error.message))
         _known[subject] = PairWalks(tuple(walks), tuple(skipped))
@@ -156,14 +168,22 @@ def rough(subject: Subject, pair: Pair) -> tuple[float | None, float | None]:
     return cutoff, least
 
 
-def walk(subject: Subject, pair: Pair, step: float = STEP) -> PairWalk:
+def walk(subject: Subject, pair: Pair, step: float = STEP, seconds: float = np.inf) -> PairWalk:
     """Walk one pair.
+
+    Args:
+        subject: the calculator.
+        pair: who is walked.
+        step: of the scan; wider where so many calculations take too long.
+        seconds: about how long it may take.
 
     Raises:
         CalculatorError: the calculator fails at distances at which it had answered before.
     """
+    began = time.perf_counter()
     curve, kT = pair.curve(subject), subject.kT
     coarse, far = _coarse(subject, curve)
+    cost = (time.perf_counter() - began) / len(coarse)
     energy_far, force_far = curve(far)
     noise = 8 * scatter(curve, far, far, 1.0)[0]
 
@@ -180,10 +200,12 @@ def walk(subject: Subject, pair: Pair, step: float = STEP) -> PairWalk:
         end = edge[1] if edge else min(far, 15.0)
     thresholds: list[Threshold] = []
     left_out = 0
+    # half of the time for the scan, the rest for what stands out of it
+    step = float(np.clip(2 * cost * (end - near) / seconds, step, max(step, _WIDEST)))
     margin = 8 * step
     distance = np.append(coarse[coarse >= near][:12], near + margin)
     if end > near + 12 * step:
-        jumps, left_out = find_jumps(curve, near + margin, end + margin, step)
+        jumps, left_out = find_jumps(curve, near + margin, end + margin, step, until=began + seconds)
         thresholds = [_threshold(pair, jump) for jump in jumps]
         scanned = grid(near + margin, end + margin, step)
         distance = np.append(coarse[(coarse >= near) & (coarse < near + margin)], scanned)
@@ -298,12 +320,12 @@ def _with_edge(
     third = 0.0
     if order >= SMOOTH:
         # of a third derivative that jumps it knows the place better: the force was lost in rounding before
-        near = [one for one in found if one.order == SMOOTH and -1e-3 < one.radius - edge[1] < _LOST]
-        same += near
-        if near:
-            order, third = SMOOTH, near[-1].third
-        if near and near[-1].radius - edge[1] > near[-1].located:
-            radius, located = near[-1].radius, near[-1].located
+        better = [one for one in found if one.order == SMOOTH and -1e-3 < one.radius - edge[1] < _LOST]
+        same += better
+        if better:
+            order, third = SMOOTH, better[-1].third
+        if better and better[-1].radius - edge[1] > better[-1].located:
+            radius, located = better[-1].radius, better[-1].located
     last = Threshold(radius, pair.species, order, jumps, jump.doubt, *edge, True, located, third)
     return [one for one in found if one not in same] + [last]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from fractions import Fraction
 
 import numpy as np
@@ -15,7 +16,7 @@ from scipy.interpolate import CubicSpline
 from mdnum.audit.curve import Curve, bisect
 from mdnum.audit.jumps import find_jumps
 from mdnum.audit.smoothness_words import place
-from mdnum.audit.thresholds import STEP, find_thresholds, walk_pairs
+from mdnum.audit.thresholds import STEP, find_thresholds, walk, walk_pairs
 
 BEFORE = float(np.nextafter(R_CUT, 0.0))
 AFTER = float(np.nextafter(R_CUT, 9.0))
@@ -42,6 +43,18 @@ def test_a_decision_on_squares_is_located_where_the_squares_differ():
     limit = Fraction(R_CUT * R_CUT)
     assert Fraction(found.inside * found.inside) < limit <= Fraction(found.outside * found.outside)
     assert np.nextafter(found.inside, 9.0) == found.outside
+
+
+def test_a_walk_that_takes_long_is_made_in_wider_steps():
+    def slow(r: float) -> tuple[float, float]:
+        time.sleep(0.001)
+        return laws.hard(r)
+
+    asked = pair_subject(slow)
+    (pair,) = (one.pair for one in walk_pairs(pair_subject(laws.hard)).walks)
+    found = walk(asked, pair, seconds=0.2)
+    assert np.diff(found.distance)[-1] == pytest.approx(0.08, rel=0.05)
+    assert [one.radius for one in found.thresholds] == [R_CUT] and found.calls < 1000
 
 
 def test_orders_and_sizes_of_jumps():
