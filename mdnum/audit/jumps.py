@@ -117,7 +117,12 @@ def find_jumps(
         if looked and time.perf_counter() > until:
             break
         looked += 1
-        if any(jump.low >= left and jump.high <= right for jump in found):
+        # a third derivative that jumps stands out of the intervals beside its own as well
+        if any(
+            jump.low >= left - beside and jump.high <= right + beside
+            for jump in found
+            for beside in (3 * step if jump.order == SMOOTH else 0.0,)
+        ):
             continue
         for jump in _zoom(curve, left, right):
             if not any(abs(jump.at - other.at) <= _same(jump, other) for other in found):
