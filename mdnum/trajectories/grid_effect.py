@@ -3,7 +3,8 @@
 Rounding every coordinate moves a crossing to another frame, hides a short visit, or lets a pair that hovers
 at the cutoff hop across it. From one file nobody can tell which flips those are, but how many there must be
 can be estimated: pairs are drawn at random near the cutoff, move as atoms of the file do between two frames,
-and are decided with and without rounding.
+and are decided with and without rounding. Among the nearest neighbors a flip is two atoms at about the same
+distance from a third that change places, and what is drawn are three atoms.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ from jaxtyping import Float, Int
 from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.resolution import SAMPLE, Resolution
 from mdnum.trajectories.source import Trajectory
+
+Places = tuple[Float[np.ndarray, "draws 3"], ...]
 
 _DRAWS = 200_000
 # Displacements are read off where they are this many steps of the grid long, if frames are so far apart.
@@ -77,27 +80,30 @@ def grid_effect(
     first: Int[np.ndarray, "first"] | None = None,
     second: Int[np.ndarray, "second"] | None = None,
     *,
+    ranked: bool = False,
     draws: int = _DRAWS,
     seed: int = 0,
 ) -> GridEffect | None:
-    """Estimates what rounding to the file's resolution does to flips at a cutoff.
+    """Estimates what rounding to the file's resolution does to flips at a cutoff, or among the nearest.
 
     Args:
         resolution: of the file.
         sample: consecutive frames as they are looked at, at the stride in question.
-        radius: the cutoff, length.
-        first: atoms on one side of a pair; None for all.
+        radius: the cutoff, length; where `ranked`, about how far the last of the nearest is away.
+        first: atoms on one side of a pair, the ones that have neighbors; None for all.
         second: atoms on the other side; None for the same.
-        draws: pairs drawn.
+        ranked: whether it is the order of distances that decides, and no length.
+        draws: pairs drawn, or triples.
         seed: of the draws.
 
     Returns:
         None where the frames cannot tell: fewer than two, nothing moves, or every coordinate is 0.
 
-    Error: the two atoms of a pair are taken to move independently and straight on, and pairs to be spread
+    Error: the atoms of a pair are taken to move independently and straight on, and pairs to be spread
         evenly around the cutoff; the draws themselves scatter by about 1 % of the shares. In an LJ liquid
-        whose float64 positions were known the shares were right to 0.01 at strides of 0.0002 to 0.1 τ
-        (tests/trajectories/test_resolution.py).
+        whose float64 positions were known the shares were right to 0.01 at strides of 0.0002 to 0.1 τ, among
+        the 4 nearest to 0.02 and the 12 nearest to 0.07 (tests/trajectories/test_resolution.py). Atoms bonded
+        to one another move together, and less against each other than this takes them to.
     """
     if len(sample) < 2 or not len(sample[0].positions):
         return None
@@ -110,21 +116,16 @@ def grid_effect(
     everyone = np.arange(len(moves))
     one, other = moves[everyone if first is None else first], None
     other = one if second is None and first is not None else moves[everyone if second is None else second]
-    spread = float(np.sqrt((one**2).mean() + (other**2).mean()))
-    if spread == 0:
+    if not one.any() and not other.any():
         return None
     random = np.random.default_rng(seed)
-    a, b = one[random.integers(len(one), size=draws)], other[random.integers(len(other), size=draws)]
-    width = min(_WIDE * spread + 4 * size, radius)
-    distance = radius + width * random.uniform(-1.0, 1.0, draws)
-    direction = random.normal(size=(draws, 3))
-    direction /= np.linalg.norm(direction, axis=1)[:, None]
-    # anywhere on the grid
-    start = random.uniform(0.0, 1.0, (draws, 3)) @ steps
-    end = start + distance[:, None] * direction
-    before, after = (start, end), (start + a, end + b)
-    was, now = (_inside(*pair, radius) for pair in (before, after))
-    seen_was, seen_now = (_inside(*_rounded(pair, steps), radius) for pair in (before, after))
+    before, after = (_triples if ranked else _pairs)(random, one, other, radius, steps, draws)
+
+    def decided(places: Places) -> np.ndarray:
+        return _closer(places) if ranked else _inside(places, radius)
+
+    was, now = decided(before), decided(after)
+    seen_was, seen_now = decided(_rounded(before, steps)), decided(_rounded(after, steps))
     happened, seen = was != now, seen_was != seen_now
     both = int((happened & seen & (now == seen_now)).sum())
     if not happened.any():
@@ -137,6 +138,55 @@ def grid_effect(
         lag=lag,
         frames=len(sample),
     )
+
+
+def _pairs(
+    random: np.random.Generator,
+    one: Float[np.ndarray, "first 3"],
+    other: Float[np.ndarray, "second 3"],
+    radius: float,
+    steps: Float[np.ndarray, "3 3"],
+    draws: int,
+) -> tuple[Places, Places]:
+    """Pairs near the radius before and after they move.
+
+    Args:
+        one, other: displacements of atoms on either side.
+    """
+    a, b = one[random.integers(len(one), size=draws)], other[random.integers(len(other), size=draws)]
+    spread = float(np.sqrt((one**2).mean() + (other**2).mean()))
+    width = min(_WIDE * spread + 4 * float(np.abs(steps).max()), radius)
+    distance = radius + width * random.uniform(-1.0, 1.0, draws)
+    # anywhere on the grid
+    start = random.uniform(0.0, 1.0, (draws, 3)) @ steps
+    end = start + distance[:, None] * _directions(random, draws)
+    return (start, end), (start + a, end + b)
+
+
+def _triples(
+    random: np.random.Generator,
+    one: Float[np.ndarray, "first 3"],
+    other: Float[np.ndarray, "second 3"],
+    radius: float,
+    steps: Float[np.ndarray, "3 3"],
+    draws: int,
+) -> tuple[Places, Places]:
+    """An atom and two others at about the same distance from it, in any directions, before and after."""
+    a = one[random.integers(len(one), size=draws)]
+    b, c = (other[random.integers(len(other), size=draws)] for _ in range(2))
+    # the distance of the middle one counts twice where the others are on opposite sides
+    spread = float(np.sqrt(2 * (one**2).mean() + 2 * (other**2).mean()))
+    width = min(_WIDE * spread + 6 * float(np.abs(steps).max()), radius)
+    more = width * random.uniform(-0.5, 0.5, draws)
+    start = random.uniform(0.0, 1.0, (draws, 3)) @ steps
+    near = start + (radius - more)[:, None] * _directions(random, draws)
+    far = start + (radius + more)[:, None] * _directions(random, draws)
+    return (start, near, far), (start + a, near + b, far + c)
+
+
+def _directions(random: np.random.Generator, draws: int) -> Float[np.ndarray, "draws 3"]:
+    found = random.normal(size=(draws, 3))
+    return found / np.linalg.norm(found, axis=1)[:, None]
 
 
 def _steps(resolution: Resolution, frame: Frame) -> Float[np.ndarray, "3 3"]:
@@ -196,15 +246,17 @@ def _shortest(d: Float[np.ndarray, "atoms 3"], box: Box) -> Float[np.ndarray, "a
     return d - np.where(box.pbc, np.round(parts), 0.0) @ matrix
 
 
-def _rounded(
-    pair: tuple[Float[np.ndarray, "draws 3"], Float[np.ndarray, "draws 3"]], steps: Float[np.ndarray, "3 3"]
-) -> tuple[Float[np.ndarray, "draws 3"], Float[np.ndarray, "draws 3"]]:
+def _rounded(places: Places, steps: Float[np.ndarray, "3 3"]) -> Places:
     inverse = np.linalg.inv(steps)
-    one, other = (np.round(x @ inverse) @ steps for x in pair)
-    return one, other
+    return tuple(np.round(x @ inverse) @ steps for x in places)
 
 
-def _inside(
-    one: Float[np.ndarray, "draws 3"], other: Float[np.ndarray, "draws 3"], radius: float
-) -> np.ndarray:
+def _inside(places: Places, radius: float) -> np.ndarray:
+    one, other = places
     return ((other - one) ** 2).sum(axis=1) < radius**2
+
+
+def _closer(places: Places) -> np.ndarray:
+    """Whether the second one is closer to the first than the third is."""
+    middle, one, other = places
+    return ((one - middle) ** 2).sum(axis=1) < ((other - middle) ** 2).sum(axis=1)

@@ -260,7 +260,7 @@ def _grid(
 
     if not one.reach > 0:
         return None
-    found = grid_effect(resolution, sample, one.reach, *groups)
+    found = grid_effect(resolution, sample, one.reach, *groups, ranked=one.ranked)
     if found is None:
         return None
     return {

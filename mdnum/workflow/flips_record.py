@@ -121,6 +121,7 @@ class Followed:
         neighbors: known from the first frame on.
         flux: (flips, moment) at frames whose velocities were looked at.
         reach: the usual distance of a pair at the threshold, length; nan where there was none.
+        ranked: whether it is mostly the order of distances that decides there, and no radius.
     """
 
     rule: Rule
@@ -128,6 +129,7 @@ class Followed:
     neighbors: Neighbors | None = None
     flux: list[tuple[int, float]] = field(default_factory=list)
     reach: float = float("nan")
+    ranked: bool = False
 
 
 @dataclass
@@ -250,7 +252,7 @@ def _write(
     if one.neighbors is None:
         members = one.tracker.members()
         one.neighbors = Neighbors.of(members, *size, one.rule.directed)
-        one.reach = _reach(one.rule, members)
+        one.reach, one.ranked = _threshold(one.rule, members)
         columns = {"i": members.i, "j": members.j, "rank": members.rank, "distance": members.distance}
         rows.add("members", {"rule": np.full(len(members), number), **columns})
     else:
@@ -269,13 +271,23 @@ def _write(
     rows.add("frames", {name: np.array([value]) for name, value in row.items()})
 
 
-def _reach(rule: Rule, members: Members) -> float:
-    """The radius of a rule, the largest of several; of one without a radius, the median distance inside."""
-    if isinstance(rule, Cutoff | Capped):
-        return rule.radius
+def _threshold(rule: Rule, members: Members) -> tuple[float, bool]:
+    """(where pairs come and go, whether their order decides there).
+
+    The radius of a rule, the largest of several; of one that counts neighbors, how far the last of them is.
+    """
+    if isinstance(rule, Cutoff):
+        return rule.radius, False
     if isinstance(rule, SpeciesCutoffs):
-        return max(rule.radii.values())
-    return float(np.median(members.distance)) if len(members) else float("nan")
+        return max(rule.radii.values()), False
+    if not len(members):
+        return (rule.radius if isinstance(rule, Capped) else float("nan")), False
+    _, begin, counts = np.unique(members.i, return_index=True, return_counts=True)
+    full = counts == rule.most
+    if 2 * np.count_nonzero(full) < len(counts):
+        # most have room for all that are near enough
+        return rule.reach if np.isfinite(rule.reach) else float(np.median(members.distance)), False
+    return float(np.median(np.maximum.reduceat(members.distance, begin)[full])), True
 
 
 def _measure_flux(one: Followed, frame: Frame, groups: Groups, species: list[str]) -> None:

@@ -174,6 +174,29 @@ def test_what_the_grid_of_an_xtc_does_to_flips(stride, timestep):
     assert f"{100 * effect.missed:.2g} %" in effect.words()
 
 
+@pytest.mark.parametrize(("k", "within"), [(4, 0.03), (12, 0.08)])
+@pytest.mark.parametrize(("stride", "timestep"), [(1, 0.005), (4, 0.005)])
+def test_what_the_grid_does_among_the_nearest(k, within, stride, timestep):
+    positions, length = liquid(60 if stride == 1 else 20, timestep, stride)
+    kept = quantized(positions, 0.01)
+
+    def neighbors(x):
+        d = x[:, None] - x[None]
+        d -= length * np.rint(d / length)
+        square = (d * d).sum(axis=2)
+        np.fill_diagonal(square, np.inf)
+        return square <= np.partition(square, k - 1, axis=1)[:, k - 1 : k], np.sqrt(square)
+
+    true, seen = (np.array([neighbors(x)[0].ravel() for x in of]) for of in (positions, kept))
+    missed, invented = missed_and_invented(true, seen)
+    frames = frames_of(kept[:8], length * np.eye(3))
+    reach = np.median(np.partition(neighbors(kept[0])[1], k - 1, axis=1)[:, k - 1])
+    effect = grid_effect(infer_from(frames), frames, float(reach), ranked=True)
+    assert effect is not None and missed > 0.1
+    assert effect.missed == pytest.approx(missed, abs=within)
+    assert effect.invented == pytest.approx(invented, abs=within)
+
+
 @pytest.mark.parametrize("rule", [Cutoff(CUTOFF), Nearest(4), Capped(CUTOFF, 12)])
 def test_what_the_file_makes_up_is_marked_as_what_it_cannot_tell(rule):
     positions, length = liquid(20, 0.005, 4)
