@@ -198,6 +198,18 @@ def _summary(found: Report, scripts: list[str], seed: int) -> dict[str, Any]:
         "ties": {"counted": found.ties[0], "not_counted": found.ties[1]},
         "keeps_order": found.keeps_order,
         "shifts": found.shifts,
+        "aliased": found.aliased,
+        "known": dict(tested.known),
+        "refusals": [
+            {
+                "why": one.words,
+                "case": one.case.name,
+                "atoms": one.case.atoms,
+                "uneven": list(one.uneven),
+                "answers": list(one.answers),
+            }
+            for one in found.refusals
+        ],
         "asked": found.asked,
         "wrong": found.wrong,
         "conforms": found.conforms,

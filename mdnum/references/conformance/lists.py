@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from importlib import metadata
 from typing import Any, Protocol, runtime_checkable
@@ -11,7 +11,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy import ndarray
 
-from mdnum.references.conformance.answer import Answer, Malformed, read
+from mdnum.references.conformance.answer import Answer, Malformed, handed_out, read
 from mdnum.references.conformance.case import Case
 from mdnum.references.conformance.refusals import meant
 from mdnum.references.oracle import widths
@@ -144,6 +144,7 @@ class PairList:
         unit: roundoff of its arithmetic; None to find out.
         superset: pairs somewhat beyond the cutoff may be there; None to find out, of a list that is kept.
         limits: what it does not claim to do.
+        known: what is known of why it fails, by code of the failure.
         source: lines that define or import it, for a script without mdnum; the last expression is `call`.
         call: what the script calls it by.
         affords: how many of the random cases it is asked, as a share: slow ones take 0.01.
@@ -162,6 +163,7 @@ class PairList:
     source: str = ""
     call: str = "pairs"
     affords: float = 1.0
+    known: Mapping[str, str] = field(default_factory=dict)
     about: str = ""
     word: str = ""
 
@@ -192,6 +194,7 @@ class Outcome:
         changed: the input that the call wrote to, or None.
         crashed: how the process ended that made the call, or None.
         late: that it did not answer in time, or None.
+        aliased: the rows of the answer before this one were other ones after this call.
     """
 
     answer: Answer | None = None
@@ -201,6 +204,7 @@ class Outcome:
     changed: str | None = None
     crashed: str | None = None
     late: str | None = None
+    aliased: bool = False
 
 
 class Session:
@@ -214,17 +218,23 @@ class Session:
     def __init__(self, tested: PairList, reuse: bool = False):
         self.tested, self.reuse = tested, reuse
         self._made: Any = None
+        self._handed: list[ndarray] = []
 
     def ask(self, case: Case) -> list[Outcome]:
         """The outcome at every still, as far as the list goes: it ends at the first that is no answer."""
+        return list(self.asked(case))
+
+    def asked(self, case: Case) -> Iterator[Outcome]:
+        """The same, one after the other."""
         if self._made is None or (self.tested.kept and not self.reuse):
             try:
                 self._made = self.tested.make()
             except SystemExit as error:
-                return [_left(error)]
+                yield _left(error)
+                return
             except Exception as error:
-                return [_failed(error, case)]
-        outcomes = []
+                yield _failed(error, case)
+                return
         positions, cell = np.zeros((0, 3)), np.zeros((3, 3))
         for step, still in enumerate(case.stills):
             pbc, count, before = np.array(case.pbc), len(still.positions), len(positions)
@@ -235,17 +245,20 @@ class Session:
                 positions[...], cell[...] = still.positions, still.cell
             else:
                 positions, cell = np.array(still.positions), np.array(still.cell)
-            outcomes.append(self._one(case, positions, cell, pbc, fresh))
-            if outcomes[-1].answer is None:
-                break
-        return outcomes
+            outcome = self._one(case, positions, cell, pbc, fresh)
+            yield outcome
+            if outcome.answer is None:
+                return
 
     def close(self) -> None:
         """Lets go of the list."""
         self._made = None
+        self._handed = []
 
     def _one(self, case: Case, positions: ndarray, cell: ndarray, pbc: ndarray, fresh: bool) -> Outcome:
         before = (positions.copy(), cell.copy(), pbc.copy())
+        handed, self._handed = self._handed, []
+        held = [part.copy() for part in handed]
         try:
             if not self.tested.kept:
                 given = self._made(positions, cell, pbc, case.r_cut)
@@ -260,15 +273,22 @@ class Session:
         try:
             # a copy: a list may hand out the buffer that it fills next time
             answer = read(given)
+            self._handed = handed_out(given)
         except Malformed as error:
             return Outcome(malformed=str(error))
+        aliased = not all(map(_same, handed, held))
         names = ("positions", "cell", "pbc")
         changed = [
             name
             for name, old, new in zip(names, before, (positions, cell, pbc), strict=True)
             if not np.array_equal(old, new)
         ]
-        return Outcome(_copied(answer), changed=changed[0] if changed else None)
+        return Outcome(_copied(answer), changed=changed[0] if changed else None, aliased=aliased)
+
+
+def _same(one: ndarray, other: ndarray) -> bool:
+    """Whether two arrays hold the same bits."""
+    return one.shape == other.shape and one.tobytes() == other.tobytes()
 
 
 def _left(error: SystemExit) -> Outcome:
@@ -277,7 +297,9 @@ def _left(error: SystemExit) -> Outcome:
 
 
 def _failed(error: Exception, case: Case, package: str | None = None) -> Outcome:
-    words = " ".join(str(error).split())
+    # what follows the first lines is where it was raised, in some libraries with the frames of compiled code
+    lines = str(error).strip().partition("Exception raised from ")[0].splitlines()
+    words = " ".join(" ".join(lines).split())
     # without atoms there is nothing that could not be done
     refused = case.atoms > 0 and meant(error, package)
     return Outcome(raised=f"{type(error).__name__}: {words[:300]}", refused=refused)

@@ -10,6 +10,8 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
+from pathlib import Path
 from typing import Any, BinaryIO
 
 from mdnum.errors import MdnumError
@@ -17,7 +19,11 @@ from mdnum.references.conformance.case import Case
 from mdnum.references.conformance.lists import Outcome, PairList, Session
 
 #: Seconds that an answer may take, for so many atoms at most and for more; and those to import a library.
+#: They are its own processor time: by the clock nothing comes in time on a machine that has other work to do.
 FEW, CALL, LONG, START = 1000, 45.0, 120.0, 120.0
+#: A process that used less than this share of the time waits for something that does not come; and one that
+#: has had this many times its seconds by the clock is not waited for, whatever else the machine does.
+_IDLE, _MOST = 0.05, 10.0
 _SIZE = struct.Struct("<Q")
 
 
@@ -38,15 +44,19 @@ class RemoteSession:
 
     def ask(self, case: Case) -> list[Outcome]:
         """The outcome at every still, as far as the list goes."""
+        outcomes: list[Outcome] = []
         try:
             if self._process is None:
                 self._process = self._started()
-            return self._exchanged(
-                (case, self.reuse, self.tested.limits), CALL if case.atoms <= FEW else LONG
-            )
+            self._asked((case, self.reuse, self.tested.limits))
+            # each step has its own time, which ends with its outcome
+            while (outcome := self._received(CALL if case.atoms <= FEW else LONG)) is not None:
+                outcomes.append(outcome)
+            return outcomes
         except _Ended as ended:
             self.close()
-            return [Outcome(late=str(ended)) if isinstance(ended, _Late) else Outcome(crashed=str(ended))]
+            late = isinstance(ended, _Late)
+            return [*outcomes, Outcome(late=str(ended)) if late else Outcome(crashed=str(ended))]
 
     def close(self) -> None:
         """Ends the process."""
@@ -72,33 +82,44 @@ class RemoteSession:
             raise ready
         return self._process
 
-    def _exchanged(self, message: Any, seconds: float) -> Any:
+    def _asked(self, message: Any) -> None:
         assert self._process is not None and self._process.stdin is not None
         try:
             _send(self._process.stdin, message)
         except OSError as error:
             raise _Ended(self._how_it_ended()) from error
-        return self._received(seconds)
 
     def _received(self, seconds: float) -> Any:
         process = self._process
         assert process is not None and process.stdout is not None
-        late = threading.Event()
-
-        def stop() -> None:
-            late.set()
-            process.kill()
-
-        timer = threading.Timer(seconds, stop)
-        timer.start()
+        done, late = threading.Event(), list[str]()
+        watch = threading.Thread(target=self._watch, args=(process, seconds, done, late), daemon=True)
+        watch.start()
         try:
             return _receive(process.stdout)
         except EOFError as error:
-            if late.is_set():
-                raise _Late(f"no answer within {seconds:.0f} s") from error
+            if late:
+                raise _Late(f"no answer within {seconds:.3g} s{late[0]}") from error
             raise _Ended(self._how_it_ended()) from error
         finally:
-            timer.cancel()
+            done.set()
+            watch.join()
+
+    @staticmethod
+    def _watch(process: Any, seconds: float, done: threading.Event, late: list[str]) -> None:
+        """Ends a process that had its time and did not answer; `late` then has the words for it."""
+        began, used = time.monotonic(), processor_seconds(process.pid)
+        left = seconds
+        while not done.wait(left):
+            elapsed = time.monotonic() - began
+            now = processor_seconds(process.pid)
+            spent = elapsed if used is None or now is None else now - used
+            waits = spent < _IDLE * elapsed
+            if spent >= seconds or waits or elapsed >= _MOST * seconds:
+                late.append(", in which it computed nothing" if waits else " of processor time")
+                process.kill()
+                return
+            left = max(0.1, seconds - spent)
 
     def _how_it_ended(self) -> str:
         assert self._process is not None
@@ -116,6 +137,16 @@ class RemoteSession:
         self._said.seek(self._from)
         lines = self._said.read().decode(errors="replace").strip().splitlines()
         return lines[-1].strip()[:200] if lines else ""
+
+
+def processor_seconds(process: int) -> float | None:
+    """What a process has used of the processor so far, all threads together; None where that is not told."""
+    try:
+        # the second word is the name of the program in brackets, which may hold blanks
+        words = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+        return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
+    except (OSError, ValueError, IndexError):
+        return None  # another system, or the process is gone
 
 
 class _Ended(Exception):
@@ -180,10 +211,11 @@ def main(word: str) -> None:
             return
         session = sessions.setdefault(reuse, Session(replace(tested, limits=limits), reuse))
         try:
-            outcomes = session.ask(case)
+            for outcome in session.asked(case):
+                _send(answers, outcome)
         except MemoryError as error:
-            outcomes = [Outcome(raised=f"MemoryError: {error}")]
-        _send(answers, outcomes)
+            _send(answers, Outcome(raised=f"MemoryError: {error}"))
+        _send(answers, None)
 
 
 if __name__ == "__main__":

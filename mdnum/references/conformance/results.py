@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from mdnum.references.conformance.alike import Refusal
 from mdnum.references.conformance.case import Case
 from mdnum.references.conformance.judge import CODES, Conventions, Failure
 from mdnum.references.conformance.lists import PairList
@@ -73,6 +74,8 @@ class Report:
         superset: pairs beyond the cutoff are part of what it gives.
         shifts: whether it gives the images that pairs are through.
         areas: tallies by area.
+        aliased: the first case in which a call wrote to the arrays of the answer before it, or None.
+        refusals: kinds of refusals, and what each hangs on.
         failed: the first failure of each kind and area, in the order in which they were met.
         seconds: in all; asking: of the list itself.
         large: (atoms, seconds) of its largest question.
@@ -87,6 +90,8 @@ class Report:
     superset: bool = False
     shifts: bool = False
     areas: dict[str, Tally] = field(default_factory=dict)
+    aliased: str | None = None
+    refusals: list[Refusal] = field(default_factory=list)
     failed: list[Failed] = field(default_factory=list)
     seconds: float = 0.0
     asking: float = 0.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import replace
@@ -9,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from mdnum.references.conformance.alike import looked_into
 from mdnum.references.conformance.case import AREAS, KEPT, Case, one
 from mdnum.references.conformance.crowds import LARGE_EDGE, SMALL_EDGE, lattice, vast
 from mdnum.references.conformance.judge import CODES, Conventions, Failure, judge, measures_well
@@ -45,6 +47,8 @@ class Examiner:
             RemoteSession(tested, reuse) if apart and tested.word else Session(tested, reuse)
         )
         self.report = Report(tested)
+        # the smallest refused case by the words of the exception, but for numbers
+        self.refused: dict[str, tuple[str, Case]] = {}
         self._find_conventions()
 
     def _find_conventions(self) -> None:
@@ -99,12 +103,24 @@ class Examiner:
         outcomes = self.session.ask(case)
         self.report.asking += time.perf_counter() - began
         for step, outcome in enumerate(outcomes):
+            if outcome.aliased and self.report.aliased is None:
+                self.report.aliased = case.name
             found = self._judged(case, step, outcome)
             if found:
                 return [failure.at(step) for failure in found], None
             if outcome.refused:
+                self._remember(case.until(step + 1), str(outcome.raised))
                 return [], outcome
         return [], None
+
+    def _remember(self, case: Case, words: str) -> None:
+        """Keeps the smallest question that an exception was met at."""
+        kind = re.sub(r"[-+\d.e]+", "#", words)
+        if kind not in self.refused or (case.steps, case.atoms) < (
+            self.refused[kind][1].steps,
+            self.refused[kind][1].atoms,
+        ):
+            self.refused[kind] = words, case
 
     def _judged(self, case: Case, step: int, outcome: Outcome) -> list[Failure]:
         if outcome.crashed is not None:
@@ -256,6 +272,8 @@ def examine(
                 break
     if shrink:
         examiner.session.reuse = False
+        refused = dict(examiner.refused.values())
+        report.refusals = looked_into(examiner, refused)
         for number, failed in enumerate(report.failed):
             if progress is not None:
                 progress(number, len(report.failed), {"phase": "shrinking", "unit": "failures"})

@@ -142,10 +142,28 @@ def _findings(run: Question) -> Iterator[Finding]:
             remedy = "Raise an exception instead: a program that calls it ends with it and loses its run."
         text = f"In {many(total, 'case')}, {_about(summary, code)}. {_sentence(first)} "
         text += f"Reproduced by {first['script']}."
+        if code == "ONE_SIDED" and all(row["text"].startswith("within rounding") for row in rows):
+            severity, title = "warning", "pairs within rounding of the cutoff are listed from one atom only"
+        if code in summary.get("known", {}):
+            text += f" {summary['known'][code]}"
         if not first["alone"]:
             text += " It fails only after other questions, so the script alone may not show it."
         yield Finding(code, severity, title, text, remedy)  # type: ignore[arg-type]
     yield from _conduct(run)
+
+
+def _quoted(words: str) -> str:
+    """What an exception said, to stand before a comma or a stop."""
+    return words.rstrip(". ")
+
+
+def _hangs_on(refusal: Mapping[str, Any], quoted: str) -> str:
+    """A sentence on what is answered of a question that was refused; nothing where nothing is."""
+    if not refusal["answers"]:
+        return ""
+    why = _quoted(refusal["why"])
+    told = f"Asked about {refusal['case']}" if why in quoted else f"{why} ({refusal['case']})"
+    return f" {told}: the same is answered {listed(refusal['answers'])}."
 
 
 def _about(summary: Mapping[str, Any], code: str) -> str:
@@ -159,7 +177,7 @@ def _about(summary: Mapping[str, Any], code: str) -> str:
 
 def _sentence(row: Mapping[str, Any]) -> str:
     where = f"{many(row['atoms'], 'atom')}" + (f", step {row['step']}" if row["steps"] > 1 else "")
-    return f"{where[:1].upper()}{where[1:]} ({row['case']}): {typeset(row['text'])}."
+    return f"{where[:1].upper()}{where[1:]} ({row['case']}): {typeset(_quoted(row['text']))}."
 
 
 def _conduct(run: Question) -> Iterator[Finding]:
@@ -191,13 +209,32 @@ def _conduct(run: Question) -> Iterator[Finding]:
             "Sums over the list then differ in their last bits from call to call.",
             "Sort the rows where runs have to repeat bit for bit.",
         )
+    if summary.get("aliased") is not None:
+        yield Finding(
+            "ALIASED",
+            "info",
+            "an answer changes when the list is asked again",
+            "The arrays that it returns are its own buffers, and the next call writes to them: first seen "
+            f"when it was asked {summary['aliased']}. Answers were copied before that, and judged as they "
+            "were.",
+            "Copy them if they are to be kept, to compare two steps or for a thread of its own.",
+        )
+    for one in summary.get("refusals", ()):
+        if one["uneven"]:
+            yield Finding(
+                "UNEVEN_REFUSALS",
+                "warning",
+                "a question is refused and the same question is answered",
+                f"{_quoted(one['why'])} ({one['case']}); but it answers the same {listed(one['uneven'])}.",
+                "Refuse by what is asked, and not by the order of atoms or by what was asked before.",
+            )
     refused = [(row, one) for row in summary["areas"] for one in row["why"] if row["refused"]]
     refused = [(row, one) for row, one in refused if ": " in one["why"]]
     total = sum(area["refused"] for area in summary["areas"])
     often = ""
     if refused:
         row, one = max(refused, key=lambda each: each[1]["cases"])
-        often = f"Most often: {one['why']}, about {row['area']}."
+        often = f"Most often: {_quoted(one['why'])}, about {row['area']}."
     if not _answered(summary):
         yield Finding(
             "NOTHING_ANSWERED",
@@ -212,6 +249,7 @@ def _conduct(run: Question) -> Iterator[Finding]:
             "REFUSES",
             "warning" if many_of_them else "info",
             f"{many(total, 'case')} refused",
-            f"It raises an exception of its own there, so nothing is computed with wrong pairs. {often}",
+            f"It raises an exception of its own there, so nothing is computed with wrong pairs. {often}"
+            + "".join(_hangs_on(one, often) for one in summary.get("refusals", ())),
             "Declare what it does not do with --limits, and the rest is asked." if many_of_them else "",
         )

@@ -101,7 +101,8 @@ def _key_figures(run: Question) -> Iterator[tuple[str, str, str]]:
     summary = run.summary
     right = sum(row["passed"] for row in summary["areas"])
     yield "Right", count(right), f"of {many(summary['asked'], 'case')}"
-    yield "Wrong", count(summary["wrong"]), f"{len(summary['failures'])} kinds, shrunk"
+    kinds = many(len(summary["failures"]), "kind")
+    yield "Wrong", count(summary["wrong"]), f"{kinds}, shrunk" if summary["failures"] else "nothing to show"
     skipped = sum(row["skipped"] for row in summary["areas"])
     yield "Not asked", count(skipped), "outside of what it claims"
     if summary["large"]:
