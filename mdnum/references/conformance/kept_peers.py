@@ -1,17 +1,19 @@
 """Libraries' lists that are kept and brought up to date, each complete in itself: see `peers`."""
 
+# pyright: reportOptionalMemberAccess=false, reportOptionalCall=false
+# (attributes begin as None without a type: a script that prints a class knows no Any)
 from __future__ import annotations
 
 from typing import Any
 
 from mdnum.references.conformance.lists import Limits, PairList, source_of
+from mdnum.references.conformance.peers import JAX_MD_KNOWN
 
 
 class AseSkinList:
     """ase.neighborlist.NeighborList, whose skin is what each of two atoms may use up."""
 
-    kept: Any
-    pbc: Any
+    kept = pbc = None
 
     def allocate(self, positions, cell, pbc, r_cut, skin):
         from ase.neighborlist import NeighborList, NewPrimitiveNeighborList
@@ -42,9 +44,8 @@ class AseSkinList:
 class JaxMdList:
     """jax-md's partition.neighbor_list: allocated once, then updated, as its documentation shows."""
 
-    found: Any
-    skewed: bool
-    free: bool
+    found = neighbor = step = None
+    skewed = free = False
 
     def allocate(self, positions, cell, pbc, r_cut, skin):
         from importlib import import_module
@@ -66,7 +67,7 @@ class JaxMdList:
         else:
             box = jnp.asarray(np.diag(cell))
             displacement, _ = space.periodic(box, wrapped=False)
-        neighbor = partition.neighbor_list(
+        self.neighbor = partition.neighbor_list(
             displacement,
             box,
             jnp.float64(r_cut),
@@ -75,11 +76,16 @@ class JaxMdList:
             disable_cell_list=self.free,
             format=partition.Sparse,
         )
-        self.found = neighbor.allocate(self.placed(positions, cell))
+        self.found = self.neighbor.allocate(self.placed(positions, cell))
+        # compiled once, as in a run; by itself each update is traced anew and takes a second
+        self.step = jax.jit(lambda found, placed: found.update(placed))
         return self.pairs(positions)
 
     def update(self, positions, cell):
-        self.found = self.found.update(self.placed(positions, cell))
+        placed = self.placed(positions, cell)
+        self.found = self.step(self.found, placed)
+        if bool(self.found.did_buffer_overflow):
+            self.found = self.neighbor.allocate(placed)
         return self.pairs(positions)
 
     def placed(self, positions, cell):
@@ -93,7 +99,7 @@ class JaxMdList:
         import numpy as np
 
         if bool(self.found.did_buffer_overflow):
-            raise ValueError("jax-md says that its list overflowed: allocate again")
+            raise ValueError("jax-md says that its list overflowed as it was allocated")
         i, j = np.asarray(self.found.idx)
         real = (i < len(positions)) & (j < len(positions))
         return {"i": i[real], "j": j[real]}
@@ -102,9 +108,7 @@ class JaxMdList:
 class MdnumVerletList:
     """mdnum's own list and rule: rebuilt before the skin is spent, box strain counted."""
 
-    listed: Any
-    built: Any
-    pbc: Any
+    listed = built = pbc = None
 
     def allocate(self, positions, cell, pbc, r_cut, skin):
         from mdnum.md.verlet import BUILDERS, RebuildRule, VerletList
@@ -169,7 +173,16 @@ KEPT_PEERS: tuple[PairList, ...] = (
         JaxMdList,
         "jax-md's partition.neighbor_list, allocated and updated",
         affords=0.01,
-        limits=Limits(minimum_image=True, all_axes=True, fixed_cell=True, atoms=1, most_atoms=5_000),
+        known=JAX_MD_KNOWN,
+        limits=Limits(
+            minimum_image=True,
+            all_axes=True,
+            lower=True,
+            right_handed=True,
+            fixed_cell=True,
+            atoms=1,
+            most_atoms=5_000,
+        ),
     ),
     PairList(
         "mdnum",

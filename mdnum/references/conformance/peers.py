@@ -135,13 +135,13 @@ def torch_sim_pairs(positions, cell, pbc, r_cut):
     import torch  # type: ignore
     from torch_sim.neighbors import torch_nl_linked_cell  # type: ignore
 
-    n = len(positions)
+    # by name: releases differ in the order of these
     pairs, _, shift = torch_nl_linked_cell(
-        torch.as_tensor(positions),
-        torch.as_tensor(cell),
-        torch.as_tensor(pbc),
-        torch.tensor(float(r_cut)),
-        torch.zeros(n, dtype=torch.long),
+        positions=torch.as_tensor(positions),
+        cell=torch.as_tensor(cell),
+        pbc=torch.as_tensor(pbc)[None],
+        cutoff=torch.tensor(float(r_cut), dtype=torch.float64),
+        system_idx=torch.zeros(len(positions), dtype=torch.long),
         self_interaction=False,
     )
     return {"i": pairs[0].numpy(), "j": pairs[1].numpy(), "shift": shift.numpy()}
@@ -200,6 +200,13 @@ def jax_md_pairs(positions, cell, pbc, r_cut):
 
 
 _SINGLE = 2.0**-24
+
+#: Measured on 512 pairs at the cutoff, release 0.2.29: in a periodic box 92 of 478 rows were one-sided, with
+#: and without a cell list; in free space, where displacement(a, b) is -displacement(b, a), none.
+JAX_MD_KNOWN = {
+    "ONE_SIDED": "Its periodic displacement, mod(d + L/2, L) - L/2, rounds otherwise from i to j than from j "
+    "to i, and each direction is decided by itself; in free space no pair is one-sided."
+}
 
 
 def _peer(name, package, function, about, **declared) -> PairList:
@@ -284,14 +291,23 @@ PEERS: tuple[PairList, ...] = (
         limits=Limits(minimum_image=True, all_axes=True, lower=True, right_handed=True, atoms=1),
     ),
     _peer("torch-sim", "torch-sim-atomistic", torch_sim_pairs, "torch-sim's linked cells", affords=0.3),
-    _peer("nvalchemi-ops", "nvalchemi-toolkit-ops", nvalchemi_pairs, "nvalchemi-ops' cell_list", affords=0.1),
+    _peer(
+        "nvalchemi-ops",
+        "nvalchemi-toolkit-ops",
+        nvalchemi_pairs,
+        "nvalchemi-ops' cell_list",
+        affords=0.3,
+        limits=Limits(whole_cell=True),
+    ),
     _peer(
         "jax-md",
         "jax-md",
         jax_md_pairs,
         "jax-md's partition.neighbor_list, allocated each time",
         affords=0.01,
-        limits=Limits(minimum_image=True, all_axes=True, most_atoms=5_000),
+        known=JAX_MD_KNOWN,
+        # its box matrix is upper triangular, with vectors as columns
+        limits=Limits(minimum_image=True, all_axes=True, lower=True, right_handed=True, most_atoms=5_000),
     ),
 )
 """Searches that start from nothing at every question."""
