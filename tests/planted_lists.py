@@ -55,6 +55,7 @@ SEARCH_DEFECTS = {
     "divides by a spread": "",
     "remembers by count": "",
     "box of the first call": "",
+    "count of the last": "",
 }
 
 #: What a list that is kept gets wrong.
@@ -82,6 +83,9 @@ KEPT_DEFECTS = {
     "counts of the first": "",
     "volume looked at": "",
     "the caller's array": "",
+    "skin of the first": "",
+    "first atom alone looked at": "",
+    "tail of a growing count lost": "",
 }
 
 _remembered: dict = {}
@@ -253,6 +257,10 @@ def _spoiled(n, r_cut, place, i, j, shift, vector, defect):
                 for new, old in zip((i, j, shift, vector), last, strict=True)
             )
         _remembered["tail"] = (i, j, shift, vector)
+    elif defect == "count of the last":
+        # the buffer is cut where it was cut before, which shows where there are more rows than then
+        most, _remembered["count"] = _remembered.get("count", len(i)), len(i)
+        i, j, shift, vector = i[:most], j[:most], shift[:most], vector[:most]
     rows = _rows(i, j, shift, vector)
     if defect == "padding handed out":
         rows["i"], rows["j"] = np.append(i, n), np.append(j, n)
@@ -303,12 +311,14 @@ class Kept:
 
     def __init__(self, defect=""):
         self.defect = defect
-        self.rows = self.tail = None
+        self.rows = self.tail = self.due_at = None
         self.age = 0
 
     def allocate(self, positions, cell, pbc, r_cut, skin):
         known = self.rows is not None and len(positions) == len(self.reference)
         self.pbc, self.r_cut, self.skin = pbc, r_cut, skin
+        if self.due_at is None or self.defect != "skin of the first":
+            self.due_at = skin
         self.first, self.most, self.slots = (np.array(cell), np.array(positions)), None, None
         self.late = False
         if not (self.defect == "known by its size" and known):
@@ -335,12 +345,14 @@ class Kept:
         size = np.sqrt((moved**2).sum(axis=1))
         if self.defect == "first atom not looked at":
             size = size[1:]
+        if self.defect == "first atom alone looked at":
+            size = size[:1]
         if self.defect == "motion along x":
             size = np.abs(moved[:, 0])
         most = float(size.max(initial=0.0))
         if self.defect == "average motion":
             most = 2.0 * float(size.mean())
-        room = self.skin if self.defect == "whole skin" else self.skin / 2
+        room = self.due_at if self.defect == "whole skin" else self.due_at / 2
         corner = float(np.abs((cell - self.cell).sum(axis=0)).max())
         if self.defect == "negative skin squared":
             return most**2 > (0.5 * (self.skin - 2 * corner)) ** 2
@@ -380,6 +392,10 @@ class Kept:
             rank = np.arange(len(order)) - np.searchsorted(rows["i"][order], rows["i"][order], "left")
             room = self.slots if np.ndim(self.slots) == 0 else np.asarray(self.slots)[rows["i"][order]] + 2
             rows = {name: part[order[rank < room]] for name, part in rows.items()}
+        if self.defect == "tail of a growing count lost":
+            last = len(rows["i"]) if self.tail is None else self.tail
+            self.tail = len(rows["i"])
+            rows = {name: part[:last] for name, part in rows.items()}
         if self.defect == "stale tail":
             if self.tail is not None and len(self.tail["i"]) > len(rows["i"]):
                 rows = {

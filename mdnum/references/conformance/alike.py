@@ -75,7 +75,13 @@ def alike(case: Case) -> Iterator[tuple[str, bool, Case]]:
 def _scaled(case: Case, power: float) -> Case:
     """All lengths multiplied by a power of two, which rounds nothing."""
     stills = tuple(
-        replace(one, positions=power * one.positions, cell=power * one.cell) for one in case.stills
+        replace(
+            one,
+            positions=power * one.positions,
+            cell=power * one.cell,
+            skin=None if one.skin is None else power * one.skin,
+        )
+        for one in case.stills
     )
     return replace(case, stills=stills, r_cut=power * case.r_cut, skin=power * case.skin, known=None)
 

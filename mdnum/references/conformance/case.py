@@ -44,11 +44,13 @@ class Still:
         positions: length, shape (atoms, 3).
         cell: lattice vectors as rows, length; rows of axes that do not repeat may hold anything finite.
         fresh: a list that is kept starts anew here, rather than being brought up to date.
+        skin: that it starts anew with, length; None for that of the case.
     """
 
     positions: ndarray
     cell: ndarray
     fresh: bool = False
+    skin: float | None = None
 
     def __post_init__(self) -> None:
         for name in ("positions", "cell"):
@@ -67,7 +69,7 @@ class Case:
         stills: one for a list that is asked once; the steps of a script for one that is kept.
         pbc: which axes repeat.
         r_cut: cutoff, length.
-        skin: of a list that is kept, length.
+        skin: of a list that is kept, length; the largest where it changes.
         known: the pairs of a single still where they are known without a search.
     """
 

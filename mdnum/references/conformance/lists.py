@@ -245,7 +245,8 @@ class Session:
                 positions[...], cell[...] = still.positions, still.cell
             else:
                 positions, cell = np.array(still.positions), np.array(still.cell)
-            outcome = self._one(case, positions, cell, pbc, fresh)
+            skin = case.skin if still.skin is None else still.skin
+            outcome = self._one(case, positions, cell, pbc, skin if fresh else None)
             yield outcome
             if outcome.answer is None:
                 return
@@ -255,15 +256,18 @@ class Session:
         self._made = None
         self._handed = []
 
-    def _one(self, case: Case, positions: ndarray, cell: ndarray, pbc: ndarray, fresh: bool) -> Outcome:
+    def _one(
+        self, case: Case, positions: ndarray, cell: ndarray, pbc: ndarray, skin: float | None
+    ) -> Outcome:
+        """One call; with a skin, a list that is kept starts anew."""
         before = (positions.copy(), cell.copy(), pbc.copy())
         handed, self._handed = self._handed, []
         held = [part.copy() for part in handed]
         try:
             if not self.tested.kept:
                 given = self._made(positions, cell, pbc, case.r_cut)
-            elif fresh:
-                given = self._made.allocate(positions, cell, pbc, case.r_cut, case.skin)
+            elif skin is not None:
+                given = self._made.allocate(positions, cell, pbc, case.r_cut, skin)
             else:
                 given = self._made.update(positions, cell)
         except SystemExit as error:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy import ndarray
 
-from mdnum.references.conformance.case import Case, Still, script
+from mdnum.references.conformance.case import Case, script
 from mdnum.references.conformance.catalog import gas
 
 _R, _SKIN, _L = 1.0, 0.3, 6.0
@@ -181,9 +181,24 @@ def _reuse() -> Iterator[Case]:
     )
     boxes = [(start, np.eye(3) * _L), (start, np.eye(3) * 9.0), (start * 0.6, np.eye(3) * 3.6)]
     yield _anew(script("other boxes", "reuse", boxes, _L, _R, _SKIN))
+    yield _other_skins()
     yield _anew(script("the same atoms three times", "reuse", [start] * 3, _L, _R, _SKIN))
+
+
+def _other_skins() -> Case:
+    """A list that starts anew with a thinner skin, and with a thicker one; each time two atoms come in."""
+    middle, path, skins = np.array([3.0, 3.0, 3.0]), [], []
+    for skin in (0.6, 0.1, 0.6):
+        apart = _R + 1.01 * skin
+        path += [_two(middle, apart), _two(middle, apart - 0.6 * skin), _two(middle, apart - 1.8 * skin)]
+        skins += [skin, None, None]
+    case = script("started anew with another skin", "reuse", path, _L, _R, max(filter(None, skins)))
+    stills = [
+        replace(one, fresh=skin is not None, skin=skin) for one, skin in zip(case.stills, skins, strict=True)
+    ]
+    return replace(case, stills=tuple(stills))
 
 
 def _anew(case: Case) -> Case:
     """A script in which every still is another question to the same list."""
-    return replace(case, stills=tuple(Still(one.positions, one.cell, fresh=True) for one in case.stills))
+    return replace(case, stills=tuple(replace(one, fresh=True) for one in case.stills))

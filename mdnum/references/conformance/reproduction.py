@@ -99,7 +99,7 @@ def check(step, x, cell, given):
 
 _ONCE = """
 fine = True
-for step, (x, cell, _) in enumerate(STEPS):
+for step, (x, cell, *_) in enumerate(STEPS):
     before = x.copy(), cell.copy()
     given = asked({call}, x, cell, PBC, R_CUT)
     if not (np.array_equal(x, before[0]) and np.array_equal(cell, before[1])):
@@ -110,13 +110,14 @@ for step, (x, cell, _) in enumerate(STEPS):
 
 _KEPT = """
 fine, kept, held = True, {call}(), None
-for step, (x, cell, fresh) in enumerate(STEPS):
+for step, (x, cell, fresh, *skin) in enumerate(STEPS):
     before = x.copy(), cell.copy()
     if not fresh and held is not None and held[0].shape == x.shape:
         held[0][...], held[1][...] = x, cell  # atoms are moved where they are, as a program does it
         x, cell = held
     held = x, cell
-    given = asked(kept.allocate, x, cell, PBC, R_CUT, SKIN) if fresh else asked(kept.update, x, cell)
+    anew = fresh and (PBC, R_CUT, *(skin or [SKIN]))
+    given = asked(kept.allocate, x, cell, *anew) if fresh else asked(kept.update, x, cell)
     if not (np.array_equal(x, before[0]) and np.array_equal(cell, before[1])):
         print(f"step {{step}}: the call wrote to its input")
         fine = False
@@ -236,7 +237,9 @@ def _numbers(failed: Failed, how: Conventions, reach: float) -> str:
         fresh = atoms is None or still.fresh or count != atoms
         atoms = count
         place = _array(still.positions)
-        stills.append(f"    ({place},\n     {_array(still.cell)}, {fresh}),")
+        skin = case.skin if still.skin is None else still.skin
+        anew = f", {skin!r}" if fresh and any(one.skin is not None for one in case.stills) else ""
+        stills.append(f"    ({place},\n     {_array(still.cell)}, {fresh}{anew}),")
     lines = [
         f"R_CUT, SKIN, REACH = {case.r_cut!r}, {case.skin!r}, {reach!r}",
         f"PBC = np.array({list(case.pbc)})",
@@ -245,7 +248,7 @@ def _numbers(failed: Failed, how: Conventions, reach: float) -> str:
         f"TOWARD = {how.toward}  # +1: vectors point from i to j",
         f"NAMES = {json.dumps(NAMES)}",
         f"TOLERANCE = {16 * how.unit!r}  # a decision this close to the cutoff is rounding",
-        "STEPS = [  # positions, cell (vectors as rows), whether the list starts anew",
+        "STEPS = [  # positions, cell (vectors as rows), whether the list starts anew (its skin)",
         *stills,
         "]",
     ]

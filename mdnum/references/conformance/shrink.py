@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mdnum.references.conformance.case import Case, Still
+from mdnum.references.conformance.case import Case
 from mdnum.references.conformance.judge import Failure
 from mdnum.references.conformance.lists import completed
 from mdnum.references.oracle import widths
@@ -198,10 +198,10 @@ def _moved(case: Case, atom: int, axis: int, digits: int) -> Case:
 def _with(case: Case, positions=None, cell=None) -> Case:
     """A case with its coordinates or cells changed at every step."""
     stills = tuple(
-        Still(
-            still.positions if positions is None else positions(still.positions),
-            still.cell if cell is None else cell(still.cell),
-            still.fresh,
+        replace(
+            still,
+            positions=still.positions if positions is None else positions(still.positions),
+            cell=still.cell if cell is None else cell(still.cell),
         )
         for still in case.stills
     )

@@ -94,6 +94,8 @@ def test_keys_that_overflow_are_found_at_100_000_atoms():
         ("box not looked at", "strain", 2, 2),
         ("stale tail", "reuse", 3, 2),
         ("reference overwritten", "motion", 2, 4),
+        ("skin of the first", "reuse", 2, 3),
+        ("tail of a growing count lost", "motion", 2, 2),
     ],
 )
 def test_failures_shrink_and_are_reproduced_without_mdnum(defect, area, atoms, steps, tmp_path: Path):
