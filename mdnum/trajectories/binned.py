@@ -108,8 +108,8 @@ class Binned:
             )  # fmt: skip
         else:
             met_from_centers(
-                *bins, *self.around, self.wrapped, self.sorted_x, lattice.vectors, free, grid.bins, grid.reach,
-                self.center_start, self.center_order, self.start, self.order,
+                *bins, *self.around, self.wrapped, self.sorted_x, lattice.vectors, free, grid.bins,
+                grid.reach, self.center_start, self.center_order, self.start, self.order,
                 self.sides.centers & self.sides.others, *what,
             )  # fmt: skip
         return int(tally[0]), int(tally[1])

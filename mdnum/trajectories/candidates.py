@@ -15,8 +15,8 @@ from mdnum.trajectories.bins import lattice_code, run_of_bins
 INSIDE, BAND, DIRECTED = 0, 1, 2
 
 
-# Not inlined, and in loops from 0 over slices: an index that could be negative costs a test for each candidate,
-# and the loop its vector instructions.
+# Not inlined, and in loops from 0 over slices: an index that could be negative costs a test for each
+# candidate, and the loop its vector instructions.
 @numba.njit(cache=True, nogil=True, inline="never")
 def _within(near, first, last, x0, x1, x2, largest, squares, flags, chosen):
     """Squares of near[:, first:last] as seen from x, and which of them, counted from first, are within."""

@@ -10,6 +10,9 @@ from jaxtyping import Bool, Float, Int
 
 from mdnum.trajectories.table import Flips
 
+# flips in a part, about
+_PART = 2048
+
 
 @dataclass(frozen=True)
 class Thresholds:
@@ -32,38 +35,6 @@ class Thresholds:
     old_first_out: Float[np.ndarray, "old_limits"]
 
 
-def sorted_order(
-    first: Int[np.ndarray, "rows"], second: Int[np.ndarray, "rows"], atoms: int
-) -> Int[np.ndarray, "rows"]:
-    """The order of pairs by (first, second); those that are the same stay in theirs.
-
-    Args:
-        atoms: a number that none of them reaches.
-    """
-    if 4 * len(first) < atoms:
-        # counting would look at every atom twice
-        return np.argsort(first * np.int64(atoms) + second, kind="stable")
-    return _counted(first, second, atoms)
-
-
-@numba.njit(cache=True, nogil=True)
-def _counted(first, second, atoms):
-    """Two counting sorts, the second of which keeps the order of the first."""
-    order, made = np.arange(first.shape[0]), np.empty(first.shape[0], np.int64)
-    for key in (second, first):
-        at = np.zeros(atoms + 1, np.int64)
-        for k in range(key.shape[0]):
-            at[key[k] + 1] += 1
-        for a in range(atoms):
-            at[a + 1] += at[a]
-        for m in range(order.shape[0]):
-            k = order[m]
-            made[at[key[k]]] = k
-            at[key[k]] += 1
-        order, made = made, order
-    return order
-
-
 @dataclass(frozen=True)
 class Changed:
     """Decisions that differ between two frames, in no order.
@@ -83,64 +54,132 @@ class Changed:
     before: Float[np.ndarray, "flips"]
 
 
-def ledger(
-    frame: int,
-    changed: Changed,
-    labels: Int[np.ndarray, "participants"],
-    atoms: int,
-    thresholds: Thresholds,
-    bound: float,
-) -> Flips:
-    """The rows of one frame.
+class Ledger:
+    """Makes the rows of frame after frame.
 
     Args:
-        frame: its position among the frames looked at.
         labels: numbers in the file of the atoms that take part.
         atoms: of the file.
-        thresholds: what the distances are compared with.
-        bound: how far a margin can be off, length.
     """
-    count = len(changed.i)
-    first, second = np.empty(count, np.int64), np.empty(count, np.int64)
-    _named(changed.i, changed.j, labels, thresholds.directed, first, second)
-    if changed.rank.any():
-        order = np.lexsort((changed.rank, second, first))
-    else:
-        order = sorted_order(first, second, atoms)
-    whole = [np.empty(count, np.int64) for _ in range(3)]
-    real, yes = [np.empty(count) for _ in range(4)], [np.empty(count, np.bool_) for _ in range(2)]
-    _fill(
-        order, first, second, changed.i, changed.j, changed.rank, changed.entered, changed.distance,
-        changed.before, *vars(thresholds).values(), bound, *whole, *real, *yes,
-    )  # fmt: skip
-    return Flips(np.full(count, frame), *whole, yes[0], *real, np.full(count, bound), yes[1])
+
+    def __init__(self, labels: Int[np.ndarray, "participants"], atoms: int):
+        self.labels, self.atoms = labels, atoms
+        # kept from frame to frame: pages that are new to a process can cost more than what is done in them
+        self._rows = np.empty((0, 7))
+
+    def flips(self, frame: int, changed: Changed, thresholds: Thresholds, bound: float) -> Flips:
+        """The rows of one frame.
+
+        Args:
+            frame: its position among the frames looked at.
+            changed: indices among the atoms that take part.
+            thresholds: what the distances are compared with.
+            bound: how far a margin can be off, length.
+        """
+        count, ranks = len(changed.i), int(changed.rank.max(initial=0)) + 1
+        if len(self._rows) < count:
+            self._rows = np.empty((count + count // 8, 7))
+        # parts of the atoms, each of whose flips fit into a core's cache
+        shift = max(int(self.atoms).bit_length() - max(count // _PART, 1).bit_length(), 0)
+        start = np.zeros((max(self.atoms, 1) - 1 >> shift) + 2, np.int64)
+        _parted(
+            changed.i, changed.j, changed.rank, changed.entered, changed.distance, changed.before,
+            self.labels, ranks, shift, start, self._rows, *vars(thresholds).values(),
+        )  # fmt: skip
+        first, second, rank = (np.empty(count, np.int64) for _ in range(3))
+        distance, distance_before, margin, margin_before = (np.empty(count) for _ in range(4))
+        entered, ambiguous = (np.empty(count, np.bool_) for _ in range(2))
+        _sorted(
+            start, shift, self._rows, ranks, bound, first, second, rank,
+            distance, distance_before, margin, margin_before, entered, ambiguous,
+        )  # fmt: skip
+        return Flips(
+            np.full(count, frame), first, second, rank, entered,
+            distance, distance_before, margin, margin_before, np.full(count, bound), ambiguous,
+        )  # fmt: skip
 
 
 @numba.njit(cache=True, nogil=True)
-def _named(i, j, labels, directed, first, second):
-    """Numbers in the file, the lower one first unless the rule is directed."""
+def _parted(
+    i, j, rank, entered, distance, before, labels, ranks, shift, start, rows,
+    directed, species, radii, last_in, first_out, old_last_in, old_first_out,
+):  # fmt: skip
+    """Rows (first, key, distance, before, margin, margin_before, entered), part by part of the first atoms.
+
+    Whole numbers among them are small enough for float64. What belongs together is moved together: where
+    there are millions, a place in memory is dear, and its width is not.
+    """
     for k in range(i.shape[0]):
-        a, b = labels[i[k]], labels[j[k]]
-        first[k], second[k] = (a, b) if directed or a < b else (b, a)
+        one, other = labels[i[k]], labels[j[k]]
+        start[((one if directed else min(one, other)) >> shift) + 1] += 1
+    for part in range(1, start.shape[0]):
+        start[part] += start[part - 1]
+    cursor = start.copy()
+    for k in range(i.shape[0]):
+        a, yes = i[k], entered[k]
+        one, other = labels[a], labels[j[k]]
+        if directed:
+            limit = last_in[a] if yes else first_out[a]
+            old_limit = old_first_out[a] if yes else old_last_in[a]
+        else:
+            one, other = min(one, other), max(one, other)
+            limit = radii[species[a], species[j[k]]]
+            old_limit = limit
+        part = one >> shift
+        at = cursor[part]
+        cursor[part] = at + 1
+        rows[at, 0], rows[at, 1] = one, other * ranks + rank[k]
+        rows[at, 2], rows[at, 3] = distance[k], before[k]
+        rows[at, 4], rows[at, 5], rows[at, 6] = limit - distance[k], old_limit - before[k], yes
 
 
 @numba.njit(cache=True, nogil=True)
-def _fill(
-    order, first_in, second_in, i, j, rank_in, entered_in, distance_in, before_in,
-    directed, species, radii, last_in, first_out, old_last_in, old_first_out, bound,
+def _sorted(
+    start, shift, rows, ranks, bound,
     first, second, rank, distance, before, margin, margin_before, entered, ambiguous,
 ):  # fmt: skip
-    """Every column in order, and the margins."""
-    for m in range(order.shape[0]):
-        k = order[m]
-        first[m], second[m], rank[m] = first_in[k], second_in[k], rank_in[k]
-        yes, here, there = entered_in[k], distance_in[k], before_in[k]
-        entered[m], distance[m], before[m] = yes, here, there
-        a = i[k]
-        if directed:
-            margin[m] = (last_in[a] if yes else first_out[a]) - here
-            margin_before[m] = (old_first_out[a] if yes else old_last_in[a]) - there
-        else:
-            radius = radii[species[a], species[j[k]]]
-            margin[m], margin_before[m] = radius - here, radius - there
-        ambiguous[m] = abs(margin[m]) <= bound or abs(margin_before[m]) <= bound
+    """The columns, in order: in each part a counting sort by the first atom, and then each atom's few."""
+    cursor = np.empty((1 << shift) + 1, np.int64)
+    most = 0
+    for part in range(start.shape[0] - 1):
+        most = max(most, start[part + 1] - start[part])
+    order = np.empty(most, np.int64)
+    for part in range(start.shape[0] - 1):
+        low, high, lowest = start[part], start[part + 1], part << shift
+        cursor[:] = 0
+        for k in range(low, high):
+            cursor[np.int64(rows[k, 0]) - lowest + 1] += 1
+        for a in range(1, cursor.shape[0]):
+            cursor[a] += cursor[a - 1]
+        for k in range(low, high):
+            a = np.int64(rows[k, 0]) - lowest
+            order[cursor[a]] = k
+            cursor[a] += 1
+        # a cursor now stands where the next atom begins
+        begin = 0
+        for a in range(cursor.shape[0] - 1):
+            end = cursor[a]
+            # Shell's sort: that of a card player for a few, and no worse than others for many
+            gap = 1
+            while 9 * gap < end - begin:
+                gap = 3 * gap + 1
+            while gap > 0:
+                for m in range(begin + gap, end):
+                    k, at = order[m], m
+                    key = rows[k, 1]
+                    while at >= begin + gap and rows[order[at - gap], 1] > key:
+                        order[at] = order[at - gap]
+                        at -= gap
+                    order[at] = k
+                gap //= 3
+            begin = end
+        for m in range(high - low):
+            k, at = order[m], low + m
+            key = np.int64(rows[k, 1])
+            first[at], second[at], rank[at] = np.int64(rows[k, 0]), key, 0
+            if ranks > 1:
+                second[at], rank[at] = key // ranks, key % ranks
+            distance[at], before[at] = rows[k, 2], rows[k, 3]
+            margin[at], margin_before[at] = rows[k, 4], rows[k, 5]
+            entered[at] = rows[k, 6] != 0.0
+            ambiguous[at] = abs(rows[k, 4]) <= bound or abs(rows[k, 5]) <= bound

@@ -175,8 +175,8 @@ def search(
         sure, doubtful = (int(1.05 * (count + left)) if kind == INSIDE else 0), int(1.05 * left) + 1
     i_open, j_open, code, value = i_open[:left], j_open[:left], code[:left], value[:left]
     smallest = _settle(
-        positions, placed.home, lattice.vectors, kind, sides.species, np.where(radii >= 0, radii * radii, -1.0),
-        radii, bound, i_open, j_open, code, tally, i, j, value,
+        positions, placed.home, lattice.vectors, kind, sides.species,
+        np.where(radii >= 0, radii * radii, -1.0), radii, bound, i_open, j_open, code, tally, i, j, value,
     )  # fmt: skip
     inside, close = int(tally[0]), int(tally[2])
     if kind == INSIDE:

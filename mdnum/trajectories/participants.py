@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numba
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mdnum.errors import InputError
-from mdnum.trajectories.binned import Sides
+from mdnum.trajectories.binned import Sides, binned
 from mdnum.trajectories.frame import Box
 from mdnum.trajectories.lattice import lattice_of
 from mdnum.trajectories.rules import Cutoff, Rule, SpeciesCutoffs
@@ -71,8 +72,10 @@ def participants(
             remedy="Use the topology that belongs to the trajectory",
             where="species",
         )
-    labels = np.union1d(first, second).astype(np.int64)
-    centers, others = np.isin(labels, first), np.isin(labels, second)
+    centers, others = np.zeros(atoms, bool), np.zeros(atoms, bool)
+    centers[first], others[second] = True, True
+    labels = np.flatnonzero(centers | others)
+    centers, others = centers[labels], others[labels]
     if (centers == others).all():
         # the same array: pairs within one set are searched for from one side only
         others = centers
@@ -91,17 +94,32 @@ def by_place(who: Participants, positions: Float[np.ndarray, "atoms 3"], box: Bo
     Raises:
         InputError: the box is none.
     """
-    if not np.isfinite(positions[who.labels]).all() or not who.radius > 0:
+    x = np.empty((len(who.labels), 3))
+    if (
+        not np.isfinite(taken(np.require(positions, np.float64, ["C", "W"]), who.labels, x))
+        or not who.radius > 0
+    ):
         return who
-    lattice = lattice_of(box)
-    components = positions[who.labels] @ lattice.inverse
-    components -= np.where(lattice.periodic, np.floor(components), 0.0)
-    steps = np.where(lattice.periodic, who.radius / lattice.widths, who.radius)
-    order = np.lexsort(np.floor(components / steps).T[::-1])
+    everyone = np.ones(len(x), bool)
+    order = binned(x, lattice_of(box), Sides(everyone, everyone, who.sides.species), who.radius, 0.0).order
     others = who.sides.others[order]
     centers = others if who.sides.centers is who.sides.others else who.sides.centers[order]
     sides = Sides(centers, others, who.sides.species[order])
     return replace(who, labels=who.labels[order], sides=sides, both=who.both[order])
+
+
+@numba.njit(cache=True, nogil=True)
+def taken(positions, labels, out):
+    """Copy the positions of some atoms; returns the largest coordinate, not finite where one is not."""
+    most0, most1, most2, finite = 0.0, 0.0, 0.0, 0
+    for at in range(labels.shape[0]):
+        i = labels[at]
+        x0, x1, x2 = positions[i, 0], positions[i, 1], positions[i, 2]
+        out[at, 0], out[at, 1], out[at, 2] = x0, x1, x2
+        most0, most1, most2 = max(most0, abs(x0)), max(most1, abs(x1)), max(most2, abs(x2))
+        # nan is larger than nothing
+        finite += int(x0 - x0 == 0.0 and x1 - x1 == 0.0 and x2 - x2 == 0.0)
+    return max(most0, most1, most2) if finite == labels.shape[0] else np.inf
 
 
 def _kinds_and_radii(

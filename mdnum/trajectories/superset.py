@@ -212,11 +212,13 @@ def listed(
             for old, new in zip(held, larger, strict=True):
                 new[:count] = old[:count]
             held = larger
+        groups = start[at * GROUPS : (at + 1) * GROUPS + 1], earliest[at * GROUPS : (at + 1) * GROUPS]
+        arrays = [*batch, *groups, *held]
         _store(
-            positions, placed.home, lattice.vectors, sides.species, radii, square, skin, guard, left, *batch,
-            start[at * GROUPS : (at + 1) * GROUPS + 1], earliest[at * GROUPS : (at + 1) * GROUPS], *held,
-        )  # fmt: skip
-    return Superset(skin, *held, start, earliest, placed.home)
+            positions, placed.home, lattice.vectors, sides.species, radii, square, skin, guard, left, *arrays
+        )
+    i, j, code, due, inside = held
+    return Superset(skin, i, j, code, due, inside, start, earliest, placed.home)
 
 
 def _room(pairs: int) -> list[np.ndarray]:

@@ -11,14 +11,14 @@ from jaxtyping import Float, Int
 from mdnum.errors import InputError
 from mdnum.trajectories.candidates import INSIDE
 from mdnum.trajectories.changes import compared, image_distances
-from mdnum.trajectories.columns import Changed, Thresholds, ledger, sorted_order
+from mdnum.trajectories.columns import Changed, Ledger, Thresholds
 from mdnum.trajectories.exchanged import exchanged
 from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.lattice import Lattice, lattice_of, own_images
 from mdnum.trajectories.looking import look
 from mdnum.trajectories.nearest import chosen
 from mdnum.trajectories.pairs import Found, Rows, pairs_of, ranks, rows_of, search
-from mdnum.trajectories.participants import Participants, by_place, indices, participants
+from mdnum.trajectories.participants import Participants, by_place, indices, participants, taken
 from mdnum.trajectories.rules import Capped, Nearest, Rule
 from mdnum.trajectories.superset import Superset, displaced, listed, skin_for
 from mdnum.trajectories.table import Flips, Members
@@ -142,7 +142,7 @@ class Tracker:
         first, second = self._who.labels[i], self._who.labels[j]
         if not self.rule.directed:
             first, second = np.minimum(first, second), np.maximum(first, second)
-        order = sorted_order(first, second, max(self._atoms, 1))
+        order = np.argsort(first * np.int64(max(self._atoms, 1)) + second)
         first, second = first[order], second[order]
         rank = ranks(first, second)
         return Members(first, second, rank, self._distances(now, i[order], j[order], rank))
@@ -301,7 +301,8 @@ class Tracker:
     def _flips(self, before: Moment, now: Moment) -> Flips:
         if not self.rule.directed and self._one_image(before, now):
             i, j, entered = exchanged(
-                before.found or self._searched(before), now.found or self._searched(now), (before.positions, before.lattice), (now.positions, now.lattice),
+                before.found or self._searched(before), now.found or self._searched(now),
+                (before.positions, before.lattice), (now.positions, now.lattice),
                 self._who.sides.species, self._who.radii,
             )  # fmt: skip
             return self._table(before, now, i, j, np.zeros(len(i), np.int64), entered)
@@ -332,7 +333,7 @@ class Tracker:
             now.last_in, now.first_out, before.last_in, before.first_out,
         )  # fmt: skip
         bound = self.bound + max(before.rounding, now.rounding)
-        return ledger(self.frames, changed, self._who.labels, self._atoms, thresholds, bound)
+        return self._ledger.flips(self.frames, changed, thresholds, bound)
 
     def _distances(self, moment: Moment, i, j, rank) -> np.ndarray:
         if self.rule.directed:
@@ -349,16 +350,16 @@ class Tracker:
             self._atoms = atoms
             self._who = participants(self.rule, self._first, self._second, self._species, atoms)
             if not self.rule.directed:
-                self._who = by_place(self._who, np.asarray(frame.positions, np.float64), frame.box)
+                self._who = by_place(self._who, frame.positions, frame.box)
+            self._ledger = Ledger(self._who.labels, atoms)
         if atoms != self._atoms:
             raise InputError(
                 f"{atoms} atoms, {self._atoms} in the frames before",
                 remedy="Split the trajectory where the number of atoms changes",
                 where=f"frame {frame.index}",
             )
-        positions = np.asarray(frame.positions, np.float64)
-        positions = np.ascontiguousarray(positions[self._who.labels])
-        largest = float(np.abs(positions).max(initial=0.0))
+        positions = np.empty((len(self._who.labels), 3))
+        largest = taken(np.require(frame.positions, np.float64, ["C", "W"]), self._who.labels, positions)
         if not np.isfinite(largest):
             broken = np.flatnonzero(~np.isfinite(positions).all(axis=1))
             at = int(broken[np.argmin(self._who.labels[broken])])
