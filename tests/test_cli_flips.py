@@ -27,7 +27,9 @@ TRICLINIC = (str(datafiles.PSF_TRICLINIC), str(datafiles.DCD_TRICLINIC))
         ((XTC, "-s", GRO, "--pairs", "O-H"), "is not of the form A-B=LENGTH"),
         ((XTC, "-s", GRO, "--cutoff", "4", "--between", "name OW", "name XX"), "names no atom"),
         ((XTC, "-s", GRO, "--cutoff", "4", "--between", "name OW", "name ("), "is no selection"),
-        ((f"{XTC}@99:", "-s", GRO, "--cutoff", "4"), "no frame is left"),
+        ((f"{XTC}@99:", "-s", GRO, "--cutoff", "4"), "@99: leaves no frame of 10"),
+        ((f"{XTC}@x:", "-s", GRO, "--cutoff", "4"), "'x:' names no frames"),
+        ((XTC, "-s", GRO, "--cutoff", "4", "--format", "foo"), "--format 'foo' is known to neither"),
         ((f"{XTC}@::-1", "-s", GRO, "--cutoff", "4"), "go backward"),
     ],
 )

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from ase.io.formats import UnknownFileTypeError
 
 from mdnum.errors import InputError
 from mdnum.trajectories.checked import FrameError
@@ -23,6 +24,8 @@ from mdnum.units import get as units_named
 
 # ASE's reader of each format raises what it likes on files that end early or hold something else
 _UNREADABLE = Exception
+# what the end of the file looks like to its reader of traj
+_ENDS = frozenset({"buffer is smaller than requested size"})
 
 
 class AseTrajectory(Trajectory):
@@ -114,10 +117,16 @@ class AseTrajectory(Trajectory):
         raise InputError("the file holds no frame", remedy="Check how it was written", where=str(self.path))
 
     def _unreadable(self, number: int, error: BaseException) -> UnreadableFrame:
-        said = str(error).strip().splitlines() or [type(error).__name__]
-        return UnreadableFrame(
-            f"frame {number} cannot be read ({said[0].rstrip('.')})", frame=number, where=str(self.path)
-        )
+        if isinstance(error, UnknownFileTypeError) and self.format == str(error):
+            raise InputError(
+                f"--format {self.format!r} is known to neither MDAnalysis nor ASE",
+                remedy="Write it as one of them does: XTC, DCD, lammpstrj, extxyz, ...",
+                where=str(self.path),
+            ) from error
+        said = (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".")
+        if said in _ENDS:
+            said = "the file ends in it"
+        return UnreadableFrame(f"frame {number} cannot be read ({said})", frame=number, where=str(self.path))
 
     def _of_traj(self, numbers: Iterator[int]) -> Iterator[tuple[int, Any]]:
         from ase.io.trajectory import TrajectoryReader

@@ -22,9 +22,11 @@ def split_path(text: str) -> tuple[Path, str]:
     """
     whole = Path(text).expanduser()
     name, at, words = text.rpartition("@")
-    if not at or whole.exists() or not _WORD.fullmatch(words):
+    if not at or whole.exists():
         return whole, ""
-    return Path(name).expanduser(), words
+    path = Path(name).expanduser()
+    # words that name no frames are said to where the file is there without them
+    return (path, words) if _WORD.fullmatch(words) or path.is_file() else (whole, "")
 
 
 def parse_slice(words: str, where: str = "") -> slice:

@@ -122,7 +122,12 @@ def refuse_cut_text(trajectory: Any, number: int) -> None:
     if number != trajectory.n_frames - 1 or (found := _text(trajectory)) is None:
         return
     path, word = found
-    last = _last_bytes(path).decode("latin-1").splitlines(keepends=True)
+    end, size = _last_bytes(path)
+    offsets = getattr(trajectory, "_offsets", ())
+    if len(offsets) > number + 1 and offsets[number + 1] < size:
+        # what was cut are lines behind this frame, too few for another: left_over tells of them
+        return
+    last = end.decode("latin-1").splitlines(keepends=True)
     if word == "XYZ":
         refuse_cut_line(last[-int(trajectory.n_atoms) :])
     elif word in ("TRJ", "MDCRD") and last:
@@ -130,17 +135,18 @@ def refuse_cut_text(trajectory: Any, number: int) -> None:
         refuse_cut_line(last[-1:], last[-1].split()[:-1])
 
 
-def _last_bytes(path: Path) -> bytes:
-    """The end of a file; of a compressed one, of what is in it, which takes reading all of it."""
+def _last_bytes(path: Path) -> tuple[bytes, int]:
+    """The end of a file, and how many bytes it has; of a compressed one, what is in it, which is all read."""
     if path.suffix not in _COMPRESSED:
+        size = path.stat().st_size
         with path.open("rb") as raw:
-            raw.seek(max(path.stat().st_size - _LAST_BYTES, 0))
-            return raw.read()
-    last = b""
+            raw.seek(max(size - _LAST_BYTES, 0))
+            return raw.read(), size
+    last, size = b"", 0
     with _COMPRESSED[path.suffix](path, "rb") as packed:
         while part := packed.read(_PART):
-            last = (last + part)[-_LAST_BYTES:]
-    return last
+            last, size = (last + part)[-_LAST_BYTES:], size + len(part)
+    return last, size
 
 
 def _text(trajectory: Any) -> tuple[Path, str] | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -32,6 +32,7 @@ from mdnum.workflow.flips_open import (
     told_resolution,
 )
 from mdnum.workflow.fork_question import Log, Progress, finish
+from mdnum.workflow.interrupt import asked_to_stop
 
 if TYPE_CHECKING:
     from mdnum.trajectories.frame import Frame
@@ -85,6 +86,7 @@ class _Found:
     times_differ: int = 0
     last: Apart = field(default_factory=lambda: Apart(0.0, 0.0, 0))
     stopped: InputError | None = None
+    interrupted: bool = False
 
 
 def compare(
@@ -160,14 +162,16 @@ def _look(
             "other": name_of(b),
             "other_file": str(b.path),
             "other_format": b.format,
-            "same_species": bool(np.array_equal(a.species.astype(str), b.species.astype(str))),
+            "same_species": _alike(a, b),
             "between": None if between is None else list(between),
             # the first rule, and all of them
             **told[0],
             "rules": told,
             "frames": found.frames,
             "in_file": [one.count for one in both],
-            "times_differ": found.times_differ,
+            # steps, units and numbers of frames are not compared with one another
+            "times_differ": found.times_differ if a.time == b.time else 0,
+            "times": [a.time, b.time],
             "timed": a.time != "frame",
             "resolution": told_resolution(resolutions[0], a),
             "other_resolution": told_resolution(resolutions[1], b),
@@ -176,16 +180,37 @@ def _look(
             "other_box": found.other_box,
             "last": {"furthest": found.last.furthest, "typical": found.last.typical},
             "stopped": None if found.stopped is None else str(found.stopped),
+            "interrupted": found.interrupted,
             "seconds": time.perf_counter() - began,
             "findings": [],
-            "status": "complete" if found.stopped is None else "stopped",
+            "status": "stopped" if found.stopped is not None or found.interrupted else "complete",
         }
     )
     return FlipsResult(folder.path, finish(folder, report, progress))
 
 
+def _alike(a: Trajectory, b: Trajectory) -> bool:
+    """Whether the atoms of two files may be the same ones: of one species each, as far as the files say."""
+    if not (a.table.named and b.table.named):
+        return True
+    first, second = ([str(one) for one in file.species] for file in (a, b))
+    if first == second:
+        return True
+    # a dump numbers its types: each number stands for one species, and each species has one
+    numbered = [all(one.isdigit() for one in words) for words in (first, second)]
+    both = set(zip(first, second, strict=True))
+    return numbered[0] != numbered[1] and len(both) == len(set(first)) == len(set(second))
+
+
 def _follow(folder: RunFolder, sets: list[_Sets], groups: Groups, progress: Log) -> _Found:
-    """Reads both once, in step."""
+    """Reads both once, in step; control-C ends it, and what was compared stays."""
+    with asked_to_stop() as stop:
+        return _followed(folder, sets, groups, progress, stop)
+
+
+def _followed(
+    folder: RunFolder, sets: list[_Sets], groups: Groups, progress: Log, stop: Callable[[], bool]
+) -> _Found:
     atoms = None
     if groups[0] is not None:
         atoms = np.unique(np.concatenate([one for one in groups if one is not None]))
@@ -200,6 +225,9 @@ def _follow(folder: RunFolder, sets: list[_Sets], groups: Groups, progress: Log)
     )
     pairs_of_frames = zip(first, second, strict=False)
     while True:
+        if stop() and found.frames:
+            found.interrupted = True
+            break
         try:
             frames = next(pairs_of_frames, None)
             if frames is None:

@@ -118,8 +118,12 @@ def sample_of(trajectory: Trajectory) -> list[Frame]:
         if not sample:
             raise
     if not sample:
+        words, count = _slice_words(trajectory.slice), trajectory.in_file
+        of = f" of {count:,}" if count is not None else ""
         raise InputError(
-            "no frame is left of what was asked for", remedy="Ask for others", where=str(trajectory.path)
+            f"@{words} leaves no frame{of}" if words else "the file holds no frame",
+            remedy="Ask for others" if words else "Check how it was written",
+            where=str(trajectory.path),
         )
     return sample
 
@@ -155,7 +159,9 @@ def cut_short(error: InputError | None, trajectory: Trajectory) -> bool:
 
     if not isinstance(error, UnreadableFrame):
         return False
-    return trajectory.in_file is None or error.frame >= trajectory.in_file - 1
+    if "the file ends" in error.message:
+        return True
+    return trajectory.in_file is not None and error.frame >= trajectory.in_file - 1
 
 
 def told_resolution(resolution: Resolution, trajectory: Trajectory) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import re
 import shutil
@@ -299,6 +300,18 @@ def test_a_number_that_was_cut_is_not_read_as_another(tmp_path, kind, name):
             assert isinstance(error, UnreadableFrame) and error.frame == len(frames) == 4, (cut, error)
 
 
+@pytest.mark.parametrize("packed", ["", ".gz"])
+def test_a_number_cut_behind_the_last_whole_frame_is_none_of_its_numbers(tmp_path, packed):
+    path = tmp_path / f"run.xyz{packed}"
+    lines = text_of("xyz", "xyz").splitlines(keepends=True)
+    # in the fourth atom of the last frame
+    text = "".join(lines[:-5])[:-3].encode()
+    path.write_bytes(gzip.compress(text) if packed else text)
+    frames, error = read(open_trajectory(path))
+    assert isinstance(error, UnreadableFrame) and error.frame == len(frames) == 4
+    assert "after 6 lines of it" in str(error)
+
+
 @pytest.mark.parametrize("asked", ["", "@::3"])
 def test_lines_behind_the_last_frame_of_a_library_are_a_frame_too(tmp_path, asked):
     path = tmp_path / "run.xyz"
@@ -324,6 +337,7 @@ def test_a_traj_that_was_cut_is_read_as_far_as_it_goes(tmp_path):
     (tmp_path / "run.traj").write_bytes(data[:-300])
     frames, error = read(open_trajectory(tmp_path / "run.traj"))
     assert isinstance(error, UnreadableFrame) and error.frame == len(frames) == 4
+    assert "the file ends in it" in str(error)
 
 
 @pytest.mark.parametrize("kind", ["traj", "extxyz"])

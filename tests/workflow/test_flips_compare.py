@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -202,6 +203,51 @@ def test_frames_of_a_slice_are_named_by_their_numbers_in_the_files(tmp_path: Pat
     assert found["first_frame"] == words and f"Positions differ from {words} on" in found["concluded"][0]
     found = looked(Path(f"{tmp_path}/a.traj@4:"), Path(f"{tmp_path}/a.traj@4:"), tmp_path / "g").summary
     assert found["beyond"] is None and found["frames"] == 8
+
+
+def test_files_that_do_not_say_it_are_of_no_other_species_or_times(tmp_path: Path) -> None:
+    frames = gas(4)
+    for one in frames:
+        one.symbols[:20] = "Ne"
+        one.info.clear()
+    write(tmp_path / "a.extxyz", frames)
+
+    def dump(name: str, row: str) -> Path:
+        lines = []
+        for n, one in enumerate(frames):
+            lines += ["ITEM: TIMESTEP", f"{10 * n}", "ITEM: NUMBER OF ATOMS", "40"]
+            lines += ["ITEM: BOX BOUNDS pp pp pp", *["0 9.0"] * 3, f"ITEM: ATOMS {row}"]
+            for k, x in enumerate(one.positions):
+                words = " ".join(f"{v:.8f}" for v in x)
+                lines.append(f"{k + 1} {1 + (k < 20)} {words}" if "type" in row else f"{k + 1} {words}")
+        (tmp_path / name).write_text("\n".join(lines) + "\n")
+        return tmp_path / name
+
+    for name, row in (("types.lammpstrj", "id type x y z"), ("bare.lammpstrj", "id x y z")):
+        found = looked(tmp_path / "a.extxyz", dump(name, row), tmp_path / f"f-{name}")
+        assert {"OTHER_SPECIES", "OTHER_TIMES"}.isdisjoint(one["code"] for one in found.summary["findings"])
+        said = finding(found, "NO_TIMES")
+        assert said is not None and said["severity"] == "info" and "one by one" in said["text"]
+    # in another order than the types are
+    for one in frames:
+        one.symbols[0] = "Ar"
+    write(tmp_path / "a.extxyz", frames)
+    found = looked(tmp_path / "a.extxyz", tmp_path / "types.lammpstrj", tmp_path / "f")
+    assert finding(found, "OTHER_SPECIES") is not None
+
+
+def test_control_c_keeps_what_was_compared(tmp_path: Path) -> None:
+    write(tmp_path / "a.traj", gas(12))
+
+    def press(done: int, of: int, told: dict) -> None:
+        if done == 5 and told["phase"] == "run":
+            signal.raise_signal(signal.SIGINT)
+
+    found = looked(tmp_path / "a.traj", tmp_path / "a.traj", tmp_path / "f", progress=press, report=True)
+    assert found.summary["frames"] == 5 and found.summary["status"] == "stopped"
+    assert found.summary["interrupted"] and finding(found, "INTERRUPTED") is not None
+    assert finding(found, "OTHER_LENGTH") is None
+    assert (found.folder / "report.html").exists()
 
 
 def test_several_rules_are_compared_as_each_alone(tmp_path: Path) -> None:

@@ -87,6 +87,27 @@ def test_only_a_file_that_breaks_off_is_said_to_break_off(tmp_path: Path) -> Non
     for name, frames in (("nan", lost), ("box", boxless), ("atoms", fewer)):
         told = remedy(f"{name}.extxyz", frames)
         assert killed not in told and "that frame" in told
+    # whole, with a word in the middle that is no number
+    write(tmp_path / "word.extxyz", gas())
+    lines = (tmp_path / "word.extxyz").read_text().splitlines(keepends=True)
+    lines[7 * 26 + 5] = "Ar 1.0 nought 2.0\n"
+    (tmp_path / "word.extxyz").write_text("".join(lines))
+    found = mdnum.flips(tmp_path / "word.extxyz", cutoffs=[2.5], out=tmp_path / "w", report=False).summary
+    assert found["frames"] == 7 and "nought" in found["stopped"] and not found["cut_short"]
+
+
+def test_what_several_rules_have_in_common_is_said_once(tmp_path: Path) -> None:
+    frames = gas(30)
+    for one in frames:
+        one.positions = np.round(one.positions, 2)
+    write(tmp_path / "a.extxyz", frames)
+    found = mdnum.flips(tmp_path / "a.extxyz", cutoffs=[2.0, 2.5, 3.0], out=tmp_path / "f", report=False)
+    (one,) = [one for one in found.summary["findings"] if one["code"] == "UNDECIDABLE"]
+    sentences = [part.strip(". ") for part in one["text"].replace("\n", ". ").split(". ")]
+    assert len(sentences) == len(set(sentences)), one["text"]
+    for rule in ("r < 2 Å", "r < 2.5 Å", "r < 3 Å"):
+        assert one["text"].count(f"{rule}:") == 1
+    assert one["text"].count("may have been on its other side") == 1
 
 
 def test_one_atom_one_frame_and_steps(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,7 +11,8 @@ import numpy as np
 from mdnum.ball.demos.base import Plot, Series
 from mdnum.errors import FolderError
 from mdnum.report.browse import Browse, Column, plain_rows
-from mdnum.report.flips.conclusions import cannot, concluded, findings, headline, views
+from mdnum.report.flips.compare_findings import findings
+from mdnum.report.flips.conclusions import cannot, concluded, headline, views
 from mdnum.report.flips.html import load
 from mdnum.report.flips.words import frame, length, rule_words
 from mdnum.report.fork.findings import Verdict

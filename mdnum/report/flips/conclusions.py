@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from mdnum.report.flips.words import frame, length, merged, of_time, rule_words
+from mdnum.report.flips.words import frame, length, of_time, rule_words
 from mdnum.report.fork.question import Question
-from mdnum.report.verdict import Finding
-from mdnum.report.words import count, listed, many, number, plain
+from mdnum.report.words import count, listed, many, number
 
 # frames after a flip in which a leap of the separation shows, and how much larger than any before it must be
 _WINDOW, _LEAP = 10, 5.0
@@ -43,7 +42,13 @@ def headline(run: Question) -> str:
     first, *others = views(run)
     text = _headline(first)
     same = run.summary["seed"] is None and not any(one["first"] for one in run.summary["rules"])
-    return text if same or not others else f"{text} {_capital(listed([_in_short(one) for one in others]))}."
+    if same or not others:
+        return text
+    # rules of which the same is to be said are told together
+    told: dict[str, list[str]] = {}
+    for one in others:
+        told.setdefault(_in_short(one), []).append(rule_words(one, one.summary))
+    return f"{text} {_capital(listed([f'those of {listed(who)} {what}' for what, who in told.items()]))}."
 
 
 def _capital(text: str) -> str:
@@ -51,17 +56,16 @@ def _capital(text: str) -> str:
 
 
 def _in_short(run: Question) -> str:
-    """When the sets of a rule differ, for a sentence."""
+    """When the sets of a rule differ, for a sentence about it."""
     first, certain = run.summary["first"], run.summary["certain"]
-    what = f"those of {rule_words(run, run.summary)}"
     if first is None:
-        return f"{what} never do"
+        return "never do"
     sure = (
         ""
         if certain == first["frame"]
         else ", within the files’ resolution" + ("" if certain is None else f" before {frame(run, certain)}")
     )
-    return f"{what} differ from {frame(run, first['frame'])} on{sure}"
+    return f"differ from {frame(run, first['frame'])} on{sure}"
 
 
 def _headline(run: Question) -> str:
@@ -278,104 +282,3 @@ def cannot(run: Question) -> Iterator[str]:
         "What was different about the two programs, and whether the neighbor list in either held all pairs, "
         "is not in their positions."
     )
-
-
-def findings(run: Question) -> Iterator[Finding]:
-    """What one should know before relying on the comparison."""
-    summary = run.summary
-    if summary["stopped"]:
-        frames = many(summary["frames"], "frame")
-        yield Finding(
-            "STOPPED",
-            "error",
-            f"the comparison ends after {frames}",
-            f"{summary['stopped']} Everything here is about the {frames} before.",
-            "Check how that file was written.",
-        )
-    yield from merged(found for one in views(run) for found in _within(one))
-    yield from _boxes(run)
-    if any(one["first"] is not None for one in summary["rules"]) and shown(run):
-        yield Finding(
-            "NO_CAUSE_FROM_FILES",
-            "info",
-            "a flip that came first is no cause",
-            "To tell, the program has to run again with the other run's decisions.",
-            "Two runs of mdnum: mdnum fork RUN_A RUN_B --replay. A system of mdnum: mdnum fork SYSTEM --vary "
-            "CHOICE. Another program: make one run with a smooth cutoff, and see whether they still part.",
-        )
-    if not summary["same_species"]:
-        yield Finding(
-            "OTHER_SPECIES",
-            "warning",
-            "the two files name different species",
-            "Atoms are compared by their numbers. If they are in another order in one of the files, nothing "
-            "here means anything.",
-            "Check that both files have their atoms in the same order.",
-        )
-    if summary["times_differ"]:
-        yield Finding(
-            "OTHER_TIMES",
-            "warning",
-            f"times differ at {many(summary['times_differ'], 'frame')}",
-            "Frames are compared one by one in the order of the files, whatever their times.",
-            "Choose frames of the same times with @START:STOP:STEP on either path.",
-        )
-    counts = [one for one in summary["in_file"] if one is not None]
-    if len(set(counts)) > 1 and not summary["stopped"]:
-        yield Finding(
-            "OTHER_LENGTH",
-            "info",
-            f"one has {many(min(counts), 'frame')}, the other {count(max(counts))}",
-            "Those that both have are compared.",
-        )
-
-
-def _within(run: Question) -> Iterator[Finding]:
-    """Sets that differ first by pairs about which the files cannot tell."""
-    first, certain = run.summary["first"], run.summary["certain"]
-    if first is None or certain == first["frame"]:
-        return
-    sure = "No pair ever differs" if certain is None else f"A pair differs first at {frame(run, certain)}"
-    several = f"{rule_words(run, run.summary)}: at " if len(run.summary["rules"]) > 1 else "At "
-    yield Finding(
-        "WITHIN_RESOLUTION",
-        "warning" if shown(run) else "info",
-        "the first pairs that differ are within the files’ resolution",
-        f"{several}{frame(run, first['frame'])} every pair that is inside in one file only is so close to "
-        f"the threshold that rounding may have put it there. {sure} by more than the resolution explains.",
-        "Take the frame that is certain, or write positions with more digits." if shown(run) else "",
-    )
-
-
-def _boxes(run: Question) -> Iterator[Finding]:
-    """Boxes or axes of repetition that are not the same."""
-    found, beyond = run.summary["other_box"], run.summary["beyond"]
-    if found is None:
-        return
-    # two runs at constant pressure have two boxes once they have parted
-    parted = not found["axes"] and beyond is not None and 0 < beyond <= found["frame"]
-    what = "repeat along different axes" if found["axes"] else "have different boxes"
-    yield Finding(
-        "OTHER_BOX",
-        "info" if parted else "warning",
-        f"the two {what} from {frame(run, found['frame'])} on",
-        f"A: {_box(run, found['a'])}. B: {_box(run, found['b'])}. Each file’s pairs are those of its own "
-        "box; how far atoms are apart is told through the box of B, along axes that both repeat along."
-        + (" The boxes came to differ after the positions did, as with a barostat." if parted else ""),
-        "" if parted else "Check that both files are of one system, and that both keep their boxes.",
-    )
-
-
-def _box(run: Question, box: Any) -> str:
-    """A box in words: lengths, angles where they are not right, and the axes along which it repeats."""
-    matrix, axes = np.array(box["matrix"]), [name for name, yes in zip("abc", box["pbc"], strict=True) if yes]
-    if not axes:
-        return "no box that repeats"
-    sizes = np.linalg.norm(matrix, axis=1)
-    text = f"{' × '.join(plain(float(one), 9) for one in sizes)} {run.summary['length']}".rstrip()
-    with np.errstate(invalid="ignore", divide="ignore"):
-        unit = matrix / sizes[:, None]
-    angles = np.degrees(np.arccos(np.clip([unit[1] @ unit[2], unit[0] @ unit[2], unit[0] @ unit[1]], -1, 1)))
-    if np.isfinite(angles).all() and np.abs(angles - 90).max() > 1e-9:
-        text += f" at {', '.join(plain(float(one), 7) for one in angles)}°"
-    return f"{text}, repeating along {listed(axes)}"

@@ -69,9 +69,9 @@ def _undecided(run: Question, one: Mapping[str, Any]) -> Iterator[Finding]:
         "UNDECIDABLE",
         "warning" if grave else "info",
         f"{many(one['ambiguous'], 'flip')} of {count(one['flips'])} within the file's resolution",
-        f"{rule_words(run, one)}: {percent(share)} of the flips have a distance so close to the threshold, "
-        "before or after, that the positions may have been on its other side before they were written; so "
-        f"have {near} pairs at an average frame, whether they flip or not. {grid['words']}".rstrip(),
+        f"{rule_words(run, one)}: {percent(share)} of the flips and, at an average frame, {near} pairs, "
+        f"whether they flip or not, cannot be told. {grid['words']} Their distance, before or after, is so "
+        "close to the threshold that the positions may have been on its other side before they were written.",
         "Write positions with more digits, or count only flips with ambiguous = False." if grave else "",
     )
 
@@ -180,7 +180,7 @@ def _images(run: Question, one: Mapping[str, Any]) -> Iterator[Finding]:
             "IMAGES",
             "info",
             f"{many(one['images'], 'pair')} through further images of an atom",
-            f"{rule_words(run, one)}: the box is narrower than twice the reach of the rule, so that an atom "
-            "meets several images of another, or its own. Each counts (rank 0, 1, ...); codes that look at "
+            f"{rule_words(run, one)}: the box is narrower than twice the reach of the rule. An atom meets "
+            "several images of another there, or its own. Each counts (rank 0, 1, ...); codes that look at "
             "the nearest image alone count fewer.",
         )

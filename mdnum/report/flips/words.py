@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,6 +12,7 @@ from mdnum.report.verdict import Finding
 from mdnum.report.words import count, many, number, plain
 
 _ORDER = ("error", "warning", "info")
+_SENTENCES = re.compile(r"(?<=\.) (?=[A-Z])")
 
 
 def merged(found: Iterable[Finding]) -> Iterator[Finding]:
@@ -20,7 +22,20 @@ def merged(found: Iterable[Finding]) -> Iterator[Finding]:
         by_code.setdefault(one.code, []).append(one)
     for several in by_code.values():
         worst = min(several, key=lambda one: _ORDER.index(one.severity))
-        yield replace(worst, text=" ".join(one.text for one in several))
+        if len(several) == 1:
+            yield worst
+            continue
+        # the text begins with the rule; the title is about that one alone
+        rule = worst.text.partition(": ")[0]
+        yield replace(worst, title=f"{worst.title} ({rule})", text=_together([one.text for one in several]))
+
+
+def _together(texts: Sequence[str]) -> str:
+    """Texts one behind the other, and sentences that all of them have once, at the end."""
+    parts = [_SENTENCES.split(text) for text in texts]
+    common = [one for one in parts[0] if all(one in other for other in parts)]
+    own = [one for part in parts for one in part if one not in common]
+    return " ".join([*own, *common])
 
 
 def timed(run: Question) -> bool:
