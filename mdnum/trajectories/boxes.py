@@ -7,6 +7,8 @@ otherwise too, and images would be put into wrong places without a word:
 - CHARMM's are symmetric matrices (since version 22, in dcd files);
 - HOOMD's have tilt factors, which MDAnalysis takes for the cosines of angles (in gsd files);
 - those of H5MD and of DL_POLY's HISTORY are vectors in any direction.
+
+Of PDB files with many models it loses boxes: see `mdnum.trajectories.pdb_boxes`.
 """
 
 from __future__ import annotations
@@ -19,8 +21,12 @@ import numpy as np
 from jaxtyping import Float
 
 from mdnum.trajectories.frame import Box
+from mdnum.trajectories.pdb_boxes import ModelBoxes, model_boxes
 
 Matrix = Float[np.ndarray, "3 3"]
+
+_PDB = frozenset({"PDB", "ENT", "XPDB"})
+_ONCE = "The file tells a box once, before its first model: it is taken for all frames."
 
 
 class Boxes:
@@ -32,16 +38,29 @@ class Boxes:
 
     def __init__(self, trajectory: Any):
         self._matrix: Callable[[int, Any], Matrix | None] | None = None
+        self._models: ModelBoxes | None = None
         path = getattr(trajectory, "filename", None)
         if isinstance(path, str | Path):
             words = [trajectory.format] if isinstance(trajectory.format, str) else list(trajectory.format)
             makers = {"DCD": _charmm, "GSD": _hoomd, "H5MD": _h5md, "HISTORY": _dlpoly}
             make = next((makers[word] for word in words if word in makers), None)
             self._matrix = make(str(path), trajectory) if make else None
+            if any(word in _PDB for word in words):
+                self._models = model_boxes(trajectory)
+        self._changed = bool(getattr(trajectory, "transformations", ()))
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What somebody who relies on the boxes should know, in sentences."""
+        return (_ONCE,) if self._models is not None and self._models.once else ()
 
     def box(self, ts: Any, number: int) -> Box:
         """The box of a timestep that is this frame of the file."""
-        box = box_of(ts.dimensions)
+        dimensions = ts.dimensions
+        if self._models is not None and (dimensions is None or not self._changed):
+            # transformations may have set another
+            dimensions = self._models.of(number)
+        box = box_of(dimensions)
         if self._matrix is None or not box.periodic:
             return box
         matrix = self._matrix(number, ts)

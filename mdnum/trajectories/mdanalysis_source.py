@@ -36,7 +36,7 @@ class MDAnalysisTrajectory(Trajectory):
         self.format = str(trajectory.format if isinstance(trajectory.format, str) else trajectory.format[0])
         self.length = _length_of(trajectory)
         self.time = "frame" if _has_no_times(trajectory, said) else "ps"
-        self.notes = tuple(notes_on(self.table))
+        self.notes = (*notes_on(self.table), *Boxes(trajectory).notes)
 
     @property
     def in_file(self) -> int | None:
