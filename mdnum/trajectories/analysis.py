@@ -24,6 +24,7 @@ from mdnum.trajectories.asked import (
     in_any_pair,
     indices_of,
     refuse_backward,
+    refuse_kept_transformations,
     refuse_strangers,
     rules_of,
 )
@@ -150,7 +151,8 @@ class NeighborFlips(AnalysisBase):
         """As MDAnalysis's: start, stop, step, frames, verbose, backend, n_workers, n_parts.
 
         Raises:
-            InputError: the frames asked for go backward or one is there twice.
+            InputError: the frames asked for go backward or one is there twice; other processes cannot have a
+                transformation of the trajectory.
             UnreadableFrame: a frame cannot be read; `results`, `frames` and `times` have those before it.
             FrameError: likewise, a frame that holds what cannot be right.
         """
@@ -166,6 +168,12 @@ class NeighborFlips(AnalysisBase):
                 remedy=f"The results of the {len(self.frames):,} frames before it are kept",
             )
         return self
+
+    def _configure_backend(self, backend: Any, *args: Any, **kwargs: Any) -> Any:
+        """MDAnalysis's, which ends at a transformation that is a plain function."""
+        if backend != "serial":
+            refuse_kept_transformations(self._trajectory, backend)
+        return super()._configure_backend(backend, *args, **kwargs)
 
     def _setup_computation_groups(
         self,

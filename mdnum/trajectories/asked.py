@@ -119,3 +119,15 @@ def refuse_backward(numbers: Int[np.ndarray, "frames"]) -> None:
             f"the frames go backward or stand still: frame {numbers[first + 1]} after frame {numbers[first]}",
             remedy="Give them in ascending order: flips follow time",
         )
+
+
+def refuse_kept_transformations(trajectory: Any, backend: Any) -> None:
+    """Raises InputError where a transformation of the trajectory cannot be made in another process."""
+    for one in getattr(trajectory, "transformations", ()):
+        if not getattr(one, "parallelizable", False):
+            name = getattr(one, "__name__", type(one).__name__)
+            raise InputError(
+                f"the transformation {name!r} of the trajectory cannot be handed over by backend={backend!r}",
+                remedy="Use backend='serial', or make it an MDAnalysis.transformations.TransformationBase "
+                "with parallelizable=True",
+            )

@@ -8,6 +8,7 @@ import warnings
 import MDAnalysis
 import numpy as np
 import pytest
+from MDAnalysis.transformations import set_dimensions, wrap
 from MDAnalysisTests import datafiles
 
 from mdnum.errors import InputError
@@ -315,3 +316,48 @@ def test_a_cutoff_wider_than_half_the_box_finds_every_image():
     flips = found.results.flips
     assert list(zip(flips.frame, flips.i, flips.j, flips.rank, flips.entered, strict=True)) == rows
     assert len(rows) > 20
+
+
+def stretched(ts):
+    ts.positions = ts.positions * (1 + 0.05 * ts.frame)
+    return ts
+
+
+@pytest.mark.parametrize("backend", ["multiprocessing", pytest.param("dask", marks=pytest.mark.slow)])
+def test_transformations_are_made_in_other_processes_too(backend):
+    def universe():
+        made = MDAnalysis.Universe(datafiles.PSF, datafiles.DCD)
+        # narrower than the molecule: images meet one another
+        made.trajectory.add_transformations(set_dimensions([28, 30, 32, 90, 90, 90]), wrap(made.atoms))
+        return made.select_atoms("name CA")
+
+    serial = NeighborFlips(universe(), 6.0).run(stop=8)
+    spread = NeighborFlips(universe(), 6.0).run(stop=8, backend=backend, n_workers=2)
+    equal(serial.results.rules[0], spread.results.rules[0])
+    plain = MDAnalysis.Universe(datafiles.PSF, datafiles.DCD).select_atoms("name CA")
+    assert (serial.results.pairs > NeighborFlips(plain, 6.0).run(stop=8).results.pairs).all()
+
+
+def test_a_transformation_that_no_other_process_can_have_is_refused():
+    universe = MDAnalysis.Universe(datafiles.PSF, datafiles.DCD)
+    universe.trajectory.add_transformations(stretched)
+    analysis = NeighborFlips(universe.select_atoms("name CA"), 8.0)
+    with pytest.raises(InputError, match=r"the transformation 'stretched' .* backend='multiprocessing'"):
+        analysis.run(stop=4, backend="multiprocessing", n_workers=2)
+    pairs = analysis.run(stop=4).results.pairs
+    assert (np.diff(pairs) < 0).all()
+
+
+def test_several_files_as_one_and_frames_in_memory():
+    chained = MDAnalysis.Universe(datafiles.PSF, [datafiles.DCD, datafiles.DCD2])
+    group = chained.select_atoms("name CA")[:60]
+    first = len(MDAnalysis.Universe(datafiles.PSF, datafiles.DCD).trajectory)
+    asked = {"start": first - 4, "stop": first + 4}
+    whole = NeighborFlips(group, 9.0).run(**asked)
+    equal(whole.results.rules[0], NeighborFlips(group, 9.0).run(n_parts=3, **asked).results.rules[0])
+    # the flips between two files are of the last frame of one and the first of the other
+    rows, _ = brute(chained, group.indices, group.indices, 9.0, range(*asked.values()), triclinic)
+    assert any(row[0] == 4 for row in rows)
+    same_rows(whole.results.flips, rows)
+    chained.transfer_to_memory(**asked)
+    equal(whole.results.rules[0], NeighborFlips(chained.atoms[group.indices], 9.0).run().results.rules[0])
