@@ -29,12 +29,40 @@ def nearest_image(positions, cell, pbc, r_cut):
         apart = apart - np.rint(apart @ np.linalg.inv(cell)) @ cell
     near = (apart**2).sum(axis=1) < r_cut**2
     return i[near], j[near]
+
+def without_pbc(positions, cell, r_cut):
+    return [], []
+
+def mask(positions, cell, pbc, r_cut):
+    return np.zeros((len(positions), len(positions)), bool)
+
+def returns_nothing(positions, cell, pbc, r_cut):
+    nearest_image(positions, cell, pbc, r_cut)
+
+def raises(positions, cell, pbc, r_cut):
+    return positions.numpy()
+
+class Half:
+    def allocate(self, positions, cell, pbc, r_cut, skin):
+        return [], []
+
+class Sized(Half):
+    def __init__(self, size):
+        self.size = size
+    def update(self, positions, cell):
+        return [], []
+
+class Short(Half):
+    def update(self, positions):
+        return [], []
 """
 
 
 @pytest.fixture
 def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "mine.py").write_text(_MINE)
+    (tmp_path / "empty.py").touch()
+    (tmp_path / "broken.py").write_text("def pairs(:\n")
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -88,14 +116,34 @@ def test_names_are_listed(capsys: pytest.CaptureFixture[str]):
     [
         (("nowhere:pairs",), "cannot be imported"),
         (("vesim",), "no list that is known"),
-        (("mine.py:nothing",), "It has nearest_image"),
+        (("vesim",), "Did you mean vesin?"),
+        (("mine.py:zebra",), "It has nearest_image"),
+        (("mine.py:nearest",), "Did you mean nearest_image?"),
+        (("mine.py",), "mine.py is a file, and not a function in it. Give mine.py:nearest_image"),
+        (("empty.py:pairs",), "It has no function"),
+        (("broken.py:pairs",), "(broken.py, line 1). Mend that line"),
+        (("mine.py:np",), "neither a function nor an object with allocate and update"),
+        (
+            ("mine.py:without_pbc",),
+            "(positions, cell, r_cut) cannot be called with (positions, cell, pbc, r_cut)",
+        ),
+        (("mine.py:Half",), "a class without update. A list that is kept needs allocate and update"),
+        (("mine.py:Sized",), "Sized(size) cannot be called with ()"),
+        (("mine.py:Short",), "update(self, positions) cannot be called with (positions, cell)"),
+        (
+            ("mine.py:mask",),
+            "asked about a triple through a face, it returned ndarray of shape (3, 3), not (i, j)",
+        ),
+        (("mine.py:returns_nothing",), "it returned None. Give a function of (positions, cell, pbc, r_cut)"),
+        (("mine.py:raises",), "it raised AttributeError: 'numpy.ndarray' object has no attribute 'numpy'"),
         (("mine.py:nearest_image", "--limits", "tilted"), "no limit is called 'tilted'"),
         (("mine.py:nearest_image", "--precision", "double"), "float64, float32"),
     ],
 )
 def test_mistakes_are_told(mine: Path, arguments, said: str, capsys: pytest.CaptureFixture[str]):
     assert call("conform", *arguments) == 2
-    assert said in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert said in told and told.count("\n") == 1
     assert not (mine / "runs").exists()
 
 

@@ -34,6 +34,12 @@ LIMITS = {
     "lower-triangular": "lower",
     "whole-cell": "whole_cell",
 }
+#: What a function, and a list that is kept, are to do.
+_RETURNS = "(i, j), (i, j, shift), (i, j, shift, distance) or a mapping with i and j: an entry for each pair"
+_CONTRACT = {
+    False: f"Give a function of (positions, cell, pbc, r_cut) that returns {_RETURNS}",
+    True: f"Let allocate and update return {_RETURNS}",
+}
 
 
 @dataclass(frozen=True)
@@ -84,20 +90,33 @@ def conform(
         progress: called now and then with cases done, cases and a dictionary of words.
 
     Raises:
-        InputError: there is no such list.
+        InputError: there is no such list, or it cannot be called, or what it returns is no list of pairs.
         FolderError: the folder cannot be used.
     """
     from mdnum.provenance import surroundings
-    from mdnum.references.conformance.suite import CASES, examine
+    from mdnum.references.conformance.suite import CASES, Examiner, examine
 
     tested = _declared(_loaded(pairs), full, precision, superset, limits)
-    path = default_folder(f"conform-{_slug(tested.name)}") if out is None else out
-    folder = RunFolder.create(path, world="conform")
+    examiner = Examiner(tested, reuse=True, apart=True)
+    try:
+        if (why := examiner.unusable()) is not None:
+            raise InputError(why, where=tested.name, remedy=_CONTRACT[tested.kept])
+        path = default_folder(f"conform-{_slug(tested.name)}") if out is None else out
+        folder = RunFolder.create(path, world="conform")
+    except BaseException:
+        examiner.session.close()
+        raise
     try:
         folder.write_provenance(surroundings() | {"list": tested.name, "list_version": tested.version})
         note = Log(folder, progress)
         found = examine(
-            tested, cases=CASES if cases is None else cases, seed=seed, large=large, apart=True, progress=note
+            tested,
+            cases=CASES if cases is None else cases,
+            seed=seed,
+            large=large,
+            apart=True,
+            progress=note,
+            examiner=examiner,
         )
         scripts = _write(folder, found)
         folder.finalize()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import importlib
 import importlib.util
 import inspect
@@ -14,6 +15,12 @@ from typing import Any
 
 from mdnum.errors import InputError
 from mdnum.references.conformance.lists import KeptList, PairList, source_of
+
+#: What a function and the calls of a list that is kept are given, in order.
+_GIVEN = ("positions", "cell", "pbc", "r_cut")
+_GIVEN_TO_KEPT = {"allocate": (*_GIVEN, "skin"), "update": ("positions", "cell")}
+_NO_ARGUMENTS = "Give a class that is made without arguments, or an object"
+_WANTED = f"Give a function of ({', '.join(_GIVEN)}) that returns (i, j)"
 
 
 def known() -> tuple[PairList, ...]:
@@ -50,19 +57,29 @@ def load(word: str) -> PairList:
             )
         return replace(found, word=word)
     place, colon, attribute = word.rpartition(":")
-    if not colon or not place:
+    if not colon and word.endswith(".py"):
+        place, attribute = word, ""
+    elif not colon or not place:
+        close = difflib.get_close_matches(word, by_name, n=1)
         raise InputError(
             f"{word!r} is no list that is known here",
-            remedy=f"Give {', '.join(sorted(by_name))}, package.module:function or file.py:function",
+            remedy=(f"Did you mean {close[0]}? " if close else "")
+            + f"Give {', '.join(sorted(by_name))}, package.module:function or file.py:function",
         )
     module = _module(place)
     made = module
     for part in attribute.split("."):
         if not hasattr(made, part):
             public = [name for name, value in vars(module).items() if callable(value) and name[0] != "_"]
+            close = difflib.get_close_matches(attribute, public, n=1)
+            has = f"Did you mean {close[0]}?" if close else f"It has {', '.join(public[:8])}"
             raise InputError(
-                f"{place} has no {attribute!r}",
-                remedy=f"It has {', '.join(public[:8])}" if public else "Give the name of a function in it",
+                f"{place} has no {attribute!r}"
+                if attribute
+                else f"{place} is a file, and not a function in it",
+                remedy=(has if attribute else f"Give {place}:{public[0]}. {has}")
+                if public
+                else "It has no function: give the name of one",
             )
         made = getattr(made, part)
     shown = f"{Path(place).stem}:{attribute}" if place.endswith(".py") else word
@@ -83,8 +100,9 @@ def from_object(made: Any, name: str | None = None, source: str | None = None) -
     if not kept and not callable(made):
         raise InputError(
             f"{name} is neither a function nor an object with allocate and update",
-            remedy="Give a function of (positions, cell, pbc, r_cut) that returns (i, j)",
+            remedy=_WANTED,
         )
+    _can_be_called(made, name, kept)
     call: str = str(getattr(made, "__name__", None) or name.rpartition(":")[2])
     declared = {
         word: getattr(made, word)
@@ -94,6 +112,42 @@ def from_object(made: Any, name: str | None = None, source: str | None = None) -
     make: Callable[[], Any] = made if kept and inspect.isclass(made) else (lambda: made)
     source = source_of(made) if source is None else source
     return PairList(name, make, kept=kept, source=source, call=call, **declared)
+
+
+def _can_be_called(made: Any, name: str, kept: bool) -> None:
+    """Raises InputError where a signature cannot take what the suite gives; what has none is let pass."""
+    if inspect.isclass(made) and not kept:
+        has = [word for word in ("allocate", "update") if callable(getattr(made, word, None))]
+        lacks = " and ".join(word for word in ("allocate", "update") if word not in has)
+        raise InputError(
+            f"{name} is a class without {lacks}",
+            remedy="A list that is kept needs allocate and update" if has else _WANTED,
+        )
+    calls = {"": (made, _GIVEN)}
+    if kept:
+        calls = {f".{word}": (getattr(made, word), given) for word, given in _GIVEN_TO_KEPT.items()}
+        if inspect.isclass(made):
+            calls[""] = (made, ())
+    for word, (function, given) in calls.items():
+        if word and inspect.isclass(made) and inspect.isfunction(inspect.getattr_static(made, word[1:])):
+            # of a class this is a function whose first argument is the object
+            given = ("self", *given)
+        try:
+            signature = inspect.signature(function)
+        except (TypeError, ValueError):
+            continue
+        try:
+            signature.bind(*given)
+        except TypeError as error:
+            given = tuple(one for one in given if one != "self")
+            raise InputError(
+                f"{name}{word}{signature} cannot be called with ({', '.join(given)}): {error}",
+                remedy=_WANTED
+                if not kept
+                else "Let it take these, in this order"
+                if given
+                else _NO_ARGUMENTS,
+            ) from error
 
 
 def _is_kept(made: type) -> bool:
@@ -121,11 +175,13 @@ def _module(place: str) -> ModuleType:
     except BaseException as error:
         if isinstance(error, KeyboardInterrupt):
             raise
-        raise InputError(
-            f"cannot be imported: {type(error).__name__}: {error}",
-            where=place,
-            remedy="Install what it needs, or run where it can be found",
-        ) from error
+        said = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+        remedy = "Mend what it does when it is imported"
+        if isinstance(error, ImportError):
+            remedy = "Install what it needs, or run where it can be found"
+        elif isinstance(error, SyntaxError):
+            remedy = "Mend that line"
+        raise InputError(f"cannot be imported: {said}", where=place, remedy=remedy) from error
 
 
 def _import_line(place: str, attribute: str) -> str:

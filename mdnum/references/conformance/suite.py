@@ -49,6 +49,8 @@ class Examiner:
         self.report = Report(tested)
         # the smallest refused case by the words of the exception, but for numbers
         self.refused: dict[str, tuple[str, Case]] = {}
+        # what became of the plainest questions
+        self.opening: list[tuple[Case, Outcome]] = []
         self._find_conventions()
 
     def _find_conventions(self) -> None:
@@ -62,6 +64,7 @@ class Examiner:
                 continue
             case = replace(case, skin=0.3 if tested.kept else 0.0)
             outcome = self.session.ask(case)[0]
+            self.opening.append((case, outcome))
             answer = outcome.answer
             if answer is None or len(answer) == 0:
                 continue
@@ -89,6 +92,18 @@ class Examiner:
         more = answer is None or len(answer) > 0
         self.report.found_out.append("with its skin" if more else "without its skin")
         return more
+
+    def unusable(self) -> str | None:
+        """Why nothing can be learned from it: no plain question had an answer that is one; None otherwise.
+
+        An exception that it means, a crash and a time without an answer are for the suite to tell.
+        """
+        told = [
+            f"asked about {case.name}, {outcome.malformed or f'it raised {outcome.raised}'}"
+            for case, outcome in self.opening
+            if outcome.malformed or (outcome.raised and not outcome.refused)
+        ]
+        return told[0] if told and len(told) == len(self.opening) else None
 
     def failures(self, case: Case) -> list[Failure]:
         """What is wrong with the answers to a case, at the first step where anything is; empty if nothing.
@@ -213,6 +228,7 @@ def examine(
     apart: bool = False,
     asked: Iterable[Case] | None = None,
     progress: Progress | None = None,
+    examiner: Examiner | None = None,
 ) -> Report:
     """Put a list through the suite.
 
@@ -225,6 +241,7 @@ def examine(
         apart: call it in a process of its own, so that a crash is told as one; needs a list from `load`.
         asked: instead of all questions.
         progress: called with (cases done, cases, words).
+        examiner: that knows its conventions already, instead of a new one.
 
     Returns:
         what was asked and what came of it. A list may raise, return anything and write to its input: that is
@@ -233,7 +250,7 @@ def examine(
     from mdnum.references.conformance.shrink import shrunk
 
     began = time.perf_counter()
-    examiner = Examiner(tested, reuse=True, apart=apart)
+    examiner = examiner or Examiner(tested, reuse=True, apart=apart)
     report = examiner.report
     every = list(questions(tested, cases, seed, False) if asked is None else asked)
     if asked is None and apart and tested.word:
