@@ -35,6 +35,20 @@ def _within(near, first, last, x0, x1, x2, largest, squares, flags, chosen):
 
 
 @numba.njit(cache=True, nogil=True)
+def _copy(sorted_x, order, begin, more, n0, n1, n2, vectors, kind, found, near, atom, run):
+    """Put the atoms of a run of bins, at an image, behind those found so far."""
+    s0 = n0 * vectors[0, 0] + n1 * vectors[1, 0] + n2 * vectors[2, 0]
+    s1 = n0 * vectors[0, 1] + n1 * vectors[1, 1] + n2 * vectors[2, 1]
+    s2 = n0 * vectors[0, 2] + n1 * vectors[1, 2] + n2 * vectors[2, 2]
+    for q in range(more):
+        near[0, found + q] = sorted_x[0, begin + q] + s0
+        near[1, found + q] = sorted_x[1, begin + q] + s1
+        near[2, found + q] = sorted_x[2, begin + q] + s2
+        atom[found + q] = order[begin + q]
+        run[found + q] = kind
+
+
+@numba.njit(cache=True, nogil=True)
 def met_once(
     first_bin, end_bin, room, runs, sorted_x, vectors, free, bins, reach, start, order,
     kind, species, low, high, largest, tally, i_out, j_out, i_open, j_open, code_open, value_open,
@@ -67,15 +81,7 @@ def met_once(
                     if more == 0:
                         continue
                     codes[kinds] = lattice_code(n0 * free[0], n1 * free[1], n2 * free[2])
-                    s0 = n0 * vectors[0, 0] + n1 * vectors[1, 0] + n2 * vectors[2, 0]
-                    s1 = n0 * vectors[0, 1] + n1 * vectors[1, 1] + n2 * vectors[2, 1]
-                    s2 = n0 * vectors[0, 2] + n1 * vectors[1, 2] + n2 * vectors[2, 2]
-                    for q in range(more):
-                        near[0, found + q] = sorted_x[0, begin + q] + s0
-                        near[1, found + q] = sorted_x[1, begin + q] + s1
-                        near[2, found + q] = sorted_x[2, begin + q] + s2
-                        atom[found + q] = order[begin + q]
-                        run[found + q] = kinds
+                    _copy(sorted_x, order, begin, more, n0, n1, n2, vectors, kinds, found, near, atom, run)
                     found += more
                     kinds += 1
         for q in range(own):
@@ -129,15 +135,7 @@ def met_from_centers(
                     if more == 0:
                         continue
                     codes[kinds] = lattice_code(n0 * free[0], n1 * free[1], n2 * free[2])
-                    s0 = n0 * vectors[0, 0] + n1 * vectors[1, 0] + n2 * vectors[2, 0]
-                    s1 = n0 * vectors[0, 1] + n1 * vectors[1, 1] + n2 * vectors[2, 1]
-                    s2 = n0 * vectors[0, 2] + n1 * vectors[1, 2] + n2 * vectors[2, 2]
-                    for q in range(more):
-                        near[0, found + q] = sorted_x[0, begin + q] + s0
-                        near[1, found + q] = sorted_x[1, begin + q] + s1
-                        near[2, found + q] = sorted_x[2, begin + q] + s2
-                        atom[found + q] = order[begin + q]
-                        run[found + q] = kinds
+                    _copy(sorted_x, order, begin, more, n0, n1, n2, vectors, kinds, found, near, atom, run)
                     found += more
                     kinds += 1
         for q in range(center_start[here], center_start[here + 1]):
