@@ -302,8 +302,10 @@ def _left(error: SystemExit) -> Outcome:
 
 def _failed(error: Exception, case: Case, package: str | None = None) -> Outcome:
     # what follows the first lines is where it was raised, in some libraries with the frames of compiled code
-    lines = str(error).strip().partition("Exception raised from ")[0].splitlines()
-    words = " ".join(" ".join(lines).split())
+    said = str(error).partition("Exception raised from ")[0].strip()
+    first, frames, rest = said.partition("Traceback of ")
+    # TorchScript says what happened in the last line of a traceback
+    words = " ".join((f"{first} {rest.splitlines()[-1]}" if frames else said).split())
     # without atoms there is nothing that could not be done
     refused = case.atoms > 0 and meant(error, package)
     return Outcome(raised=f"{type(error).__name__}: {words[:300]}", refused=refused)

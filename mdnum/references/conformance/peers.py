@@ -290,7 +290,15 @@ PEERS: tuple[PairList, ...] = (
         unit=_SINGLE,
         limits=Limits(minimum_image=True, all_axes=True, lower=True, right_handed=True, atoms=1),
     ),
-    _peer("torch-sim", "torch-sim-atomistic", torch_sim_pairs, "torch-sim's linked cells", affords=0.3),
+    _peer(
+        "torch-sim",
+        "torch-sim-atomistic",
+        torch_sim_pairs,
+        "torch-sim's linked cells",
+        affords=0.3,
+        # its documentation asks for wrapped positions and for periodicity along all axes or none
+        limits=Limits(wrapped=True, all_axes=True),
+    ),
     _peer(
         "nvalchemi-ops",
         "nvalchemi-toolkit-ops",

@@ -124,6 +124,8 @@ for step, (x, cell, fresh, *skin) in enumerate(STEPS):
     fine = check(step, *before, given) and fine
 """
 
+_WAITS = 'print("it waits for an answer; Control-C ends it", flush=True)'
+
 _MAPPING = '''
 def asked(function, *arguments):
     """What the list returns."""
@@ -215,13 +217,16 @@ def script(tested: PairList, failed: Failed, how: Conventions, superset: bool = 
     reach = case.r_cut + (2 * case.skin if case.skin else 0.5 * case.r_cut) if superset else case.r_cut
     title = f"{tested.name}{f' {tested.version}' if tested.version else ''}: {worst.text}"
     case_words = f"Found by: {failed.asked.name}, at its step {worst.step}."
+    # an exception may quote code, whose strings must not end this one
+    title = title.replace("\\", "/").replace('"""', "'''")
     parts = [
-        '"""' + "\n".join(textwrap.wrap(title.replace("\\", "/"), 100)) + f'\n\n{case_words}\n"""',
+        '"""' + "\n".join(textwrap.wrap(title, 100)) + f'\n\n{case_words}\n"""',
         "import collections\nimport itertools\n\nimport numpy as np",
         tested.source.strip() or f"# import {tested.call} here: its lines could not be found",
         _numbers(failed, how, reach),
         _MAPPING.strip(),
         _BRUTE_FORCE.strip(),
+        *([_WAITS] if worst.code == "NO_ANSWER" else []),
         (_KEPT if tested.kept else _ONCE).strip().format(call=tested.call),
         'print("the list is right" if fine else "the list is wrong")\nraise SystemExit(not fine)',
     ]

@@ -10,6 +10,7 @@ import numpy as np
 import planted_lists
 import pytest
 
+from mdnum.references.conformance import reproduction
 from mdnum.references.conformance.alike import alike
 from mdnum.references.conformance.case import one, script
 from mdnum.references.conformance.catalog import gas
@@ -143,8 +144,27 @@ def test_the_words_of_an_exception_end_where_its_frames_begin():
     def raises(positions, cell, pbc, r_cut):
         raise RuntimeError("no  cell\nto speak of\nException raised from f at a.cpp:3\nframe #0: f")
 
+    def scripted(positions, cell, pbc, r_cut):
+        raise RuntimeError(
+            "Failed in the interpreter.\nTraceback of TorchScript (most recent call last):\n"
+            '  File "a.py", line 3, in f\n    x = y\n        ~ <--- HERE\nRuntimeError: no atoms\n'
+        )
+
     (outcome,) = Session(from_object(raises)).ask(_TWO)
     assert outcome.raised == "RuntimeError: no cell to speak of"
+    (outcome,) = Session(from_object(scripted)).ask(_TWO)
+    assert outcome.raised == "RuntimeError: Failed in the interpreter. RuntimeError: no atoms"
+
+
+def test_words_that_end_a_string_do_not_end_the_script():
+    def quotes(positions, cell, pbc, r_cut):
+        raise KeyError('in """f""" of C:\\new\\u: "x"')
+
+    tested = from_object(quotes)
+    report = examine(tested, asked=[_TWO], shrink=False)
+    lines = reproduction.script(tested, report.failed[0], report.how)
+    assert "in '''f''' of C:/" in lines.partition("Found by")[0]
+    compile(lines, "script", "exec")
 
 
 _SLOW = """
