@@ -234,7 +234,7 @@ def test_a_coarse_file_says_so(tmp_path: Path) -> None:
     one = found.summary["rules"][0]
     assert one["ambiguous"] > 0.1 * one["flips"] and one["grid"]["missed"] > 0.01
     (said,) = [one for one in found.summary["findings"] if one["code"] == "UNDECIDABLE"]
-    assert said["severity"] == "warning" and "hides about" in said["text"]
+    assert said["severity"] == "warning" and "% of the flips that happened are hidden" in said["text"]
 
 
 @pytest.mark.slow

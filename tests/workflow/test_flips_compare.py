@@ -77,7 +77,7 @@ def test_one_run_written_twice_is_not_said_to_differ(tmp_path: Path) -> None:
     # on the coarse grid sets do differ, all of it within the resolution
     assert summary["first"] is not None and summary["first"]["ambiguous"] == summary["first"]["pairs"]
     said = finding(found, "WITHIN_RESOLUTION")
-    assert said is not None and "No pair ever differs" in said["text"]
+    assert said is not None and "no pair ever differs" in said["text"]
     # half a step along each axis, and not one more
     table = RunFolder.open(found.folder).read("apart")
     assert table["bound"].max() == pytest.approx(np.sqrt(3) * 0.005, rel=1e-3)

@@ -211,8 +211,10 @@ def _pairs(run: Question) -> Browse | None:
             Column(0, "frame", kind="count"),
             Column(1, "pair", kind="pair"),
             Column(3, "inside in", kind="word", words=("A only", "B only")),
-            *(Column(4 + at, name.replace("_a", " in A").replace("_b", " in B"), unit, digits=5)
-              for at, name in enumerate(names)),
+            Column(4, "r in A", unit, digits=5),
+            Column(5, "r in B", unit, digits=5),
+            Column(6, "margin in A", unit),
+            Column(7, "margin in B", unit),
             Column(8, "", kind="word", words=("", "undecidable")),
             *((Column(9, "rule", kind="word", words=rules),) if several else ()),
         ),

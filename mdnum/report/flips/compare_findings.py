@@ -85,14 +85,15 @@ def _within(run: Question) -> Iterator[Finding]:
     first, certain = run.summary["first"], run.summary["certain"]
     if first is None or certain == first["frame"]:
         return
-    sure = "No pair ever differs" if certain is None else f"A pair differs first at {frame(run, certain)}"
+    sure = "no pair ever differs" if certain is None else f"a pair differs first at {frame(run, certain)}"
     several = f"{rule_words(run, run.summary)}: at " if len(run.summary["rules"]) > 1 else "At "
     yield Finding(
         "WITHIN_RESOLUTION",
         "warning" if shown(run) else "info",
         "the first pairs that differ are within the files’ resolution",
-        f"{several}{frame(run, first['frame'])} every pair that is inside in one file only is so close to "
-        f"the threshold that rounding may have put it there. {sure} by more than the resolution explains.",
+        f"{several}{frame(run, first['frame'])} it may be rounding alone; {sure} by more than the resolution "
+        "explains. Every pair that is inside in one file only there is so close to the threshold that "
+        "rounding may have put it there.",
         "Take the frame that is certain, or write positions with more digits." if shown(run) else "",
     )
 

@@ -21,6 +21,12 @@ CENSORED = 0.5
 #: Fewer flips than this say nothing in shares.
 FEW = 20
 
+# shares of flips hidden and made up that are not worth a number
+_HARDLY = 1e-3
+_ESTIMATED = (
+    " How many that happened are not at their frame (hidden), and how many did not happen where they stand "
+    "(made up), is estimated from how atoms move in the file at this stride."
+)
 _BOUND = "Write frames more often, or take what the file shows as a lower bound."
 
 
@@ -59,9 +65,17 @@ def _algebra(run: Question, place: int, one: Mapping[str, Any]) -> Iterator[Find
 
 
 def _undecided(run: Question, one: Mapping[str, Any]) -> Iterator[Finding]:
-    grid = one["grid"] or {"missed": 0.0, "invented": 0.0, "words": ""}
+    grid = one["grid"] or {"missed": 0.0, "invented": 0.0}
     if not one["ambiguous"] and max(grid["missed"], grid["invented"]) <= UNDECIDED:
         return
+    told = ""
+    if one["grid"] is not None and max(grid["missed"], grid["invented"]) < _HARDLY:
+        told = "; fewer than 1 in 1,000 are hidden or made up"
+    elif one["grid"] is not None:
+        told = (
+            f"; about {percent(grid['missed'])} of the flips that happened are hidden, and "
+            f"{percent(grid['invented'])} of those in the file made up"
+        )
     share = one["ambiguous"] / one["flips"]
     grave = one["flips"] >= FEW and max(share, grid["missed"], grid["invented"]) > UNDECIDED
     near = number(one["near_mean"], 2)
@@ -69,9 +83,10 @@ def _undecided(run: Question, one: Mapping[str, Any]) -> Iterator[Finding]:
         "UNDECIDABLE",
         "warning" if grave else "info",
         f"{many(one['ambiguous'], 'flip')} of {count(one['flips'])} within the file's resolution",
-        f"{rule_words(run, one)}: {percent(share)} of the flips and, at an average frame, {near} pairs, "
-        f"whether they flip or not, cannot be told. {grid['words']} Their distance, before or after, is so "
-        "close to the threshold that the positions may have been on its other side before they were written.",
+        f"{rule_words(run, one)}: {percent(share)} of the flips cannot be told, nor {near} pairs at an "
+        f"average frame, whether they flip or not{told}. Their distance, before or after, is so close to "
+        "the threshold that the positions may have been on its other side before they were written."
+        + (_ESTIMATED if told else ""),
         "Write positions with more digits, or count only flips with ambiguous = False." if grave else "",
     )
 

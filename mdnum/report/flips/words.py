@@ -12,6 +12,8 @@ from mdnum.report.verdict import Finding
 from mdnum.report.words import count, many, number, plain
 
 _ORDER = ("error", "warning", "info")
+# a rule that stays on one line
+_SHORT = 20
 _SENTENCES = re.compile(r"(?<=\.) (?=[A-Z])")
 
 
@@ -27,6 +29,8 @@ def merged(found: Iterable[Finding]) -> Iterator[Finding]:
             continue
         # the text begins with the rule; the title is about that one alone
         rule = worst.text.partition(": ")[0]
+        if len(rule) < _SHORT:
+            rule = rule.replace(" ", "\N{NO-BREAK SPACE}")
         yield replace(worst, title=f"{worst.title} ({rule})", text=_together([one.text for one in several]))
 
 
