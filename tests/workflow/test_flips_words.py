@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import json
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,9 @@ import pytest
 from ase.io import write
 
 import mdnum
+from mdnum import report
 from mdnum.cli import flips_print
+from mdnum.errors import FolderError
 from mdnum.report.flips import findings, html, limits, sections
 from mdnum.report.fork.question import Question
 from mdnum.report.words import percent
@@ -135,3 +138,22 @@ def test_one_atom_one_frame_and_steps(tmp_path: Path, capsys: pytest.CaptureFixt
     page = (steps.folder / "report.html").read_text(encoding="utf-8")
     assert "20 steps apart" in page and "20 step " not in page and "20 steps apart" in printed(steps)
     assert "by 1 pair" in page and "by 1 pairs" not in page
+
+
+def test_a_folder_of_another_version_is_refused_in_a_line_or_works(tmp_path: Path) -> None:
+    write(tmp_path / "a.traj", gas())
+    found = mdnum.flips(tmp_path / "a.traj", cutoffs=[2.5], out=tmp_path / "f", report=False)
+    path = found.folder / "summary.json"
+    summary = json.loads(path.read_text(encoding="utf-8"))
+    # what was not looked for yet
+    later = ("velocities_odd", "cut_short", "leaps", "interrupted")
+    old = {name: value for name, value in summary.items() if name not in later}
+    old["rules"] = [{name: value for name, value in one.items() if name != "grid"} for one in old["rules"]]
+    path.write_text(json.dumps(old))
+    report.write(found.folder)
+    # what a page is about
+    old["rules"] = [{name: value for name, value in one.items() if name != "stride"} for one in old["rules"]]
+    path.write_text(json.dumps({name: value for name, value in old.items() if name != "has_times"}))
+    with pytest.raises(FolderError, match="lacks has_times, stride") as caught:
+        report.write(found.folder)
+    assert f"mdnum flips {tmp_path / 'a.traj'}" in str(caught.value) and "\n" not in str(caught.value)

@@ -215,7 +215,7 @@ def _pairs(run: Question) -> Browse | None:
             Column(5, "r in B", unit, digits=5),
             Column(6, "margin in A", unit),
             Column(7, "margin in B", unit),
-            Column(8, "", kind="word", words=("", "undecidable")),
+            Column(8, "decided", kind="word", words=("yes", "no")),
             *((Column(9, "rule", kind="word", words=rules),) if several else ()),
         ),
         rows=plain_rows(columns),

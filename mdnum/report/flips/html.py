@@ -17,6 +17,19 @@ from mdnum.store import RunFolder
 
 # the ledger and the contacts may be larger than memory, and what is told of them is in the summary
 _TABLES = ("frames", "lifetimes", "neighbors", "residues", "busiest")
+# what summary.json says of a file and of each rule, without which there is no page
+_NEEDED = (
+    "atoms", "backward", "even", "file", "format", "frames", "has_times", "interval", "length", "notes",
+    "reader", "resolution", "rules", "seconds", "slice", "stopped", "system", "time", "timed", "window",
+)  # fmt: skip
+_OF_A_RULE = (
+    "ambiguous", "by_residue_name", "by_species", "chatter", "contacts", "directed", "entered", "flips",
+    "flips_per_frame", "images", "intermittent", "left", "lifetime", "min_margin", "near_mean", "neighbors",
+    "pairs_first", "pairs_flipped", "pairs_last", "pairs_mean", "rule", "stays_over", "stride",
+)  # fmt: skip
+# what was not looked for by the first versions
+_LATER = {"between": None, "velocities_odd": False, "cut_short": False, "leaps": None, "interrupted": False}
+_LATER_OF_A_RULE = {"grid": None, "flux": None}
 
 
 def write_report(folder: RunFolder | str | Path) -> Path:
@@ -28,7 +41,7 @@ def write_report(folder: RunFolder | str | Path) -> Path:
     Raises:
         FolderError: no finished ledger in the folder, or it cannot be written.
     """
-    folder, run = load(folder, "flips")
+    folder, run = _loaded(folder)
     browsed = sections.pairs(run)
     return write_page(
         folder,
@@ -48,10 +61,31 @@ def write_report(folder: RunFolder | str | Path) -> Path:
 
 def record(folder: RunFolder | str | Path) -> Verdict:
     """Judges a trajectory and writes headline and findings into its summary.json."""
-    folder, run = load(folder, "flips")
+    folder, run = _loaded(folder)
     judged = findings.judge(run)
     judged.store(folder, run.summary)
     return judged
+
+
+def _loaded(folder: RunFolder | str | Path) -> tuple[RunFolder, Question]:
+    """The folder and what a page needs of it.
+
+    Raises:
+        FolderError: nothing in it was finished, or an older mdnum left out what a page needs by now.
+    """
+    folder, run = load(folder, "flips")
+    summary = {**_LATER, **run.summary}
+    rules = [{**_LATER_OF_A_RULE, **one} for one in summary.get("rules", ())]
+    missing = [name for name in _NEEDED if name not in summary]
+    missing += [name for name in _OF_A_RULE if any(name not in one for one in rules)]
+    if missing:
+        raise FolderError(
+            f"this ledger was written by another version of mdnum and lacks {', '.join(missing)}",
+            remedy=f"Look again: mdnum flips {summary.get('file', 'TRAJECTORY')}; the report that is there "
+            "stays as it is",
+            where=str(folder.path),
+        )
+    return folder, Question(run.path, {**summary, "rules": rules}, "", run.provenance, run.tables)
 
 
 def load(
