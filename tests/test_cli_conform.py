@@ -9,6 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
+import numpy as np
 import pytest
 from command_line import call, printed
 
@@ -164,6 +165,18 @@ def test_what_refuses_everything_is_not_called_safe():
     codes = {one.code: one for one in judged.findings}
     assert set(codes) == {"NOTHING_ANSWERED", "RAISED"} and codes["NOTHING_ANSWERED"].severity == "error"
     assert "boom" in codes["NOTHING_ANSWERED"].text
+
+
+def test_what_answers_rightly_or_not_at_all_is_told_as_that():
+    def far(positions, cell, pbc, r_cut):
+        if np.abs(positions).max(initial=0.0) > 1.0:
+            raise IndexError("no such bin")
+        return ([0, 1], [1, 0]) if len(positions) == 2 else ([], [])
+
+    tested = [one("two", "few", [[0.0, 0, 0], [0.5, 0, 0]]), one("far", "outside", [[2.0, 0, 0]])]
+    judged = _judged(far, tested)
+    assert judged.headline == "it gave no answer in 1 of 2 cases, and the right pairs wherever it answered."
+    assert any(line == "Where it fails: outside (1 of 1)." for line in judged.evidence)
 
 
 def test_one_mistake_has_one_script_and_names_all_areas():

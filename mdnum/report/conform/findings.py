@@ -68,9 +68,18 @@ def judge(run: Question) -> Verdict:
         headline = f"{run.name} answered no question."
     elif not summary["wrong"]:
         headline = f"{run.name} gave the right pairs in all of {many(answered, 'case')}."
+    elif _silent(summary):
+        headline = f"{run.name} gave no answer in {count(summary['wrong'])} of "
+        headline += f"{many(summary['asked'], 'case')}, and the right pairs wherever it answered."
     else:
         headline = f"{run.name} failed {count(summary['wrong'])} of {many(summary['asked'], 'case')}."
     return verdict(headline, _evidence(run), found, plain_tone="good")
+
+
+def _silent(summary: Mapping[str, Any]) -> bool:
+    """Whether every failure is that nothing came back: what came back was right."""
+    codes = {code for row in summary["areas"] for code in row["codes"]}
+    return codes <= {"CRASHED", "NO_ANSWER", "RAISED"}
 
 
 def _answered(summary: Mapping[str, Any]) -> int:
@@ -85,7 +94,7 @@ def _evidence(run: Question) -> Iterator[str]:
     if wrong:
         worst = sorted(wrong, key=lambda row: -row["failed"])[:4]
         parts = [f"{row['area']} ({count(row['failed'])} of {count(row['asked'])})" for row in worst]
-        yield f"It fails about {listed(parts)}."
+        yield f"Where it fails: {listed(parts)}."
     scripts = len(summary["failures"])
     if scripts:
         least = min(row["atoms"] for row in summary["failures"])

@@ -66,6 +66,7 @@ def areas(run: Question, width: float = PAGE_WIDTH) -> Figure:
 
 def _bars(run: Question, figure: Figure) -> None:
     axes = figure.subplots()
+    axes.grid(visible=False, axis="y")
     rows = [row for row in run.summary["areas"] if row["asked"]]
     place = np.arange(len(rows))[::-1]
     # a share of each area: one of 100,000 atoms counts as much as 500 drawn at random
