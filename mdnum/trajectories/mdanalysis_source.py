@@ -18,6 +18,8 @@ from mdnum.trajectories.source import AtomTable, Trajectory, UnreadableFrame
 from mdnum.trajectories.tails import left_over, refuse_cut_text
 
 #: what readers raise on files that end early or hold something else
+# what a word that is no number is told as, by readers that take it for the end of the file
+_NO_NUMBER = "could not convert"
 READING_FAILS = (OSError, EOFError, ValueError, RuntimeError, StopIteration, IndexError, KeyError, TypeError)
 
 
@@ -264,7 +266,13 @@ def notes_on(table: AtomTable) -> Iterator[str]:
 
 def first_line(error: BaseException) -> str:
     """What an error says, in a line."""
-    text = str(error).strip().splitlines()
+    cause: BaseException | None = error
+    while cause is not None and not str(cause).strip():
+        cause = cause.__context__
+    text = str(error if cause is None else cause).strip().splitlines()
+    if text and cause is not error and not text[0].startswith(_NO_NUMBER):
+        # how a reader stumbles over an end is its own business
+        text = []
     if not text and isinstance(error, StopIteration | EOFError):
         return "the file ends in it"
     return text[0].rstrip(".") if text else type(error).__name__

@@ -312,6 +312,16 @@ def test_a_number_cut_behind_the_last_whole_frame_is_none_of_its_numbers(tmp_pat
     assert "after 6 lines of it" in str(error)
 
 
+def test_a_word_in_the_middle_is_not_the_end_of_the_file(tmp_path):
+    path = tmp_path / "run.xyz"
+    lines = text_of("xyz", "xyz").splitlines(keepends=True)
+    lines[2 * 11 + 5] = "Ar 1.0 nought 2.0\n"
+    path.write_text("".join(lines))
+    frames, error = read(open_trajectory(path))
+    assert isinstance(error, UnreadableFrame) and error.frame == len(frames) == 2
+    assert "nought" in str(error) and "ends" not in str(error)
+
+
 @pytest.mark.parametrize("asked", ["", "@::3"])
 def test_lines_behind_the_last_frame_of_a_library_are_a_frame_too(tmp_path, asked):
     path = tmp_path / "run.xyz"
