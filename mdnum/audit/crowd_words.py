@@ -106,7 +106,7 @@ def reach(walk: PairWalk, units: Words) -> list[dict[str, str]]:
                 "STEEP_SWITCH",
                 "warning",
                 "the interaction is switched off so steeply that it is nearly a step",
-                f"Near {steep[1]:.4g} {units.length} the curvature of two {walk.pair.name} is "
+                f"Near {steep[1]:.4g} {units.length} the curvature of the pair {walk.pair.name} is "
                 f"{steep[0]:.2g} times "
                 "that at the bottom of their well: atoms that pass there feel a spring that much stiffer, "
                 "and forces that no bond explains.",
@@ -119,8 +119,9 @@ def reach(walk: PairWalk, units: Words) -> list[dict[str, str]]:
                 "MANY_KINKS",
                 "info",
                 "more places stand out than were looked at",
-                f"Along {walk.pair.name}, {walk.left_out} more places stood out of the scan; a table that is "
-                "interpolated with corners looks like this.",
+                f"Along {walk.pair.name}, {count(walk.left_out, 'more place')} stood out of the scan; a "
+                "table that is interpolated looks like this. Those that stand out most were looked at, as "
+                "many as the time allowed.",
             )
         )
     return found

@@ -28,6 +28,7 @@ _MOST_CROSSINGS = 2
 """Crossings of one threshold that are measured, each by another atom."""
 
 _CALLS_AT_CROSSING = 170
+_PATIENCE = 4.0
 _CALLS_ON_ROUTE = 430
 _CUT_OUT = 40
 """Atoms of the structure that are kept where a calculation of all takes too long."""
@@ -108,7 +109,9 @@ def walk_surroundings(
         except CalculatorError as error:
             skipped.append((f"{_CUT_OUT} atoms cut out of the structure", error.message))
             atoms, groups = subject.atoms, _groups(subject.atoms, single)
-    affordable = max(int(seconds / (cost * _CALLS_AT_CROSSING)), 1)
+    # one in any case, unless it alone takes several times what was allowed
+    one = cost * _CALLS_AT_CROSSING
+    affordable = max(int(seconds / one), int(one < _PATIENCE * seconds))
     targeted = _targeted(atoms, thresholds, groups)
     if len(targeted) > affordable:
         skipped.append((f"{len(targeted) - affordable} more crossings of known thresholds", "a lack of time"))

@@ -28,8 +28,22 @@ _LEVELS = 10
 _OUTLIER = 4.0
 """A mismatch this many times those around it is looked at more closely."""
 
+_STANDS_OUT = 10.0
+"""The same of an eighth difference, which may be all rounding: the largest of some hundred is five times the
+median."""
+
+_TOLD = 3.0
+"""A step so many times what stands out of a scan is also located, wherever it is in its interval."""
+
+_EIGHTH = np.array([1.0, -8.0, 28.0, -56.0, 70.0, -56.0, 28.0, -8.0, 1.0])
+_OF_A_STEP = 35.0
+"""A step of 1 makes the two eighth differences whose middle is beside it so large."""
+
 _SQUARE = 0.15
 """How near to 2 the power is with which a mismatch falls where a second derivative jumps."""
+
+_ALONE = 6.0
+"""Times the mismatch of the others at which one of them is alone."""
 
 _SEEN = 3
 """Zooms at which it does so, at least; what cannot be resolved does for one or two."""
@@ -91,9 +105,11 @@ def find_jumps(
 ) -> tuple[list[Jump], int]:
     """Every jump of energy, force, curvature or third derivative that stands out of a scan.
 
-    How small a jump that is depends on how the curve bends: measured at a spacing of 0.025 Å, steps of the
-    energy down to 3e-6 eV on a Lennard-Jones wall of ε = 1 eV and down to 1e-8 eV on a soft one; steps of the
-    force down to 1e-8 eV/Å on the soft one, and from 3e-4 eV/Å on in every case on the wall.
+    How small a jump that is depends on how the curve bends; `smallest_steps` tells it of a force. Measured at
+    a spacing of 0.025 Å, 40 steps of the force of each size at random places of five laws (Lennard-Jones of
+    ε = 0.01 and 0.4 eV, Morse, Buckingham, a soft one): of 1e-3, 1e-4 and 1e-5 eV/Å all are found, of 1e-6
+    199 of 200, the other on a wall. Steps of the energy are found down to 3e-6 eV on a Lennard-Jones wall of
+    ε = 1 eV and down to 1e-8 eV on a soft one.
 
     Args:
         curve: what is looked at; must be defined a little beyond both ends.
@@ -108,7 +124,7 @@ def find_jumps(
     """
     suspects = [
         one
-        for one in _outliers(curve, grid(low, high, step))
+        for one in _outliers(curve, grid(low, high, step))[0]
         if not any(one[1] - 2.5 * step < place < one[2] + 2.5 * step for place in expected)
     ]
     found: list[Jump] = []
@@ -193,21 +209,69 @@ def decay_power(curve: Curve, edge: float, room: float) -> float | None:
     return float(np.median(slopes[-4:]))
 
 
-def _outliers(curve: Curve, places: Float[np.ndarray, "points"]) -> list[tuple[float, float, float]]:
-    """(how far it stands out, left, right) of intervals whose mismatch stands out, the worst first."""
+def smallest_steps(
+    curve: Curve, low: float, high: float, step: float
+) -> tuple[Float[np.ndarray, "intervals"], Float[np.ndarray, "intervals"]]:
+    """Where `find_jumps` looked, and how large a step of the force has to be there to be found.
+
+    Args:
+        curve: as `find_jumps` was given it; what that asked is known to the curve.
+        low: as before.
+        high: as before.
+        step: as before.
+
+    Returns:
+        (middles of the intervals that are compared with others, eV/Å at each).
+
+    Error:
+        A step that stands out alone is found where it is this large: of 125 planted in five laws of force,
+        125; of those a third as large, half.
+    """
+    places = grid(low, high, step)
+    seen = _outliers(curve, places)[1]
+    compared = np.isfinite(seen)
+    return (0.5 * (places[:-1] + places[1:]))[compared], _TOLD * seen[compared]
+
+
+def _outliers(
+    curve: Curve, places: Float[np.ndarray, "points"]
+) -> tuple[list[tuple[float, float, float]], Float[np.ndarray, "intervals"]]:
+    """Intervals that do not join their two sides as those around them do.
+
+    Returns:
+        (how far it stands out, left, right) of each, the worst first; and the smallest step of the force that
+        stands out, by interval: infinite at both ends, which nothing is compared with.
+    """
     middle = places[len(places) // 2]
     noise = scatter(curve, middle, middle, places[-1] - places[0]).min(axis=0)
-    floors = 64 * np.array([*noise, 2 * noise[0] + (places[1] - places[0]) * noise[1]])
+    sums = np.array([*noise, 2 * noise[0] + (places[1] - places[0]) * noise[1]])
+    # (row, interval of its first value, what rounding leaves of it, times the usual that stand out)
+    rows = [(row, 3, 64 * least, _OUTLIER) for row, least in zip(_mismatch(curve, places), sums, strict=True)]
+    rows += [
+        (row, 4, 900 * least, _STANDS_OUT) for row, least in zip(_eighth(curve, places), noise, strict=True)
+    ]
     kept: dict[int, float] = {}
-    for row, least in zip(_mismatch(curve, places), floors, strict=True):
+    smallest = np.full(len(places) - 1, np.inf)
+    for number, (row, first, least, times) in enumerate(rows):
         for k, value in enumerate(row):
             around = np.concatenate([row[max(k - 12, 0) : max(k - 3, 0)], row[k + 4 : k + 13]])
             usual = max(float(np.median(around)) if len(around) else 0.0, float(least), 1e-300)
-            if value >= row[max(k - 3, 0) : k + 4].max() and value > _OUTLIER * usual:
-                kept[k] = max(kept.get(k, 0.0), value / usual)
-    # three points on either side have no mismatch of their own
+            if number == len(rows) - 1:
+                smallest[first + k] = times * usual / _OF_A_STEP
+            if value >= row[max(k - 3, 0) : k + 4].max() and value > times * usual:
+                kept[first + k] = max(kept.get(first + k, 0.0), value / usual)
     ranked = sorted(((ratio, k) for k, ratio in kept.items()), reverse=True)
-    return [(ratio, float(places[k + 3]), float(places[k + 4])) for ratio, k in ranked]
+    return [(ratio, float(places[k]), float(places[k + 1])) for ratio, k in ranked], smallest
+
+
+def _eighth(curve: Curve, places: Float[np.ndarray, "points"]) -> Float[np.ndarray, "2 intervals"]:
+    """Eighth differences of energy and force: of the two whose middles are an interval's ends, the smaller.
+
+    On a wall they are a hundredth of how badly two cubics meet, and a step is as much larger in them as
+    rounding is.
+    """
+    differences = np.abs(np.lib.stride_tricks.sliding_window_view(curve.many(places), 9, axis=1) @ _EIGHTH)
+    return np.minimum(differences[:, :-1], differences[:, 1:])
 
 
 def _mismatch(curve: Curve, places: Float[np.ndarray, "points"]) -> Float[np.ndarray, "3 intervals"]:
@@ -238,7 +302,8 @@ def _zoom(curve: Curve, left: float, right: float) -> list[Jump]:
         width = (right - left) / _DIVISIONS
         mismatch = _mismatch(curve, np.linspace(left - 4 * width, right + 4 * width, _DIVISIONS + 9))
         floor = np.array([*noise, 2 * noise[0] + width * noise[1]])
-        best = int(np.argmax((mismatch / floor[:, None]).max(axis=0)))
+        usual = np.maximum(floor, np.median(mismatch, axis=1))
+        best = int(np.argmax((mismatch / usual[:, None]).max(axis=0)))
         history.append(mismatch[:, best])
         clear.append(mismatch[:, best] > 30 * floor)
         # a jump shows more in the intervals beside it than in its own
@@ -248,11 +313,13 @@ def _zoom(curve: Curve, left: float, right: float) -> list[Jump]:
         if len(history) < 2:
             continue
         falls = history[-1] / np.maximum(history[-2], 1e-300)
-        # a force whose second derivative jumps: its mismatch falls with the square of the spacing, exactly
-        if clear[-1][1] and abs(np.log(max(falls[1], 1e-300)) / np.log(_NARROWER) + 2) < _SQUARE:
+        # a force whose second derivative jumps: its mismatch falls with the square of the spacing, exactly,
+        # and there alone; at the points of a table it does so everywhere
+        alone = mismatch[1, best] > _ALONE * usual[1]
+        if clear[-1][1] and alone and abs(np.log(max(falls[1], 1e-300)) / np.log(_NARROWER) + 2) < _SQUARE:
             seconds, place = seconds + 1, (left, right)
         for row in (1, 0):
-            jumped = abs(_level(curve, row, left)(right) - curve(left)[row])
+            jumped = abs(_level(curve, row, left, right)(right) - curve(left)[row])
             now = history[-1][row]
             if clear[-1][row] and 0.8 < falls[row] < 1.3 and 0.7 * jumped < now < 1.4 * jumped:
                 low, high = locate(curve, row, left, right)
@@ -275,16 +342,18 @@ def locate(curve: Curve, row: int, left: float, right: float) -> tuple[float, fl
         row: 0 for the energy (without the work done on the way), 1 for the force.
         left, right: two sides of a jump, so near that the value changes by little else.
     """
-    level = _level(curve, row, left)
+    level = _level(curve, row, left, right)
     middle = 0.5 * (level(left) + level(right))
     rising = level(right) > level(left)
     return bisect(lambda x: (level(x) > middle) == rising, left, right)
 
 
-def _level(curve: Curve, row: int, left: float) -> Callable[[float], float]:
-    """The force, or the energy without the work done on the way from left: what is left of it are jumps."""
+def _level(curve: Curve, row: int, left: float, right: float) -> Callable[[float], float]:
+    """The force without its slope before left, or the energy without the work done from there: only jumps."""
     if row == 1:
-        return lambda x: curve(x)[1]
+        back = left - (right - left)
+        slope_before = (curve(left)[1] - curve(back)[1]) / (left - back)
+        return lambda x: curve(x)[1] - slope_before * (x - left)
     return lambda x: curve(x)[0] + 0.5 * (x - left) * (curve(left)[1] + curve(x)[1])
 
 

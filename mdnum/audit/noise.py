@@ -22,6 +22,11 @@ RATTLE = 0.03
 FEW = 8
 
 
+#: Of an energy: noise that a double's rounding explains. What answers in single precision has more, on every
+#: line.
+_QUIET = 1e-11
+
+
 @dataclass(frozen=True)
 class Noise:
     """What an answer may differ by without anything being wrong.
@@ -123,8 +128,8 @@ def settled(
         noise = along_a_line(subject, there, rng)
         if best is None or noise.energy < 0.1 * best[1].energy:
             best = there, noise
-        # quiet enough to be rounding of single precision or better
-        if noise.energy < 1e-6 * max(1.0, abs(subject.energy(there))):
+        # quiet enough to be rounding; where it is not, a threshold on the line looks like noise as well
+        if noise.energy < _QUIET * max(1.0, abs(subject.energy(there))):
             break
     assert best is not None
     there, noise = best

@@ -23,6 +23,9 @@ from mdnum.audit.thresholds import STEPS, PairWalk, walk_pairs
 _MOST = 160
 """Neighbors of the crowded center; radius graphs are cut at 32 by habit, and at 50, 100 or 120 elsewhere."""
 
+_FEWEST = 4
+"""Of which a calculator too slow for more is given."""
+
 _NEAR, _FAR = 0.5, 0.94
 """The crowd is between these fractions of the cutoff."""
 
@@ -97,11 +100,12 @@ def crowd(
             progress(k, len(alike), {"phase": f"crowding {walk.pair.species[0]}"})
         radius = walk.cutoff or _WITHOUT_CUTOFF
         share = seconds / len(alike)
-        for count in (most, most // 2, most // 4, most // 8):
+        fewest = max(most // 8, _FEWEST)
+        for count in sorted({max(most // part, fewest) for part in (1, 2, 4, 8)}, reverse=True):
             # some refuse what is too dense for them, and for some it takes too long
             try:
                 with only_trying(subject):
-                    if count > most // 8 and _CALLS * _cost(subject, walk.pair, radius, count) > share:
+                    if count > fewest and _CALLS * _cost(subject, walk.pair, radius, count) > share:
                         continue
                     found.append(_crowded(subject, walk, radius, count, share))
                 break

@@ -100,6 +100,17 @@ def _tables(
             }
             for one in around.events
         ],
+        "How closely pairs were looked at": [
+            {
+                "pair": crowd_words.together("-".join(walk.pair.species)),
+                f"from ({units.length})": walk.steps[0],
+                f"to ({units.length})": walk.steps[1],
+                f"a step of the force is seen from ({units.force})": walk.steps[3],
+                f"over half of the way from ({units.force})": walk.steps[2],
+            }
+            for walk in walks.walks
+            if walk.steps
+        ],
         "Crowded atoms": [
             {
                 "element": one.species,
@@ -126,12 +137,14 @@ def _numbers(walks: PairWalks, around: Surroundings, crowds: Sequence[Crowd], kT
     orders = [one.order for one in thresholds] + [one.jump.order for one in around.events]
     return {
         "pairs": len(walks.walks),
+        "pairs_not_walked": list(walks.not_walked),
         "thresholds": len(thresholds),
         "cutoffs": cutoffs,
         "order": min(orders, default=None),
         "largest_energy_jump": max(steps, default=0.0),
         "largest_energy_jump_kT": max(steps, default=0.0) / kT if kT else None,
         "largest_force_jump": max(forces, default=0.0),
+        "force_steps_seen": max((walk.steps[3] for walk in walks.walks if walk.steps), default=None),
         "crossings_measured": around.measured,
         "routes": len(around.routes),
         "unexplained": sum(one.threshold is None for one in around.events),

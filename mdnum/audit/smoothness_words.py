@@ -10,7 +10,7 @@ from mdnum.audit.crowd_words import Words, caps, count, reach
 from mdnum.audit.environments import Event, Surroundings, unexplained
 from mdnum.audit.jumps import SMOOTH
 from mdnum.audit.provoke import Crowd
-from mdnum.audit.thresholds import PairWalks, Threshold
+from mdnum.audit.thresholds import BESIDE, PairWalks, Threshold
 from mdnum.references.findings import finding
 
 ORDERS = (
@@ -58,8 +58,9 @@ def place(threshold: Threshold) -> str:
 def summary(walks: PairWalks, around: Surroundings, crowds: Sequence[Crowd], kT: float, units: Words) -> str:
     """One or two sentences with the numbers."""
     thresholds = [one for walk in walks.walks for one in walk.thresholds]
-    found = f"Walking {len(walks.walks)} pairs of species found {count(len(thresholds), 'threshold')}"
-    if len(walks.walks) == 1:
+    of = f" of {len(walks.walks) + len(walks.not_walked)}" if walks.not_walked else ""
+    found = f"Walking {len(walks.walks)}{of} pairs of species found {count(len(thresholds), 'threshold')}"
+    if len(walks.walks) == 1 and not of:
         one = walks.walks[0].pair.name.split("-")[0]
         found = f"Walking two {one} found {count(len(thresholds), 'threshold')}"
     if not walks.walks:
@@ -89,7 +90,34 @@ def summary(walks: PairWalks, around: Surroundings, crowds: Sequence[Crowd], kT:
         tail += f"; an atom keeps {kept} neighbors and drops the rest"
     elif crowds:
         tail += f"; {max(one.neighbors for one in crowds)} neighbors at once are all kept"
-    return f"{found}; {tail}."
+    missing = f" Not walked: {', '.join(walks.not_walked)}." if walks.walks and walks.not_walked else ""
+    return f"{found}; {tail}.{missing}{_least(walks, units)}"
+
+
+def _least(walks: PairWalks, units: Words) -> str:
+    """How small a step of the force can be that escapes."""
+    seen = [walk.steps for walk in walks.walks if walk.steps]
+    if not seen:
+        return ""
+    low, half, everywhere = (max(one[k] for one in seen) for k in (0, 2, 3))
+    high = min(one[1] for one in seen)
+    if not low < high:
+        return ""
+    known = (
+        f", but for {BESIDE:g} {units.length} beside a threshold"
+        if any(w.thresholds for w in walks.walks)
+        else ""
+    )
+    return (
+        f" A step of the force above {_rounded_up(everywhere)} {units.force} would have shown anywhere from "
+        f"{low:.3g} to {high:.3g} {units.length}{known}; one above {_rounded_up(half)} over half of that."
+    )
+
+
+def _rounded_up(value: float) -> str:
+    """One digit that does not promise more than is known."""
+    digit = 10.0 ** np.floor(np.log10(value))
+    return f"{np.ceil(value / digit) * digit:.1g}"
 
 
 def _worst(walks: PairWalks, around: Surroundings) -> tuple[int, float, float] | None:
@@ -109,7 +137,7 @@ def findings(
 ) -> list[dict[str, str]]:
     """Findings by severity of what they mean for a run and for a derivative."""
     found = [*_pair_findings(walks, around, kT, units)]
-    found += _unexplained(around, kT, units)
+    found += _unexplained(around, kT, units, walks.not_walked)
     found += [one for crowded in crowds for one in caps(crowded, kT, units)]
     found += [one for walk in walks.walks for one in reach(walk, units)]
     return found
@@ -196,7 +224,9 @@ def _among(around: Surroundings, thresholds: Sequence[Threshold]) -> list[Event]
     return [one for one in around.events if one.threshold in thresholds and one.jump.order == 0]
 
 
-def _unexplained(around: Surroundings, kT: float, units: Words) -> list[dict[str, str]]:
+def _unexplained(
+    around: Surroundings, kT: float, units: Words, not_walked: Sequence[str]
+) -> list[dict[str, str]]:
     events = unexplained(around.events)
     sharp = [one for one in events if one.jump.order <= 1]
     found: list[dict[str, str]] = []
@@ -207,6 +237,8 @@ def _unexplained(around: Surroundings, kT: float, units: Words) -> list[dict[str
         if worst.ties:
             center, k = worst.ties[0]
             tie = f" There the {k}-th and the next neighbor of atom {center} are equally far."
+        if not_walked:
+            tie += f" It may be a threshold of a pair that was not walked: {', '.join(not_walked)}."
         found.append(
             finding(
                 "JUMP_AMONG_MANY",

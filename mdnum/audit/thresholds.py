@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations_with_replacement
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -14,7 +15,7 @@ from jaxtyping import Float
 from mdnum.audit.base import Progress, Subject
 from mdnum.audit.curve import Curve, bisect, grid, scatter, slope
 from mdnum.audit.digits import digits
-from mdnum.audit.jumps import SMOOTH, Jump, decay_power, find_jumps, measure
+from mdnum.audit.jumps import SMOOTH, Jump, decay_power, find_jumps, measure, smallest_steps
 from mdnum.audit.probes import FARTHEST, Pair, pairs
 from mdnum.audit.subject import CalculatorError, only_trying
 
@@ -34,13 +35,19 @@ _NEAREST = 0.3
 _COSTLY = 1000.0
 """Distances are walked down to where two particles cost this many kT."""
 
+BESIDE = 0.35
+"""So near to a threshold that was found a second one may be hidden, length: what a scan compares with."""
+
 _LOST = 0.01
 """So near to its end a smooth force may be lost in rounding, length."""
 
 _HAIR = 3e-8
 """Of a distance: a force that would be 0 so little further on is no jump where it ends."""
 
-_KNOTS = 6
+_ROUNDING = 1e-15
+"""Of the energy of two particles of several atoms, and of all forces on them: what rounding may change."""
+
+_KNOTS = 3
 """More jumps of a third derivative than these are the knots of a table."""
 
 _SMOOTHEST = 6
@@ -94,6 +101,9 @@ class PairWalk:
             (a table with cubic splines between its points); else 0.
         quantum: of energies (eV) and forces (eV/Å) that are rounded to decimals; 0 where they are not. No
             jump below a few of them is told.
+        steps: (from, to, half, all) of the scan within the range: between these distances, length, but not
+            beside thresholds, a step of the force above `all`, eV/Å, is found, and one above `half` at half
+            of them; None without a scan.
     """
 
     pair: Pair
@@ -106,14 +116,23 @@ class PairWalk:
     calls: int
     quantum: tuple[float, float] = (0.0, 0.0)
     knots: int = 0
+    steps: tuple[float, float, float, float] | None = None
 
 
 @dataclass(frozen=True)
 class PairWalks:
-    """What walking pairs told: the walks, and what was left out and why."""
+    """What walking pairs told.
+
+    Attributes:
+        walks: one for each pair that was walked.
+        skipped: what was left out, and why.
+        not_walked: pairs of species of the structure without a walk of their own, "Cu-Zr" say; none where
+            whole molecules were walked, whose atoms are not asked about one by one.
+    """
 
     walks: tuple[PairWalk, ...]
     skipped: tuple[tuple[str, str], ...]
+    not_walked: tuple[str, ...] = ()
 
 
 _known: WeakKeyDictionary[Any, PairWalks] = WeakKeyDictionary()
@@ -151,8 +170,18 @@ def walk_pairs(subject: Subject, progress: Progress | None = None) -> PairWalks:
                 walks.append(walk(subject, pair, seconds=left / (len(found) - k)))
             except CalculatorError as error:
                 skipped.append((f"pair {pair.name}", error.message))
-        _known[subject] = PairWalks(tuple(walks), tuple(skipped))
+        _known[subject] = PairWalks(tuple(walks), tuple(skipped), _not_walked(subject, walks))
     return _known[subject]
+
+
+def _not_walked(subject: Subject, walks: Sequence[PairWalk]) -> tuple[str, ...]:
+    """Pairs of species of the structure that no walk was about."""
+    if any(one.pair.moves == "molecule" for one in walks):
+        return ()
+    walked = {frozenset(one.pair.species) for one in walks}
+    species = sorted(set(subject.atoms.get_chemical_symbols()))
+    both = combinations_with_replacement(species, 2)
+    return tuple("-".join(two) for two in both if frozenset(two) not in walked)
 
 
 def rough(subject: Subject, pair: Pair) -> tuple[float | None, float | None]:
@@ -184,8 +213,12 @@ def walk(subject: Subject, pair: Pair, step: float = STEP, seconds: float = np.i
     curve, kT = pair.curve(subject), subject.kT
     coarse, far = _coarse(subject, curve)
     cost = (time.perf_counter() - began) / len(coarse)
-    energy_far, force_far = curve(far)
+    energy_far = curve(far)[0]
     noise = 8 * scatter(curve, far, far, 1.0)[0]
+    if len(pair.second) > 1:
+        # what is within a particle is rounded otherwise where the two stand otherwise
+        inside = float(np.abs(subject.forces(pair.at(far))).sum())
+        noise = np.maximum(noise, _ROUNDING * np.array([4 * abs(energy_far), inside]))
 
     def alive(distance: float) -> bool:
         energy, force = curve(distance)
@@ -193,13 +226,14 @@ def walk(subject: Subject, pair: Pair, step: float = STEP, seconds: float = np.i
 
     costs = np.abs(curve.many(coarse)[0] - energy_far) > _COSTLY * kT
     near = float(coarse[np.flatnonzero(costs)[-1] + 1]) if costs[:-1].any() else float(coarse[0])
-    edge = None if alive(far) and force_far else _edge(coarse, alive)
+    edge = None if alive(far) else _edge(coarse, alive)
     if edge is None and not alive(float(coarse[-2])):
         end = near  # nothing anywhere
     else:
         end = edge[1] if edge else min(far, 15.0)
     thresholds: list[Threshold] = []
     left_out = 0
+    smallest = None
     # half of the time for the scan, the rest for what stands out of it
     step = float(np.clip(2 * cost * (end - near) / seconds, step, max(step, _WIDEST)))
     margin = 8 * step
@@ -207,6 +241,7 @@ def walk(subject: Subject, pair: Pair, step: float = STEP, seconds: float = np.i
     if end > near + 12 * step:
         jumps, left_out = find_jumps(curve, near + margin, end + margin, step, until=began + seconds)
         thresholds = [_threshold(pair, jump) for jump in jumps]
+        smallest = smallest_steps(curve, near + margin, end + margin, step)
         scanned = grid(near + margin, end + margin, step)
         distance = np.append(coarse[(coarse >= near) & (coarse < near + margin)], scanned)
     thirds = sum(one.order == SMOOTH for one in thresholds)
@@ -223,11 +258,34 @@ def walk(subject: Subject, pair: Pair, step: float = STEP, seconds: float = np.i
     if any(quantum):
         # nearly all that stands out of such a curve is a step of rounding
         thresholds, left_out = [kept for one in thresholds if (kept := _beyond(one, quantum))], 0
+    known = [one.radius for one in thresholds]
+    seen = None if smallest is None else _seen(*smallest, end, STEPS * quantum[1], known)
     return PairWalk(
         pair, tuple(sorted(thresholds, key=lambda one: one.radius)), distance, values[0] - energy_far,
         values[1], thresholds[-1].radius if edge and thresholds else None, left_out, len(curve.known),
-        quantum, knots,
+        quantum, knots, seen,
     )  # fmt: skip
+
+
+def _seen(
+    places: Float[np.ndarray, "intervals"],
+    steps: Float[np.ndarray, "intervals"],
+    end: float,
+    rounding: float,
+    known: Sequence[float],
+) -> tuple[float, float, float, float] | None:
+    """(from, to, step of the force that is found at half of the places, step that is found at all).
+
+    Beside a threshold that is known, another is hidden: those places do not count, nor do those beyond the
+    end.
+    """
+    felt = places < end
+    for radius in known:
+        felt &= np.abs(places - radius) > BESIDE
+    if not felt.any():
+        return None
+    told = np.maximum(steps[felt], rounding)
+    return float(places[felt][0]), float(places[felt][-1]), float(np.median(told)), float(told.max())
 
 
 def _quantum(values: Float[np.ndarray, "2 points"], summed: int) -> tuple[float, float]:

@@ -110,7 +110,7 @@ def test_what_is_said_of_a_shift_and_of_switches():
             "ase.calculators.lj:LennardJones(sigma=3.4, epsilon=0.01, rc=8.5, ro=6.0, smooth=True)",
             [(6.0, 2), (8.5, 2)],
         ),
-        ("ase.calculators.morse:MorsePotential(epsilon=0.5, r0=2.6)", [(2.7 * 2.6, 3)]),
+        ("ase.calculators.morse:MorsePotential(epsilon=0.5, r0=2.6)", [(1.9 * 2.6, 3), (2.7 * 2.6, 3)]),
         ("ase.calculators.tip3p:TIP3P(rc=5.5, width=1.0)", [(4.5, 2), (5.5, 2)]),
         ("ase.calculators.tip4p:TIP4P(rc=5.5, width=1.0)", [(4.5, 2), (5.5, 2)]),
         ("ase.calculators.emt:EMT", [(5.8768, 0)]),

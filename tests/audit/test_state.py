@@ -188,3 +188,21 @@ def test_a_slow_calculator_is_asked_in_every_sequence(monkeypatch):
     assert asked == {"sizes", "a slow drift", "two atoms head on"}
     assert any(what.endswith("questions of the sequence “sizes”") for what, _ in part.skipped)
     assert not any(what.startswith("the sequence") for what, _ in part.skipped)
+
+
+def test_failing_on_an_atom_without_neighbors_is_found_where_the_cluster_has_one_too():
+    """A bond order divides by the number of neighbors; the structure with a vacancy is answered."""
+
+    class Bonds(planted.Good):
+        def answer(self, atoms):
+            i, _, _ = self.pairs(self.positions(atoms), self.shifts(atoms), atoms)
+            if (np.bincount(i, minlength=len(atoms)) == 0).any():
+                raise ZeroDivisionError("0.0 cannot be raised to a negative power")
+            return super().answer(atoms)
+
+    # the first twelve of them have holes between them
+    atoms = crystal().repeat(2)[np.random.default_rng(1).permutation(64)]
+    assert isinstance(atoms, Atoms)
+    found = alone(subject(Bonds), atoms, Noise(1e-13, 1e-13))
+    assert isinstance(found.refused[-1], tuple) and "cluster" in found.refused[-1][0]
+    assert [one["code"] for one in found.findings()] == ["LONELY_FAILS"]
