@@ -7,6 +7,8 @@ outside the box, odd cells and few atoms go in as they are.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from mdnum.references.conformance.lists import Limits, PairList, source_of
 
 
@@ -201,6 +203,9 @@ def jax_md_pairs(positions, cell, pbc, r_cut):
 
 _SINGLE = 2.0**-24
 
+#: An edge of a box of at most FLT_EPSILON is taken for none (calc_distances.h): a library for Angstrom.
+_OF_MDANALYSIS = Limits(minimum_image=True, all_axes=True, lower=True, right_handed=True, least_cutoff=1e-3)
+
 #: Measured on 512 pairs at the cutoff, release 0.2.29: in a periodic box 92 of 478 rows were one-sided, with
 #: and without a cell list; in free space, where displacement(a, b) is -displacement(b, a), none.
 JAX_MD_KNOWN = {
@@ -262,7 +267,7 @@ PEERS: tuple[PairList, ...] = (
         full=False,
         unit=_SINGLE,
         affords=0.3,
-        limits=Limits(minimum_image=True, all_axes=True, lower=True, right_handed=True),
+        limits=_OF_MDANALYSIS,
     ),
     _peer(
         "mdanalysis-brute",
@@ -272,7 +277,7 @@ PEERS: tuple[PairList, ...] = (
         full=False,
         unit=_SINGLE,
         affords=0.3,
-        limits=Limits(minimum_image=True, all_axes=True, lower=True, right_handed=True, most_atoms=20_000),
+        limits=replace(_OF_MDANALYSIS, most_atoms=20_000),
     ),
     _peer(
         "scipy",

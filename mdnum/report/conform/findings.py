@@ -104,11 +104,13 @@ def _evidence(run: Question) -> Iterator[str]:
         )
     refused = sum(row["refused"] for row in summary["areas"])
     skipped = sum(row["skipped"] for row in summary["areas"])
-    if refused or skipped:
-        yield (
-            f"It refused {many(refused, 'case')}; {many(skipped, 'case')} "
-            f"{'was' if skipped == 1 else 'were'} not asked, because it does not claim to do them."
-        )
+    told = [f"it refused {many(refused, 'case')}"] * bool(refused)
+    if skipped:
+        was, them = ("was", "it") if skipped == 1 else ("were", "them")
+        told.append(f"{many(skipped, 'case')} {was} not asked, because it does not claim to do {them}")
+    if told:
+        words = "; ".join(told)
+        yield f"{words[:1].upper()}{words[1:]}."
 
 
 def conventions(run: Question) -> Iterator[tuple[str, str]]:

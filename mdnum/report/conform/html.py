@@ -61,12 +61,15 @@ def record(folder: RunFolder | str | Path) -> Verdict:
 def areas(run: Question, width: float = PAGE_WIDTH) -> Figure:
     """A bar per area: right, wrong, refused."""
     rows = len(run.summary["areas"])
-    return drawn(partial(_bars, run), 0.9 + 0.27 * rows if width >= PAGE_WIDTH else 1.1 + 0.33 * rows, width)
+    height = 0.9 + 0.27 * rows if width >= PAGE_WIDTH else 1.1 + 0.33 * rows
+    figure = drawn(partial(_bars, run), height, width)
+    # lines along the bars would strike through the numbers beside them
+    figure.axes[0].grid(visible=False, axis="y")
+    return figure
 
 
 def _bars(run: Question, figure: Figure) -> None:
     axes = figure.subplots()
-    axes.grid(visible=False, axis="y")
     rows = [row for row in run.summary["areas"] if row["asked"]]
     place = np.arange(len(rows))[::-1]
     # a share of each area: one of 100,000 atoms counts as much as 500 drawn at random
