@@ -115,6 +115,7 @@ def _look(
 ) -> FlipsResult:
     from mdnum.trajectories.resolution import infer_from
     from mdnum.workflow import flips_numbers, flips_record
+    from mdnum.workflow.flips_differing import plain_box
 
     log = Log(folder, progress)
     sample = sample_of(trajectory)
@@ -157,6 +158,7 @@ def _look(
         {
             **about(trajectory, "flips"),
             "between": None if between is None else list(between),
+            "box": plain_box(sample[0].box),
             "frames": found.frames,
             **steps,
             "window": window,

@@ -105,10 +105,11 @@ def other_box(frames: Sequence[Frame], tolerance: float) -> dict[str, Any] | Non
     return {
         "axes": bool((one.pbc != other.pbc).any()),
         "apart": float(np.abs(np.asarray(one.matrix) - np.asarray(other.matrix)).max()),
-        "a": _plain(one),
-        "b": _plain(other),
+        "a": plain_box(one),
+        "b": plain_box(other),
     }
 
 
-def _plain(box: Box) -> dict[str, Any]:
+def plain_box(box: Box) -> dict[str, Any]:
+    """A box as plain values, for summary.json."""
     return {"matrix": np.asarray(box.matrix, float).tolist(), "pbc": np.asarray(box.pbc, bool).tolist()}

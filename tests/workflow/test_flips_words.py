@@ -157,3 +157,28 @@ def test_a_folder_of_another_version_is_refused_in_a_line_or_works(tmp_path: Pat
     with pytest.raises(FolderError, match="lacks has_times, stride") as caught:
         report.write(found.folder)
     assert f"mdnum flips {tmp_path / 'a.traj'}" in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_file_without_a_box_or_with_half_of_one_says_so(tmp_path: Path) -> None:
+    def said(name: str, pbc: Any) -> tuple[str, str]:
+        frames = gas(4)
+        for one in frames:
+            one.pbc = pbc
+        write(tmp_path / f"{name}.traj", frames)
+        found = mdnum.flips(tmp_path / f"{name}.traj", cutoffs=[2.5], out=tmp_path / name)
+        notes = [one["text"] for one in found.summary["findings"] if one["code"] == "READING"]
+        return " ".join(notes), (found.folder / "report.html").read_text(encoding="utf-8")
+
+    for name, pbc, note, row in (
+        (
+            "none",
+            False,
+            "no pair is looked for through a boundary",
+            "no box that repeats",
+        ),
+        ("half", [True, False, True], "repeats along a and c only", "6 × 6 × 6 Å, repeating along a and c"),
+        ("whole", True, "", "6 × 6 × 6 Å, repeating along a, b and c"),
+    ):
+        text, page = said(name, pbc)
+        assert note in text and row in page
+        assert bool(note) == ("repeat" in text)

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
-
-import numpy as np
 
 from mdnum.report.flips.conclusions import shown, views
-from mdnum.report.flips.words import frame, merged, rule_words
+from mdnum.report.flips.words import box_words, frame, merged, rule_words
 from mdnum.report.fork.question import Question
 from mdnum.report.verdict import Finding
-from mdnum.report.words import count, listed, many, plain
+from mdnum.report.words import count, many
 
 
 def findings(run: Question) -> Iterator[Finding]:
@@ -110,23 +107,8 @@ def _boxes(run: Question) -> Iterator[Finding]:
         "OTHER_BOX",
         "info" if parted else "warning",
         f"the two {what} from {frame(run, found['frame'])} on",
-        f"A: {_box(run, found['a'])}. B: {_box(run, found['b'])}. Each file’s pairs are those of its own "
-        "box; how far atoms are apart is told through the box of B, along axes that both repeat along."
+        f"A: {box_words(run, found['a'])}. B: {box_words(run, found['b'])}. Each file’s pairs are those of "
+        "its own box; how far atoms are apart is told through the box of B, along axes that repeat in both."
         + (" The boxes came to differ after the positions did, as with a barostat." if parted else ""),
         "" if parted else "Check that both files are of one system, and that both keep their boxes.",
     )
-
-
-def _box(run: Question, box: Any) -> str:
-    """A box in words: lengths, angles where they are not right, and the axes along which it repeats."""
-    matrix, axes = np.array(box["matrix"]), [name for name, yes in zip("abc", box["pbc"], strict=True) if yes]
-    if not axes:
-        return "no box that repeats"
-    sizes = np.linalg.norm(matrix, axis=1)
-    text = f"{' × '.join(plain(float(one), 9) for one in sizes)} {run.summary['length']}".rstrip()
-    with np.errstate(invalid="ignore", divide="ignore"):
-        unit = matrix / sizes[:, None]
-    angles = np.degrees(np.arccos(np.clip([unit[1] @ unit[2], unit[0] @ unit[2], unit[0] @ unit[1]], -1, 1)))
-    if np.isfinite(angles).all() and np.abs(angles - 90).max() > 1e-9:
-        text += f" at {', '.join(plain(float(one), 7) for one in angles)}°"
-    return f"{text}, repeating along {listed(axes)}"

@@ -12,7 +12,7 @@ from mdnum.report.flips.words import duration, flips_of, length, life, merged, r
 from mdnum.report.fork.findings import Verdict
 from mdnum.report.fork.question import Question, verdict
 from mdnum.report.verdict import Finding
-from mdnum.report.words import count, many, number, percent
+from mdnum.report.words import count, listed, many, number, percent
 
 #: Rules that the verdict tells about one by one.
 _TOLD = 3
@@ -155,6 +155,13 @@ def _times(run: Question) -> Iterator[Finding]:
 def _notes(run: Question) -> Iterator[Finding]:
     summary = run.summary
     said = list(summary["notes"])
+    box = summary.get("box")
+    if box is not None and not all(box["pbc"]):
+        axes = [name for name, yes in zip("abc", box["pbc"], strict=True) if yes]
+        said.append(
+            f"The box repeats along {listed(axes)} only." if axes
+            else "The file has no box that repeats: no pair is looked for through a boundary."
+        )  # fmt: skip
     if summary["velocities_odd"]:
         said.append(
             "Atoms are displaced further between the first two frames than their velocities say: the "

@@ -9,7 +9,7 @@ from typing import Any
 from mdnum.errors import FolderError
 from mdnum.report.flips import figures as drawn
 from mdnum.report.flips import findings, sections
-from mdnum.report.flips.words import duration, per_time, rule_words, size
+from mdnum.report.flips.words import box_words, duration, per_time, rule_words, size
 from mdnum.report.fork.findings import Verdict
 from mdnum.report.fork.question import Question, declared, write_page
 from mdnum.report.words import count, number, percent
@@ -124,6 +124,9 @@ def _what(run: Question) -> Iterator[tuple[str, str]]:
     frames = f", frames {summary['slice']}" if summary["slice"] else ""
     yield "File", f"{summary['file']}{frames} ({summary['format']}, read by {summary['reader']})"
     yield "Size", size(run)
+    if summary.get("box"):
+        varies = "" if summary["frames"] < 2 else ", at the first frame"
+        yield "Box", box_words(run, summary["box"]) + varies
     if summary["between"]:
         yield "Between", " and ".join(f"“{one}”" for one in summary["between"])
     for one in summary["rules"]:

@@ -7,9 +7,11 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from mdnum.report.fork.question import Question
 from mdnum.report.verdict import Finding
-from mdnum.report.words import count, many, number, plain
+from mdnum.report.words import count, listed, many, number, plain
 
 _ORDER = ("error", "warning", "info")
 # a rule that stays on one line
@@ -129,3 +131,18 @@ def moment(run: Question, table: Mapping[str, Any]) -> tuple[str, Any]:
 def flips_of(one: Mapping[str, Any]) -> str:
     """1,234 flips, 600 entered and 634 left."""
     return f"{many(one['flips'], 'flip')}, {count(one['entered'])} entered and {count(one['left'])} left"
+
+
+def box_words(run: Question, box: Any) -> str:
+    """A box in words: lengths, angles where they are not right, and the axes along which it repeats."""
+    matrix, axes = np.array(box["matrix"]), [name for name, yes in zip("abc", box["pbc"], strict=True) if yes]
+    if not axes:
+        return "no box that repeats"
+    sizes = np.linalg.norm(matrix, axis=1)
+    text = f"{' × '.join(plain(float(one), 9) for one in sizes)} {run.summary['length']}".rstrip()
+    with np.errstate(invalid="ignore", divide="ignore"):
+        unit = matrix / sizes[:, None]
+    angles = np.degrees(np.arccos(np.clip([unit[1] @ unit[2], unit[0] @ unit[2], unit[0] @ unit[1]], -1, 1)))
+    if np.isfinite(angles).all() and np.abs(angles - 90).max() > 1e-9:
+        text += f" at {', '.join(plain(float(one), 7) for one in angles)}°"
+    return f"{text}, repeating along {listed(axes)}"
