@@ -96,19 +96,30 @@ def precision(
     if not size or not typical:
         return
     ulps = noise.energy / np.spacing(size)
-    narrow = next((name for bits, name in _FORMATS if max(energy.bits, force.bits) <= bits), None)
+    whose, narrow = _narrowest(energy.bits, force.bits)
     share = noise.force / typical
     eps = np.finfo(np.float64).eps
     if narrow is None and not (ulps > _NOISY and share > _NOISY * eps):
         return
     carried = f"forces carry about {max(-np.log10(max(share, eps)), 0):.0f} digits"
-    told = f"All answers are numbers of {narrow}" if narrow else "Answers scatter more than doubles do"
+    told = f"All {whose} are numbers of {narrow}" if narrow else "Answers scatter more than doubles do"
     yield finding(
         "LOW_PRECISION",
         "info",
-        f"answers are of {narrow}" if narrow else "answers carry fewer digits than a double",
+        f"{whose} are of {narrow}" if narrow else "answers carry fewer digits than a double",
         f"{told}: along a line the energy scatters by {noise.energy:.1g} eV, {ulps:.1g} times the last bit "
         f"of a double of its size, and {carried}.",
         "Expect runs to part and energies to wander at this level; where it matters, compute in double "
         "precision.",
     )
+
+
+def _narrowest(energy: int, force: int) -> tuple[str, str | None]:
+    """(what carries few bits, the name of their format), None where neither energies nor forces do."""
+
+    def named(bits: int) -> str | None:
+        return next((name for most, name in _FORMATS if bits <= most), None)
+
+    if both := named(max(energy, force)):
+        return "answers", both
+    return ("energies", found) if (found := named(energy)) else ("forces", named(force))

@@ -22,9 +22,10 @@ RATTLE = 0.03
 FEW = 8
 
 
-#: Of an energy: noise that a double's rounding explains. What answers in single precision has more, on every
-#: line.
-_QUIET = 1e-11
+#: Of an energy: noise that rounding explains, of doubles and of numbers of single precision.
+_QUIET, _QUIET_SINGLE = 1e-11, 1e-6
+#: A line that is so much quieter than another has no threshold on it; rounding differs by less between lines.
+_QUIETER = 1e-3
 
 
 @dataclass(frozen=True)
@@ -126,10 +127,12 @@ def settled(
     for _ in range(tries):
         there = displaced(given, RATTLE * rng.uniform(-1, 1, (len(given), 3)))
         noise = along_a_line(subject, there, rng)
-        if best is None or noise.energy < 0.1 * best[1].energy:
+        if best is None or noise.energy < _QUIETER * best[1].energy:
             best = there, noise
         # quiet enough to be rounding; where it is not, a threshold on the line looks like noise as well
-        if noise.energy < _QUIET * max(1.0, abs(subject.energy(there))):
+        energy = subject.energy(there)
+        single = float(np.float32(energy)) == energy
+        if noise.energy < (_QUIET_SINGLE if single else _QUIET) * max(1.0, abs(energy)):
             break
     assert best is not None
     there, noise = best

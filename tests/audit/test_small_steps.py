@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from audit import laws
+from audit import laws, planted
 from audit.laws import R_CUT, Pairwise, law, subject
 
 from mdnum.audit import environments, probes, provoke, thresholds
 from mdnum.audit.crowd_words import reach, units_of
 from mdnum.audit.curve import Curve
+from mdnum.audit.digits import precision
 from mdnum.audit.environments import Surroundings
 from mdnum.audit.jumps import find_jumps, smallest_steps
-from mdnum.audit.noise import settled
+from mdnum.audit.noise import Noise, settled
 from mdnum.audit.smoothness import Smoothness
 from mdnum.audit.smoothness_words import summary
 from mdnum.audit.subject import CalculatorSubject
@@ -209,3 +210,34 @@ def test_a_threshold_on_a_line_is_not_taken_for_noise():
         subject(lambda: OnFirstLine(laws.soft), laws.Atoms("Ar12", grid)), np.random.default_rng(0)
     )
     assert noise.energy < 1e-13
+
+
+class Narrow(planted.Good):
+    """Energies, or forces, through another format."""
+
+    energies = forces = staticmethod(lambda value: value)
+
+    def extra(self, atoms, energy, forces):
+        return self.energies(energy), self.forces(forces)
+
+
+def through_single(value):
+    return np.float64(np.float32(value))
+
+
+@pytest.mark.parametrize(
+    ("which", "rounding", "code", "words"),
+    [
+        ("energies", through_single, "LOW_PRECISION", "All energies are numbers of single precision"),
+        ("forces", through_single, "LOW_PRECISION", "All forces are numbers of single precision"),
+        ("energies", lambda value: np.round(value, 5), "QUANTIZED", "the energy to 5 (1e-05 eV)"),
+    ],
+    ids=["energies single", "forces single", "energies rounded"],
+)
+def test_few_digits_of_energies_or_of_forces_alone_are_told(which, rounding, code, words):
+    class Some(Narrow):
+        pass
+
+    setattr(Some, which, staticmethod(rounding))
+    (found,) = precision(planted.subject(Some), planted.chain(), Noise(1e-8, 1e-8), np.random.default_rng(0))
+    assert found["code"] == code and words in found["text"]

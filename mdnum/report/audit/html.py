@@ -13,7 +13,7 @@ from mdnum.ball.demos.base import Plot, Series
 from mdnum.report.fork.findings import Verdict
 from mdnum.report.fork.question import Question, declared, load, verdict, write_page
 from mdnum.report.verdict import Finding, restore
-from mdnum.report.words import count, heading, number, typeset
+from mdnum.report.words import count, heading, many, number, typeset
 from mdnum.store import RunFolder
 
 _ROLES = ("first", "second", "third", "bad", "muted", "ink")
@@ -80,7 +80,11 @@ def _key_figures(run: Question) -> Iterator[tuple[str, str, str]]:
     yield "To run", summary["safe_to_run"], "a simulation with it"
     yield "To differentiate", summary["safe_to_differentiate"], "through it"
     found = [one["severity"] for one in summary["findings"]]
-    yield "Findings", count(found.count("error") + found.count("warning")), f"{found.count('error')} errors"
+    yield (
+        "Findings",
+        count(found.count("error") + found.count("warning")),
+        many(found.count("error"), "error"),
+    )
     numbers = {part["name"]: part["numbers"] for part in summary["parts"]}
     if "dynamics" in numbers and numbers["dynamics"].get("drift") is not None:
         yield "Drift", number(numbers["dynamics"]["drift"], 2, signed=True), "meV/atom/ps"
