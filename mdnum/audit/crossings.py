@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from mdnum.audit.base import Subject
 from mdnum.audit.nve import Run, at
-from mdnum.audit.thresholds import Threshold
+from mdnum.audit.threshold import Threshold
 from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.rules import SpeciesCutoffs
 from mdnum.trajectories.tracker import Tracker

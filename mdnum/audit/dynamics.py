@@ -19,7 +19,7 @@ from mdnum.audit.noise import FEW, Noise, along_a_line, roomy
 from mdnum.audit.nve import Run, at, fitting_timestep, prepared, run
 from mdnum.audit.rigid import rigid
 from mdnum.audit.subject import CalculatorError, only_trying
-from mdnum.audit.thresholds import Threshold
+from mdnum.audit.threshold import Threshold
 from mdnum.references.findings import finding
 
 _MOST_STEPS, _FEWEST_STEPS = 400, 32

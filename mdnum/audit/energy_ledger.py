@@ -17,7 +17,7 @@ from mdnum.audit.drift import Drift, drift, wandering
 from mdnum.audit.hidden import Hidden, hidden_jumps
 from mdnum.audit.noise import Noise
 from mdnum.audit.nve import Run
-from mdnum.audit.thresholds import Threshold
+from mdnum.audit.threshold import Threshold
 
 #: Flips whose jumps are measured; the others are told by the mean of these.
 _MEASURED = 240

@@ -19,7 +19,8 @@ from mdnum.audit.jumps import SMOOTH, Jump, find_jumps, locate, measure
 from mdnum.audit.probes import Pair, molecules, whole
 from mdnum.audit.routes import Crossing, Route
 from mdnum.audit.subject import CalculatorError
-from mdnum.audit.thresholds import STEP, STEPS, Threshold, walk_pairs
+from mdnum.audit.threshold import Threshold
+from mdnum.audit.thresholds import STEP, STEPS, walk_pairs
 
 _SIDE = 1e-7
 """Half the stretch around an expected crossing in which it is located, length."""

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 from mdnum.audit.base import Subject
 from mdnum.audit.curve import Curve
-from mdnum.audit.thresholds import Threshold
+from mdnum.audit.threshold import Threshold
 
 _TIED = 1e-6
 """Two distances this near to one another are tied, length."""

@@ -13,7 +13,8 @@ from mdnum.audit import smoothness_words as words
 from mdnum.audit.base import Curve, Part, Progress, Subject
 from mdnum.audit.environments import Surroundings, walk_surroundings
 from mdnum.audit.provoke import Crowd, crowd
-from mdnum.audit.thresholds import PairWalk, PairWalks, Threshold, walk_pairs
+from mdnum.audit.threshold import Threshold
+from mdnum.audit.thresholds import PairWalk, PairWalks, walk_pairs
 
 _ULPS = 12
 """Representable distances shown on either side of a jump."""

@@ -10,7 +10,8 @@ from mdnum.audit.crowd_words import Words, caps, count, reach
 from mdnum.audit.environments import Event, Surroundings, unexplained
 from mdnum.audit.jumps import SMOOTH
 from mdnum.audit.provoke import Crowd
-from mdnum.audit.thresholds import BESIDE, PairWalks, Threshold
+from mdnum.audit.threshold import Threshold
+from mdnum.audit.thresholds import BESIDE, PairWalks
 from mdnum.references.findings import finding
 
 ORDERS = (

@@ -17,7 +17,7 @@ from mdnum.audit.approaches import Asked, approaches
 from mdnum.audit.base import Part, Progress, Subject
 from mdnum.audit.noise import FEW, Noise, displaced, settled
 from mdnum.audit.subject import CalculatorError, CalculatorSubject, only_trying
-from mdnum.audit.thresholds import Threshold
+from mdnum.audit.threshold import Threshold
 from mdnum.audit.written import written
 from mdnum.references.findings import finding
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations_with_replacement
 from typing import Any
@@ -13,11 +13,13 @@ import numpy as np
 from jaxtyping import Float
 
 from mdnum.audit.base import Progress, Subject
-from mdnum.audit.curve import Curve, bisect, grid, scatter, slope
+from mdnum.audit.curve import Curve, grid, scatter
 from mdnum.audit.digits import digits
-from mdnum.audit.jumps import SMOOTH, Jump, decay_power, find_jumps, measure, smallest_steps
+from mdnum.audit.ends import end_of, with_end
+from mdnum.audit.jumps import SMOOTH, find_jumps, smallest_steps
 from mdnum.audit.probes import FARTHEST, Pair, pairs
 from mdnum.audit.subject import CalculatorError, only_trying
+from mdnum.audit.threshold import SMOOTHEST, Threshold, at_jump
 
 STEP = 0.025
 """Spacing of a scan, in the unit of length. Two thresholds closer than this may be told as one."""
@@ -38,50 +40,11 @@ _COSTLY = 1000.0
 BESIDE = 0.35
 """So near to a threshold that was found a second one may be hidden, length: what a scan compares with."""
 
-_LOST = 0.01
-"""So near to its end a smooth force may be lost in rounding, length."""
-
-_HAIR = 3e-8
-"""Of a distance: a force that would be 0 so little further on is no jump where it ends."""
-
 _ROUNDING = 1e-15
 """Of the energy of two particles of several atoms, and of all forces on them: what rounding may change."""
 
 _KNOTS = 3
 """More jumps of a third derivative than these are the knots of a table."""
-
-_SMOOTHEST = 6
-"""Orders above this are told as this one: that smooth or smoother."""
-
-
-@dataclass(frozen=True)
-class Threshold:
-    """A distance at which the energy or one of its derivatives jumps, or beyond which nothing is left.
-
-    Attributes:
-        radius: the distance, length.
-        species: of the two atoms (of the reference atoms of two molecules).
-        order: the lowest derivative of the energy that jumps: 0 the energy, 1 the force, 2 the curvature, 3
-            the third derivative, and so on; 6 stands for 6 or smoother.
-        jumps: of energy (eV), force along the line (eV/Å) and curvature (eV/Å²): beyond minus before.
-        doubt: how large each of them could look where nothing jumps.
-        inside: the last distance before it that was told apart.
-        outside: the first one beyond it; the next double where a value jumps.
-        dies: whether the two do not interact beyond it.
-        located: how far off radius can be, length.
-        third: jump of the third derivative, eV/Å³, where that is the lowest and was measured; else 0.
-    """
-
-    radius: float
-    species: tuple[str, str]
-    order: int
-    jumps: tuple[float, float, float]
-    doubt: tuple[float, float, float]
-    inside: float
-    outside: float
-    dies: bool
-    located: float
-    third: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -226,7 +189,7 @@ def walk(subject: Subject, pair: Pair, step: float = STEP, seconds: float = np.i
 
     costs = np.abs(curve.many(coarse)[0] - energy_far) > _COSTLY * kT
     near = float(coarse[np.flatnonzero(costs)[-1] + 1]) if costs[:-1].any() else float(coarse[0])
-    edge = None if alive(far) else _edge(coarse, alive)
+    edge = None if alive(far) else end_of(coarse, alive)
     if edge is None and not alive(float(coarse[-2])):
         end = near  # nothing anywhere
     else:
@@ -240,7 +203,7 @@ def walk(subject: Subject, pair: Pair, step: float = STEP, seconds: float = np.i
     distance = np.append(coarse[coarse >= near][:12], near + margin)
     if end > near + 12 * step:
         jumps, left_out = find_jumps(curve, near + margin, end + margin, step, until=began + seconds)
-        thresholds = [_threshold(pair, jump) for jump in jumps]
+        thresholds = [at_jump(pair, jump) for jump in jumps]
         smallest = smallest_steps(curve, near + margin, end + margin, step)
         scanned = grid(near + margin, end + margin, step)
         distance = np.append(coarse[(coarse >= near) & (coarse < near + margin)], scanned)
@@ -249,7 +212,7 @@ def walk(subject: Subject, pair: Pair, step: float = STEP, seconds: float = np.i
     if knots:
         thresholds, left_out = [one for one in thresholds if one.order < SMOOTH], 0
     if edge is not None:
-        thresholds = _with_edge(pair, curve, edge, thresholds, near)
+        thresholds = with_end(pair, curve, edge, thresholds, near)
     thresholds = [
         one for one in thresholds if pair.moves == "molecule" or not _of_others(pair, one, thresholds)
     ]
@@ -299,7 +262,7 @@ def _beyond(threshold: Threshold, quantum: tuple[float, float]) -> Threshold | N
     rounding = STEPS * quantum[0], STEPS * quantum[1]
     if threshold.order <= 1 and (abs(energy) > rounding[0] or abs(force) > rounding[1]):
         return threshold
-    return replace(threshold, order=_SMOOTHEST, jumps=(0.0, 0.0, 0.0)) if threshold.dies else None
+    return replace(threshold, order=SMOOTHEST, jumps=(0.0, 0.0, 0.0)) if threshold.dies else None
 
 
 def _of_others(pair: Pair, threshold: Threshold, thresholds: Sequence[Threshold]) -> bool:
@@ -323,93 +286,3 @@ def _coarse(subject: Subject, curve: Curve) -> tuple[Float[np.ndarray, "points"]
     if first > len(places) - 4:
         curve(float(places[-4]))  # says why
     return places[first:], float(places[-1])
-
-
-def _edge(coarse: Float[np.ndarray, "points"], alive: Callable[[float], bool]) -> tuple[float, float] | None:
-    """Neighboring distances, the last at which anything is felt and the next; None where nothing ever is.
-
-    A smooth switch may be lost in rounding, here and there, before it ends: whatever is felt beyond what
-    was found moves the search outward.
-    """
-    for k in range(len(coarse) - 2, -1, -1):
-        if alive(float(coarse[k])):
-            low, high = float(coarse[k]), float(coarse[k + 1])
-            break
-    else:
-        return None
-    top = high
-    for _ in range(20):
-        low, high = bisect(alive, low, high)
-        beyond = [low + (top - low) * 0.5**power for power in range(1, 40)]
-        felt = [place for place in beyond if place > high and alive(place)]
-        if not felt:
-            return low, high
-        low, high = max(felt), top
-    return low, high
-
-
-def _threshold(pair: Pair, jump: Jump) -> Threshold:
-    return Threshold(
-        jump.high if jump.exact else jump.at, pair.species, jump.order,
-        (jump.energy, jump.force, jump.curvature), jump.doubt, jump.low, jump.high, False,
-        jump.high - jump.low, jump.third,
-    )  # fmt: skip
-
-
-def _with_edge(
-    pair: Pair, curve: Curve, edge: tuple[float, float], found: list[Threshold], near: float
-) -> list[Threshold]:
-    """The thresholds with the one beyond which nothing is left, measured as such."""
-    inner = [one.radius for one in found if one.radius < edge[0] - 1e-3]
-    room = min(edge[0] - max([near, *inner]), 0.5)
-    jump = measure(curve, *edge, room, exact=True)
-    if jump.order == 1 and _nearly_gone(curve, jump, room):
-        jump = replace(jump, order=2, force=0.0)
-    order, radius = jump.order, edge[1]
-    power = decay_power(curve, edge[1], room) if order >= 2 else None
-    if power is not None:
-        order = int(np.clip(round(power) + 1, 2, _SMOOTHEST))
-        if order > SMOOTH - 1:  # it may have been lost in rounding before its end
-            radius = max(_root(curve, edge[1], room, round(power)), edge[1])
-    jumps = (jump.energy, jump.force, jump.curvature if order <= SMOOTH - 1 else 0.0)
-    located = max(radius - edge[0], edge[1] - edge[0])
-    # what the scan took for a threshold of its own there is this one
-    same = [one for one in found if abs(one.radius - edge[1]) <= 1e-3]
-    third = 0.0
-    if order >= SMOOTH:
-        # of a third derivative that jumps it knows the place better: the force was lost in rounding before
-        better = [one for one in found if one.order == SMOOTH and -1e-3 < one.radius - edge[1] < _LOST]
-        same += better
-        if better:
-            order, third = SMOOTH, better[-1].third
-        if better and better[-1].radius - edge[1] > better[-1].located:
-            radius, located = better[-1].radius, better[-1].located
-    last = Threshold(radius, pair.species, order, jumps, jump.doubt, *edge, True, located, third)
-    return [one for one in found if one not in same] + [last]
-
-
-def _nearly_gone(curve: Curve, jump: Jump, room: float) -> bool:
-    """Whether a force that falls to nothing is cut a hair before it would get there.
-
-    Where a switch is left out once it rounds to 0, that is the square root of a rounding before its end.
-    """
-    steepness, error = slope(curve, jump.low, -1, room, 0.0)
-    left = abs(jump.force / steepness) if abs(steepness) > error else np.inf
-    return left < _HAIR * max(abs(jump.low), 1.0)
-
-
-def _root(curve: Curve, edge: float, room: float, power: int) -> float:
-    """Where a force that falls with this power of the distance to its end would vanish.
-
-    The edge itself where it is no further off than such an extrapolation can tell: it falls to the power only
-    in the limit, while the edge is known to the last bit unless the force was lost in rounding before it.
-    """
-    places = edge - room * np.array([0.02, 0.01, 0.005])
-    far, near, nearer = np.abs(curve.many(places)[1]) ** (1.0 / power)
-    if not far > near > nearer:
-        return edge
-    first = places[1] + near * (places[1] - places[0]) / (far - near)
-    root = places[2] + nearer * (places[2] - places[1]) / (near - nearer)
-    if abs(root - edge) <= 3 * abs(root - first):
-        return edge
-    return float(root) if abs(root - edge) < 1e-3 * max(room, 1.0) else edge

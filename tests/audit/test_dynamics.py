@@ -16,7 +16,7 @@ from mdnum.audit.drift import Drift, drift, ratio, wandering
 from mdnum.audit.dynamics import Dynamics
 from mdnum.audit.nve import fitting_timestep, prepared, run
 from mdnum.audit.rigid import rigid, rigid_bonds
-from mdnum.audit.thresholds import Threshold
+from mdnum.audit.threshold import Threshold
 
 STEPS = 120
 

@@ -22,7 +22,7 @@ from mdnum.audit.noise import Noise
 from mdnum.audit.state import State
 from mdnum.audit.structures import water
 from mdnum.audit.subject import CalculatorError, CalculatorSubject
-from mdnum.audit.thresholds import Threshold
+from mdnum.audit.threshold import Threshold
 from mdnum.audit.written import written
 
 
