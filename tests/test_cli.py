@@ -6,6 +6,7 @@ import io
 import json
 import subprocess
 import sys
+import time
 import tomllib
 import types
 from dataclasses import dataclass, field
@@ -248,11 +249,22 @@ def test_progress_appears_at_a_terminal_after_a_while():
     assert stream.getvalue() != ""
 
 
-def test_progress_stays_away_from_pipes_and_short_runs():
+def test_progress_is_a_line_now_and_then_where_it_is_piped():
     pipe = io.StringIO()
-    with ProgressBar(pipe, delay=0.0) as progress:
+    with ProgressBar(pipe, delay=0.2, pause=0.2) as progress:
         progress(100, 1_000, INFO)
-        assert progress._timer is None
+        until = time.monotonic() + 20
+        while pipe.getvalue().count("\n") < 2 and time.monotonic() < until:
+            time.sleep(0.01)
+    lines = pipe.getvalue().splitlines()
+    assert len(lines) >= 2
+    assert all("100 of 1,000 steps" in line for line in lines)
+
+
+def test_progress_stays_away_from_short_runs():
+    pipe = io.StringIO()
+    with ProgressBar(pipe, delay=60.0) as progress:
+        progress(100, 1_000, INFO)
     short = _Terminal()
     with ProgressBar(short, delay=60.0) as progress:
         progress(100, 1_000, INFO)

@@ -1,4 +1,4 @@
-"""The progress bar of a run: on stderr, only at a terminal, only once a run has proved to be long."""
+"""Progress on stderr once work has proved to be long: a bar at a terminal, elsewhere a line now and then."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self, TextIO
 
@@ -50,13 +50,16 @@ class ProgressBar:
     for seconds, without calling.
 
     Args:
-        stream: where to draw; nothing is drawn unless it is a terminal.
-        delay: seconds of run before the bar appears.
+        stream: where to draw a bar, or to print lines where it is no terminal.
+        delay: seconds of run before the bar or the first line appears.
+        pause: seconds to the second line, doubled after each up to a minute, where it is no terminal.
     """
 
-    def __init__(self, stream: TextIO | None = None, delay: float = 2.0):
+    def __init__(self, stream: TextIO | None = None, delay: float = 2.0, pause: float = 8.0):
         self._stream = sys.stderr if stream is None else stream
         self._delay = delay
+        self._pause = pause
+        self._began = time.monotonic()
         self._lock = threading.Lock()
         self._bar: Progress | None = None
         self._task: TaskID | None = None
@@ -65,10 +68,8 @@ class ProgressBar:
         self._closed = False
 
     def __enter__(self) -> Self:
-        if self._stream.isatty():
-            self._timer = threading.Timer(self._delay, self._start)
-            self._timer.daemon = True
-            self._timer.start()
+        self._began = time.monotonic()
+        self._after(self._delay, self._start if self._stream.isatty() else self._print)
         return self
 
     def __exit__(
@@ -91,6 +92,25 @@ class ProgressBar:
     def shown(self) -> bool:
         """Whether the bar has appeared."""
         return self._bar is not None
+
+    def _after(self, seconds: float, action: Callable[[], None]) -> None:
+        self._timer = threading.Timer(seconds, action)
+        self._timer.daemon = True
+        self._timer.start()
+
+    def _print(self) -> None:
+        with self._lock:
+            if self._closed:
+                return
+            step, steps, info = self._last
+            phase = str(info.get("phase", "run"))
+            line = f"mdnum: {_WORDS.get(phase, phase)}"
+            if _counts(steps, info):
+                line += f", {describe(step, steps, info)}"
+            with suppress(OSError, ValueError):  # whoever read it has gone
+                print(f"{line} ({time.monotonic() - self._began:.0f} s)", file=self._stream, flush=True)
+            self._after(self._pause, self._print)
+            self._pause = min(2 * self._pause, 60.0)
 
     def _start(self) -> None:
         from rich.console import Console
@@ -117,7 +137,7 @@ class ProgressBar:
             return
         step, steps, info = self._last
         phase = str(info.get("phase", "run"))
-        counting = steps > 0 and (phase == "run" or "unit" in info)
+        counting = _counts(steps, info)
         self._bar.update(
             self._task,
             description=_WORDS.get(phase, phase),
@@ -125,6 +145,10 @@ class ProgressBar:
             completed=step,
             line=describe(step, steps, info) if counting else "",
         )
+
+
+def _counts(steps: int, info: dict[str, Any]) -> bool:
+    return steps > 0 and (info.get("phase", "run") == "run" or "unit" in info)
 
 
 def describe(step: int, steps: int, info: dict[str, Any]) -> str:
