@@ -1,4 +1,4 @@
-"""A limit on the time of a verb, asked for by a person: what was not examined by then is said, not guessed."""
+"""A limit on the time of a verb: what was not examined by then is said, not guessed."""
 
 from __future__ import annotations
 

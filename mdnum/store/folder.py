@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 
 _FILES = (
     "system.toml", "structure.extxyz", "provenance.json", "summary.json", "log.txt", "checkpoint.npz",
-    "trajectory.traj", "report.html", "gradients.npz", "answers.json", *(f"{name}.parquet" for name in COLUMNS),
+    "trajectory.traj", "report.html", "gradients.npz", "answers.json",
+    *(f"{name}.parquet" for name in COLUMNS),
 )  # fmt: skip
 _LOCK = ".lock"
 
