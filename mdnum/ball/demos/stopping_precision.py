@@ -72,11 +72,14 @@ def problem(dtype: str, policy: RolePrecision, reduction: Reduction = Sequential
 
 
 def policies(dtype: str) -> dict[str, RolePrecision]:
-    """The three that are compared: wide, narrow with a narrow sum, narrow with a wide sum."""
+    """The three that are compared: wide, narrow with a narrow sum, narrow with a wide sum.
+
+    All take the loss in float32 of what positions they have: a loss of sixteen bits would be rounded itself.
+    """
     wide = "float32"
     return {
         "float32": RolePrecision.all(wide),
-        f"{dtype}, fragile sum": RolePrecision.all(dtype),
+        f"{dtype}, fragile sum": RolePrecision(dtype, dtype, dtype, dtype, wide),
         f"{dtype}, float32 sum": RolePrecision(dtype, dtype, wide, wide, wide),
     }
 
@@ -90,6 +93,17 @@ class Row:
     run: BallRun
     gradient: Gradient
 
+    @property
+    def moves(self) -> np.ndarray:
+        """Largest change of a position in each step, m, shape (steps,)."""
+        return np.abs(np.diff(self.run.y.astype(np.float64), axis=0)).max(axis=1)
+
+    @property
+    def contact(self) -> int | None:
+        """First step (from 1) in which a ball touches the floor; None where none does."""
+        touched = self.run.first_contact[self.run.first_contact > 0]
+        return int(touched.min()) if len(touched) else None
+
     def data(self) -> dict[str, Any]:
         """Plain values for `--json`."""
         assert self.run.history is not None
@@ -99,6 +113,8 @@ class Row:
             "penetration": [float(x) for x in self.run.residual],
             "penetration_before": [float(x) for x in self.run.history[:, 0]],
             "residuals_of_step_1": [float(x) for x in first[np.isfinite(first)]],
+            "largest_move": [float(x) for x in self.moves],
+            "first_contact": self.contact,
             "loss": self.gradient.value,
             "grad_k": self.gradient.gradient["k"],
             "depends_on_k": self.gradient.depends["k"],
@@ -116,14 +132,12 @@ def measure(dtype: str) -> list[Row]:
     return rows
 
 
-def exact(dtype: str) -> tuple[float, float]:
-    """Loss and derivative by the gain of the run that makes one iteration, in exact arithmetic."""
+def exact(dtype: str) -> tuple[list[float], float]:
+    """Losses of no iteration and of one, and the derivative by the gain of one, in exact arithmetic."""
     _, depths = boundary_batch(dtype)
-    p = [Fraction(float(depth)) for depth in depths]
+    squares = sum(Fraction(float(depth)) ** 2 for depth in depths) / len(depths)
     share = 1 - Fraction(ALPHA) * Fraction(K)
-    loss = sum((share * one) ** 2 for one in p) / len(p)
-    slope = sum(-2 * share * Fraction(ALPHA) * one**2 for one in p) / len(p)
-    return float(loss), float(slope)
+    return [float(squares), float(share**2 * squares)], float(-2 * share * Fraction(ALPHA) * squares)
 
 
 def run() -> Demo:
@@ -136,6 +150,8 @@ def run() -> Demo:
     slopes = {dtype: [row.gradient.gradient["k"] for row in rows[dtype]] for dtype in FORMATS}
     counts = {dtype: [row.run.iterations.tolist() for row in rows[dtype]] for dtype in FORMATS}
     truth = {dtype: exact(dtype)[1] for dtype in FORMATS}
+    losses = {dtype: [row.gradient.value for row in rows[dtype]] for dtype in FORMATS}
+    exact_losses = {dtype: [exact(dtype)[0][n] for n in (1, 0, 1)] for dtype in FORMATS}
     step = 2.0**-24
     lost = abs(slopes["float16"][2] / truth["float16"] - 1)
     restored = abs(scaled.gradient["k"] / truth["float16"] - 1)
@@ -155,6 +171,18 @@ def run() -> Demo:
                 counts[dtype],
                 f"{ran}, {did_not}, {ran}",
                 counts[dtype] == [ran, did_not, ran],
+            )
+            for dtype in FORMATS
+        ),
+        *(
+            Check(
+                f"losses on the boundary of {dtype} are those of the exact positions, to float32",
+                losses[dtype],
+                "one iteration, none, one, to 2^-20 relative",
+                all(
+                    abs(loss / expected - 1) < 2.0**-20
+                    for loss, expected in zip(losses[dtype], exact_losses[dtype], strict=True)
+                ),
             )
             for dtype in FORMATS
         ),
@@ -199,6 +227,7 @@ def run() -> Demo:
         ),
         numbers={
             "iterations": counts,
+            "loss": losses,
             "grad_k": slopes,
             "grad_k_exact": truth,
             "grad_k_scaled": scaled.gradient["k"],
@@ -231,6 +260,8 @@ def _table(rows: dict[str, list[Row]], truth: dict[str, float], scaled: Gradient
             row.name,
             " ".join(str(n) for n in row.run.iterations),
             float(row.run.history[0, 0]),  # type: ignore[index]
+            " ".join(f"{move:.4g}" for move in row.moves),
+            row.contact,
             row.gradient.value,
             row.gradient.gradient["k"],
             truth[row.dtype],
@@ -241,11 +272,11 @@ def _table(rows: dict[str, list[Row]], truth: dict[str, float], scaled: Gradient
     ]
     half = lines[-1]
     lines.append(
-        (*half[:1], "float16, float32 sum, loss scaled", *half[2:5], scaled.gradient["k"], *half[6:])
+        (*half[:1], "float16, float32 sum, loss scaled", *half[2:7], scaled.gradient["k"], *half[8:])
     )
     columns = (
-        "boundary of", "run", "iterations", "first residual (m)", "loss (m²)", "dloss/dk", "exact",
-        "depends on k",
+        "boundary of", "run", "iterations", "first residual (m)", "largest move by step (m)", "first contact",
+        "loss (m²)", "dloss/dk", "exact", "depends on k",
     )  # fmt: skip
     return Table("Three precisions on two boundaries", columns, tuple(lines))
 

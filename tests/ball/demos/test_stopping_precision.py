@@ -41,7 +41,7 @@ def first_step(depths: np.ndarray, tol: float, state, sums) -> tuple[int, float]
 
 def test_every_check_holds(demo: Demo) -> None:
     assert [check.what for check in demo.checks if not check.ok] == []
-    assert len(demo.checks) == 8
+    assert len(demo.checks) == 10
 
 
 @pytest.mark.parametrize("dtype", KINDS)
@@ -71,6 +71,21 @@ def test_the_known_derivatives(demo: Demo) -> None:
         demo.numbers["grad_k_scaled"], demo.numbers["grad_k_exact"]["float16"], rtol=1e-3
     )
     assert 0.42 < demo.numbers["error_unscaled"] < 0.44
+
+
+def test_losses_and_moves_are_those_of_a_loop_in_float32_of_the_narrow_positions(demo: Demo) -> None:
+    fragile = {"bfloat16": 1.0930185823099237e-07, "float16": 1.1098907748419151e-07}
+    for dtype, low in KINDS.items():
+        _, depths = boundary_batch(dtype)
+        for row, state in zip(demo.data[dtype].values(), (np.float32, low, low), strict=True):
+            start = np.array([state(-d) for d in depths])
+            moved = row["iterations"] == [1, 0, 0, 0]
+            y = np.array([state(one + state(state(0.25) * -one)) for one in start]) if moved else start
+            np.testing.assert_allclose(row["loss"], np.mean(y.astype(np.float32) ** 2), rtol=2e-7)
+            # what is left below the floor is set to 0 at the end of a step
+            assert row["largest_move"] == [float(depths[0]), 0.0, 0.0, 0.0]
+            assert row["first_contact"] == 1
+        assert demo.numbers["loss"][dtype][1] == fragile[dtype]
 
 
 def test_only_the_fragile_runs_do_not_depend_on_the_gain(demo: Demo) -> None:
