@@ -25,6 +25,7 @@ class History:
         frame: position among the frames looked at, from 1.
         entered: whether the pair is inside at that frame.
         frames: frames looked at.
+        ambiguous: whether the file's resolution may have made each flip; none where that is not known.
     """
 
     i: Int[np.ndarray, "pairs"]
@@ -35,6 +36,7 @@ class History:
     frame: Int[np.ndarray, "flips"]
     entered: Bool[np.ndarray, "flips"]
     frames: int
+    ambiguous: Bool[np.ndarray, "flips"]
 
     @classmethod
     def of(cls, flips: Flips, first: Members, frames: int) -> History:
@@ -45,9 +47,8 @@ class History:
             first: pairs inside at the first frame.
             frames: frames looked at, at least 1.
         """
-        return cls.of_columns(
-            flips.frame, flips.entered, (flips.i, flips.j, flips.rank), (first.i, first.j, first.rank), frames
-        )
+        pair, members = (flips.i, flips.j, flips.rank), (first.i, first.j, first.rank)
+        return cls.of_columns(flips.frame, flips.entered, pair, members, frames, flips.ambiguous)
 
     @classmethod
     def of_columns(
@@ -57,11 +58,12 @@ class History:
         pair: Sequence[Int[np.ndarray, "flips"]],
         first: Sequence[Int[np.ndarray, "members"]],
         frames: int,
+        ambiguous: Bool[np.ndarray, "flips"] | None = None,
     ) -> History:
         """As `of`, from the columns that it looks at.
 
         Args:
-            frame, entered: of each flip, in the order of frames.
+            frame, entered, ambiguous: of each flip, in the order of frames.
             pair: i, j and rank of each flip.
             first: i, j and rank of each pair inside at the first frame.
         """
@@ -83,7 +85,11 @@ class History:
         rows[1:] = np.cumsum(np.bincount(of_flip, minlength=len(heads))) if flips else 0
         source = order[flip] - starts
         i, j, rank = (column[heads] for column in columns)
-        return cls(i, j, rank, inside, rows, np.asarray(frame)[source], np.asarray(entered)[source], frames)
+        unsure = np.zeros(flips, bool) if ambiguous is None else np.asarray(ambiguous)
+        return cls(
+            i, j, rank, inside, rows, np.asarray(frame)[source], np.asarray(entered)[source], frames,
+            unsure[source],
+        )  # fmt: skip
 
     def __len__(self) -> int:
         return len(self.i)

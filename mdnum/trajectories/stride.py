@@ -35,16 +35,18 @@ class Strides:
         stride: 1, 2, 4, ...
         flips: of the frames 0, stride, 2 stride, ...
         of: flips of all frames, as far as these reach.
+        doubtful: of those that are left out, flips that the rounding of the file may have made.
     """
 
     stride: Int[np.ndarray, "strides"]
     flips: Int[np.ndarray, "strides"]
     of: Int[np.ndarray, "strides"]
+    doubtful: Int[np.ndarray, "strides"]
 
     @classmethod
     def of_history(cls, history: History, strides: Sequence[int]) -> Strides:
         """Counts them: of the flips of a pair between two frames that are kept, an odd one is left."""
-        pair, kept, total = history.pair, [], []
+        pair, counts = history.pair, []
         for stride in strides:
             reach = (history.frames - 1) // stride * stride
             seen = history.frame <= reach
@@ -53,12 +55,16 @@ class Strides:
                 np.concatenate([[True], (np.diff(block) != 0) | (np.diff(pair[seen]) != 0)])[: len(block)]
             )
             sizes = np.diff(np.append(new, len(block)))
-            kept.append(int(np.count_nonzero(sizes % 2)))
-            total.append(len(block))
-        return cls(np.array(strides, np.int64), np.array(kept, np.int64), np.array(total, np.int64))
+            unsure = np.add.reduceat(history.ambiguous[seen].astype(np.int64), new) if len(new) else sizes
+            left_out = sizes // 2 * 2
+            counts.append((len(block) - left_out.sum(), len(block), np.minimum(left_out, unsure).sum()))
+        kept, total, doubtful = np.array(counts, np.int64).reshape(-1, 3).T
+        return cls(np.array(strides, np.int64), kept, total, doubtful)
 
     def __add__(self, other: Strides) -> Strides:
-        return Strides(self.stride, self.flips + other.flips, self.of + other.of)
+        return Strides(
+            self.stride, self.flips + other.flips, self.of + other.of, self.doubtful + other.doubtful
+        )
 
     @property
     def share(self) -> Float[np.ndarray, "strides"]:
@@ -72,9 +78,9 @@ class Between:
 
     Attributes:
         lost: the estimate; None where the numbers do not tell.
-        low, high: what two ways of carrying the losses on give; None where `lost` is.
+        low, high: the range of it, never of no width; None where `lost` is.
         doubled: share that every second frame alone would lose.
-        says: where it comes from, in words.
+        says: where it comes from, or why there is none, in words.
     """
 
     lost: float | None
@@ -99,6 +105,11 @@ def between_frames(found: Strides) -> Between | None:
     by a factor q, halving the stride for ever brings back a geometric series of them. In a liquid q itself
     falls with the stride, from about 1 where motion looks Brownian to 1/4 where atoms fly straight, so that q
     held fixed says too much (high), and q that falls on as from one doubling to the next too little (low).
+    Where there are too few strides to see q fall, low is that of straight flight from here on.
+
+    Flips that the rounding of the file may have made revert just so, and say nothing of what lies between its
+    frames: the range is that with and without them, and there is no number where they are half of what a
+    stride of 2 leaves out. What chance does to counts is in the range, by two standard deviations.
 
     Returns:
         None with fewer than three strides, or no flips.
@@ -108,26 +119,60 @@ def between_frames(found: Strides) -> Between | None:
     """
     if len(found.stride) < 3 or tuple(found.stride[:3]) != (1, 2, 4) or not found.of.all():
         return None
-    shares = found.share[:4]
-    losses = -np.diff(shares)
-    near, far = float(losses[0]), float(losses[1])
+    shares, of = found.share[:4], int(found.of[1])
+    near, second = float(shares[0] - shares[1]), float(shares[0] - shares[2])
     if near <= 0:
-        return Between(0.0, 0.0, 0.0, 0.0, "looking at every second frame alone loses no flip")
+        # 3 events or fewer are not seen in one case of 20; each is two flips
+        return Between(
+            0.0, 0.0, _share(2 * 6.0 / of), 0.0, "looking at every second frame alone loses no flip"
+        )
     said = (
-        f"looking at every second frame alone loses {_percent(1 - shares[1])} of the flips, at every fourth "
-        f"{_percent(1 - shares[2])}"
+        f"looking at every second frame alone loses {_percent(near)} of the flips, at every fourth "
+        f"{_percent(second)}"
     )
+    if 2 * found.doubtful[1] > found.of[1] - found.flips[1]:
+        made = _percent(float(found.doubtful[1] / found.of[1]))
+        return Between(
+            None, None, None, near,
+            f"{said}: but the file's digits may have made {made}, which is not told apart from motion",
+        )  # fmt: skip
+    lost = np.diff(-found.flips[:4] * (of / found.of[:4]))
+    sure = np.maximum(lost - np.diff(found.doubtful[:4] * (of / found.of[:4])), 0.0)
     if near < _FEW:
         # straight flight, and too few to see a trend in: in proportion to the stride, or to its square
-        return Between(_share(near), _share(near / 3), _share(2 * near), near, said)
-    q = near / far if far > 0 else math.inf
-    trend = min(q / (far / float(losses[2])), 1.0) if len(losses) > 2 and losses[2] > 0 and far > 0 else 1.0
-    low = _series(near, q * trend, trend)
-    if q >= _DIES_OUT or low is None:
-        return Between(None, None, None, near, f"{said}: that does not die out as the stride is halved")
-    high = near * q / (1 - q)
+        low, high = float(sure[0]) / of / 3, 2 * (near + 2 * math.sqrt(2 * near / of))
+        return Between(_share(near), _share(low), _share(high), near, said)
+    ranges = [carried for carried in map(_carried_on, (lost, sure)) if carried is not None]
+    if len(ranges) < 2:
+        return Between(
+            None,
+            None,
+            None,
+            near,
+            f"{said}: that does not die out as the stride is halved, as where motion looks Brownian",
+        )
+    low, high = min(low for low, _ in ranges) / of, max(high for _, high in ranges) / of
+    # what chance does to the counts: a flip that is left out comes with the one that takes it back
+    chance = 2 * np.sqrt(2 * np.maximum(lost[:2], 2.0) / lost[:2] ** 2)
+    least, most = low * max(1 - chance[0], 0.0), high * (1 + chance.sum())
     said = f"{said}, carried on to ever shorter strides"
-    return Between(_share(math.sqrt(low * high)), _share(low), _share(high), near, said)
+    return Between(_share(math.sqrt(low * high)), _share(least), _share(most), near, said)
+
+
+def _carried_on(lost: Float[np.ndarray, "doublings"]) -> tuple[float, float] | None:
+    """(low, high) of the flips that are missing; None where their number does not come to an end.
+
+    Args:
+        lost: flips that each doubling of the stride leaves out, two or three numbers.
+    """
+    near, far = float(lost[0]), float(lost[1])
+    if far <= 0 or near / far >= _DIES_OUT:
+        return None
+    q = near / far
+    high = near * q / (1 - q)
+    trend = q * float(lost[2]) / far if len(lost) > 2 and lost[2] > 0 else 1.0
+    low = _series(near, q * trend, trend) if trend < 1 else min(near / 3, high)
+    return None if low is None else (low, high)
 
 
 def _series(first: float, q: float, trend: float) -> float | None:

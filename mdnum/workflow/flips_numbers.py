@@ -98,11 +98,15 @@ def histories(folder: RunFolder, rule: int, frames: int) -> Iterator[tuple[int, 
     parts = max(1, -(-rows // _PART_ROWS))
     for part in range(parts):
         first = _columns(streams["members"], ("i", "j", "rank"), rule, part, parts)
-        flips = _columns(streams["flips"], ("frame", "entered", "i", "j", "rank"), rule, part, parts)
+        flips = _columns(
+            streams["flips"], ("frame", "entered", "i", "j", "rank", "ambiguous"), rule, part, parts
+        )
         pair = [flips[name] for name in ("i", "j", "rank")]
         yield (
             part, parts,
-            History.of_columns(flips["frame"], flips["entered"], pair, list(first.values()), frames),
+            History.of_columns(
+                flips["frame"], flips["entered"], pair, list(first.values()), frames, flips["ambiguous"]
+            ),
         )  # fmt: skip
 
 
@@ -117,7 +121,7 @@ def _columns(
             mine &= (rows["i"].astype(np.int64) * _SPREAD + rows["j"]) % parts == part
         for name in names:
             found[name].append(rows[name][mine])
-    empty = {"entered": np.zeros(0, bool)}
+    empty = {"entered": np.zeros(0, bool), "ambiguous": np.zeros(0, bool)}
     return {
         name: np.concatenate(some) if some else empty.get(name, np.zeros(0, np.int64))
         for name, some in found.items()
@@ -267,6 +271,7 @@ def told(found: Counted) -> dict[str, Any]:
             "stride": found.strides.stride.tolist(),
             "flips": found.strides.flips.tolist(),
             "of": found.strides.of.tolist(),
+            "doubtful": found.strides.doubtful.tolist(),
             **_between(found.strides),
         },
     }

@@ -110,8 +110,7 @@ def _between(run: Question, one: Mapping[str, Any]) -> Iterator[Finding]:
             "BETWEEN_FRAMES",
             "warning" if found["doubled"] > HIDDEN else "info",
             "how many flips happened between the frames cannot be told",
-            f"{rule_words(run, one)}: {found['says']}, as where motion looks Brownian at this stride. Frames "
-            "half as far apart would bring a share of that order to light, and more between them.",
+            f"{rule_words(run, one)}: {found['says']}.",
             _BOUND,
         )
     elif one["flips"] >= FEW and found["lost"] is not None and found["lost"] > HIDDEN:
@@ -119,8 +118,7 @@ def _between(run: Question, one: Mapping[str, Any]) -> Iterator[Finding]:
             "BETWEEN_FRAMES",
             "warning",
             f"about {percent(found['lost'])} of the flips happened and reverted between frames",
-            f"{rule_words(run, one)}: {found['says']}. Two ways of doing that give {percent(found['low'])} "
-            f"and {percent(found['high'])}.",
+            f"{rule_words(run, one)}: {found['says']}: {percent(found['low'])} to {percent(found['high'])}.",
             _BOUND,
         )
 

@@ -105,7 +105,9 @@ def _between(run: Question, one: Mapping[str, Any]) -> Iterator[tuple[str, str]]
         if found["lost"] is None:
             told = "no number can be given"
         else:
-            told = f"about {percent(found['lost'])} of all flips" if found["lost"] else "none"
+            low, high = percent(found["low"]), percent(found["high"])
+            share = f"about {percent(found['lost'])} ({low} to {high})" if found["lost"] else f"below {high}"
+            told = f"{share} of all flips"
         yield "Lost between frames, by leaving frames out", f"{told} ({found['says']})"
     if flux is not None and flux["crossed"]:
         unit = run.summary["time"]
