@@ -7,7 +7,7 @@ those of one process to the last bit. What two parts found at the frame that bot
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, fields
 from typing import Any
@@ -33,7 +33,13 @@ from mdnum.trajectories.checked import FrameError, check_frame
 from mdnum.trajectories.far import smallest_radius
 from mdnum.trajectories.frame import Frame
 from mdnum.trajectories.joined import Part, RuleResult, joined
-from mdnum.trajectories.mdanalysis_source import READING_FAILS, first_line, frame_of, table_of
+from mdnum.trajectories.mdanalysis_source import (
+    READING_FAILS,
+    first_line,
+    frame_of,
+    labels_of,
+    table_of,
+)
 from mdnum.trajectories.resolution import SAMPLE, Resolution, infer_from
 from mdnum.trajectories.rules import Rule
 from mdnum.trajectories.source import UnreadableFrame
@@ -142,6 +148,8 @@ class NeighborFlips(AnalysisBase):
         self._at = 0
         self._trackers: list[Tracker] = []
         self._boxes: Boxes | None = None
+        self._labels: Callable[[int], np.ndarray | None] | None = None
+        self._names: np.ndarray | None = None
         self._guard: XtcFile | None = None
         self._opened = False
         self._done, self._reading = 0, True
@@ -211,6 +219,8 @@ class NeighborFlips(AnalysisBase):
         """MDAnalysis's timestep of a frame, once it is known that reading it does not end the process."""
         if not self._opened:
             self._guard, self._boxes = opened(self._trajectory), Boxes(self._trajectory)
+            self._labels = labels_of(self._trajectory)
+            self._names = self._labels(0)
             self._opened = True
         if self._guard is not None:
             self._guard.check(number)
@@ -220,6 +230,7 @@ class NeighborFlips(AnalysisBase):
     def _let_go(self) -> None:
         """Leaves files that were opened: an open file does not go to another process."""
         self._guard, self._boxes, self._opened = None, None, False
+        self._labels = None
 
     def _compute(self, indexed_frames: np.ndarray, verbose: Any = None, **kwargs: Any) -> NeighborFlips:
         self._at = int(indexed_frames[0, 0]) if len(indexed_frames) else 0
@@ -297,12 +308,12 @@ class NeighborFlips(AnalysisBase):
 
     def _checked(self, ts: Any) -> Frame:
         frame = self._frame(ts)
-        check_frame(frame, self._seen, self._pbc, radius=self._radius, bits=32)
+        check_frame(frame, self._seen, self._pbc, None, self._names, radius=self._radius, bits=32)
         return frame
 
     def _frame(self, ts: Any) -> Frame:
-        assert self._boxes is not None
-        return frame_of(ts, int(ts.frame), self._boxes)
+        assert self._boxes is not None and self._labels is not None
+        return frame_of(ts, int(ts.frame), self._boxes, labels=self._labels(int(ts.frame)))
 
     def _bound_at(self, frame: Frame) -> float:
         if self._bound is not None or self._resolution is None:

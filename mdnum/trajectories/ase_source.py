@@ -108,6 +108,7 @@ class AseTrajectory(Trajectory):
             positions=np.array(atoms.positions, np.float64),
             box=Box(matrix, pbc),
             velocities=velocities,
+            labels=np.array(atoms.get_chemical_symbols()),
         )
 
     def _first(self) -> Any:

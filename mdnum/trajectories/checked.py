@@ -44,12 +44,14 @@ def checked(
     Raises:
         FrameError: a coordinate is not finite, an atom is further out than any gets or than floats tell
             distances of that length, more than one atom is at exactly 0, 0, 0, the box repeats along other
-            axes than in the first frame (most often: there is none), or along one without a vector.
+            axes than in the first frame (most often: there is none), or along one without a vector, or an
+            atom is said to be another one than in the first frame.
     """
-    pbc = None
+    pbc = labels = None
     for frame in frames:
         pbc = frame.box.pbc if pbc is None else pbc
-        check_frame(frame, atoms, pbc, where, radius=radius, bits=bits)
+        labels = frame.labels if labels is None else labels
+        check_frame(frame, atoms, pbc, where, labels, radius=radius, bits=bits)
         yield frame
 
 
@@ -58,6 +60,7 @@ def check_frame(
     atoms: Int[np.ndarray, "chosen"] | None = None,
     pbc: Bool[np.ndarray, "3"] | None = None,
     where: str | None = None,
+    labels: np.ndarray | None = None,
     *,
     radius: float = np.inf,
     bits: int = 64,
@@ -66,7 +69,21 @@ def check_frame(
 
     Args:
         pbc: axes along which the first frame repeats; None for any.
+        labels: of the first frame; None for any.
     """
+    if labels is not None and frame.labels is not None:
+        others = np.flatnonzero(labels != frame.labels)
+        others = others if atoms is None else np.intersect1d(others, atoms)
+        if others.size:
+            atom = int(others[0])
+            raise FrameError(
+                f"frame {frame.index}: atom {atom} is {frame.labels[atom]}, and {labels[atom]} in the "
+                f"first one looked at{_and_others(others.size)}",
+                frame=frame.index,
+                remedy="Write all frames in one order of atoms, or leave out those that differ with "
+                "@START:STOP: pairs are followed by the place of their atoms in the file",
+                where=where,
+            )
     if pbc is not None and (frame.box.pbc != pbc).any():
         raise FrameError(
             f"frame {frame.index} {_repeats(frame.box.pbc)}, and the first one looked at {_repeats(pbc)}",

@@ -38,6 +38,7 @@ class Frame:
         positions: length; those of all atoms of the file.
         box: the box of this frame.
         velocities: length per time, where the file has them.
+        labels: names, elements or types of the atoms, where the file has them in every frame.
     """
 
     index: int
@@ -45,3 +46,4 @@ class Frame:
     positions: Float[np.ndarray, "atoms 3"]
     box: Box
     velocities: Float[np.ndarray, "atoms 3"] | None = None
+    labels: np.ndarray | None = None

@@ -52,7 +52,9 @@ class GroTrajectory(TextTrajectory):
             velocities = _columns(rows, width, 6)[:, 3:] * _NANOMETER
         found = _TIME.search(block[0])
         time = float(found[1]) if found and self.time == "ps" else float(number)
-        return Frame(number, time, values * _NANOMETER, _box(block[-1]), velocities)
+        # residue and name; numbers are cut to five digits
+        labels = np.array([row[5:15].strip() for row in rows])
+        return Frame(number, time, values * _NANOMETER, _box(block[-1]), velocities, labels)
 
     def _block(self, lines: TextIOBase) -> list[str] | None:
         title = lines.readline()

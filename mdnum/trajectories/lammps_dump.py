@@ -49,10 +49,10 @@ class LammpsDump(TextTrajectory):
         self.time = time if "TIME" in items else "step"
         if units is None:
             self.notes = ("The dump does not say its units (LAMMPS's dump_modify units yes writes them).",)
-        name = next((one for one in ("element", "type") if one in columns), None)
-        if name is None:
+        labels = _labels(columns, rows[order])
+        if labels is None:
             return AtomTable.plain(["X"] * len(rows), named=False)
-        return AtomTable.plain([str(one) for one in rows[order, columns.index(name)]])
+        return AtomTable.plain([str(one) for one in labels])
 
     def _frame(self, number: int, block: list[str]) -> Frame:
         items = _items(block)
@@ -78,7 +78,7 @@ class LammpsDump(TextTrajectory):
         if "TIME" in items and set(_VELOCITIES) <= set(columns):
             velocities = _numbers(rows, columns, _VELOCITIES)
         time = float(items["TIME"][0]) if "TIME" in items else float(step)
-        return Frame(number, time, positions, Box(matrix, pbc), velocities)
+        return Frame(number, time, positions, Box(matrix, pbc), velocities, _labels(columns, rows))
 
     def _order(self, number: int, columns: list[str], rows: np.ndarray) -> np.ndarray:
         """The rows in the order of their ids, which are those of the first frame."""
@@ -127,6 +127,12 @@ class LammpsDump(TextTrajectory):
         if block:
             raise ValueError("the file ends in the head of a frame")
         return None
+
+
+def _labels(columns: list[str], rows: np.ndarray) -> np.ndarray | None:
+    """Elements of the atoms, else their types; None where the dump has neither."""
+    name = next((one for one in ("element", "type") if one in columns), None)
+    return None if name is None else rows[:, columns.index(name)].astype(str)
 
 
 def _items(block: list[str]) -> dict[str, list[str]]:

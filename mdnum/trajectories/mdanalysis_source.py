@@ -4,18 +4,24 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mdnum.errors import InputError
-from mdnum.trajectories.boxes import Boxes
-from mdnum.trajectories.frame import Frame
+from mdnum.trajectories.boxes import Boxes, box_of
+from mdnum.trajectories.frame import Box, Frame
+from mdnum.trajectories.rules import Cutoff
 from mdnum.trajectories.slices import chosen
 from mdnum.trajectories.source import AtomTable, Trajectory, UnreadableFrame
 from mdnum.trajectories.tails import left_over, refuse_cut_text
+from mdnum.trajectories.tracker import Tracker
+
+# a distance that bonded atoms have, and others do not come to, Å
+_CLOSE = 1.4
 
 #: what readers raise on files that end early or hold something else
 # what a word that is no number is told as, by readers that take it for the end of the file
@@ -38,7 +44,8 @@ class MDAnalysisTrajectory(Trajectory):
         self.format = str(trajectory.format if isinstance(trajectory.format, str) else trajectory.format[0])
         self.length = _length_of(trajectory)
         self.time = "frame" if _has_no_times(trajectory, said) else "ps"
-        self.notes = (*notes_on(self.table), *Boxes(trajectory).notes)
+        boxes = Boxes(trajectory)
+        self.notes = (*notes_on(self.table), *boxes.notes, *differing_box(trajectory, boxes))
 
     @property
     def in_file(self) -> int | None:
@@ -50,7 +57,7 @@ class MDAnalysisTrajectory(Trajectory):
 
     def frames(self) -> Iterator[Frame]:
         trajectory = self._universe.trajectory
-        boxes = Boxes(trajectory)
+        boxes, labels = Boxes(trajectory), labels_of(trajectory)
         at = None
         for number in chosen(self.slice, self.in_file):
             with warnings.catch_warnings():
@@ -60,7 +67,7 @@ class MDAnalysisTrajectory(Trajectory):
                     # some formats go forward only, so that the next frame is asked for as the next
                     step = at is not None and number == at + 1 and trajectory.ts.frame == at
                     ts = trajectory.next() if step else trajectory[number]
-                    frame = frame_of(ts, number, boxes, self.time == "frame")
+                    frame = frame_of(ts, number, boxes, self.time == "frame", labels(number))
                 except READING_FAILS as error:
                     raise UnreadableFrame(
                         f"frame {number} cannot be read ({first_line(error)})",
@@ -76,7 +83,42 @@ class MDAnalysisTrajectory(Trajectory):
             raise UnreadableFrame(f"frame {count} cannot be read ({rest})", frame=count, where=str(self.path))
 
 
-def frame_of(ts: Any, number: int, boxes: Boxes, untimed: bool = False) -> Frame:
+def labels_of(trajectory: Any) -> Callable[[int], np.ndarray | None]:
+    """What the file says its atoms are in each frame: MDAnalysis reads that of the first alone.
+
+    Args:
+        trajectory: MDAnalysis's reader. Others than those of XYZ files and of PDB models give None.
+    """
+    from MDAnalysis.lib.util import anyopen
+
+    words = [trajectory.format] if isinstance(trajectory.format, str) else list(trajectory.format)
+    begins = {"XYZ": "_offsets", "PDB": "_start_offsets", "ENT": "_start_offsets"}
+    word = next((word for word in words if word in begins), None)
+    # where each frame begins; another release of MDAnalysis may keep it elsewhere
+    offsets = None if word is None or trajectory.n_frames < 2 else getattr(trajectory, begins[word], None)
+    if offsets is None:
+        return lambda number: None
+    file: Any = anyopen(str(trajectory.filename))
+
+    def of(number: int) -> np.ndarray | None:
+        file.seek(offsets[number])
+        if word == "XYZ":
+            rows = list(islice(file, trajectory.n_atoms + 2))[2:]
+            return np.array([row.split(maxsplit=1)[0] for row in rows])
+        found: list[str] = []
+        for row in file:
+            if row.startswith(("ATOM  ", "HETATM")):
+                found.append(f"{row[17:21].strip()} {row[12:16].strip()}")
+            elif found and row.startswith(("ENDMDL", "MODEL", "END")):
+                break
+        return np.array(found)
+
+    return of
+
+
+def frame_of(
+    ts: Any, number: int, boxes: Boxes, untimed: bool = False, labels: np.ndarray | None = None
+) -> Frame:
     """A frame from an MDAnalysis timestep, copied."""
     return Frame(
         index=number,
@@ -84,6 +126,7 @@ def frame_of(ts: Any, number: int, boxes: Boxes, untimed: bool = False) -> Frame
         positions=np.array(ts.positions, np.float64),
         box=boxes.box(ts, number),
         velocities=np.array(ts.velocities, np.float64) if ts.has_velocities else None,
+        labels=labels,
     )
 
 
@@ -253,6 +296,41 @@ def _has_no_times(trajectory: Any, said: list[str]) -> bool:
     return "time" not in trajectory.ts.data and any(
         "no dt information" in one for one in [*said, *(str(w.message) for w in caught)]
     )
+
+
+def differing_box(trajectory: Any, boxes: Boxes) -> Iterator[str]:
+    """A sentence on where MDAnalysis takes a box for another one than the file has, from two frames."""
+    worst, said = -1, ""
+    for number in (0, trajectory.n_frames - 1):
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                ts = trajectory[number]
+                ours, theirs = boxes.box(ts, number), box_of(ts.dimensions)
+            apart = float(np.abs(ours.matrix - theirs.matrix)[ours.pbc].max(initial=0.0))
+            # float32, and angles from cosines
+            if not apart > 1e-4 * float(np.abs(ours.matrix).max()):
+                continue
+            counts = [_close_pairs(ts, box) for box in (theirs, ours)]
+        except (*READING_FAILS, InputError):
+            # a frame that cannot be used is told in its turn
+            continue
+        if counts[0] - counts[1] > worst:
+            worst = counts[0] - counts[1]
+            said = (
+                "The file's box is not the one that MDAnalysis makes of its lengths and angles: its vectors "
+                f"differ by up to {apart:.3g} Å, so that images stand elsewhere. mdnum takes the file's. In "
+                f"frame {number} MDAnalysis puts {counts[0]:,} pairs of atoms closer than {_CLOSE:g} Å, "
+                f"the file's {counts[1]:,}."
+            )
+    if said:
+        yield said
+
+
+def _close_pairs(ts: Any, box: Box) -> int:
+    tracker = Tracker(Cutoff(_CLOSE))
+    tracker.step(Frame(0, 0.0, np.array(ts.positions, np.float64), box))
+    return len(tracker.members())
 
 
 def notes_on(table: AtomTable) -> Iterator[str]:

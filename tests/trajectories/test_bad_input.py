@@ -18,6 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from MDAnalysisTests import datafiles
 
+import mdnum
 from mdnum.errors import InputError
 from mdnum.trajectories import NeighborFlips
 from mdnum.trajectories.checked import FrameError, checked
@@ -463,3 +464,91 @@ def test_nobody_and_nothing(tmp_path):
     assert list(open_trajectory(f"{tmp_path / 'run.traj'}@9:").frames()) == []
     with pytest.raises(InputError, match="named twice"):
         open_trajectory(f"{tmp_path / 'run.traj'}@9:", slice=":2")
+
+
+def relabeled(tmp_path, kind):
+    """A file of six frames in whose fourth the last two atoms have changed their places in the list."""
+    path = tmp_path / f"relabeled.{kind}"
+    rng = np.random.default_rng(4)
+    frames = []
+    for number in range(6):
+        names = ["O", "H", "H", "C"] if number < 3 else ["O", "H", "C", "H"]
+        frames.append(Atoms(names, rng.uniform(0, 8, (4, 3)), cell=np.eye(3) * 9, pbc=True))
+    if kind in ("extxyz", "traj"):
+        ase.io.write(path, frames)
+        return path
+    text = ""
+    for number, atoms in enumerate(frames):
+        rows = list(zip(atoms.get_chemical_symbols(), atoms.positions, strict=True))
+        if kind == "xyz":
+            text += "4\nplain\n" + "".join(f"{n} {x:.5f} {y:.5f} {z:.5f}\n" for n, (x, y, z) in rows)
+        elif kind == "pdb":
+            text += f"MODEL {number + 1:8d}\nCRYST1{3 * '    9.000'}{3 * '  90.00'} P 1           1\n"
+            for at, (name, (x, y, z)) in enumerate(rows, 1):
+                text += f"ATOM  {at:5d}  {name:<3s} WAT A   1    {x:8.3f}{y:8.3f}{z:8.3f}  1.00  0.00\n"
+            text += "ENDMDL\n"
+        elif kind == "gro":
+            text += "title\n    4\n"
+            for at, (name, (x, y, z)) in enumerate(rows, 1):
+                text += f"    1WAT  {name:>5s}{at:5d}{x / 10:8.3f}{y / 10:8.3f}{z / 10:8.3f}\n"
+            text += "   0.90000   0.90000   0.90000\n"
+        else:
+            text += (
+                f"ITEM: TIMESTEP\n{number}\nITEM: NUMBER OF ATOMS\n4\nITEM: BOX BOUNDS pp pp pp\n"
+                + "0 9\n" * 3
+            )
+            text += "ITEM: ATOMS id element x y z\n"
+            text += "".join(
+                f"{at} {n} {x:.5f} {y:.5f} {z:.5f}\n" for at, (n, (x, y, z)) in enumerate(rows, 1)
+            )
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize("kind", ["extxyz", "traj", "xyz", "pdb", "gro", "lammpstrj"])
+def test_atoms_that_change_their_order_or_element_in_mid_file_end_it(tmp_path, kind):
+    path = relabeled(tmp_path, kind)
+    trajectory = open_trajectory(path)
+    read = []
+    with pytest.raises(FrameError, match=r"frame 3: atom 2 is .*C, and .*H in the first one") as told:
+        for frame in checked(trajectory.frames(), where=str(path)):
+            read.append(frame.index)
+    assert read == [0, 1, 2] and told.value.frame == 3
+    # those atoms are not looked at
+    assert len(list(checked(trajectory.frames(), np.array([0, 1])))) == 6
+    # what came before is kept, and said
+    summary = mdnum.flips(path, cutoffs=[3.0], out=tmp_path / "out", report=False).summary
+    assert summary["frames"] == 3 and summary["status"] == "stopped"
+    assert "atom 2" in summary["stopped"]
+    if kind in ("xyz", "pdb"):
+        with pytest.raises(FrameError, match="frame 3: atom 2"):
+            NeighborFlips(MDAnalysis.Universe(str(path)), r_cut=3.0).run()
+
+
+def test_where_a_box_is_another_than_that_of_mdanalysis_it_is_said_with_the_pairs_that_tell():
+    notes = open_trajectory(datafiles.DCD_TRICLINIC, datafiles.PSF_TRICLINIC).notes
+    (said,) = [note for note in notes if "box" in note]
+    universe = MDAnalysis.Universe(datafiles.PSF_TRICLINIC, datafiles.DCD_TRICLINIC)
+    universe.trajectory[-1]
+    x, counts = universe.atoms.positions.astype(float), []
+    from MDAnalysis.lib.formats.libdcd import DCDFile
+    from MDAnalysis.lib.mdamath import triclinic_vectors
+
+    with DCDFile(datafiles.DCD_TRICLINIC) as file:
+        xx, xy, yy, xz, yz, zz = list(file)[-1].unitcell
+    shifts = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), -1).reshape(-1, 3)
+    for matrix in (
+        triclinic_vectors(universe.dimensions, dtype=np.float64),
+        np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]),
+    ):
+        # wrapped first, so that the nearest images are among those tried
+        wrapped = (np.linalg.solve(matrix.T, x.T).T % 1.0) @ matrix
+        close = 0
+        for n in range(len(x)):
+            apart = np.linalg.norm(wrapped[n] - wrapped[n + 1 :, None] + shifts @ matrix, axis=2)
+            close += int((apart < 1.4).sum())
+        counts.append(f"{close:,}")
+    assert counts[0] != counts[1]
+    assert f"puts {counts[0]} pairs" in said and f"the file's {counts[1]}." in said
+    # where both are one, there is nothing to say
+    assert not any("box" in note for note in open_trajectory(datafiles.XTC, datafiles.GRO).notes)
