@@ -251,7 +251,7 @@ def test_progress_appears_at_a_terminal_after_a_while():
 
 def test_progress_is_a_line_now_and_then_where_it_is_piped():
     pipe = io.StringIO()
-    with ProgressBar(pipe, delay=0.2, pause=0.2) as progress:
+    with ProgressBar(pipe, pause=0.2) as progress:
         progress(100, 1_000, INFO)
         until = time.monotonic() + 20
         while pipe.getvalue().count("\n") < 2 and time.monotonic() < until:
@@ -263,7 +263,7 @@ def test_progress_is_a_line_now_and_then_where_it_is_piped():
 
 def test_progress_stays_away_from_short_runs():
     pipe = io.StringIO()
-    with ProgressBar(pipe, delay=60.0) as progress:
+    with ProgressBar(pipe, pause=60.0) as progress:
         progress(100, 1_000, INFO)
     short = _Terminal()
     with ProgressBar(short, delay=60.0) as progress:

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
 _WORDS = {
+    "start": "starting",
     "compile": "compiling",
     "run": "running",
     "gradient": "differentiating",
@@ -51,11 +52,11 @@ class ProgressBar:
 
     Args:
         stream: where to draw a bar, or to print lines where it is no terminal.
-        delay: seconds of run before the bar or the first line appears.
-        pause: seconds to the second line, doubled after each up to a minute, where it is no terminal.
+        delay: seconds of run before the bar appears.
+        pause: seconds to the first line where it is no terminal, doubled after each up to a minute.
     """
 
-    def __init__(self, stream: TextIO | None = None, delay: float = 2.0, pause: float = 8.0):
+    def __init__(self, stream: TextIO | None = None, delay: float = 2.0, pause: float = 10.0):
         self._stream = sys.stderr if stream is None else stream
         self._delay = delay
         self._pause = pause
@@ -64,12 +65,15 @@ class ProgressBar:
         self._bar: Progress | None = None
         self._task: TaskID | None = None
         self._timer: threading.Timer | None = None
-        self._last: tuple[int, int, dict[str, Any]] = (0, 0, {"phase": "compile"})
+        self._last: tuple[int, int, dict[str, Any]] = (0, 0, {"phase": "start"})
         self._closed = False
 
     def __enter__(self) -> Self:
         self._began = time.monotonic()
-        self._after(self._delay, self._start if self._stream.isatty() else self._print)
+        if self._stream.isatty():
+            self._after(self._delay, self._start)
+        else:
+            self._after(self._pause, self._print)
         return self
 
     def __exit__(
@@ -109,8 +113,8 @@ class ProgressBar:
                 line += f", {describe(step, steps, info)}"
             with suppress(OSError, ValueError):  # whoever read it has gone
                 print(f"{line} ({time.monotonic() - self._began:.0f} s)", file=self._stream, flush=True)
-            self._after(self._pause, self._print)
             self._pause = min(2 * self._pause, 60.0)
+            self._after(self._pause, self._print)
 
     def _start(self) -> None:
         from rich.console import Console
