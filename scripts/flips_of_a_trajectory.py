@@ -13,7 +13,8 @@ been written, and as if positions had been rounded to so many decimals:
     missed, made up   flips that rounding hides from a frame, or puts there
 
 How to read it. Where "of all" falls, contacts seem to last longer than they do, by as much; "by rate" shows
-it. Where "said lost" is a dash, motion looks Brownian at that stride and no number can be given. A file with
+it. Where "said lost" is a dash, motion looks Brownian at that stride, or cannot be
+told apart from the rounding of the file, and no number is given. A file with
 three decimals of a nanometer (xtc) is the row with two decimals of an Ångström.
 """
 
@@ -70,7 +71,8 @@ def told(row: dict[str, Any], whole: int) -> list[Any]:
     between, life = row["stride"], row["lifetime"]
     said = None
     if between["lost"] is not None:
-        said = f"{between['lost']:.1%} ({between['low']:.1%} to {between['high']:.1%})"
+        lost, low, high = (f"{100 * between[name]:.2g}" for name in ("lost", "low", "high"))
+        said = f"{lost}% ({low} to {high})"
     share = row["flips"] / whole if whole else float("nan")
     median = life["median"] and life["median"] * row["interval"]
     return [
