@@ -243,6 +243,28 @@ def _drift(run: Run) -> Iterator[Finding]:
     yield Finding("DRIFT", "warning", title, text, remedy)
 
 
+def _wander(run: Run) -> Iterator[Finding]:
+    """What the flips do to an energy that should be constant."""
+    atoms, units = run.summary.get("atoms"), run.units
+    thermal = units.k_B * float(np.mean(run.series["temperature"]))
+    conserves = (run.system.get("dynamics") or {}).get("kind", "nve") == "nve"
+    if not jump(run) or not atoms or not conserves or not thermal > 0:
+        return
+    moved = np.cumsum(run.series["energy_jump"], dtype=np.float64)
+    low, high = min(float(moved.min()), 0.0), max(float(moved.max()), 0.0)
+    share = (high - low) / (atoms * thermal)
+    if share < DRIFT_SHARE:
+        return
+    text = (
+        f"The jumps of the ledger add up to between {number(low, signed=True)} and "
+        f"{number(high, signed=True)} {units.energy} on the way: {percent(share)} of k_B T per atom. The run is "
+        "not at one energy, and not at one temperature."
+    )
+    remedy = 'Use cutoff.kind = "switched" or "quintic", or move cutoff.radius between two neighbor shells.'
+    span = f"{number(low, 2, signed=True)} to {number(high, 2, signed=True)} {units.energy}"
+    yield Finding("WANDER", "warning", f"flips move the total energy by {span}", text, remedy)
+
+
 def _ase(run: Run) -> Iterator[Finding]:
     ase = run.summary.get("ase") or {}
     if ase.get("ok") is False:
@@ -262,12 +284,12 @@ def _ase(run: Run) -> Iterator[Finding]:
 #: Rules in the order in which their findings are told, and the codes they decide anew each time.
 RULES: tuple[Rule, ...] = (
     _status, _lost_pairs, _mismatch, _algebra, _ledger, _budget, _ase, _dangerous_builds, _tie, _ambiguous,
-    _chatter, _drift, _cutoff,
+    _chatter, _drift, _wander, _cutoff,
 )  # fmt: skip
 CODES = frozenset({
     "RUN_FAILED", "NOT_FINISHED", "LOST_PAIRS", "LISTS_DISAGREE", "DANGEROUS_BUILDS", "EVENT_ALGEBRA",
     "LEDGER_INCOMPLETE", "BUDGET_OPEN", "TIE_AT_CUTOFF", "AMBIGUOUS_DECISIONS", "CHATTER", "HARD_CUTOFF",
-    "FORCE_JUMP", "DRIFT", "ASE_DISAGREES", "ASE_NOT_COMPARED",
+    "FORCE_JUMP", "DRIFT", "WANDER", "ASE_DISAGREES", "ASE_NOT_COMPARED",
 })  # fmt: skip
 
 

@@ -69,8 +69,9 @@ def conclude(found: Iterable[Finding], evidence: Iterable[str], complete: bool) 
         complete: whether the run came to its end.
     """
     findings = tuple(sorted(found, key=lambda finding: _ORDER.index(finding.severity)))
-    errors = [finding.title for finding in findings if finding.severity == "error"]
-    warnings = [finding.title for finding in findings if finding.severity == "warning"]
+    errors, warnings, notes = (
+        [finding.title for finding in findings if finding.severity == severity] for severity in _ORDER
+    )
     if len(errors) > 2:
         # the first is the cause more often than not
         errors[1:] = [f"{len(errors) - 1} more errors below"]
@@ -80,10 +81,11 @@ def conclude(found: Iterable[Finding], evidence: Iterable[str], complete: bool) 
         headline = (
             f"The record is complete; look at {many(len(warnings), 'point')} first: {listed(warnings)}."
         )
-    elif complete:
-        headline = "The record is complete and nothing needs attention."
     else:
-        headline = "As far as it went, the record is complete and nothing needs attention."
+        headline = "The record is complete" if complete else "As far as it went, the record is complete"
+        headline += (
+            f"; to be known: {listed(notes)}." if notes else ", and none of the checks found anything."
+        )
     tone = "error" if errors else "warning" if warnings else "good"
     return Verdict(tone, headline, tuple(evidence), findings)
 

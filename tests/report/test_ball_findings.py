@@ -33,7 +33,7 @@ def summary(run, **changes):
 def test_a_good_run(good):
     verdict = findings.judge(good)
     assert verdict.tone == "good" and verdict.findings == ()
-    assert verdict.headline == "The record is complete and nothing needs attention."
+    assert verdict.headline == "The record is complete, and none of the checks found anything."
     flips = good.rows["contacts"]
     assert flips > 10
     assert f"All {flips} contact flips are accounted for" in verdict.evidence[0]

@@ -74,7 +74,7 @@ def test_every_reference_of_a_figure_has_its_target(page):
 
 def test_the_page_states_what_the_folder_holds(page, folder):
     run = load(folder)
-    assert "The record is complete and nothing needs attention." in page
+    assert "The record is complete; to be known: every flip kicks the energy." in page
     assert f"All {run.flips_total:,} flips are accounted for" in page
     assert "HARD_CUTOFF" in page and "prefers-color-scheme: dark" in page and "@media print" in page
     assert "Liquid argon (Rahman 1964)" in page and "9f1c52d0a7b3e4c8" in page

@@ -82,7 +82,7 @@ def load(folder: RunFolder | str | Path, question: str, verb: str = "fork") -> t
 def verdict(
     headline: str, evidence: Iterable[str], found: Iterable[Finding], *, plain_tone: str = "info"
 ) -> Verdict:
-    """A verdict whose tone is that of its worst finding.
+    """A verdict whose tone is that of its worst finding, which its headline names.
 
     Args:
         plain_tone: where there is nothing worse than information.
@@ -90,6 +90,15 @@ def verdict(
     findings = sorted(found, key=lambda finding: _ORDER.index(finding.severity))
     worst = findings[0].severity if findings else "info"
     tone: Any = plain_tone if worst == "info" else worst
+    title = findings[0].title if findings else ""
+    if title.lower() in headline.lower():
+        pass
+    elif worst == "error":
+        headline = f"{title[:1].upper()}{title[1:]}. {headline}"
+    elif worst == "warning":
+        more = sum(finding.severity == "warning" for finding in findings) - 1
+        rest = f", and {many(more, 'more point')} below" if more else ""
+        headline = f"{headline} Look first: {title}{rest}."
     return Verdict(tone, headline, tuple(evidence), tuple(findings))
 
 
