@@ -257,8 +257,8 @@ def _wander(run: Run) -> Iterator[Finding]:
         return
     text = (
         f"The jumps of the ledger add up to between {number(low, signed=True)} and "
-        f"{number(high, signed=True)} {units.energy} on the way: {percent(share)} of k_B T per atom. The run is "
-        "not at one energy, and not at one temperature."
+        f"{number(high, signed=True)} {units.energy} on the way: {percent(share)} of k_B T per atom. "
+        "The run is not at one energy, and not at one temperature."
     )
     remedy = 'Use cutoff.kind = "switched" or "quintic", or move cutoff.radius between two neighbor shells.'
     span = f"{number(low, 2, signed=True)} to {number(high, 2, signed=True)} {units.energy}"
