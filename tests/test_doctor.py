@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -120,6 +122,32 @@ def test_contraction_is_computed_and_not_assumed():
     """The same question has another answer on a processor without FMA."""
     code = "from mdnum.doctor import arithmetic as a; print(a.contraction().status)"
     assert _rows_under(code, XLA_FLAGS="--xla_cpu_max_isa=AVX") == "ok"
+
+
+_FLUSHING = """
+#include <xmmintrin.h>
+__attribute__((constructor)) static void flush(void) { _mm_setcsr(_mm_getcsr() | 0x8040); }
+"""
+
+
+def test_subnormal_numbers_are_computed_with_and_not_compared(tmp_path: Path):
+    """Beside a library that tells the processor to flush, where comparing them with anything is no use."""
+    compiler = shutil.which("cc") or shutil.which("gcc")
+    library, source = tmp_path / "flushing.so", tmp_path / "flushing.c"
+    source.write_text(_FLUSHING)
+    build = [str(compiler), "-shared", "-fPIC", "-o", str(library), str(source)]
+    if compiler is None or sys.platform != "linux" or subprocess.run(build, capture_output=True).returncode:
+        pytest.skip("no compiler here, or another processor")
+    code = "from mdnum.doctor import arithmetic as a; print(a.subnormals().seen)"
+    assert _rows_under(code, LD_PRELOAD=str(library)) == "flushed to zero by numpy, flushed to zero by jax"
+    assert _rows_under(code).startswith("kept by numpy")
+
+
+def test_what_jax_does_with_subnormal_numbers_is_told_by_itself():
+    """Beside what its own multiplication gives, from a result that is normal again."""
+    half = jax.jit(lambda x, y: x * y)(jnp.full(20, 2.0**-1000), jnp.full(20, 2.0**-60))
+    back = np.asarray(half).view(np.int64)
+    assert arithmetic.subnormals().seen.endswith("kept by jax" if back.all() else "flushed to zero by jax")
 
 
 def test_a_lost_float64_is_unsafe():

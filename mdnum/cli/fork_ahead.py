@@ -76,8 +76,7 @@ def foretell(
 
 def _print_foretold(summary: Mapping[str, Any]) -> None:
     out = output.console()
-    until = summary["linear_until"]
-    out.print(f"  small enough for a forecast up to step {until:,} of {summary['steps']:,}", markup=False)
+    out.print(f"  {summary['says']}", markup=False)
     for title, flips in (("flips first", summary["first"]), ("nearest to flipping", summary["nearest"])):
         table = [
             (

@@ -184,7 +184,7 @@ def _annotated(line: Line, pair: tuple[int, int]) -> Boundary | None:
     kind = int(line.simulation.type_of(np.array([i]), np.array([j]))[0])
     apart = float(np.sqrt(np.max(np.sum((runs[1].x - runs[0].x) ** 2, axis=1))))
     below, above = sides
-    bound = simulations[0].decider.bounds[kind]
+    bound = float(simulations[0].decider.bounds_at(looks[0].x.T[None])[0, kind])
     return Boundary(below, above, step, i, j, bound, len(pairs) - 1, apart, None)
 
 

@@ -98,8 +98,8 @@ def protection(fork: Fork) -> tuple[Float[np.ndarray, "steps"], Float[np.ndarray
     deciders = {"A": fork.twin.a.decider, "B": fork.twin.b.decider}
     a, b = deciders.values()
     cutoffs = float(np.max(np.abs(_cutoffs(a) - _cutoffs(b)))) if len(a.r_cut) == len(b.r_cut) else np.inf
-    finer = min(deciders, key=lambda name: _bound(deciders[name]))
-    rest = cutoffs + _bound(deciders[finer])
+    finer = min(deciders, key=lambda name: np.nanmax(fork.series[f"bound {name}"]))
+    rest = cutoffs + fork.series[f"bound {finer}"]
     return fork.series[f"nearest {finer}"], 2.0 * fork.series["B"] + rest
 
 
@@ -107,12 +107,6 @@ def _cutoffs(decider: PairDecider) -> Float[np.ndarray, "types"]:
     """What is compared with, in the program's dtype, as a distance."""
     values = np.array([threshold.value for threshold in decider.thresholds])
     return np.sqrt(values) if decider.space == "r2" else values
-
-
-def _bound(decider: PairDecider) -> float:
-    """The largest rounding bound as a length."""
-    slope = 2.0 * np.array(decider.r_cut) if decider.space == "r2" else np.ones(len(decider.r_cut))
-    return float(np.max(np.array(decider.bounds) / slope))
 
 
 def wider(twin: Twin) -> str | None:

@@ -27,12 +27,14 @@ class Neighborhood:
         positions: in A, from the middle of the pair, length, shape (near, 3).
         moved: B's positions minus A's, length, shape (near, 3).
         margins: of the deciding pair in A and in B, as each program computes it, in the quantity's space.
+        bounds: on the rounding errors of these.
     """
 
     atoms: Int[np.ndarray, "near"]
     positions: Float[np.ndarray, "near 3"]
     moved: Float[np.ndarray, "near 3"]
     margins: tuple[float, float]
+    bounds: tuple[float, float]
 
 
 def neighborhood(fork: Fork, reach: float = REACH) -> Neighborhood | None:
@@ -65,7 +67,11 @@ def neighborhood(fork: Fork, reach: float = REACH) -> Neighborhood | None:
     chosen = np.concatenate([[i, j], chosen[(chosen != i) & (chosen != j)]])
     moved = np.stack(cell.displacement(x_a[chosen], x_b[chosen]), axis=-1)
     margins = _margin(twin.a, twin.a, x_a, i, j), _margin(twin.a, twin.b, x_b, i, j)
-    return Neighborhood(chosen, from_middle[chosen], moved, margins)
+    kind = int(twin.a.type_of(np.array([i]), np.array([j]))[0])
+    frame = twin.frame or Frame.same(twin.b.atoms)
+    own = x_a.T[None], frame.inverse.positions(x_b.T[None])
+    a, b = (float(run.decider.bounds_at(x)[0, kind]) for run, x in zip((twin.a, twin.b), own, strict=True))
+    return Neighborhood(chosen, from_middle[chosen], moved, margins, (a, b))
 
 
 def _margin(labels: Simulation, run: Simulation, x: Float[np.ndarray, "atoms 3"], i: int, j: int) -> float:

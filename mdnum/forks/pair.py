@@ -73,7 +73,8 @@ class Fork:
         series: arrays by step: "step"; separations from A "B", "B|A", "A|B from A", "B 1", ..., from B "A|B"
             and "B|A from B" (length); "cross", pairs that differ; "overridden" and "furthest" of B|A;
             energies "energy A", "energy B", "energy B|A"; "nearest A", "nearest B", the distance of the pair
-            next to its cutoff from it (length); "ambiguous A", "ambiguous B", ambiguous decisions.
+            next to its cutoff from it (length); "bound A", "bound B", how far rounding can move a distance
+            that is compared (length); "ambiguous A", "ambiguous B", ambiguous decisions.
         flips: cross-run flips, the first `FLIPS_KEPT`.
         flips_total: of all.
         doubts: ambiguous decisions of A and of B, the first `FLIPS_KEPT` of each.
@@ -298,6 +299,7 @@ def _series(gathered: list[Stretch]) -> dict[str, np.ndarray]:
         series["furthest"] = np.concatenate([s.furthest["B|A"] for s in gathered])
     for name in ("A", "B"):
         series[f"nearest {name}"] = np.concatenate([s.nearest[name] for s in gathered])
+        series[f"bound {name}"] = np.concatenate([s.bound[name] for s in gathered])
         series[f"ambiguous {name}"] = np.concatenate([s.ambiguous[name] for s in gathered])
     return series
 
@@ -336,4 +338,4 @@ def _start_margin(twin: Twin, flip: CrossFlip) -> tuple[float, float]:
     kind = int(a.type_of(np.array([flip.i]), np.array([flip.j]))[0])
     d = HostCell(a.cell, a.decider.dtype).displacement(x[[flip.i]], x[[flip.j]])
     quantity = float(a.decider.host_quantity(*d)[0])
-    return a.decider.thresholds[kind].value - quantity, a.decider.bounds[kind]
+    return a.decider.thresholds[kind].value - quantity, float(a.decider.bounds_at(x.T[None])[0, kind])

@@ -41,6 +41,7 @@ class Tangents:
             none.
         pairs: i, j of those decisions (i < j; -1 where there is none), shape (2, rows, KEPT, 2).
         margins: of those decisions, in the quantity's space, same shape as `reach`.
+        moved: largest displacement since the list was built, at each step, length, shape (rows,).
     """
 
     segment: Segment
@@ -49,6 +50,7 @@ class Tangents:
     reach: Float[np.ndarray, "signs rows kept"]
     pairs: Int[np.ndarray, "signs rows kept ends"]
     margins: Float[np.ndarray, "signs rows kept"]
+    moved: Float[np.ndarray, "rows"]
 
 
 def tangents(
@@ -112,6 +114,7 @@ def tangents(
             np.swapaxes(amplitude.astype(np.float64) * np.exp(-shift), 0, 1),
             np.swapaxes(_labels(segment, slot, amplitude), 0, 1),
             np.swapaxes(near.astype(np.float64), 0, 1),
+            np.array(segment.rows_of("moved")),
         )
         if segment.closes in FAILURES:
             return

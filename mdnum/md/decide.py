@@ -7,6 +7,7 @@ the ledger all compute them through this file, with the same bits.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import jax
@@ -22,6 +23,7 @@ from mdnum.md.potentials import of_type
 from mdnum.md.verlet import SLOTS
 from mdnum.precision import Reach, distance_bound, squared_distance_bound
 from mdnum.precision.exact import squared_norm
+from mdnum.precision.ulp import unit_roundoff
 
 # slots that the loops over a list take at a time: half a byte of decisions. Measured in float64 on one core,
 # ms a force: 1.4 for N = 4,000 and 59 for 108,000; with 8 at a time 2.2 and 78 (the compiler then gives up
@@ -84,21 +86,45 @@ class PairDecider:
         """What every dtype is an approximation of: the thresholds of double precision."""
         return tuple(threshold.value for threshold in replace(self, dtype="float64").thresholds)
 
-    @property
+    @cached_property
     def bounds(self) -> tuple[float, ...]:
         """Bound on |computed margin - exact margin| given the state, by pair type, in the quantity's space.
 
         The exact margin is that of the state's positions in the system's own box and against its own
         threshold, both doubles: narrowing any of them is rounding like any other (error analysis:
         precision.bounds). Evaluated a thousandth beyond r_cut, it holds for every pair up to there; a pair
-        that is further away has a margin beyond any rounding.
+        that is further away is decided rightly, or its computed margin is within the bound. It is that of
+        atoms within the reach; where they may have left it, ask `bounds_at`.
         """
+        return tuple(float(bound) for bound in self._bounds(None))
+
+    def bounds_at(self, x: Float[np.ndarray, "rows 3 atoms"]) -> Float[np.ndarray, "rows types"]:
+        """`bounds` at each of some states: they grow where atoms have left the reach along a free axis.
+
+        Positions that are rounded before they are subtracted lose more the larger they are, and along a free
+        axis nothing brings them back.
+
+        Args:
+            x: wrapped positions of each state, in the dtype of the state, length.
+        """
+        bounds = np.tile(np.array(self.bounds), (len(x), 1))
+        narrows = unit_roundoff(np.dtype(self.state)) < unit_roundoff(np.dtype(self.dtype))
+        if narrows and len(self.reach.lattice) < 3 and x.size:
+            seen = np.maximum(x.max(axis=2), -x.min(axis=2)).astype(np.float64)
+            left = (seen > self.reach.coordinate).any(axis=1)
+            if left.any():
+                with np.errstate(over="ignore"):
+                    bounds[left] = np.stack(self._bounds(seen[left]), axis=-1)
+        return bounds
+
+    def _bounds(self, seen: Float[np.ndarray, "rows 3"] | None) -> list:
+        """`bounds`, by pair type, for atoms within the reach or within so much where that is more."""
         bound = squared_distance_bound if self.space == "r2" else distance_bound
-        dtype, state = np.dtype(self.dtype), np.dtype(self.state)
-        return tuple(
-            float(bound(_BEYOND * r, self.reach, dtype, state)) + abs(held.value - exact)
+        given = self.reach, np.dtype(self.dtype), np.dtype(self.state), seen
+        return [
+            bound(_BEYOND * r, *given) + abs(held.value - exact)
             for r, held, exact in zip(self.r_cut, self.thresholds, self.exact_thresholds, strict=True)
-        )
+        ]
 
     def values(self) -> jax.Array:
         """Threshold values as an array of the decision's dtype, shape (types,)."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import cached_property
 from typing import Any
 
 import equinox as eqx
@@ -179,7 +180,7 @@ class LatticeDecider(PairDecider):
         unit = self.spacing * self.spacing
         return tuple(Threshold((limit - 0.5) * unit, "<", "r2") for limit in self.limits)
 
-    @property
+    @cached_property
     def bounds(self) -> tuple[float, ...]:
         """Nothing is rounded, and no margin is zero."""
         return (0.0,) * len(self.r_cut)

@@ -70,7 +70,9 @@ def _three(values) -> Vector:
     return x, y, z
 
 
-def displacement_bound(r, reach: Reach, dtype: DTypeLike = np.float64, state: DTypeLike = np.float64):
+def displacement_bound(
+    r, reach: Reach, dtype: DTypeLike = np.float64, state: DTypeLike = np.float64, seen=None
+):
     """Bound on the length of the error of a computed displacement.
 
     Half an ulp, at most u times its size, for each result that is rounded. Where the state has more digits
@@ -83,32 +85,38 @@ def displacement_bound(r, reach: Reach, dtype: DTypeLike = np.float64, state: DT
         reach: of the box.
         dtype: of the arithmetic.
         state: of the positions.
+        seen: largest |coordinate| along each axis where it may be beyond that of the reach, length,
+            shape (..., 3).
 
     Returns:
-        The bound, length, of the shape of r.
+        The bound, length, of the shape of r, or that of `seen` without its last axis.
     """
     u = unit_roundoff(dtype)
     sizes, roundings = reach.rounded()
     if unit_roundoff(state) < u:
-        sizes = sizes + 2 * np.array(reach.coordinate)
+        coordinate = np.array(reach.coordinate)
+        sizes = sizes + 2 * (coordinate if seen is None else np.fmax(coordinate, seen))
     error = u * sizes + reach.narrowed(dtype)
-    return _SECOND_ORDER * (float(np.linalg.norm(error)) + u * roundings * np.asarray(r, np.float64))
+    length = float(np.linalg.norm(error)) if error.ndim == 1 else np.linalg.norm(error, axis=-1)
+    return _SECOND_ORDER * (length + u * roundings * np.asarray(r, np.float64))
 
 
-def squared_distance_bound(r, reach: Reach, dtype: DTypeLike = np.float64, state: DTypeLike = np.float64):
+def squared_distance_bound(
+    r, reach: Reach, dtype: DTypeLike = np.float64, state: DTypeLike = np.float64, seen=None
+):
     """Bound on |computed r² - exact r²|: the displacement's error, and gamma_3 for squares and sums.
 
     Args: as `displacement_bound`.
 
     Returns:
-        The bound, length squared, of the shape of r.
+        The bound, length squared, shaped likewise.
     """
     r = np.asarray(r, np.float64)
-    error = displacement_bound(r, reach, dtype, state)
+    error = displacement_bound(r, reach, dtype, state, seen)
     return 2.0 * r * error + error**2 + gamma(3, dtype) * (r + error) ** 2
 
 
-def distance_bound(r, reach: Reach, dtype: DTypeLike = np.float64, state: DTypeLike = np.float64):
+def distance_bound(r, reach: Reach, dtype: DTypeLike = np.float64, state: DTypeLike = np.float64, seen=None):
     """Bound on |computed r - exact r|, r = sqrt(r²) with a correctly rounded square root.
 
     A length is off by no more than its vector; the square root halves the relative error of r² and adds one
@@ -117,8 +125,8 @@ def distance_bound(r, reach: Reach, dtype: DTypeLike = np.float64, state: DTypeL
     Args: as `displacement_bound`.
 
     Returns:
-        The bound, length, of the shape of r.
+        The bound, length, shaped likewise.
     """
     r = np.asarray(r, np.float64)
-    error = displacement_bound(r, reach, dtype, state)
+    error = displacement_bound(r, reach, dtype, state, seen)
     return error + (gamma(3, dtype) / 2 + _SECOND_ORDER * unit_roundoff(dtype)) * (r + error)

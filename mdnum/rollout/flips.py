@@ -136,7 +136,6 @@ class PairRecorder:
         decider = simulation.decider
         self._cell, self._decision_cell = HostCell(simulation.cell), HostCell(simulation.cell, decider.dtype)
         self._inclusive = decider.compare.endswith("<=")
-        self._bounds = np.array(decider.bounds)
         self._energy_jumps, self._force_jumps = simulation.jumps()
 
     def inside(self, bits: UInt8[np.ndarray, "words atoms"]) -> int:
@@ -152,6 +151,10 @@ class PairRecorder:
         """Pairs inside at every step of a segment."""
         return np.array([self.inside(bits) for bits in segment.rows_of("bits")], np.int64)
 
+    def bounds(self, segment: Segment) -> Float[np.ndarray, "rows types"]:
+        """Bounds on the rounding error of margins at every step of a segment, in the quantity's space."""
+        return self.simulation.decider.bounds_at(segment.rows_of("x"))
+
     def ambiguous(self, segment: Segment) -> Int[np.ndarray, "rows"]:
         """Pairs whose decision another legitimate rounding could have changed, at every step of a segment."""
         return np.bincount(self.doubtful(segment).step - segment.first, minlength=segment.rows)
@@ -159,9 +162,9 @@ class PairRecorder:
     def doubtful(self, segment: Segment) -> Ambiguous:
         """The pairs that `ambiguous` counts, in the order of their steps."""
         parts: list[Ambiguous] = []
-        bounds, table = self._bounds, segment.table
+        bounds, table = self.bounds(segment), segment.table
         # almost always no pair comes that close; where one does, the host looks again
-        close = np.flatnonzero(segment.rows_of("nearest") <= bounds.max())
+        close = np.flatnonzero(segment.rows_of("nearest") <= bounds.max(axis=1))
         if len(close):
             slot, first = np.nonzero(table.index < self.simulation.atoms)
             second = table.index[slot, first]
@@ -171,11 +174,12 @@ class PairRecorder:
         for row in close:
             x = segment.rows_of("x")[row]
             kind, margin = self._margins(x[:, first].T, x[:, second].T, i, j)
-            at = np.flatnonzero(np.abs(margin) <= bounds[kind])
+            bound = bounds[row][kind]
+            at = np.flatnonzero(np.abs(margin) <= bound)
             at = at[sort_rows(np.zeros(len(at), np.int64), np.stack([i[at], j[at]], axis=1))]
             step = np.full(len(at), segment.first + row, np.int64)
             parts.append(
-                Ambiguous(step, i[at].astype(np.int64), j[at].astype(np.int64), margin[at], bounds[kind[at]])
+                Ambiguous(step, i[at].astype(np.int64), j[at].astype(np.int64), margin[at], bound[at])
             )
         return Ambiguous.joined(parts)
 
@@ -281,6 +285,7 @@ class PairRecorder:
         sign = np.where(entered, 1.0, -1.0)
         step = segment.first + row
         order = sort_rows(step, labels)
+        bound = self.bounds(segment)[row, kind] if len(row) else np.zeros(0)
         with np.errstate(invalid="ignore", divide="ignore"):
             extra = {
                 "distance": distance[order],
@@ -294,7 +299,7 @@ class PairRecorder:
             labels[order],
             entered[order],
             margin[order],
-            self._bounds[kind][order],
+            bound[order],
             (sign * self._energy_jumps[kind])[order],
             extra,
         )

@@ -39,6 +39,7 @@ class Stretch:
         overridden: by counterfactual: decisions it would have made otherwise, shape (rows,).
         furthest: by counterfactual: distance of the furthest of them from its cutoff, length, shape (rows,).
         nearest: of A and B, how far the pair next to its cutoff is from it at least, length, shape (rows,).
+        bound: of A and B, how far rounding can move a distance that is compared, length, shape (rows,).
         ambiguous: of A and B, how many decisions rounding could have changed, shape (rows,).
         doubts: which ones they are.
         failed: by run, "blow-up" or "runaway" where it ended that way.
@@ -53,6 +54,7 @@ class Stretch:
     overridden: dict[str, Float[np.ndarray, "rows"]]
     furthest: dict[str, Float[np.ndarray, "rows"]]
     nearest: dict[str, Float[np.ndarray, "rows"]]
+    bound: dict[str, Float[np.ndarray, "rows"]]
     ambiguous: dict[str, Float[np.ndarray, "rows"]]
     doubts: dict[str, Ambiguous]
     failed: dict[str, str]
@@ -135,6 +137,7 @@ def lockstep(
             separation["A|B"] = _padded(apart(cell_a, rows_b, rows), rows_a)
             separation["A|B from A"] = apart(cell_a, rows_a, rows)
         nearest = {"A": _nearest(a, rows_a, rows_a), "B": _nearest(b, rows_b, rows_a)}
+        bound = {"A": _bound(a, rows_a, Frame.same(a.atoms)), "B": _bound(b, rows_b, frame)}
         doubts = {"A": leader.doubts(end), "B": follower.doubts(end)}
         ambiguous = {
             name: np.where(np.isnan(nearest[name]), np.nan, _per_row(doubts[name], rows_a)) for name in doubts
@@ -152,6 +155,7 @@ def lockstep(
             overridden,
             furthest,
             nearest,
+            {name: _padded(values, rows_a) for name, values in bound.items()},
             ambiguous,
             doubts,
             failed,
@@ -255,6 +259,14 @@ def _nearest(run: Simulation, rows: Rows | None, clock: Rows) -> Float[np.ndarra
         # a step without a pair has nothing near
         margin = np.where(np.isinf(margin), np.inf, length)
     return _padded(margin, clock)
+
+
+def _bound(run: Simulation, rows: Rows | None, frame: Frame) -> Float[np.ndarray, "rows"]:
+    """The largest rounding bound of any pair type at each step of a run as a length."""
+    if rows is None:
+        return np.zeros(0)
+    slope = 2.0 * np.array(run.decider.r_cut) if run.decider.space == "r2" else 1.0
+    return (run.decider.bounds_at(frame.inverse.positions(rows.x)) / slope).max(axis=1)
 
 
 def _padded(values: np.ndarray, rows: Rows) -> np.ndarray:

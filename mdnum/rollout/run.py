@@ -164,7 +164,7 @@ class Rollout:
             self.folder.append("flips", flip_columns(ledger))
         for row in done.health.take(segment, self.recorder.missed):
             self.folder.append("epochs", row)
-        done.tally.take(segment, rows, ledger)
+        done.tally.take(segment, rows, ledger, self.recorder.bounds(segment))
         if done.first is None:
             done.first = segment.unsorted("x", 0)
         done.last = segment.unsorted("x", segment.rows - 1)

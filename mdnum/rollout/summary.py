@@ -59,6 +59,7 @@ class Tally:
     ambiguous_flips: int = 0
     pairs_first: int = 0
     pairs_last: int = 0
+    bound: float = 0.0
     start_up_seconds: float = 0.0
     seconds: float = 0.0
     steps_per_second: float | None = None
@@ -66,8 +67,11 @@ class Tally:
     conserved: Line = field(default_factory=Line)
     without_jumps: Line = field(default_factory=Line)
 
-    def take(self, segment: Segment, rows: dict[str, np.ndarray], ledger: Ledger) -> None:
-        """Add a segment: its rows of series.parquet and its flips."""
+    def take(
+        self, segment: Segment, rows: dict[str, np.ndarray], ledger: Ledger, bounds: Float[np.ndarray, "..."]
+    ) -> None:
+        """Add a segment: its rows of series.parquet, its flips and the bounds of its margins."""
+        self.bound = max(self.bound, float(np.max(bounds)))
         pairs = rows["pairs"]
         if self.step < 0:
             self.pairs_first = int(pairs[0])
@@ -153,7 +157,7 @@ def summarize(simulation: Simulation, done: Any, steps: int, status: str) -> dic
             "energy_jump": float(energy_jump[np.argmax(np.abs(energy_jump))]),
             "force_jump": float(force_jump[np.argmax(np.abs(force_jump))]),
             "smoothness": cutoff.smoothness if cutoff is not None else simulation.model.smoothness.order,
-            "bound": float(max(simulation.decider.bounds)),
+            "bound": max(tally.bound, *simulation.decider.bounds),
         },
         "lattice": None
         if simulation.lattice is None

@@ -15,7 +15,7 @@ from mdnum.store import RunFolder
 from mdnum.workflow.fork_question import Log, Progress, basics, finish, loaded, opened
 
 if TYPE_CHECKING:
-    from mdnum.forks.forecast import Forecast, Foretold
+    from mdnum.forks.forecast import Forecast, Foretold, Range
     from mdnum.systems.load import System
 
 #: Flips that are listed of each kind.
@@ -83,7 +83,7 @@ def fork_forecast(
     try:
         Log(folder, progress)(0, 0, {"phase": "carrying a tangent along"})
         found = forecast(simulation, last)
-        first, nearest = found.first(size, _FIRST), found.nearest(_NEAREST)
+        first, nearest, good = found.first(size, _FIRST), found.nearest(_NEAREST), found.good_until(size)
         _write(folder, found, {"first": first, "nearest": nearest})
         folder.finalize()
         summary = {
@@ -91,7 +91,11 @@ def fork_forecast(
             "size": size,
             "first": [_row(flip) for flip in first],
             "nearest": [_row(flip) for flip in nearest],
-            "linear_until": found.linear_until(size),
+            "until": good.step,
+            "ends": good.ends,
+            "kicks": found.kicks,
+            "examined": int(found.listed[: good.step + 1].sum()),
+            "says": _says(good, last, int(found.listed[: good.step + 1].sum())),
             "linear": LINEAR * simulation.r_cut,
             "ulp": found.ulp,
             "seconds": time.perf_counter() - began,
@@ -101,6 +105,19 @@ def fork_forecast(
         folder.close()
         raise
     return ForecastResult(folder.path, found, finish(folder, report, progress))
+
+
+def _says(good: Range, last: int, examined: int) -> str:
+    """How far a forecast goes, why no further, and what it looked at."""
+    why = {
+        "end": "",
+        "flip": ": the flip there kicks its atoms, and what follows is not foretold",
+        "close": f": whether a decision of step {good.step + 1:,} flips is within the error",
+        "size": ": the displacement is too large for a forecast after it",
+        "list": ": a pair beyond the neighbor list could come inside after it, and those are not looked at",
+    }[good.ends]
+    until = f"up to step {good.step:,} of {last:,}" if good.step >= 0 else f"for no step of {last:,}"
+    return f"Good {until}{why}; {examined:,} decisions of listed pairs were examined."
 
 
 def _row(flip: Foretold) -> dict[str, Any]:

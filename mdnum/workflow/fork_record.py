@@ -143,8 +143,8 @@ def _decision(fork: Fork, around: Neighborhood | None) -> dict[str, Any] | None:
     # the margin of r² is so many times that of r
     slope = 2.0 * run.decider.r_cut[kind] if space == "r2" else 1.0
     length = made.margin / slope
-    bounds = {name: one.decider.bounds[kind] for name, one in (("A", fork.twin.a), ("B", fork.twin.b))}
     margins = dict(zip("AB", around.margins, strict=True)) if around is not None else {}
+    bounds = dict(zip("AB", around.bounds, strict=True)) if around is not None else {made.run: made.bound}
     return {
         "channel": "pair",
         "step": made.step,

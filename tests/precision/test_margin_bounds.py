@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
-from mdnum.md.cell import Cell, HostCell, wrap_positions
+from mdnum.md.cell import Cell, HostCell, complete, wrap_positions
 from mdnum.md.decide import CONVENTIONS, PairDecider
 
 ROLES = [(state, dtype) for state in ("float64", "float32") for dtype in ("float64", "float32")]
@@ -79,6 +79,56 @@ def test_no_margin_is_further_from_the_exact_one_than_its_bound(seed, box, compa
         square = nearest_square(start[k], end[k], cell)
         exact = exact_value - (root(square) if decider.space == "r" else square)
         assert abs(margin - exact) <= decider.bounds[0], (box, roles, compare, float(abs(margin - exact)))
+
+
+def random_box(rng: np.random.Generator) -> Cell:
+    """A box with any of its axes open, wide enough for the cutoff."""
+    matrix = np.diag(rng.uniform(6, 9, 3)) + rng.uniform(-1, 1, (3, 3))
+    return Cell.create(matrix * (6 / min(6.0, Cell.create(matrix).widths.min())), rng.random(3) < 0.5)
+
+
+@settings(max_examples=150)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    compare=st.sampled_from(CONVENTIONS),
+    roles=st.sampled_from(ROLES),
+    drift=st.floats(-1, 5),
+)
+def test_a_bound_holds_wherever_atoms_drift(seed, compare, roles, drift):
+    """Bounds asked of a decider that knows where the atoms began, of pairs that have moved on together."""
+    state, dtype = roles
+    rng = np.random.default_rng(seed)
+    cell, count = random_box(rng), 6
+    start = rng.random((count, 3)) @ np.asarray(complete(np.asarray(cell.matrix), np.array(cell.pbc)))
+    decider = decider_of(cell, compare, state, dtype, start)
+    start = start + 10**drift * rng.standard_normal(3)
+    direction = rng.standard_normal((count, 3))
+    # some roundings of the distance away from the cutoff, or some of the coordinates
+    unit = float(np.finfo(dtype).eps) * rng.choice([RADIUS, np.abs(start).max()], (count, 1))
+    r = RADIUS + rng.uniform(-2, 2, (count, 1)) * unit
+    end = start + r * direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    start, end = (wrap_positions(cell, x)[0].astype(state) for x in (start, end))
+    quantity = decider.host_quantity(*HostCell(cell, dtype).displacement(start, end))
+    value = Fraction(RADIUS * RADIUS)
+    for k, (bound,) in enumerate(decider.bounds_at(np.stack([start, end], axis=2))):
+        square = nearest_square(start[k], end[k], cell)
+        exact = Fraction(RADIUS) - root(square) if decider.space == "r" else value - square
+        margin = Fraction(decider.thresholds[0].value) - Fraction(float(quantity[k]))
+        told = cell.pbc, roles, compare, float(margin), float(exact), bound
+        if square < Fraction(1.001 * RADIUS) ** 2:
+            assert abs(margin - exact) <= bound, told
+        inside, should = (x >= 0 if compare.endswith("<=") else x > 0 for x in (margin, exact))
+        assert inside == should or abs(margin) <= bound, told
+
+
+def test_bounds_grow_only_along_free_axes_and_only_where_positions_are_narrowed():
+    far = np.full((1, 3, 2), 3004.0)
+    for box, roles in itertools.product(("brick", "cluster"), ROLES):
+        cell = Cell.create(*BOXES[box])
+        decider = decider_of(cell, "r2 <", *roles, np.ones((2, 3)))
+        grows = box == "cluster" and roles == ("float64", "float32")
+        assert bool(decider.bounds_at(far)[0, 0] > 100 * decider.bounds[0]) is grows
+        assert decider.bounds_at(far / 3004)[0] == decider.bounds
 
 
 @pytest.mark.parametrize("compare", ["r2 <", "r <"])

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
@@ -64,7 +64,7 @@ class CertifiedHorizon:
         wrong: first step with a decision that exact arithmetic decides otherwise; None where there is none.
         total: ambiguous decisions.
         decisions: the first of them.
-        bounds: of the margin, by pair type, in the quantity's space.
+        bounds: of the margin, by pair type, in the quantity's space: the largest of any step.
         closest: smallest |margin| of any pair at each step, in the quantity's space, shape (steps + 1,).
     """
 
@@ -158,13 +158,14 @@ def certified_horizon(
     closest: list[np.ndarray] = []
     total, reached = 0, 0
     horizon = wrong = None
-    bounds: tuple[float, ...] = ()
+    largest = np.array(simulation.decider.bounds)
     for segment in Engine(simulation, last, start=start).segments():
-        bounds = _bounds(simulation.decider, segment.rows_of("x"))
+        bounds = simulation.decider.bounds_at(segment.rows_of("x"))
+        largest = np.maximum(largest, bounds.max(axis=0))
         nearest = segment.rows_of("nearest")
         closest.append(nearest)
-        for row in np.flatnonzero(nearest <= max(bounds)):
-            found = _ambiguous(simulation, segment, int(row), bounds)
+        for row in np.flatnonzero(nearest <= bounds.max(axis=1)):
+            found = _ambiguous(simulation, segment, int(row), bounds[row])
             total += len(found)
             if found and horizon is None:
                 horizon = segment.first + int(row)
@@ -174,15 +175,8 @@ def certified_horizon(
         reached = segment.last
         if progress is not None:
             progress(reached, last)
+    bounds = tuple(largest.tolist())
     return CertifiedHorizon(reached, horizon, wrong, total, tuple(listed), bounds, np.concatenate(closest))
-
-
-def _bounds(decider: PairDecider, x: Float[np.ndarray, "rows 3 atoms"]) -> tuple[float, ...]:
-    """The decider's bounds, for atoms that may have left the region in which they started."""
-    with np.errstate(invalid="ignore"):
-        largest = np.abs(x.astype(np.float64)).max(axis=(0, 2))
-    a, b, c = np.fmax(decider.reach.coordinate, largest).tolist()
-    return replace(decider, reach=replace(decider.reach, coordinate=(a, b, c))).bounds
 
 
 def _check(simulation: Simulation) -> None:
@@ -201,7 +195,7 @@ def _check(simulation: Simulation) -> None:
 
 
 def _ambiguous(
-    simulation: Simulation, segment: Segment, row: int, bounds: tuple[float, ...]
+    simulation: Simulation, segment: Segment, row: int, bounds: Float[np.ndarray, "types"]
 ) -> list[Ambiguous]:
     table, decider = segment.table, simulation.decider
     x = segment.unsorted("x", row)
@@ -215,7 +209,7 @@ def _ambiguous(
     margin = value - quantity.astype(np.float64)
     decided = decider.inside(quantity.astype(np.float64), value)
     found = []
-    for p in np.flatnonzero(np.abs(margin) <= np.array(bounds)[kind]).tolist():
+    for p in np.flatnonzero(np.abs(margin) <= bounds[kind]).tolist():
         exact, inside = exact_margin(decider, simulation.cell, x[i[p]], x[j[p]], int(kind[p]))
         found.append(
             Ambiguous(
@@ -224,7 +218,7 @@ def _ambiguous(
                 int(j[p]),
                 bool(decided[p]),
                 float(margin[p]),
-                bounds[int(kind[p])],
+                float(bounds[kind[p]]),
                 float(exact),
                 bool(decided[p]) != inside,
             )

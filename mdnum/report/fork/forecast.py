@@ -12,7 +12,7 @@ from mdnum.ball.demos.base import Plot, Series
 from mdnum.report.fork.findings import Verdict
 from mdnum.report.fork.question import Question, declared, load, size_of, took, verdict, write_page
 from mdnum.report.verdict import Finding
-from mdnum.report.words import count, many, number
+from mdnum.report.words import count, many, number, typeset
 from mdnum.store import RunFolder
 
 
@@ -36,7 +36,8 @@ def write_report(folder: RunFolder | str | Path) -> Path:
         captions={
             "reach": "The smallest displacement, along the one direction that was followed, at which a "
             "decision of the step comes out otherwise: below the dashed line the one asked for flips it. "
-            "Above the solid line the displacement has grown too large by then for a forecast."
+            "Above the solid line the displacement has grown too large by then for a forecast. Where a flip "
+            "kicks its atoms, nothing is foretold after the first one."
         },
         figures=list(_key_figures(run)),
         first=[_row(flip) for flip in run.summary["first"]],
@@ -58,14 +59,16 @@ def judge(run: Question) -> Verdict:
     summary = run.summary
     size = f"{number(summary['size'], 2)} {run.units.length}"
     first, nearest = summary["first"], summary["nearest"]
+    until, ends = _range(run)
     if first:
         flip = first[0]
         which = f"pair {flip['i']}–{flip['j']} at step {count(flip['step'])}"
         headline = f"A random displacement of {size} is expected to flip {which} first."
+    elif until < 0:
+        headline = f"Nothing is foretold of a random displacement of {size}."
     else:
-        headline = (
-            f"A random displacement of {size} is expected to flip nothing in {many(run.steps, 'step')}."
-        )
+        whole = f"in {many(run.steps, 'step')}" if ends == "end" else f"up to step {count(until)}"
+        headline = f"A random displacement of {size} is expected to flip nothing {whole}."
     evidence = []
     if nearest:
         flip = nearest[0]
@@ -74,21 +77,56 @@ def judge(run: Question) -> Verdict:
             f"{number(abs(flip['amplitude']), 2)} {run.units.length} will do, "
             f"{number(flip['ulps'], 2)} ulps of the start."
         )
-    until = count(summary["linear_until"])
-    evidence.append(f"A displacement of {size} is small enough for a forecast up to step {until}.")
-    return verdict(headline, evidence, _findings(run), plain_tone="info" if first else "good")
+    if "says" in summary:
+        evidence.append(typeset(summary["says"]))
+    return verdict(
+        headline, evidence, _findings(run), plain_tone="info" if first or ends != "end" else "good"
+    )
+
+
+def _range(run: Question) -> tuple[int, str]:
+    """The last step of which something is foretold, and why it is the last."""
+    summary = run.summary
+    if "until" in summary:
+        return summary["until"], summary["ends"]
+    # of folders that were written before a range ended with the first flip
+    if summary["first"]:
+        return summary["first"][0]["step"], "flip"
+    return summary["linear_until"], "end" if summary["linear_until"] == run.steps else "size"
+
+
+#: Code, title, text and remedy of what ends a forecast before the run, but for a flip.
+_ENDS = {
+    "size": (
+        "NOT_LINEAR",
+        "the displacement grows too large",
+        "From there on it is more than half a percent of the cutoff: its square counts.",
+        "Ask for a smaller displacement.",
+    ),
+    "close": (
+        "TOO_CLOSE_TO_FORETELL",
+        "whether a decision flips is within the error",
+        "A decision of the step after comes out otherwise at very nearly the displacement asked for, and if "
+        "it does, it kicks its atoms.",
+        "Ask for a displacement that is a little larger or smaller.",
+    ),
+    "list": (
+        "BEYOND_THE_LIST",
+        "a pair that is not listed could come inside",
+        "The atoms have used up so much of the skin that the displacement could bring in a pair from beyond "
+        "the neighbor list, and such pairs are not looked at.",
+        "Give a larger neighbors.skin.",
+    ),
+}
 
 
 def _findings(run: Question) -> Iterator[Finding]:
     summary = run.summary
-    if summary["linear_until"] < run.steps:
-        yield Finding(
-            "NOT_LINEAR",
-            "info",
-            f"nothing is foretold beyond step {count(summary['linear_until'])}",
-            "From there on the displacement is more than half a percent of the cutoff: its square counts.",
-            "Ask for a smaller displacement.",
-        )
+    until, ends = _range(run)
+    if ends in _ENDS:
+        code, title, text, remedy = _ENDS[ends]
+        what = f"nothing is foretold beyond step {count(until)}" if until >= 0 else "nothing is foretold"
+        yield Finding(code, "info", f"{what}: {title}", text, remedy)
     if summary["size"] < 8 * summary["ulp"]:
         yield Finding(
             "BELOW_ROUNDING",
@@ -139,7 +177,8 @@ def _key_figures(run: Question) -> Iterator[tuple[str, str, str]]:
         f"{length} flip it",
     )
     yield "In ulps", number(nearest[0]["ulps"], 2) if nearest else "–", "of the largest start coordinate"
-    yield "Linear until", f"step {count(summary['linear_until'])}", f"of {count(run.steps)}"
+    until = _range(run)[0]
+    yield "Good until", f"step {count(until)}" if until >= 0 else "–", f"of {count(run.steps)}"
     yield "Took", f"{number(summary.get('seconds'), 2)} s", "one tangent run"
 
 

@@ -129,12 +129,3 @@ def test_what_gives_no_bound_is_refused():
     unsafe = replace(simulation, rule=replace(simulation.rule, every=5))
     with pytest.raises(InputError, match="may leave pairs out"):
         certified_horizon(unsafe, 10)
-
-
-def test_a_cluster_may_leave_the_region_in_which_it_started():
-    """What narrowing the positions can do is taken from where the atoms are, not from where they began."""
-    cell = Cell.create(np.zeros((3, 3)), False)
-    decider = PairDecider((2.3,), "r2 <", "float32", cell.reach(np.ones((2, 3))))
-    far = np.full((1, 3, 2), 3004.0)
-    assert exact_bounds._bounds(decider, far)[0] > 100 * decider.bounds[0]
-    assert exact_bounds._bounds(decider, far / 3004)[0] == decider.bounds[0]
