@@ -145,9 +145,7 @@ def walk_pairs(subject: Subject, progress: Progress | None = None) -> PairWalks:
             except TimeUp:
                 skipped.append((f"pair {pair.name}", TIME_UP))
                 left += 1
-        _known[subject] = PairWalks(
-            tuple(walks), tuple(skipped), _not_walked(subject, walks), possible, left
-        )
+        _known[subject] = PairWalks(tuple(walks), tuple(skipped), _not_walked(subject, walks), possible, left)
     return _known[subject]
 
 
