@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -19,8 +20,9 @@ from command_line import call
 import mdnum
 from mdnum.audit.base import Part
 from mdnum.audit.causes import heads
+from mdnum.audit.load import Loaded
 from mdnum.audit.verdict import judge
-from mdnum.cli.audit_print import by_cause
+from mdnum.cli.audit_print import by_cause, print_rows
 from mdnum.errors import InputError
 from mdnum.references.findings import finding
 from mdnum.report import write
@@ -356,13 +358,40 @@ def test_a_deadline_ends_an_audit_and_the_rest_is_resumed(tmp_path, monkeypatch)
         mdnum.audit_calculator(planted.Good, atoms, minutes=0.0, out=tmp_path / "none")
 
 
-def test_reduced_units_are_told_as_such():
+#: Units that a calculator without dimensions has none of; kT and file names are no units.
+DIMENSIONS = re.compile(r"(?<![\w./])(m?eV|Å|fs|ps|K)(?![\w.]\w|\w)")
+
+
+def test_an_audit_in_reduced_units_names_no_others(tmp_path, monkeypatch, capsys):
+    """Headline, findings, tables, labels of figures, the script beside the page, and the terminal."""
+
+    class Wrong(planted.OneImage, planted.HardEdge):
+        def extra(self, atoms, energy, forces):
+            return energy, forces + 0.1
+
+    loaded = Loaded("reduced", "reduced", Wrong, units=LJ, kT=0.1)
+    monkeypatch.setattr("mdnum.audit.load.load_calculator", lambda words: loaded)
+    atoms = planted.crystal()
+    atoms.info["origin"] = "8 atoms, nearest distance 2.76 Å"
+    checks = "invariance,forces,curl,state,dynamics"
+    result = mdnum.audit_calculator("reduced", atoms, checks=checks, steps=16, out=tmp_path / "a")
+    codes = {one["code"] for one in result.findings}
+    assert {"IMAGES", "FORCES_NOT_GRADIENT", "NET_FORCE", "ENERGY_JUMP", "NOT_CONSERVED"} & codes
+    print_rows(by_cause(result.summary))
+    page = (tmp_path / "a/report.html").read_text()
+    assert "<svg" in page and "mε/atom/τ" in page and "ε/σ" in page and "reproduce.py" in page
+    seen = re.sub(r"<(style|script)\b.*?</\1>|<(?!!--)[^>]*>", " ", page, flags=re.DOTALL)
+    for text in (seen, (tmp_path / "a/summary.json").read_text(), capsys.readouterr().out):
+        assert not [text[one.start() - 40 : one.end() + 20] for one in DIMENSIONS.finditer(text)]
+
+
+def test_units_are_replaced_and_names_of_files_are_not():
     rows = {"Table": [{"curl (eV/Å²)": 1.0, "plane": "x"}]}
     said = Part("curl", "Curl", "0.1 eV/Å", [finding("CURL", "error", "t", "1 meV", "r")], rows)
-    said = replace(said, skipped=[("a cell 1.6 Å wide", "a lack of time")])
+    said = replace(said, skipped=[("a cell 1.6 Å wide", "eV.py in SteveV failed at 3 eV.")])
     found = _in_units(said, LJ)
     assert found.says == "0.1 ε/σ" and found.findings[0]["text"] == "1 mε"
-    assert found.skipped[0] == ("a cell 1.6 σ wide", "a lack of time")
+    assert found.skipped[0] == ("a cell 1.6 σ wide", "eV.py in SteveV failed at 3 ε.")
     assert found.tables["Table"][0] == {"curl (ε/σ²)": 1.0, "plane": "x"}
     assert _in_units(said, METAL) is said
 
