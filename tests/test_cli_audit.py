@@ -84,7 +84,7 @@ def test_control_c_keeps_what_was_found(copper, capsys, monkeypatch):
     assert lines[0].startswith(
         f"Stopped during curl. {EMT} (as far as asked: curl not asked, state not asked)"
     )
-    assert lines[-1] == "the rest: mdnum audit --resume out"
+    assert lines[-1] == "ask the rest, and anew what was cut short: mdnum audit --resume out"
     assert "the check of state stopped" in lines
     summary = json.loads((copper / "out/summary.json").read_text())
     assert summary["status"] == "stopped" and [part["name"] for part in summary["parts"]] == ["forces"]

@@ -27,7 +27,7 @@ def audit(
     checks: list[str] | None = typer.Option(
         None,
         metavar="WORD,WORD",
-        help="Only these: smoothness, invariance, forces, curl, state, dynamics.",
+        help="Only these: invariance, forces, curl, smoothness, state, dynamics.",
     ),
     temperature: float | None = typer.Option(
         None, min=0.0, metavar="KELVIN", help="For kT and for the run; 300 K by default."
@@ -76,5 +76,5 @@ def audit(
     summary = result.summary if as_json else by_cause(result.summary)
     code = output.answer(result.folder, summary, print_rows, as_json=as_json)
     if result.summary["status"] != "complete" and not as_json:
-        typer.echo(f"the rest: mdnum audit --resume {result.folder}")
+        typer.echo(f"ask the rest, and anew what was cut short: mdnum audit --resume {result.folder}")
     return output.EXIT_STOPPED if stopped else code

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from mdnum.units import Units
     from mdnum.workflow.audit_record import AuditRecord
 
-#: Checks in the order in which they are made.
-CHECKS = ("smoothness", "invariance", "forces", "curl", "state", "dynamics")
+#: Checks in the order in which they are made: those that tell most by a call first.
+CHECKS = ("invariance", "forces", "curl", "smoothness", "state", "dynamics")
 
 
 class AuditStopped(KeyboardInterrupt):

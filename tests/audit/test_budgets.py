@@ -17,6 +17,7 @@ from mdnum.audit.forces import Forces
 from mdnum.audit.invariance import Invariance
 from mdnum.audit.smoothness import Smoothness
 from mdnum.audit.state import State
+from mdnum.audit.thresholds import walk_pairs
 
 CHECKS: dict[str, Check] = {
     "smoothness": Smoothness(neighbors=8, routes=1),
@@ -58,8 +59,9 @@ def test_evidence_is_the_same_on_a_machine_a_million_times_slower(name: str, mon
 
 @pytest.mark.parametrize("name", ["smoothness", "invariance", "forces", "curl", "state"])
 def test_a_deadline_leaves_ways_unasked_and_says_which(name: str):
+    calls = {"smoothness": walk_pairs(subject(planted.Good, three())).walks[0].calls, "invariance": 0}
     asked = subject(planted.Good, three())
-    asked.meter.deadline = Deadline({"smoothness": 1000, "invariance": 40}.get(name, 100))  # pyright: ignore[reportAttributeAccessIssue]
+    asked.meter.deadline = Deadline(calls.get(name, 60) + 40)  # pyright: ignore[reportAttributeAccessIssue]
     part = CHECKS[name](asked)
     assert 0 < part.asked < part.possible
     assert sum(why == "the time was up" for _, why in part.skipped) > 0
