@@ -36,8 +36,8 @@ def audit(
         None, min=0.0, metavar="FS", help="Of the run; from the fastest vibration by default."
     ),
     steps: int | None = typer.Option(None, min=16, help="Of the run; 200 by default."),
-    minutes: float | None = typer.Option(
-        None, "--time", metavar="MINUTES", help="Ask nothing more after that; what was not asked is told."
+    time: float | None = typer.Option(
+        None, metavar="MINUTES", help="Ask nothing more after that; what was not asked is told."
     ),
     out: Path | None = typer.Option(
         None, "-o", "--out", metavar="DIR", help="The audit folder; runs/audit-NAME-N by default."
@@ -65,7 +65,7 @@ def audit(
                 temperature=temperature,
                 timestep=timestep,
                 steps=steps,
-                minutes=minutes,
+                time=time,
                 out=out,
                 resume=resume,
                 report=not no_report,

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import re
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 from mdnum.errors import InputError
@@ -65,7 +65,7 @@ def audit(
     temperature: float | None = None,
     timestep: float | None = None,
     steps: int | None = None,
-    minutes: float | None = None,
+    time: float | None = None,
     out: str | Path | None = None,
     resume: str | Path | None = None,
     report: bool = True,
@@ -86,7 +86,8 @@ def audit(
         timestep: of the run, fs (τ of a system in reduced units); default a fraction of the fastest
             vibration.
         steps: of the run; default 200.
-        minutes: after which nothing more is asked; what was not asked by then is told, and can be resumed.
+        time: minutes, after which nothing more is asked; what was not asked by then is told, and can be
+            resumed.
         out: the new audit folder; default runs/audit-<name>-<n>.
         resume: the folder of an audit that was killed, stopped or short of time: the checks that it holds are
             kept, the others are made as it was asked for.
@@ -103,7 +104,7 @@ def audit(
     from mdnum.deadline import Deadline
     from mdnum.workflow import audit_record
 
-    deadline = Deadline(minutes)
+    deadline = Deadline(time)
     if resume is None:
         if calculator is None:
             raise InputError("no calculator is named", remedy="Name one, or resume an audit")
@@ -292,7 +293,7 @@ def _ask(check: Check, subject: CalculatorSubject, told: Log) -> Part:
     from mdnum.audit.subject import CalculatorError
     from mdnum.references.findings import finding
 
-    began = time.perf_counter()
+    began = perf_counter()
     try:
         return check(subject, told)
     except CalculatorError as error:
@@ -310,5 +311,5 @@ def _ask(check: Check, subject: CalculatorSubject, told: Log) -> Part:
             f"The calculator failed: it {error.message}.",
             findings=[failed],
             skipped=[(f"the rest of {check.name}", error.message)],
-            seconds=time.perf_counter() - began,
+            seconds=perf_counter() - began,
         )

@@ -156,10 +156,15 @@ def test_a_switch_over_a_short_way_is_steep(onset: float, steep: bool, monkeypat
     assert codes(walk, asked) == ({"STEEP_SWITCH": "warning"} if steep else {})
 
 
-def test_a_crowd_has_neighbors_however_slow(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(provoke, "_cost", lambda *asked: 1e3)
+def test_a_crowd_that_is_refused_is_made_smaller():
+    class Few(Pairwise):
+        def calculate(self, atoms=None, properties=None, system_changes=("positions",)):
+            if atoms is not None and len(atoms) > 6 and not atoms.pbc.any():
+                raise ValueError("too many atoms")
+            super().calculate(atoms, properties, system_changes)
+
     grid = np.stack(np.unravel_index(np.arange(8), (2, 2, 2)), axis=1) * 3.6
-    (found,) = provoke.crowd(subject(lambda: Pairwise(laws.soft), laws.Atoms("Ar8", grid)), most=8)
+    (found,) = provoke.crowd(subject(lambda: Few(laws.soft), laws.Atoms("Ar8", grid)), most=8)
     assert found.neighbors == 4 and found.kept is None
 
 

@@ -341,7 +341,7 @@ def test_a_deadline_ends_an_audit_and_the_rest_is_resumed(tmp_path, monkeypatch)
     monkeypatch.setattr("mdnum.deadline.Deadline", Spent)
     atoms, checks = planted.chain(), "invariance,forces,curl"
     whole = mdnum.audit_calculator(planted.Good, atoms, checks=checks, out=tmp_path / "whole", report=False)
-    cut = mdnum.audit_calculator(planted.Good, atoms, checks=checks, minutes=1.0, out=tmp_path / "cut")
+    cut = mdnum.audit_calculator(planted.Good, atoms, checks=checks, time=1.0, out=tmp_path / "cut")
     assert cut.summary["status"] == "unfinished"
     ways = cut.summary["parts"][-1]
     assert ways["name"] == "forces" and 0 < ways["asked"] < ways["possible"] == 15
@@ -355,7 +355,7 @@ def test_a_deadline_ends_an_audit_and_the_rest_is_resumed(tmp_path, monkeypatch)
     assert done.parts["forces"].says == whole.parts["forces"].says
     with pytest.raises(InputError, match="--time"):
         monkeypatch.undo()
-        mdnum.audit_calculator(planted.Good, atoms, minutes=0.0, out=tmp_path / "none")
+        mdnum.audit_calculator(planted.Good, atoms, time=0.0, out=tmp_path / "none")
 
 
 #: Units that a calculator without dimensions has none of; kT and file names are no units.
