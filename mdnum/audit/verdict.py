@@ -75,8 +75,11 @@ def _answer(question: str, parts: Sequence[Part], wanted: Sequence[str]) -> Answ
         return "with care"
     if not set(wanted).issuperset(_NEEDED[question]):
         return "not asked"
+    begun = {part.name for part in parts}
     asked = {part.name for part in parts if not _largely_unasked(part)}
-    return "yes" if asked.issuperset(_NEEDED[question]) else "as far as asked"
+    if asked.issuperset(_NEEDED[question]):
+        return "yes"
+    return "as far as asked" if begun.intersection(_NEEDED[question]) else "not asked"
 
 
 def _largely_unasked(part: Part) -> bool:
@@ -103,7 +106,11 @@ def _headline(name: str, answers: Mapping[str, Answer], parts: Sequence[Part], l
         if finding["severity"] == severity
     ]
     if not titles:
-        return f"{head}: {_counted(len(parts), 'check')} found nothing."
+        return (
+            f"{head}: nothing was asked."
+            if not parts
+            else f"{head}: {_counted(len(parts), 'check')} found nothing."
+        )
     shown = list(dict.fromkeys(titles))
     if len(shown) > 3:
         shown[2:] = [f"and {len(shown) - 2} more findings"]

@@ -143,6 +143,8 @@ def audit(
                 break
             except TimeUp:
                 during, why = check.name, TIME_UP
+                if record.cut is not None and record.cut.name == check.name:
+                    record.add(record.cut, check, subject, whole=False)
                 break
             cut = any(reason == TIME_UP for _, reason in part.skipped)
             record.add(part, check, subject, whole=not cut)

@@ -47,6 +47,7 @@ class AuditRecord:
         question: checks, temperature, timestep and steps that were asked for.
         parts: of the checks that are done.
         pairs: names of structures that show a finding, without "-before" and "-after".
+        cut: of the check that a deadline cut short, which is asked again: as far as it had been asked.
         found: thresholds, as far as a check has looked for them; None if none has.
         seconds: that the audit took before it was resumed.
     """
@@ -58,6 +59,7 @@ class AuditRecord:
     question: dict[str, Any]
     parts: list[Part] = field(default_factory=list)
     pairs: list[str] = field(default_factory=list)
+    cut: Part | None = None
     found: list[Threshold] | None = None
     seconds: float = 0.0
     began: float = field(default_factory=time.perf_counter)
@@ -84,6 +86,13 @@ class AuditRecord:
         """
         if part.name == "smoothness" and whole:
             self.thresholds(subject)
+        if whole:
+            self.cut = None
+        else:
+            # asked again, and not as far: what was known stays known
+            earlier = self.cut if self.cut is not None and self.cut.name == part.name else part
+            part = self.cut = max(earlier, part, key=lambda one: one.asked)
+            self.keep()
         self.parts.append(part)
         write_parts(self.folder, [part])
         tables: Mapping[str, Any] = getattr(check, "recorded", {})
@@ -109,6 +118,7 @@ class AuditRecord:
                 "question": self.question,
                 "parts": [plain(part) for part in self.parts],
                 "pairs": self.pairs,
+                "cut": None if self.cut is None else plain(self.cut),
                 "files": sorted(path.name for path in shown.glob("failed-*.extxyz")),
                 "thresholds": None if self.found is None else [plain(one) for one in self.found],
                 "seconds": self._took,
@@ -220,6 +230,7 @@ def open_again(path: str | Path, calculator: Any, load: Callable[[Any], Loaded])
             state["question"],
             [_restored(one) for one in state["parts"]],
             state["pairs"],
+            None if state["cut"] is None else _restored(state["cut"]),
             None if found is None else [Threshold(**{k: _tuple(v) for k, v in one.items()}) for one in found],
             state["seconds"],
         )

@@ -218,6 +218,9 @@ def test_what_is_largely_unasked_is_not_safe():
     assert judge("x", [parts[0], nearly, *parts[2:]]).run == "yes"
     judged = judge("x", parts[:3], ["smoothness", *REST])
     assert (judged.run, judged.differentiate) == ("as far as asked", "as far as asked")
+    nothing = judge("x", [], ["smoothness", *REST])
+    assert nothing.run == nothing.differentiate == "not asked" and "safe" not in nothing.headline
+    assert judge("x", parts[1:2], ["smoothness", *REST]).differentiate == "not asked"
     assert judged.headline == (
         "x is safe as far as asked (curl not asked, state not asked, dynamics not asked): "
         "3 checks found nothing."
@@ -348,6 +351,10 @@ def test_a_deadline_ends_an_audit_and_the_rest_is_resumed(tmp_path, monkeypatch)
     assert f"{ways['asked']} of 15 ways of forces, curl not asked" in cut.summary["headline"]
     assert {"what": "the check of curl", "why": "the time was up", "part": "curl"} in cut.summary["left_out"]
     assert f"{ways['asked']} of 15 ways asked" in (tmp_path / "cut/report.html").read_text()
+    # asked again, and not as far: nothing that was known is lost
+    Spent.looks = 3
+    less = mdnum.audit_calculator(planted.Good, time=1.0, resume=tmp_path / "cut", report=False)
+    assert less.summary["headline"] == cut.summary["headline"]
     with pytest.raises(InputError, match="has no name"):
         mdnum.audit_calculator(resume=tmp_path / "cut")
     done = mdnum.audit_calculator(planted.Good, resume=tmp_path / "cut", report=False)
