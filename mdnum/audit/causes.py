@@ -18,6 +18,22 @@ _AMONG_MANY = ("JUMP_AMONG_MANY", "CURVATURE_JUMP_AMONG_MANY")
 #: make every other way of writing a structure down another structure; images that are lost have no forces; a
 #: force that is no gradient does not keep the energy of a run.
 _BRINGS: dict[str, tuple[str, ...]] = {
+    "NOT_REPEATABLE": (
+        "STALE_STATE",
+        "STALE_DYNAMICS",
+        "ORDER",
+        "TOPOLOGY_BY_ORDER",
+        *_IMAGES,
+        "MIRROR",
+        "DUMMY_CELL",
+        *_AMONG_MANY,
+        *_FORCES,
+        *_RUN,
+        "ENERGY_STEP",
+        "NOISE_FLOOR",
+        "LOW_PRECISION",
+        "QUANTIZED",
+    ),
     "STALE_STATE": ("STALE_DYNAMICS", *_RUN),
     "NEIGHBOR_CAP_BY_ORDER": ("NEIGHBOR_CAP", "ORDER", *_IMAGES, *_AMONG_MANY, *_FORCES, *_RUN),
     "NEIGHBOR_CAP": ("ORDER", *_IMAGES, *_AMONG_MANY, *_FORCES, *_RUN),
@@ -28,6 +44,8 @@ _BRINGS: dict[str, tuple[str, ...]] = {
     "ENERGY_JUMP": ("FLIPS_CHANGE_ENERGY", "ENERGY_STEP"),
     "JUMP_AMONG_MANY": ("CURVATURE_JUMP_AMONG_MANY", "HIDDEN_JUMPS"),
 }
+#: Causes that are ones only as errors: answers that differ in a last bit bring nothing about.
+_AS_ERRORS = ("NOT_REPEATABLE",)
 _SEVERITIES = ("info", "warning", "error")
 
 
@@ -51,7 +69,9 @@ def heads(findings: Sequence[tuple[str, str]]) -> list[int]:
         above = (
             first[cause]
             for cause, brought in _BRINGS.items()
-            if cause in first and code in brought and ranks[first[cause]] >= max(ranks[place], 1)
+            if cause in first
+            and code in brought
+            and ranks[first[cause]] >= max(ranks[place], 2 if cause in _AS_ERRORS else 1)
         )
         found.append(next(above, first[code]))
     # of what goes below one that goes below another, the top

@@ -27,7 +27,7 @@ def audit(
     checks: list[str] | None = typer.Option(
         None,
         metavar="WORD,WORD",
-        help="Only these: invariance, forces, curl, smoothness, state, dynamics.",
+        help="Only these: invariance, smoothness, forces, curl, state, dynamics.",
     ),
     temperature: float | None = typer.Option(
         None, min=0.0, metavar="KELVIN", help="For kT and for the run; 300 K by default."

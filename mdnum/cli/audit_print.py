@@ -36,5 +36,5 @@ def print_rows(summary: Mapping[str, Any]) -> None:
 
 
 def _ways(part: Mapping[str, Any]) -> str:
-    asked, possible = part["asked"], part["possible"]
+    asked, possible = part.get("asked", 0), part.get("possible", 0)
     return f"{asked:,}" if asked == possible else f"{asked:,} of {possible:,}"

@@ -21,8 +21,9 @@ if TYPE_CHECKING:
     from mdnum.units import Units
     from mdnum.workflow.audit_record import AuditRecord
 
-#: Checks in the order in which they are made: those that tell most by a call first.
-CHECKS = ("invariance", "forces", "curl", "smoothness", "state", "dynamics")
+#: Checks in the order in which they are made: what tells most by a call first, and thresholds before those
+#: that may ask at them.
+CHECKS = ("invariance", "smoothness", "forces", "curl", "state", "dynamics")
 
 
 class AuditStopped(KeyboardInterrupt):

@@ -243,6 +243,9 @@ def named(*codes: str) -> list[tuple[str, str]]:
         (named("NEIGHBOR_CAP_BY_ORDER", "ORDER", "EXTENSIVE", "CURL", "NOT_CONSERVED"), [0] * 5),
         # two that have nothing to do with one another, and one that is found twice
         (named("STALE_STATE", "CURL", "STALE_DYNAMICS", "CURL"), [0, 1, 0, 1]),
+        # answers that differ each time explain what differs, those that differ in a last bit do not
+        (named("IMAGES", "NOT_REPEATABLE"), [1, 1]),
+        ([("IMAGES", "warning"), ("NOT_REPEATABLE", "warning")], [0, 1]),
         # a warning explains no error, and information nothing
         ([("NARROW_CELL", "warning"), ("EXTENSIVE", "error")], [1, 1]),
         ([("STALE_STATE", "info"), ("STALE_DYNAMICS", "info")], [0, 1]),

@@ -87,14 +87,9 @@ def _key_figures(run: Question) -> Iterator[tuple[str, str, str]]:
     summary = run.summary
     yield "To run", summary["safe_to_run"], "a simulation with it"
     yield "To differentiate", summary["safe_to_differentiate"], "through it"
-    found = [one["severity"] for one in summary["findings"]]
-    yield (
-        "Findings",
-        count(
-            sum(one.severity != "info" for one, _ in _groups([restore(one) for one in summary["findings"]]))
-        ),
-        many(found.count("error"), "error"),
-    )
+    alone = [one.severity for one, _ in _groups([restore(one) for one in summary["findings"]])]
+    errors = alone.count("error")
+    yield "Findings", count(errors + alone.count("warning")), many(errors, "error")
     numbers = {part["name"]: part["numbers"] for part in summary["parts"]}
     if "dynamics" in numbers and numbers["dynamics"].get("drift") is not None:
         yield "Drift", number(numbers["dynamics"]["drift"], 2, signed=True), numbers["dynamics"]["drift_unit"]
@@ -114,10 +109,19 @@ def _part(part: Mapping[str, Any]) -> dict[str, Any]:
         "curves": [curve["name"] for curve in part["curves"]],
         "tables": [_table(title, rows) for title, rows in part["tables"].items() if rows],
         "skipped": [(heading(one["what"]), one["why"]) for one in part["skipped"]],
-        "ways": f"{count(part['asked'])} of {many(part['possible'], 'way')} asked"
-        if part.get("asked") is not None
-        else "",
+        "ways": _ways(part),
     }
+
+
+def _ways(part: Mapping[str, Any]) -> str:
+    asked, possible = part.get("asked"), part.get("possible")
+    if asked is None or possible is None:  # a folder from before they were counted
+        return ""
+    return (
+        f"{many(asked, 'way')} asked"
+        if asked == possible
+        else f"{count(asked)} of {count(possible)} ways asked"
+    )
 
 
 def _table(title: str, rows: list[Mapping[str, Any]]) -> dict[str, Any]:
