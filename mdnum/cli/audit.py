@@ -56,7 +56,13 @@ def audit(
     from mdnum.workflow.audit import audit as ask
 
     stopped = False
-    with watched() as progress:
+    folder = resume or out
+
+    def go_on() -> str | None:
+        begun = folder is not None and (folder / "checkpoint.npz").exists()
+        return f"Continue with `mdnum audit --resume {folder}`" if begun else None
+
+    with watched(go_on) as progress:
         try:
             result = ask(
                 calculator,
