@@ -100,6 +100,19 @@ def test_run_prints_what_a_person_wants_to_know(rollout: Recorder, capsys: pytes
     assert err == ""
 
 
+@pytest.mark.parametrize(("units", "words"), [("lj", ("ε", "τ", "σ")), ("metal", ("eV", "ps", "Å"))])
+def test_numbers_in_a_terminal_have_units(
+    rollout: Recorder, capsys: pytest.CaptureFixture[str], units, words
+):
+    energy, time, length = words
+    rollout.summary |= {"units": units, "ase": {"energy_rel": 1e-16, "force_max": 2e-13, "ok": True}}
+    assert call("run", "argon/crystal-108") == 0
+    out = capsys.readouterr().out
+    assert f"1e-09 {energy}/atom/{time}" in out
+    assert f"closes, residual 2e-12 {energy}" in out
+    assert f"energy 1e-16 relative, forces 2e-13 {energy}/{length} at most" in out
+
+
 def test_run_as_json_is_one_document(rollout: Recorder, capsys: pytest.CaptureFixture[str]):
     assert call("run", "argon/crystal-108", "--json") == 0
     document = json.loads(capsys.readouterr().out)

@@ -81,14 +81,17 @@ def test_control_c_keeps_what_was_found(copper, capsys, monkeypatch):
     arguments = ("audit", EMT, "-s", "cu.extxyz", "-o", "out", "--checks")
     assert call(*arguments, "forces,curl,state") == 130
     lines = printed(capsys)
-    assert lines[0].startswith(f"Stopped during curl. {EMT}: 1 check found nothing")
+    assert lines[0].startswith(
+        f"Stopped during curl. {EMT} (as far as asked: curl not asked, state not asked)"
+    )
+    assert lines[-1] == "ask the rest, and anew what was cut short: mdnum audit --resume out"
     assert "the check of state stopped" in lines
     summary = json.loads((copper / "out/summary.json").read_text())
     assert summary["status"] == "stopped" and [part["name"] for part in summary["parts"]] == ["forces"]
     assert "Stopped during curl" in (copper / "out/report.html").read_text()
     # nothing was found yet
     assert call("audit", EMT, "-s", "cu.extxyz", "-o", "other", "--checks", "curl") == 130
-    assert "stopped" in capsys.readouterr().err
+    assert "stopped. Continue with `mdnum audit --resume other`" in capsys.readouterr().err
     assert not (copper / "other/summary.json").exists()
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -10,8 +11,65 @@ import numpy as np
 from ase import Atoms
 from jaxtyping import Float
 
+from mdnum.deadline import Deadline
+
 #: (done, of how many, {"phase": words}) now and then.
 Progress = Callable[[int, int, dict[str, Any]], None]
+
+
+#: Why something was not asked that would have been.
+TIME_UP = "the time was up"
+
+
+class TimeUp(Exception):
+    """The time that a person gave has passed: what is in progress is left."""
+
+
+@dataclass
+class Meter:
+    """Calls of a calculator by all of its objects, and the time that is left for more.
+
+    Evidence is counted in calls, so that it does not depend on the load of a machine; a deadline cuts it
+    short.
+
+    Attributes:
+        calls: so far.
+        deadline: a person's; by default there is none.
+    """
+
+    calls: int = 0
+    deadline: Deadline = field(default_factory=Deadline)
+    _limited: int = 0
+
+    def count(self) -> None:
+        """Counts a call.
+
+        Raises:
+            TimeUp: the deadline has passed, and what is in progress may be left.
+        """
+        if self._limited and self.deadline.passed:
+            raise TimeUp
+        self.calls += 1
+
+    @contextmanager
+    def limited(self) -> Iterator[None]:
+        """One way of many is asked here: no call is made after the deadline.
+
+        Raises:
+            TimeUp: the deadline has passed, now or before the end.
+        """
+        if self.deadline.passed:
+            raise TimeUp
+        self._limited += 1
+        try:
+            yield
+        finally:
+            self._limited -= 1
+
+
+def meter_of(subject: Subject) -> Meter:
+    """A subject's meter; of one that has none, one that counts nothing."""
+    return getattr(subject, "meter", None) or Meter()
 
 
 class Subject(Protocol):
@@ -81,6 +139,8 @@ class Part:
         numbers: figures for summary.json, plain values.
         skipped: (what, why) of what was not looked at.
         seconds: time it took.
+        asked: ways of asking that were gone, those on which the calculator failed included.
+        possible: ways that there are in all; more than asked where the time was up.
     """
 
     name: str
@@ -92,6 +152,8 @@ class Part:
     numbers: Mapping[str, Any] = field(default_factory=dict)
     skipped: Sequence[tuple[str, str]] = ()
     seconds: float = 0.0
+    asked: int = 1
+    possible: int = 1
 
 
 class Check(Protocol):

@@ -11,7 +11,7 @@ import numpy as np
 from ase import Atoms
 from jaxtyping import Float
 
-from mdnum.audit.base import Part, Progress, Subject
+from mdnum.audit.base import TIME_UP, Part, Progress, Subject, TimeUp, meter_of
 from mdnum.audit.noise import FEW, Noise, displaced, of_all_kinds, settled
 from mdnum.references.findings import finding
 
@@ -23,8 +23,6 @@ _POINTS = 12
 _SIGNIFICANT = 10.0
 #: Antisymmetric over symmetric part of the derivative of the forces: below, it is precision.
 _SMALL = 1e-4
-#: Loops that are looked at however slow the calculator is, and seconds after which no more are.
-_FEWEST, _SECONDS = 2, 20.0
 
 
 @dataclass(frozen=True)
@@ -80,13 +78,17 @@ class Curl:
         skipped: list[tuple[str, str]] = []
         for place in of_all_kinds(len(wanted)):
             what, u, v = wanted[place]
-            if len(found) >= _FEWEST and time.perf_counter() - began > _SECONDS:
-                skipped.append((f"a loop of {what}", f"{_SECONDS:g} s were used up"))
-                continue
             if progress is not None:
                 progress(len(found), len(wanted), {"phase": "curl", "unit": "loops"})
-            tried = [around(worker, atoms, u, v, radius, noise, what) for radius in _RADII]
-            found[place] = agreed(tried)
+            try:
+                with meter_of(worker).limited():
+                    tried = [around(worker, atoms, u, v, radius, noise, what) for radius in _RADII]
+            except TimeUp:
+                skipped.append((f"a loop of {what}", TIME_UP))
+            else:
+                found[place] = agreed(tried)
+        if not found:
+            raise TimeUp
         loops = [found[place] for place in sorted(found)]
         wrong = [one for one in loops if not one.conservative]
         return Part(
@@ -104,6 +106,8 @@ class Curl:
             },
             skipped=skipped,
             seconds=time.perf_counter() - began,
+            asked=len(loops),
+            possible=len(wanted),
         )
 
 

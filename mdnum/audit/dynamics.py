@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from ase import Atoms
 
-from mdnum.audit.base import Part, Progress, Subject
+from mdnum.audit.base import Part, Progress, Subject, meter_of
 from mdnum.audit.crossings import crossings
 from mdnum.audit.dynamics_words import part
 from mdnum.audit.energy_ledger import Result, balance, by_means, crossing_rows, energy_rows
@@ -22,11 +22,9 @@ from mdnum.audit.subject import CalculatorError, only_trying
 from mdnum.audit.threshold import Threshold
 from mdnum.references.findings import finding
 
-_MOST_STEPS, _FEWEST_STEPS = 400, 32
-#: Seconds that a run may take where nobody says how many steps.
-_SECONDS = 20.0
-#: Calls of the calculator for a step: two in the run of half the time step, warming up, work on the way.
-_CALLS = 6.0
+#: Of a run where nobody says how many. A step takes some six calls: two in the run of half the time step,
+#: warming up, work on the way.
+_STEPS = 200
 _COMPARED = 12
 
 
@@ -43,7 +41,7 @@ class Dynamics:
     Args:
         thresholds: finds where flips happen; see `mdnum.audit.thresholds.find_thresholds`.
         timestep: internal time; a fraction of the fastest vibration if None.
-        steps: of the run; as many as take half a minute if None.
+        steps: of the run; 200 if None.
         seed: of the velocities.
     """
 
@@ -56,6 +54,10 @@ class Dynamics:
 
     def __call__(self, subject: Subject, progress: Progress | None = None) -> Part:
         """Ask it; see `Check`."""
+        with meter_of(subject).limited():
+            return self._asked(subject, progress)
+
+    def _asked(self, subject: Subject, progress: Progress | None) -> Part:
         began = time.perf_counter()
         told = progress or (lambda done, total, info: None)
         rng = np.random.default_rng(self.seed)
@@ -68,7 +70,7 @@ class Dynamics:
         step = self.timestep if self.timestep is not None else fitting
         if not np.isfinite(step):
             return _nothing_moves(self.name, began)
-        count = self.steps or _affordable(worker, start)
+        count = self.steps or _STEPS
         total = 3 * count + count // 4
 
         def each(before: int) -> Callable[[int], None]:
@@ -117,17 +119,6 @@ def _only_molecules(subject: Subject) -> bool:
     except CalculatorError:
         return True
     return False
-
-
-def _affordable(subject: Subject, start: Atoms) -> int:
-    """Steps that take no longer than they may."""
-    began = time.perf_counter()
-    for _ in range(3):
-        start.positions[0, 0] += 1e-6
-        subject.energy(at(start, start.positions))
-        subject.forces(at(start, start.positions))
-    took = (time.perf_counter() - began) / 3
-    return int(np.clip(_SECONDS / (_CALLS * took), _FEWEST_STEPS, _MOST_STEPS))
 
 
 def _stale(subject: Subject, whole: Run, like: Atoms, noise: Noise) -> tuple[float, float]:

@@ -57,7 +57,7 @@ class _Words:
         self.time = units.time if units is not None else "ps"
         self.factor = units.time_factor if units is not None else 98.22694788464064
         self.energy = "ε" if self.reduced else "eV"
-        self.unit = f"1e-3 {self.energy}/atom/{self.time}" if self.reduced else "meV/atom/ps"
+        self.unit = f"m{self.energy}/atom/{self.time}"
         self.atoms = result.whole.positions.shape[1]
         self.per_atom = 1e3 * self.factor / self.atoms
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -21,8 +20,6 @@ from mdnum.audit.threshold import Threshold
 
 #: Flips whose jumps are measured; the others are told by the mean of these.
 _MEASURED = 240
-#: Seconds in which that is done, and flips that are measured however long it takes.
-_SECONDS, _FEWEST = 16.0, 12
 #: Steps with flips that a sample must have.
 _ENOUGH = 30
 
@@ -64,7 +61,6 @@ def balance(
     limits: Sequence[Threshold],
     rng: np.random.Generator,
     noise: float = 0.0,
-    seconds: float = _SECONDS,
 ) -> Ledger:
     """Account for the energy of a run.
 
@@ -75,7 +71,6 @@ def balance(
         limits: where flips happen.
         rng: picks the steps whose flips are measured where there are too many.
         noise: of the energy, eV.
-        seconds: about how long to measure flips, and half as long again to look for jumps elsewhere.
     """
     crossed = crossings(whole, like, limits)
     by_step: dict[int, list[int]] = {}
@@ -84,7 +79,6 @@ def balance(
     # a step without a crossing that needs care costs one call; of the others a sample must do
     orders = np.array([limits[one.threshold].order for one in crossed], np.int64)
     sharp = int((orders < 2).sum())
-    began = time.perf_counter()
     stepped = len({one.step for one, order in zip(crossed, orders, strict=True) if order < 2})
     # a sample of steps is as good as all, unless it is a handful because each step has so many
     smooth = 2 if sharp <= _MEASURED or _MEASURED * stepped >= _ENOUGH * sharp else 1
@@ -104,8 +98,6 @@ def balance(
         places = by_step.get(step, [])
         if step in careful and step not in chosen:
             continue
-        if step in careful and len(measured) > _FEWEST and time.perf_counter() - began > seconds:
-            continue
         found = account(probe, whole, like, step, [crossed[place] for place in places], limits, smooth)
         rest[step] = found.rest
         measured |= dict(zip(places, found.jumps, strict=True))
@@ -117,7 +109,7 @@ def balance(
     for one, order in zip(crossed, orders, strict=True):
         if order == 0:
             known.setdefault(one.step, []).append(one.share)
-    hidden = hidden_jumps(probe, whole, like, rest, known, noise, 0.5 * seconds)
+    hidden = hidden_jumps(probe, whole, like, rest, known, noise)
     return Ledger(crossed, jumps, measured, rest, hidden)
 
 

@@ -6,7 +6,6 @@ for two may not be.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -14,7 +13,7 @@ import numpy as np
 from ase import Atoms
 from ase.neighborlist import neighbor_list
 
-from mdnum.audit.base import Progress, Subject
+from mdnum.audit.base import TIME_UP, Progress, Subject, TimeUp, meter_of
 from mdnum.audit.jumps import SMOOTH, Jump, find_jumps, locate, measure
 from mdnum.audit.probes import Pair, molecules, whole
 from mdnum.audit.routes import Crossing, Route
@@ -28,11 +27,17 @@ _SIDE = 1e-7
 _MOST_CROSSINGS = 2
 """Crossings of one threshold that are measured, each by another atom."""
 
-_CALLS_AT_CROSSING = 170
-_PATIENCE = 4.0
-_CALLS_ON_ROUTE = 430
+_CROSSINGS = 4
+"""Crossings of known thresholds in the structure that are measured, by 170 calls or so each."""
+
+_ROUTES = 2
+"""Through the structure, scanned for unknown thresholds by 430 calls or so each."""
+
 _CUT_OUT = 40
-"""Atoms of the structure that are kept where a calculation of all takes too long."""
+"""Atoms of the structure that are kept where there are many."""
+
+_MANY = 500
+"""Atoms from which a part of the structure is walked through, and not all of it."""
 
 _MOST_TRIPLES = 4
 _LENGTH = 0.6
@@ -72,7 +77,9 @@ class Surroundings:
         routes: names of routes that were scanned for unknown ones.
         expected: crossings of known thresholds on those routes.
         skipped: (what, why).
-        atoms: in the structure that was walked through; a part of the subject's where a calculation is slow.
+        atoms: in the structure that was walked through; a part of the subject's where that has many.
+        asked: crossings and routes that were walked, those on which the calculator failed included.
+        possible: all of them.
     """
 
     events: tuple[Event, ...]
@@ -81,17 +88,20 @@ class Surroundings:
     expected: int
     skipped: tuple[tuple[str, str], ...]
     atoms: int
+    asked: int = 0
+    possible: int = 0
 
 
 def walk_surroundings(
-    subject: Subject, progress: Progress | None = None, seconds: float = 6.0
+    subject: Subject, progress: Progress | None = None, crossings: int = _CROSSINGS, routes: int = _ROUTES
 ) -> Surroundings:
     """Walk triples, and atoms of the structure, through the known thresholds and look for unknown ones.
 
     Args:
         subject: the calculator and its structure.
         progress: called now and then.
-        seconds: about how long to measure known thresholds in the structure, and again to look for others.
+        crossings: of known thresholds in the structure that are measured.
+        routes: through the structure on which others are looked for.
     """
     walks = walk_pairs(subject).walks
     thresholds = [one for walk in walks for one in walk.thresholds if one.order < SMOOTH or one.dies]
@@ -99,51 +109,62 @@ def walk_surroundings(
     single = bool(walks) and walks[0].pair.moves == "atom"
     atoms = subject.atoms
     groups = _groups(atoms, single)
-    cost = _cost(subject, atoms, groups[0])
+    subject.forces(atoms)
     events: list[Event] = []
     skipped: list[tuple[str, str]] = []
-    if cost * _CALLS_ON_ROUTE > seconds and len(atoms) > _CUT_OUT and walks:
+    if len(atoms) > _MANY and walks:
         atoms = _cut_out(atoms, groups, walks[0].pair)
         groups = _groups(atoms, single)
         try:
-            cost = _cost(subject, atoms, groups[0])
+            subject.forces(atoms)
         except CalculatorError as error:
             skipped.append((f"{_CUT_OUT} atoms cut out of the structure", error.message))
             atoms, groups = subject.atoms, _groups(subject.atoms, single)
-    # one in any case, unless it alone takes several times what was allowed
-    one = cost * _CALLS_AT_CROSSING
-    affordable = max(int(seconds / one), int(one < _PATIENCE * seconds))
     targeted = _targeted(atoms, thresholds, groups)
-    if len(targeted) > affordable:
-        skipped.append((f"{len(targeted) - affordable} more crossings of known thresholds", "a lack of time"))
-        targeted = targeted[:affordable]
+    if len(targeted) > crossings:
+        more = len(targeted) - crossings
+        skipped.append((f"{more} more crossings of known thresholds", f"{crossings} were measured"))
+        targeted = targeted[:crossings]
     triples = _triples(subject) if single else []
-    total = len(targeted) + len(triples) + 1
+    random = _random(atoms, groups, routes)
+    total = len(targeted) + len(triples) + len(random)
+    asked = 0
     for k, (route, crossing) in enumerate(targeted):
         if progress:
-            progress(k, total, {"phase": "walking through the structure"})
+            progress(k, total, {"phase": "walking through the structure", "unit": "ways"})
         try:
-            event = _at_crossing(subject, route, crossing)
+            with meter_of(subject).limited():
+                event = _at_crossing(subject, route, crossing)
             events += [] if _rounded(event, quantum) else [event]
         except CalculatorError as error:
             skipped.append((route.name, error.message))
+        except TimeUp:
+            skipped.append((route.name, TIME_UP))
+            continue
+        asked += 1
+    measured = asked
     scanned: list[str] = []
     expected = 0
-    random = _random(atoms, groups, seconds / cost)
-    if not random:
-        skipped.append(("routes through the structure", f"one calculation takes {cost:.2g} s"))
     for k, (route, low, high) in enumerate([*triples, *random]):
         if progress:
-            progress(min(len(targeted) + k, total - 1), total, {"phase": route.name})
+            progress(len(targeted) + k, total, {"phase": route.name, "unit": "ways"})
         try:
-            found, known = _scanned(subject, route, thresholds, low, high)
+            with meter_of(subject).limited():
+                found, known = _scanned(subject, route, thresholds, low, high)
+        except TimeUp:
+            skipped.append((route.name, TIME_UP))
+            continue
         except CalculatorError as error:
             skipped.append((route.name, error.message))
+            asked += 1
             continue
+        asked += 1
         scanned.append(route.name)
         events += [one for one in found if not _rounded(one, quantum)]
         expected += known
-    return Surroundings(tuple(events), len(targeted), tuple(scanned), expected, tuple(skipped), len(atoms))
+    return Surroundings(
+        tuple(events), measured, tuple(scanned), expected, tuple(skipped), len(atoms), asked, total
+    )
 
 
 def _groups(atoms: Atoms, single: bool) -> list[np.ndarray]:
@@ -270,21 +291,8 @@ def _triples(subject: Subject) -> list[tuple[Route, float, float]]:
     return found
 
 
-def _cost(subject: Subject, atoms: Atoms, group: np.ndarray) -> float:
-    """Seconds of a calculation after the first."""
-    subject.forces(atoms)  # whatever is made at the first question is made
-    begin = time.perf_counter()
-    for k in (1, 2, 3):
-        subject.forces(Route("", atoms, group, int(group[0]), np.eye(3)[0]).at(k * 1e-3))
-    return max((time.perf_counter() - begin) / 3, 1e-5)
-
-
-def _random(
-    atoms: Atoms, groups: Sequence[np.ndarray], affordable: float
-) -> list[tuple[Route, float, float]]:
-    """Routes of some atoms in arbitrary directions, as many as so many calculations allow."""
-    # one in any case, unless it alone takes several times what was allowed
-    count = int(np.clip(affordable / _CALLS_ON_ROUTE, affordable > _CALLS_ON_ROUTE / 4, 8))
+def _random(atoms: Atoms, groups: Sequence[np.ndarray], count: int) -> list[tuple[Route, float, float]]:
+    """Routes of so many atoms in arbitrary directions."""
     rng = np.random.default_rng(0)
     found: list[tuple[Route, float, float]] = []
     for k in rng.permutation(len(groups))[:count]:

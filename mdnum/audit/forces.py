@@ -11,7 +11,7 @@ import numpy as np
 from ase import Atoms
 from jaxtyping import Float
 
-from mdnum.audit.base import Curve, Part, Progress, Subject
+from mdnum.audit.base import TIME_UP, Curve, Part, Progress, Subject, TimeUp, meter_of
 from mdnum.audit.digits import precision
 from mdnum.audit.noise import FEW, Noise, direction, displaced, of_all_kinds, settled
 from mdnum.references.findings import finding
@@ -23,8 +23,6 @@ _SIGNIFICANT = 10.0
 #: Of the root mean square force: below, a disagreement is one of tables or precision.
 _SMALL = 1e-4
 _DIRECTIONS, _ATOMS = 3, 4
-#: Directions that are looked at however slow the calculator is, and seconds after which no more are.
-_FEWEST, _SECONDS = 3, 20.0
 
 
 @dataclass(frozen=True)
@@ -85,12 +83,15 @@ class Forces:
         wanted = list(directions(atoms, rng))
         for place in of_all_kinds(len(wanted)):
             what, line = wanted[place]
-            if len(found) >= _FEWEST and time.perf_counter() - began > _SECONDS:
-                skipped.append((f"moving {what}", f"{_SECONDS:g} s were used up"))
-                continue
             if progress is not None:
                 progress(len(found), len(wanted), {"phase": "forces", "unit": "directions"})
-            found[place] = slope(worker, atoms, line, forces, noise, what)
+            try:
+                with meter_of(worker).limited():
+                    found[place] = slope(worker, atoms, line, forces, noise, what)
+            except TimeUp:
+                skipped.append((f"moving {what}", TIME_UP))
+        if not found:
+            raise TimeUp
         slopes = [found[place] for place in sorted(found)]
         sums = list(_sums(atoms, forces, noise))
         told = [
@@ -120,6 +121,8 @@ class Forces:
             },
             skipped=skipped,
             seconds=time.perf_counter() - began,
+            asked=len(slopes),
+            possible=len(wanted),
         )
 
 

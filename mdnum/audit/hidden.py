@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,7 +10,7 @@ import numpy as np
 from ase import Atoms
 from jaxtyping import Float
 
-from mdnum.audit.base import Subject
+from mdnum.audit.base import Subject, meter_of
 from mdnum.audit.nve import Run, at
 
 #: Halvings of a step's way: what is left of it then is a millionth of an Å.
@@ -24,6 +23,8 @@ _FOLLOWED = 0.15
 _MOSTLY = 0.5
 #: Steps that are looked at, at most.
 _MOST_STEPS = 40
+#: Calls after which no further step is looked at.
+_CALLS = 800
 #: Of kT: what a step leaves unexplained below this is not looked at.
 _SMALL = 1e-6
 
@@ -97,7 +98,6 @@ def hidden_jumps(
     rest: Float[np.ndarray, "steps"],
     sharp: Mapping[int, Sequence[float]],
     noise: float,
-    seconds: float = 8.0,
 ) -> Hidden:
     """Look into the steps that leave most unexplained: is it all at single places of their way?
 
@@ -108,16 +108,16 @@ def hidden_jumps(
         rest: energy that each step leaves unexplained; nan where that is not known.
         sharp: by step, shares of its way at which a known threshold jumps, which are not counted again.
         noise: of the energy, eV.
-        seconds: about how long to look.
     """
     limit = max(40 * noise, _SMALL * probe.kT)
     large = np.abs(np.nan_to_num(rest)) > limit
     candidates = np.flatnonzero(large)[np.argsort(-np.abs(rest[large]), kind="stable")]
-    began = time.perf_counter()
+    meter = meter_of(probe)
+    began = meter.calls
     jumps: list[Jump] = []
     looked: dict[int, float] = {}
     for step in candidates[:_MOST_STEPS]:
-        if looked and time.perf_counter() - began > seconds:
+        if looked and meter.calls - began > _CALLS:
             break
         looked[int(step)] = float(rest[step])
         jumps += _into(probe, run, like, int(step), sharp.get(int(step), ()), limit)

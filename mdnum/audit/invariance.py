@@ -12,7 +12,7 @@ from ase import Atoms
 
 from mdnum.audit import transformations
 from mdnum.audit.answer import Refusal, ask
-from mdnum.audit.base import Part, Progress, Subject
+from mdnum.audit.base import TIME_UP, Part, Progress, Subject, TimeUp, meter_of
 from mdnum.audit.noise import Noise, along_a_line, louder, settled, under_jitter
 from mdnum.audit.subject import CalculatorError
 from mdnum.audit.transformations import Same
@@ -23,8 +23,6 @@ from mdnum.references.findings import finding
 _ALLOWED = 40.0
 #: Of kT for the whole structure: a difference below is one of precision rather than of physics.
 _SMALL = 1e-3
-#: Seconds after which only one way of each kind is still looked at.
-_SECONDS = 30.0
 
 #: What it means that two ways of writing down one structure differ, and what to do: title, remedy.
 _MEANING: Mapping[str, tuple[str, str]] = {
@@ -138,23 +136,23 @@ class Invariance:
         refused: list[tuple[Same, CalculatorError]] = []
         ways = _in_turns(transformations.all_of(atoms, subject.atoms, rng))
         late: list[tuple[str, str]] = []
-        tried: set[str] = set()
         judged = _Judge(subject, worker, atoms, noise, rng)
         for done, same in enumerate(ways):
             if progress is not None:
                 progress(done, len(ways), {"phase": "invariance", "unit": "structures"})
-            if same.code in tried and time.perf_counter() - began > _SECONDS:
-                late.append((same.what, f"{_SECONDS:g} s were used up"))
-                continue
-            tried.add(same.code)
             try:
-                differences.append(judged(same))
+                with meter_of(worker).limited():
+                    differences.append(judged(same))
+            except TimeUp:
+                late.append((same.what, TIME_UP))
             except CalculatorError as error:
                 if same.code == "NARROW_CELL" and error.cause is not None:
                     late.append((same.what, error.message))
                     judged.narrow_refused(same, error)
                 else:
                     refused.append((same, error))
+        if len(late) == len(ways) and late[0][1] == TIME_UP:
+            raise TimeUp
         found = [*_refusals(refused), *self._findings(differences, judged, refused)]
         wrong = [one for one in differences if not one.agrees]
         return Part(
@@ -174,6 +172,8 @@ class Invariance:
             },
             skipped=[*((same.what, error.message) for same, error in refused), *late],
             seconds=time.perf_counter() - began,
+            asked=len(ways) - sum(why == TIME_UP for _, why in late),
+            possible=len(ways),
         )
 
     def _findings(

@@ -8,7 +8,6 @@ the mismatch falls while one zooms in tells what is there, whatever the curve lo
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -101,7 +100,7 @@ def find_jumps(
     step: float,
     most: int = 24,
     expected: Sequence[float] = (),
-    until: float = np.inf,
+    calls: float = np.inf,
 ) -> tuple[list[Jump], int]:
     """Every jump of energy, force, curvature or third derivative that stands out of a scan.
 
@@ -117,7 +116,8 @@ def find_jumps(
         step: spacing of the scan. Two thresholds closer together than this may be told as one.
         most: how many places are looked at closely, those that stand out most.
         expected: places that are known to stand out and not to be looked at.
-        until: of `time.perf_counter`, after which only the place that stands out most is looked at.
+        calls: places at which the curve may be asked; after them only the place that stands out most is
+            looked at.
 
     Returns:
         (jumps by coordinate, how many places that stood out were left out).
@@ -130,7 +130,7 @@ def find_jumps(
     found: list[Jump] = []
     looked = 0
     for _, left, right in suspects[:most]:
-        if looked and time.perf_counter() > until:
+        if looked and len(curve.known) > calls:
             break
         looked += 1
         # a third derivative that jumps stands out of the intervals beside its own as well

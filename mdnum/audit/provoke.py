@@ -7,7 +7,6 @@ something jumps; where it keeps the first k in its own order, a permutation of t
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -15,7 +14,7 @@ import numpy as np
 from ase import Atoms
 from jaxtyping import Float, Int
 
-from mdnum.audit.base import Progress, Subject
+from mdnum.audit.base import TIME_UP, Progress, Subject, TimeUp, meter_of
 from mdnum.audit.probes import Pair
 from mdnum.audit.subject import CalculatorError, only_trying
 from mdnum.audit.thresholds import STEPS, PairWalk, walk_pairs
@@ -24,7 +23,7 @@ _MOST = 160
 """Neighbors of the crowded center; radius graphs are cut at 32 by habit, and at 50, 100 or 120 elsewhere."""
 
 _FEWEST = 4
-"""Of which a calculator too slow for more is given."""
+"""Of which a calculator that refuses more is given."""
 
 _NEAR, _FAR = 0.5, 0.94
 """The crowd is between these fractions of the cutoff."""
@@ -35,11 +34,12 @@ _SIDES = (1e-9, 1e-6)
 _SURE = 30.0
 _WITHOUT_CUTOFF = 6.0
 
-_CALLS = 150
-"""Calculations that crowding one atom takes at least."""
+_TIES = 160
+"""With how many neighbors ties are looked at, three calls each, beside the habitual ones; the share of one of
+several species is less."""
 
 _HABITUAL = (12, 16, 20, 24, 30, 32, 40, 48, 50, 60, 64, 80, 96, 100, 120, 128, 150, 200, 250, 256)
-"""Ties that are looked at in any case; the others as the time allows, from the first on."""
+"""Ties that are looked at in any case."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,10 @@ class Crowd:
 
 
 def crowd(
-    subject: Subject, progress: Progress | None = None, most: int = _MOST, seconds: float = 10.0
+    subject: Subject,
+    progress: Progress | None = None,
+    most: int = _MOST,
+    skipped: list[tuple[str, str]] | None = None,
 ) -> list[Crowd]:
     """Crowd an atom of each species that the calculator takes alone.
 
@@ -84,7 +87,7 @@ def crowd(
         subject: the calculator.
         progress: called now and then.
         most: neighbors given to the center.
-        seconds: about how long to look, for all species together.
+        skipped: gets what was not looked at, and why.
 
     Returns:
         one for each species of the structure; none for a calculator that takes no single atoms.
@@ -99,29 +102,20 @@ def crowd(
         if progress:
             progress(k, len(alike), {"phase": f"crowding {walk.pair.species[0]}"})
         radius = walk.cutoff or _WITHOUT_CUTOFF
-        share = seconds / len(alike)
         fewest = max(most // 8, _FEWEST)
         for count in sorted({max(most // part, fewest) for part in (1, 2, 4, 8)}, reverse=True):
-            # some refuse what is too dense for them, and for some it takes too long
+            # some refuse what is too dense for them
             try:
-                with only_trying(subject):
-                    if count > fewest and _CALLS * _cost(subject, walk.pair, radius, count) > share:
-                        continue
-                    found.append(_crowded(subject, walk, radius, count, share))
+                with only_trying(subject), meter_of(subject).limited():
+                    found.append(_crowded(subject, walk, radius, count, _TIES // len(alike)))
                 break
             except CalculatorError:
                 continue
+            except TimeUp:
+                if skipped is not None:
+                    skipped.append((f"crowding {walk.pair.species[0]}", TIME_UP))
+                break
     return found
-
-
-def _cost(subject: Subject, pair: Pair, radius: float, count: int) -> float:
-    """Seconds of a calculation of a crowd, after the first."""
-    atoms, _ = cluster(pair, radius, count)
-    subject.forces(atoms)
-    atoms.positions[0, 0] += 1e-6
-    began = time.perf_counter()
-    subject.forces(atoms)
-    return time.perf_counter() - began
 
 
 def cluster(pair: Pair, radius: float, count: int) -> tuple[Atoms, Float[np.ndarray, "neighbors"]]:
@@ -148,15 +142,13 @@ def cluster(pair: Pair, radius: float, count: int) -> tuple[Atoms, Float[np.ndar
     return atoms, distance
 
 
-def _crowded(subject: Subject, walk: PairWalk, radius: float, count: int, seconds: float) -> Crowd:
-    began = time.perf_counter()
+def _crowded(subject: Subject, walk: PairWalk, radius: float, count: int, ties: int) -> Crowd:
     pair, quantum = walk.pair, walk.quantum
     atoms, distances = cluster(pair, radius, count)
     direction = _gap(atoms)
     side = next((one for one in _SIDES if _resolved(subject, atoms, direction, distances, one)), _SIDES[-1])
     between = 0.5 * (distances[1:] + distances[:-1])
     quiet = [_change(subject, atoms, direction, place, side) for place in between[:: max(count // 10, 1)]]
-    cost = (time.perf_counter() - began) / (3 * len(quiet) + 4)
     # a force's change and that of its change are four roundings of each of three components
     noise_energy = max(max(energy for energy, _ in quiet), 1e-14, 4 * quantum[0] / _SURE)
     # an atom that its neighbors press hard has forces with more rounding in them than another
@@ -167,9 +159,8 @@ def _crowded(subject: Subject, walk: PairWalk, radius: float, count: int, second
     noise_force = np.maximum(np.max([force for _, force in quiet], axis=0), floor)
     jumps: list[tuple[int, float, float]] = []
     over: list[tuple[int, float, float]] = []
-    every = int((seconds - (time.perf_counter() - began)) / (3 * cost))
     for k, place in enumerate(distances):
-        if k >= every and k + 1 not in _HABITUAL:
+        if k >= ties and k + 1 not in _HABITUAL:
             continue
         energy, force = _change(subject, atoms, direction, place, side)
         jumps.append((k + 1, energy, float(force.max())))

@@ -10,7 +10,7 @@ import numpy as np
 
 from mdnum.audit import crowd_words
 from mdnum.audit import smoothness_words as words
-from mdnum.audit.base import Curve, Part, Progress, Subject
+from mdnum.audit.base import Curve, Part, Progress, Subject, TimeUp, meter_of
 from mdnum.audit.environments import Surroundings, walk_surroundings
 from mdnum.audit.provoke import Crowd, crowd
 from mdnum.audit.threshold import Threshold
@@ -26,15 +26,15 @@ class Smoothness:
     """Is the energy smooth wherever atoms can go, and if not, where, to what order and by how much?
 
     Args:
-        seconds: about how long to look for unknown thresholds in the structure, and again in crowds.
         neighbors: how many a crowded center gets.
+        routes: through the structure, on which unknown thresholds are looked for.
     """
 
     name = "smoothness"
 
-    def __init__(self, seconds: float = 8.0, neighbors: int = 160):
-        self.seconds = seconds
+    def __init__(self, neighbors: int = 160, routes: int = 2):
         self.neighbors = neighbors
+        self.routes = routes
 
     def __call__(self, subject: Subject, progress: Progress | None = None) -> Part:
         """Walk and crowd.
@@ -44,11 +44,14 @@ class Smoothness:
         """
         began = time.perf_counter()
         walks = walk_pairs(subject, progress)
-        around = walk_surroundings(subject, progress, self.seconds)
-        crowds = crowd(subject, progress, self.neighbors, self.seconds)
+        if not walks.walks and meter_of(subject).deadline.passed:
+            raise TimeUp
+        around = walk_surroundings(subject, progress, routes=self.routes)
+        late: list[tuple[str, str]] = []
+        crowds = crowd(subject, progress, self.neighbors, late)
         units = crowd_words.units_of(subject)
-        skipped = [*walks.skipped, *around.skipped]
-        if not crowds:
+        skipped = [*walks.skipped, *around.skipped, *late]
+        if not crowds and not late:
             skipped.append(
                 ("caps on the number of neighbors", "the calculator takes no crowd of single atoms")
             )
@@ -62,6 +65,8 @@ class Smoothness:
             numbers=_numbers(walks, around, crowds, subject.kT),
             skipped=skipped,
             seconds=time.perf_counter() - began,
+            asked=walks.possible - walks.left + around.asked + len(crowds),
+            possible=walks.possible + around.possible + len(crowds) + len(late),
         )
 
 

@@ -14,7 +14,7 @@ from mdnum.audit import probes
 from mdnum.audit.alone import alone
 from mdnum.audit.answer import Answer, Refusal, ask
 from mdnum.audit.approaches import Asked, approaches
-from mdnum.audit.base import Part, Progress, Subject
+from mdnum.audit.base import TIME_UP, Part, Progress, Subject, TimeUp, meter_of
 from mdnum.audit.noise import FEW, Noise, displaced, settled
 from mdnum.audit.subject import CalculatorError, CalculatorSubject, only_trying
 from mdnum.audit.threshold import Threshold
@@ -25,10 +25,6 @@ from mdnum.references.findings import finding
 #: terms in another order.
 _ALLOWED = 40.0
 _REPEATS = 3
-#: Seconds for all sequences, of which each has its share: what a quick one leaves the others have.
-_SECONDS = 30.0
-#: Questions of a sequence that are compared however long it takes, the last ones.
-_FEWEST = 1
 
 
 @dataclass
@@ -65,20 +61,21 @@ class State:
         total = sum(map(len, sequences.values()))
         done, rows = 0, []
         late: list[tuple[str, str]] = []
-        for place, (word, sequence) in enumerate(sequences.items()):
-            left = _SECONDS - (time.perf_counter() - began)
-            if left < 0:
-                late.append((f"the sequence “{word}”", f"{_SECONDS:g} s were used up"))
-                continue
-            through = _Through(subject, sequence, noise, word, left / (len(sequences) - place))
-            for row in through():
-                rows.append(row)
-                if progress is not None:
-                    progress(done + through.reached, total, {"phase": "state", "unit": "structures"})
+        for word, sequence in sequences.items():
+            through = _Through(subject, sequence, noise, word)
+            compared = len(rows)
+            try:
+                with meter_of(subject).limited():
+                    for row in through():
+                        rows.append(row)
+                        if progress is not None:
+                            progress(done + through.reached, total, {"phase": "state", "unit": "structures"})
+            except TimeUp:
+                left = sum(one.compared for one in sequence) - (len(rows) - compared)
+                late.append((f"{left} questions of the sequence “{word}”", TIME_UP))
             done += len(sequence)
-            if through.left_out:
-                questions = f"{through.left_out} questions of the sequence “{word}”"
-                late.append((questions, "new objects take long: the others were compared"))
+        if late and not rows:
+            raise TimeUp
         repeats = _repeated(subject, atoms)
         lonely = alone(subject, atoms, noise)
         self.structures |= lonely.structures
@@ -116,6 +113,8 @@ class State:
                 *lonely.skipped,
             ],
             seconds=time.perf_counter() - began,
+            asked=len(rows),
+            possible=sum(one.compared for sequence in sequences.values() for one in sequence),
         )
 
     def _approached(self, subject: Subject, sequences: dict[str, list[Asked]]) -> list[tuple[str, str]]:
@@ -300,24 +299,18 @@ class _Through:
         sequence: what is asked.
         noise: of the calculator.
         word: the sequence's name.
-        seconds: that it may take. Where that is not enough every structure is still asked about, and fewer
-            answers are compared, the last ones first.
     """
 
-    def __init__(self, subject: Subject, sequence: list[Asked], noise: Noise, word: str, seconds: float):
+    def __init__(self, subject: Subject, sequence: list[Asked], noise: Noise, word: str):
         self._subject, self._sequence, self._noise, self._word = subject, sequence, noise, word
-        self._ends = time.perf_counter() + seconds
-        #: How far it has come, and how many answers that could be compared were not.
-        self.reached = self.left_out = 0
+        #: How far it has come.
+        self.reached = 0
 
     def __call__(self) -> Iterator[dict[str, Any]]:
         """A row for each answer that is compared."""
-        began = time.perf_counter()
         used = self._subject.fresh()
         if isinstance(used, CalculatorSubject):
             used.renews = False  # what an object does after it has failed is a question here
-        ask(used, self._sequence[0].atoms)
-        compared = self._affordable(time.perf_counter() - began)
         before: Atoms | None = None
         known: dict[int, Answer | Refusal] = {}
         size, failed = 0.0, False
@@ -326,7 +319,7 @@ class _Through:
             was_broken, failed = failed, isinstance(old, Refusal)
             previous, before = before or asked.atoms, asked.atoms
             self.reached = place + 1
-            if place not in compared:
+            if not asked.compared:
                 continue
             # structures come again within a sequence, which keeps them, so their ids are theirs
             if id(asked.atoms) not in known:
@@ -348,15 +341,6 @@ class _Through:
                 size = size or abs(new.energy)
                 share = max(1.0, abs(new.energy) / size) if size else 1.0
                 yield row | _apart(old, new, self._noise, share)
-
-    def _affordable(self, took: float) -> set[int]:
-        """Places that are compared, where a new object and its answer take so many seconds."""
-        places = [place for place, asked in enumerate(self._sequence) if asked.compared]
-        # the one object's own answers come first
-        left = self._ends - time.perf_counter() - 0.3 * took * len(self._sequence)
-        count = max(int(left / took) if took > 0 else len(places), _FEWEST)
-        self.left_out = max(len(places) - count, 0)
-        return set(places[self.left_out :])
 
 
 def _apart(old: Answer, new: Answer, noise: Noise, share: float) -> dict[str, Any]:

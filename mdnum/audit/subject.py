@@ -12,6 +12,7 @@ import numpy as np
 from ase import Atoms
 from jaxtyping import Float
 
+from mdnum.audit.base import Meter
 from mdnum.errors import MdnumError
 from mdnum.units import METAL, Units
 
@@ -79,7 +80,8 @@ class CalculatorSubject:
         self.atoms = _bare(atoms)
         self.kT = kT
         self.folder = None if folder is None else Path(folder)
-        self.calls = 0
+        #: Counts the calls of all objects of the calculator.
+        self.meter = Meter()
         self.saving = True
         #: Make a new object after one that raised: some are of no use afterwards.
         self.renews = True
@@ -101,6 +103,7 @@ class CalculatorSubject:
             self.name, self._make, self.atoms, kT=self.kT, folder=self.folder, units=self.units
         )
         other._saved, other.saving, other.known = self._saved, self.saving, self.known
+        other.meter = self.meter
         return other
 
     def about(self, atoms: Atoms) -> CalculatorSubject:
@@ -180,7 +183,7 @@ class CalculatorSubject:
         if not same:
             if self._nearly(asked):
                 self.forget()
-            self.calls += 1
+            self.meter.count()
         self._last = bits
         return asked
 

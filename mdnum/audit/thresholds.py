@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations_with_replacement
@@ -12,7 +11,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from jaxtyping import Float
 
-from mdnum.audit.base import Progress, Subject
+from mdnum.audit.base import TIME_UP, Progress, Subject, TimeUp, meter_of
 from mdnum.audit.curve import Curve, grid, scatter
 from mdnum.audit.digits import digits
 from mdnum.audit.ends import end_of, with_end
@@ -24,11 +23,12 @@ from mdnum.audit.threshold import SMOOTHEST, Threshold, at_jump
 STEP = 0.025
 """Spacing of a scan, in the unit of length. Two thresholds closer than this may be told as one."""
 
-_WIDEST = 0.08
-"""Spacing of a scan at most, however long a calculation takes."""
+_CALLS = 20_000
+"""For walking all pairs, each of which has its share: some 600 go into a scan, 100 to 300 into each place
+that stands out of it."""
 
-_SECONDS = 45.0
-"""For walking all pairs, each of which has its share."""
+_FEWEST_CALLS = 1500
+"""A pair whose share is less is not walked."""
 
 STEPS = 2.5
 """Of answers that are rounded to decimals: a jump of so many steps is more than rounding."""
@@ -91,11 +91,15 @@ class PairWalks:
         skipped: what was left out, and why.
         not_walked: pairs of species of the structure without a walk of their own, "Cu-Zr" say; none where
             whole molecules were walked, whose atoms are not asked about one by one.
+        possible: pairs that there are to walk.
+        left: those that were not, because the time was up or there are too many.
     """
 
     walks: tuple[PairWalk, ...]
     skipped: tuple[tuple[str, str], ...]
     not_walked: tuple[str, ...] = ()
+    possible: int = 0
+    left: int = 0
 
 
 _known: WeakKeyDictionary[Any, PairWalks] = WeakKeyDictionary()
@@ -121,19 +125,27 @@ def walk_pairs(subject: Subject, progress: Progress | None = None) -> PairWalks:
     if subject not in _known:
         found, skipped = pairs(subject)
         walks = []
-        began = time.perf_counter()
+        # those beyond the most frequent ones are told so already
+        calls, left = _CALLS, sum(what.startswith("pair ") for what, _ in skipped)
+        possible = len(found) + left
         for k, pair in enumerate(found):
-            left = _SECONDS - (time.perf_counter() - began)
-            if left < 0:
-                skipped.append((f"pair {pair.name}", f"{_SECONDS:g} s were used up by other pairs"))
+            share = max(calls // (len(found) - k), _FEWEST_CALLS)
+            if calls < _FEWEST_CALLS:
+                left += 1
+                skipped.append((f"pair {pair.name}", f"{_CALLS:,} calls were used up by other pairs"))
                 continue
             if progress:
                 progress(k, len(found), {"phase": f"walking {pair.name}", "unit": "pairs"})
             try:
-                walks.append(walk(subject, pair, seconds=left / (len(found) - k)))
+                with meter_of(subject).limited():
+                    walks.append(walk(subject, pair, calls=share))
+                calls -= walks[-1].calls
             except CalculatorError as error:
                 skipped.append((f"pair {pair.name}", error.message))
-        _known[subject] = PairWalks(tuple(walks), tuple(skipped), _not_walked(subject, walks))
+            except TimeUp:
+                skipped.append((f"pair {pair.name}", TIME_UP))
+                left += 1
+        _known[subject] = PairWalks(tuple(walks), tuple(skipped), _not_walked(subject, walks), possible, left)
     return _known[subject]
 
 
@@ -160,22 +172,20 @@ def rough(subject: Subject, pair: Pair) -> tuple[float | None, float | None]:
     return cutoff, least
 
 
-def walk(subject: Subject, pair: Pair, step: float = STEP, seconds: float = np.inf) -> PairWalk:
+def walk(subject: Subject, pair: Pair, step: float = STEP, calls: float = np.inf) -> PairWalk:
     """Walk one pair.
 
     Args:
         subject: the calculator.
         pair: who is walked.
-        step: of the scan; wider where so many calculations take too long.
-        seconds: about how long it may take.
+        step: of the scan.
+        calls: after so many, only the place that stands out most of the scan is looked at closely.
 
     Raises:
         CalculatorError: the calculator fails at distances at which it had answered before.
     """
-    began = time.perf_counter()
     curve, kT = pair.curve(subject), subject.kT
     coarse, far = _coarse(subject, curve)
-    cost = (time.perf_counter() - began) / len(coarse)
     energy_far = curve(far)[0]
     noise = 8 * scatter(curve, far, far, 1.0)[0]
     if len(pair.second) > 1:
@@ -197,12 +207,10 @@ def walk(subject: Subject, pair: Pair, step: float = STEP, seconds: float = np.i
     thresholds: list[Threshold] = []
     left_out = 0
     smallest = None
-    # half of the time for the scan, the rest for what stands out of it
-    step = float(np.clip(2 * cost * (end - near) / seconds, step, max(step, _WIDEST)))
     margin = 8 * step
     distance = np.append(coarse[coarse >= near][:12], near + margin)
     if end > near + 12 * step:
-        jumps, left_out = find_jumps(curve, near + margin, end + margin, step, until=began + seconds)
+        jumps, left_out = find_jumps(curve, near + margin, end + margin, step, calls=calls)
         thresholds = [at_jump(pair, jump) for jump in jumps]
         smallest = smallest_steps(curve, near + margin, end + margin, step)
         scanned = grid(near + margin, end + margin, step)

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 from mdnum.audit.base import Part
+from mdnum.audit.causes import grouped
 
-Answer = Literal["yes", "with care", "no", "not asked"]
+Answer = Literal["yes", "as far as asked", "with care", "no", "not asked"]
 
 #: Checks without which a question has no answer.
 _NEEDED = {
@@ -21,6 +22,8 @@ _APART = {
     "run": ("FORCE_JUMP", "CURVATURE_JUMP", "CURVATURE_JUMP_AMONG_MANY"),
     "differentiate": ("DRIFT", "TIMESTEP"),
 }
+#: Of the ways of a check: from here on it counts as asked.
+_NEARLY = 0.9
 
 
 @dataclass(frozen=True)
@@ -40,23 +43,28 @@ class Judgment:
     evidence: tuple[str, ...]
 
 
-def judge(name: str, parts: Sequence[Part]) -> Judgment:
+def judge(name: str, parts: Sequence[Part], wanted: Sequence[str] | None = None) -> Judgment:
     """Both answers from the parts of an audit.
 
     Args:
         name: of the calculator.
         parts: as the checks gave them.
+        wanted: checks that were to be made; those of the parts if None.
     """
-    answers: dict[str, Answer] = {question: _answer(question, parts) for question in ("run", "differentiate")}
+    names = [part.name for part in parts]
+    left = [one for one in wanted or () if one not in names]
+    answers: dict[str, Answer] = {
+        question: _answer(question, parts, [*names, *left]) for question in ("run", "differentiate")
+    }
     return Judgment(
         answers["run"],
         answers["differentiate"],
-        _headline(name, answers, parts),
+        _headline(name, answers, parts, left),
         tuple(part.says for part in parts),
     )
 
 
-def _answer(question: str, parts: Sequence[Part]) -> Answer:
+def _answer(question: str, parts: Sequence[Part], wanted: Sequence[str]) -> Answer:
     bearing = [
         finding for part in parts for finding in part.findings if finding["code"] not in _APART[question]
     ]
@@ -65,25 +73,48 @@ def _answer(question: str, parts: Sequence[Part]) -> Answer:
         return "no"
     if "warning" in severities:
         return "with care"
-    asked = {part.name for part in parts}
-    return "yes" if asked.issuperset(_NEEDED[question]) else "not asked"
+    if not set(wanted).issuperset(_NEEDED[question]):
+        return "not asked"
+    begun = {part.name for part in parts}
+    asked = {part.name for part in parts if not _largely_unasked(part)}
+    if asked.issuperset(_NEEDED[question]):
+        return "yes"
+    return "as far as asked" if begun.intersection(_NEEDED[question]) else "not asked"
 
 
-def _headline(name: str, answers: Mapping[str, Answer], parts: Sequence[Part]) -> str:
+def _largely_unasked(part: Part) -> bool:
+    return part.asked < _NEARLY * part.possible
+
+
+def _headline(name: str, answers: Mapping[str, Answer], parts: Sequence[Part], left: Sequence[str]) -> str:
     head = _said(name, answers["run"], answers["differentiate"])
+    unasked = [
+        f"{part.asked:,} of {part.possible:,} ways of {part.name}" for part in parts if _largely_unasked(part)
+    ]
+    unasked += [f"{one} not asked" for one in left]
+    head = head or name
+    if unasked:
+        # whatever the answers are, what they do not rest on is said beside them
+        far = "" if "as far as asked" in head else "as far as asked: "
+        head += f" ({far}{', '.join(unasked)})"
+    told = [finding for part in parts for finding in part.findings]
+    alone = [one for one, _ in grouped(told, [(one["code"], one["severity"]) for one in told])]
     titles = [
         finding["title"]
         for severity in ("error", "warning")
-        for part in parts
-        for finding in part.findings
+        for finding in alone
         if finding["severity"] == severity
     ]
     if not titles:
-        return f"{head or name}: {_counted(len(parts), 'check')} found nothing."
+        return (
+            f"{head}: nothing was asked."
+            if not parts
+            else f"{head}: {_counted(len(parts), 'check')} found nothing."
+        )
     shown = list(dict.fromkeys(titles))
     if len(shown) > 3:
         shown[2:] = [f"and {len(shown) - 2} more findings"]
-    return f"{head or name}: {'; '.join(shown)}."
+    return f"{head}: {'; '.join(shown)}."
 
 
 def _said(name: str, run: Answer, differentiate: Answer) -> str:
@@ -91,12 +122,14 @@ def _said(name: str, run: Answer, differentiate: Answer) -> str:
     if run == differentiate:
         return {
             "yes": f"{name} is safe to run and to differentiate",
+            "as far as asked": f"{name} is safe as far as asked",
             "with care": f"Use {name} with care, to run and to differentiate",
             "no": f"Neither run nor differentiate {name} as it is",
             "not asked": "",
         }[run]
     words = {
-        "yes": "safe to {verb}", "with care": "to be {done} with care", "no": "not safe to {verb}",
+        "yes": "safe to {verb}", "as far as asked": "safe as far as asked to {verb}",
+        "with care": "to be {done} with care", "no": "not safe to {verb}",
     }  # fmt: skip
     said = [
         words[answer].format(verb=verb, done=done)

@@ -79,7 +79,10 @@ def _speed(rate: float | None) -> str:
 
 
 def _print_rows(summary: Mapping[str, Any]) -> None:
-    ase = summary.get("ase") or {}
+    from mdnum.units import get
+
+    ase, units = summary.get("ase") or {}, get(str(summary.get("units") or "lj"))
+    energy = units.energy
     rows = [
         ("system", f"{summary.get('system')}, {summary.get('atoms')} atoms, {summary.get('steps'):,} steps"),
         ("flips", f"{summary.get('flips_entered'):,} entered, {summary.get('flips_left'):,} left"),
@@ -89,12 +92,12 @@ def _print_rows(summary: Mapping[str, Any]) -> None:
             f"{summary.get('rebuilds'):,} rebuilds, {summary.get('dangerous_builds'):,} dangerous,"
             f" {summary.get('lost_pairs'):,} pairs lost",
         ),
-        ("energy drift", f"{output.show(summary.get('energy_drift'))} per atom and time unit"),
-        ("energy budget", _budget(summary)),
+        ("energy drift", _with(summary.get("energy_drift"), f"{energy}/atom/{units.time}")),
+        ("energy budget", _budget(summary, energy)),
         (
             "against ASE",
             f"energy {output.show(ase.get('energy_rel'))} relative,"
-            f" forces {output.show(ase.get('force_max'))} at most"
+            f" forces {_with(ase.get('force_max'), f'{energy}/{units.length}')} at most"
             if ase.get("energy_rel") is not None
             else "not compared",
         ),
@@ -103,9 +106,13 @@ def _print_rows(summary: Mapping[str, Any]) -> None:
     output.print_table("", ("", ""), rows)
 
 
-def _budget(summary: Mapping[str, Any]) -> str:
+def _with(value: float | None, unit: str) -> str:
+    return output.show(value) if value is None else f"{output.show(value)} {unit}"
+
+
+def _budget(summary: Mapping[str, Any], unit: str) -> str:
     closes = summary.get("energy_budget_closes")
-    residual = output.show(summary.get("energy_budget_residual"))
+    residual = _with(summary.get("energy_budget_residual"), unit)
     if closes is None:
         return f"residual {residual}"
     return f"{'closes' if closes else 'does not close'}, residual {residual}"

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 from mdnum.errors import InputError
@@ -18,11 +19,11 @@ if TYPE_CHECKING:
     from mdnum.audit.load import Loaded
     from mdnum.audit.subject import CalculatorSubject
     from mdnum.units import Units
+    from mdnum.workflow.audit_record import AuditRecord
 
-#: Checks in the order in which they are made.
-CHECKS = ("smoothness", "invariance", "forces", "curl", "state", "dynamics")
-_BOLTZMANN = 8.617333262e-5
-"""eV/K (CODATA 2018, exact)."""
+#: Checks in the order in which they are made: what tells most by a call first, and thresholds before those
+#: that may ask at them.
+CHECKS = ("invariance", "smoothness", "forces", "curl", "state", "dynamics")
 
 
 class AuditStopped(KeyboardInterrupt):
@@ -58,93 +59,107 @@ class AuditResult:
 
 
 def audit(
-    calculator: str | Callable[[], Any],
+    calculator: str | Callable[[], Any] | None = None,
     structure: Atoms | str | Path | None = None,
     *,
     checks: str | Sequence[str] | None = None,
     temperature: float | None = None,
     timestep: float | None = None,
     steps: int | None = None,
+    time: float | None = None,
     out: str | Path | None = None,
+    resume: str | Path | None = None,
     report: bool = True,
     progress: Progress | None = None,
 ) -> AuditResult:
     """Ask a calculator whether it is safe to run and to differentiate.
 
+    How much is asked is counted in calls of the calculator and does not depend on how fast it answers: some
+    6,000 calls for one element. Whatever ends an audit, the checks that were done are in its folder.
+
     Args:
-        calculator: as the command line names one, or a function that makes a new ASE calculator.
+        calculator: as the command line names one, or a function that makes a new ASE calculator; may be left
+            out where an audit of one that was named in words is resumed. The Python that it names is run.
         structure: ASE's atoms or a file that ASE reads; by default what comes with the calculator, or one
             that is built for it.
         checks: words of `CHECKS`; default all.
         temperature: K, of kT and of the run; default the system's own, or 300.
         timestep: of the run, fs (τ of a system in reduced units); default a fraction of the fastest
             vibration.
-        steps: of the run; default as many as take half a minute, 400 at most.
+        steps: of the run; default 200.
+        time: minutes, after which nothing more is asked; what was not asked by then is told, and can be
+            resumed.
         out: the new audit folder; default runs/audit-<name>-<n>.
+        resume: the folder of an audit that was killed, stopped or short of time: the checks that it holds are
+            kept, the others are made as it was asked for.
         report: write report.html.
         progress: called now and then with what is done, of how much, and a dictionary of figures.
 
     Raises:
-        InputError: no such calculator, structure or check.
+        InputError: no such calculator, structure or check; something that a resumed audit has already.
         FolderError: the folder cannot be used.
         AuditStopped: a KeyboardInterrupt came after a check was done; what was found till then has been
             written, its page included, and is the exception's `result`.
     """
-    from mdnum.audit.verdict import judge
-    from mdnum.provenance import surroundings
-    from mdnum.store import RunFolder
-    from mdnum.store.naming import default_folder
+    from mdnum.audit.base import TIME_UP, TimeUp
+    from mdnum.deadline import Deadline
     from mdnum.workflow import audit_record
 
-    began = time.perf_counter()
-    wanted = _wanted(checks)
-    loaded = _loaded(calculator)
-    asked = _structure(structure, loaded)
-    folder = RunFolder.create(default_folder(f"audit-{loaded.stem}") if out is None else out, world="audit")
+    deadline = Deadline(time)
+    if resume is None:
+        if calculator is None:
+            raise InputError("no calculator is named", remedy="Name one, or resume an audit")
+        loaded = _loaded(calculator)
+        _internal(timestep, loaded.units)
+        question = {
+            "checks": list(_wanted(checks)), "temperature": temperature, "timestep": timestep, "steps": steps,
+        }  # fmt: skip
+        record = audit_record.begin(
+            loaded, out, _structure(structure, loaded), question, words=isinstance(calculator, str)
+        )
+    else:
+        given = {
+            "structure": structure, "checks": checks, "temperature": temperature, "timestep": timestep,
+            "steps": steps, "out": out,
+        }  # fmt: skip
+        if words := [word for word, value in given.items() if value is not None]:
+            raise InputError(
+                f"an audit is resumed as it was asked for, and {words[0]} is given",
+                remedy=f"Leave out {', '.join(words)}, or begin another audit",
+            )
+        record = audit_record.open_again(resume, calculator, _loaded)
+    folder, during, why = record.folder, None, ""
     try:
-        subject = _subject(loaded, asked, temperature, folder.path)
-        folder.write_provenance(surroundings() | {"calculator": loaded.name})
-        audit_record.write_structures(folder.path, {"structure": subject.atoms})
+        subject = _subject(record)
+        subject.meter.deadline = deadline
         told = Log(folder, progress)
-        parts: list[Part] = []
-        pairs: dict[str, Atoms] = {}
-        during = None
-        for check in _checks(wanted, subject, timestep, steps):
+        for check in _checks(record, subject):
             told(0, 0, {"phase": check.name})
             try:
                 part = _in_units(_ask(check, subject, told), subject.units)
             except KeyboardInterrupt:
-                if not parts:
+                if not record.parts:
                     raise
-                during = check.name
+                during, why = check.name, "stopped"
                 break
-            parts.append(part)
-            pairs |= getattr(check, "structures", {})
-            tables: Mapping[str, Any] = getattr(check, "recorded", {})
-            for name, columns in tables.items():
-                folder.append(name, columns)
-        audit_record.write_parts(folder, parts)
-        audit_record.write_structures(folder.path, pairs)
-        if pairs:
-            names = [name.removesuffix("-before") for name in pairs if name.endswith("-before")]
-            (folder.path / audit_record.SCRIPT).write_text(
-                audit_record.script(loaded.name, names), encoding="utf-8"
-            )
+            except TimeUp:
+                during, why = check.name, TIME_UP
+                if record.cut is not None and record.cut.name == check.name:
+                    record.add(record.cut, check, subject, whole=False)
+                break
+            cut = any(reason == TIME_UP for _, reason in part.skipped)
+            record.add(part, check, subject, whole=not cut)
+            if cut:
+                during, why = check.name, TIME_UP
+                break
         folder.finalize()
-        units = (subject.units.length, subject.units.energy)
-        summary = audit_record.summarize(
-            loaded.name, subject.atoms, subject.kT, units, parts, judge(loaded.name, parts)
-        )
-        summary |= {"structure": asked.info.get("origin"), "seconds": time.perf_counter() - began}
-        if during is not None:
-            audit_record.stop(summary, during, wanted)
-        folder.write_summary(summary)
+        record.write(during, why)
     except BaseException:
         folder.close()
         raise
-    found = {part.name: part for part in parts}
+    found = {part.name: part for part in record.parts}
     result = AuditResult(folder.path, found, finish(folder, report, progress))
-    if during is not None:
+    if why == "stopped":
         raise AuditStopped(result)
     return result
 
@@ -196,40 +211,38 @@ def _structure(structure: Atoms | str | Path | None, loaded: Loaded) -> Atoms:
     return found
 
 
-def _subject(loaded: Loaded, atoms: Atoms, temperature: float | None, folder: Path) -> CalculatorSubject:
+def _subject(record: AuditRecord) -> CalculatorSubject:
     from mdnum.audit.subject import CalculatorSubject
 
-    kT = 300.0 * _BOLTZMANN if loaded.kT is None else loaded.kT
-    if temperature is not None:
-        kT = temperature * loaded.units.k_B
+    loaded, folder = record.loaded, record.folder.path / "structures"
     return CalculatorSubject(
-        loaded.name, loaded.make, atoms, kT=kT, folder=folder / "structures", units=loaded.units
+        loaded.name, loaded.make, record.atoms, kT=record.kT, folder=folder, units=loaded.units
     )
 
 
-def _checks(
-    wanted: Sequence[str], subject: CalculatorSubject, timestep: float | None, steps: int | None
-) -> Iterator[Check]:
-    """The checks asked for, in their order."""
+def _checks(record: AuditRecord, subject: CalculatorSubject) -> list[Check]:
+    """The checks that are asked for and not done, in their order."""
     from mdnum.audit.curl import Curl
     from mdnum.audit.dynamics import Dynamics
     from mdnum.audit.forces import Forces
     from mdnum.audit.invariance import Invariance
     from mdnum.audit.smoothness import Smoothness
     from mdnum.audit.state import State
-    from mdnum.audit.thresholds import find_thresholds
 
+    steps, timestep = record.question["steps"], _internal(record.question["timestep"], subject.units)
     made: dict[str, Callable[[], Check]] = {
         "smoothness": Smoothness,
         "invariance": Invariance,
         "forces": Forces,
         "curl": Curl,
-        "state": lambda: State(find_thresholds),
-        "dynamics": lambda: Dynamics(find_thresholds, _internal(timestep, subject), steps),
+        "state": lambda: State(record.thresholds),
+        "dynamics": lambda: Dynamics(record.thresholds, timestep, steps),
     }
-    for name in wanted:
-        if name in made:
-            yield made[name]()
+    return [made[name]() for name in record.left]
+
+
+#: A unit of a system with dimensions where text has one: not in the name of a file.
+_UNIT = re.compile(r"(?<![\w./])(m?)eV(?![A-Za-z0-9_]|\.\w)|Å(?![A-Za-z0-9_])")
 
 
 def _in_units(part: Part, units: Units) -> Part:
@@ -237,15 +250,25 @@ def _in_units(part: Part, units: Units) -> Part:
     if units.energy == "eV":
         return part
 
+    def unit(found: re.Match[str]) -> str:
+        return units.length if found[0] == "Å" else f"{found[1]}{units.energy}"
+
     def told(value: Any) -> Any:
         if isinstance(value, str):
-            return value.replace("eV", units.energy).replace("Å", units.length)
+            return _UNIT.sub(unit, value)
         if isinstance(value, Mapping):
             return {told(key): told(item) for key, item in value.items()}
         return [told(item) for item in value] if isinstance(value, list | tuple) else value
 
     curves = [
-        replace(one, title=told(one.title), x_label=told(one.x_label), y_label=told(one.y_label))
+        replace(
+            one,
+            title=told(one.title),
+            x_label=told(one.x_label),
+            y_label=told(one.y_label),
+            lines=told(one.lines),
+            marks=told(one.marks),
+        )
         for one in part.curves
     ]
     return replace(
@@ -254,17 +277,16 @@ def _in_units(part: Part, units: Units) -> Part:
         findings=told(list(part.findings)),
         tables=told(part.tables),
         curves=curves,
-        skipped=[(told(what), why) for what, why in part.skipped],
+        skipped=[(told(what), told(why)) for what, why in part.skipped],
     )
 
 
-def _internal(timestep: float | None, subject: CalculatorSubject) -> float | None:
+def _internal(timestep: float | None, units: Units) -> float | None:
     """A time step in length * sqrt(mass / energy), of one in fs, or in τ for reduced units."""
     if timestep is None:
         return None
     if not timestep > 0:
         raise InputError(f"a time step of {timestep:g}; expected one above 0", remedy="Correct --timestep")
-    units = subject.units
     return timestep * units.time_factor / (1000.0 if units.time == "ps" else 1.0)
 
 
@@ -274,7 +296,7 @@ def _ask(check: Check, subject: CalculatorSubject, told: Log) -> Part:
     from mdnum.audit.subject import CalculatorError
     from mdnum.references.findings import finding
 
-    began = time.perf_counter()
+    began = perf_counter()
     try:
         return check(subject, told)
     except CalculatorError as error:
@@ -292,5 +314,5 @@ def _ask(check: Check, subject: CalculatorSubject, told: Log) -> Part:
             f"The calculator failed: it {error.message}.",
             findings=[failed],
             skipped=[(f"the rest of {check.name}", error.message)],
-            seconds=time.perf_counter() - began,
+            seconds=perf_counter() - began,
         )

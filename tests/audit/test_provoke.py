@@ -15,7 +15,7 @@ PAIR = Pair(("Ar", "Ar"), laws.Atoms("Ar"), laws.Atoms("Ar"), 0.0, False, "Ar-Ar
 
 
 def crowded(make):
-    (found,) = crowd(subject(make), most=NEIGHBORS, seconds=30.0)
+    (found,) = crowd(subject(make), most=NEIGHBORS)
     return found
 
 

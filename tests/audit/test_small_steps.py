@@ -112,7 +112,7 @@ def test_pairs_that_were_not_walked_are_named(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(thresholds, "pairs", lambda subject: found(subject, most=1))
     grid = np.stack(np.unravel_index(np.arange(12), (3, 2, 2)), axis=1) * 3.6
     mixed = laws.Atoms("ArKrArArKrArArKrArArKrAr", grid)
-    part = Smoothness(seconds=0.3, neighbors=8)(subject(lambda: Pairwise(laws.soft), mixed))
+    part = Smoothness(neighbors=8, routes=0)(subject(lambda: Pairwise(laws.soft), mixed))
     assert part.numbers["pairs_not_walked"] == ["Ar-Kr", "Kr-Kr"]
     assert "Walking 1 of 3 pairs of species" in part.says and "Not walked: Ar-Kr, Kr-Kr." in part.says
     assert {"pair Ar-Kr", "pair Kr-Kr"} <= {what for what, _ in part.skipped}
@@ -156,10 +156,15 @@ def test_a_switch_over_a_short_way_is_steep(onset: float, steep: bool, monkeypat
     assert codes(walk, asked) == ({"STEEP_SWITCH": "warning"} if steep else {})
 
 
-def test_a_crowd_has_neighbors_however_slow(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(provoke, "_cost", lambda *asked: 1e3)
+def test_a_crowd_that_is_refused_is_made_smaller():
+    class Few(Pairwise):
+        def calculate(self, atoms=None, properties=None, system_changes=("positions",)):
+            if atoms is not None and len(atoms) > 6 and not atoms.pbc.any():
+                raise ValueError("too many atoms")
+            super().calculate(atoms, properties, system_changes)
+
     grid = np.stack(np.unravel_index(np.arange(8), (2, 2, 2)), axis=1) * 3.6
-    (found,) = provoke.crowd(subject(lambda: Pairwise(laws.soft), laws.Atoms("Ar8", grid)), most=8)
+    (found,) = provoke.crowd(subject(lambda: Few(laws.soft), laws.Atoms("Ar8", grid)), most=8)
     assert found.neighbors == 4 and found.kept is None
 
 
@@ -181,13 +186,12 @@ class Residue(Pairwise):
         self.results["forces"][-1, 0] += 2e-17
 
 
-def test_a_crossing_that_takes_too_long_is_told(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(environments, "_cost", lambda *asked: 1.0)
+def test_crossings_beyond_the_number_that_is_measured_are_told():
     grid = np.stack(np.unravel_index(np.arange(8), (2, 2, 2)), axis=1) * 3.6
     asked = CalculatorSubject("planted", lambda: Pairwise(laws.hard), laws.Atoms("Ar8", grid), kT=laws.KT)
-    around = environments.walk_surroundings(asked, seconds=8.0)
-    assert around.measured == 0
-    assert any("more crossing" in what and why == "a lack of time" for what, why in around.skipped)
+    around = environments.walk_surroundings(asked, crossings=1, routes=0)
+    assert (around.measured, around.asked) == (1, around.possible)
+    assert ("1 more crossings of known thresholds", "1 were measured") in around.skipped
 
 
 class OnFirstLine(Pairwise):

@@ -36,7 +36,7 @@ def codes(part) -> dict[str, str]:
 
 def test_a_crossing_among_others_is_measured_to_the_last_bit():
     """Of a pair law, the jump among others is that of the two alone."""
-    around = walk_surroundings(subject(lambda: Pairwise(laws.hard), cluster()), seconds=2.0)
+    around = walk_surroundings(subject(lambda: Pairwise(laws.hard), cluster()))
     measured = [one for one in around.events if one.threshold is not None]
     assert measured
     for event in measured:
@@ -51,7 +51,7 @@ def test_what_depends_on_three_is_found_where_two_show_nothing():
     """A constant for each angle with two short sides: invisible to two atoms, a jump for three."""
     asked = subject(lambda: laws.Angles(laws.soft), cluster())
     assert [one.radius for one in find_thresholds(asked)] == [pytest.approx(R_CUT, rel=0.01)]
-    part = Smoothness(seconds=2.0, neighbors=8)(asked)
+    part = Smoothness(neighbors=8)(asked)
     assert codes(part)["JUMP_AMONG_MANY"] == "error"
     assert part.numbers["unexplained"] > 0
 
@@ -79,7 +79,7 @@ def test_crossings_on_a_route_are_those_of_a_fine_scan():
 
 
 def test_what_is_said_of_a_hard_cutoff():
-    part = Smoothness(seconds=0.3, neighbors=8)(subject(lambda: Pairwise(laws.hard), cluster()))
+    part = Smoothness(neighbors=8, routes=0)(subject(lambda: Pairwise(laws.hard), cluster()))
     assert codes(part) == {"ENERGY_JUMP": "error"}
     (found,) = part.findings
     assert repr(float(np.nextafter(R_CUT, 0.0))) in found["text"]
@@ -92,7 +92,7 @@ def test_what_is_said_of_a_hard_cutoff():
 @pytest.mark.slow
 def test_what_is_said_of_a_shift_and_of_switches():
     said = {
-        name: codes(Smoothness(seconds=0.3, neighbors=8)(subject(lambda law=law: Pairwise(law), cluster())))
+        name: codes(Smoothness(neighbors=8, routes=0)(subject(lambda law=law: Pairwise(law), cluster())))
         for name, law in {
             "shifted": laws.shifted, "once": laws.switched(1), "twice": laws.switched(2),
         }.items()

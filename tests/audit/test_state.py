@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 import pytest
 from ase import Atoms
@@ -172,22 +170,6 @@ def test_sequences_go_through_what_they_say():
     np.testing.assert_allclose(steps, 0.04, rtol=1e-9)
     boxes = [asked.atoms for asked in state.wrapping(crystal(), rng)]
     assert np.ptp(boxes[1].get_scaled_positions(wrap=False)) > 1
-
-
-def test_a_slow_calculator_is_asked_in_every_sequence(monkeypatch):
-    """Each sequence has its share of the time: fewer answers are compared, and that is told."""
-
-    class Slow(planted.Good):
-        def __init__(self):
-            super().__init__()
-            time.sleep(0.02)
-
-    monkeypatch.setattr(state, "_SECONDS", 0.8)
-    part = State()(subject(Slow, chain()))
-    asked = {row["sequence"] for row in part.tables["One object, asked again and again, beside new ones"]}
-    assert asked == {"sizes", "a slow drift", "two atoms head on"}
-    assert any(what.endswith("questions of the sequence “sizes”") for what, _ in part.skipped)
-    assert not any(what.startswith("the sequence") for what, _ in part.skipped)
 
 
 def test_failing_on_an_atom_without_neighbors_is_found_where_the_cluster_has_one_too():

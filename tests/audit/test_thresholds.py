@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from fractions import Fraction
 
 import numpy as np
@@ -45,15 +44,11 @@ def test_a_decision_on_squares_is_located_where_the_squares_differ():
     assert np.nextafter(found.inside, 9.0) == found.outside
 
 
-def test_a_walk_that_takes_long_is_made_in_wider_steps():
-    def slow(r: float) -> tuple[float, float]:
-        time.sleep(0.001)
-        return laws.hard(r)
-
-    asked = pair_subject(slow)
-    (pair,) = (one.pair for one in walk_pairs(pair_subject(laws.hard)).walks)
-    found = walk(asked, pair, seconds=0.2)
-    assert np.diff(found.distance)[-1] == pytest.approx(0.08, rel=0.05)
+def test_a_walk_of_few_calls_looks_at_what_stands_out_most():
+    asked = pair_subject(laws.hard)
+    (pair,) = (one.pair for one in walk_pairs(asked).walks)
+    found = walk(asked, pair, calls=1)
+    assert np.diff(found.distance)[-1] == pytest.approx(STEP, rel=0.05)
     assert [one.radius for one in found.thresholds] == [R_CUT] and found.calls < 1000
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from mdnum.audit.causes import grouped
 from mdnum.ball.demos.base import Plot, Series
 from mdnum.report.fork.findings import Verdict
 from mdnum.report.fork.question import Question, declared, load, verdict, write_page
@@ -37,15 +38,17 @@ def write_report(folder: RunFolder | str | Path) -> Path:
         for curve in part["curves"]
         if (plot := _plot(run, curve)) is not None
     }
+    judged = judge(run)
     return write_page(
         folder,
         run,
-        judge(run),
+        judged,
         "audit/run.html.j2",
         drawn,
         captions={curve["name"]: curve["title"] for part in run.summary["parts"] for curve in part["curves"]},
         figures=list(_key_figures(run)),
         parts=[_part(part) for part in run.summary["parts"]],
+        groups=_groups(judged.findings),
         what=list(_what(run)),
         reproduce=_script(folder.path),
     )
@@ -74,22 +77,25 @@ def _typeset(one: Finding) -> Finding:
     return replace(one, title=typeset(one.title), text=typeset(one.text), remedy=typeset(one.remedy))
 
 
+def _groups(findings: Sequence[Finding]) -> list[tuple[Finding, list[Finding]]]:
+    """Findings that stand by themselves, each with what may be of the same cause."""
+    return grouped(findings, [(one.code, one.severity) for one in findings])
+
+
 def _key_figures(run: Question) -> Iterator[tuple[str, str, str]]:
     """(label, value, small print) of the strip below the verdict."""
     summary = run.summary
     yield "To run", summary["safe_to_run"], "a simulation with it"
     yield "To differentiate", summary["safe_to_differentiate"], "through it"
-    found = [one["severity"] for one in summary["findings"]]
-    yield (
-        "Findings",
-        count(found.count("error") + found.count("warning")),
-        many(found.count("error"), "error"),
-    )
+    alone = [one.severity for one, _ in _groups([restore(one) for one in summary["findings"]])]
+    errors = alone.count("error")
+    yield "Findings", count(errors + alone.count("warning")), many(errors, "error")
     numbers = {part["name"]: part["numbers"] for part in summary["parts"]}
     if "dynamics" in numbers and numbers["dynamics"].get("drift") is not None:
-        yield "Drift", number(numbers["dynamics"]["drift"], 2, signed=True), "meV/atom/ps"
+        yield "Drift", number(numbers["dynamics"]["drift"], 2, signed=True), numbers["dynamics"]["drift_unit"]
     if "forces" in numbers and "largest_difference" in numbers["forces"]:
-        yield "Forces", number(numbers["forces"]["largest_difference"], 1), "from differences, eV/Å"
+        force = f"{summary['units']['energy']}/{summary['units']['length']}"
+        yield "Forces", number(numbers["forces"]["largest_difference"], 1), f"from differences, {force}"
     if "invariance" in numbers and "told_apart" in numbers["invariance"]:
         one = numbers["invariance"]
         yield "Told apart", f"{count(one['told_apart'])} of {count(one['ways'])}", "ways to write it down"
@@ -103,8 +109,19 @@ def _part(part: Mapping[str, Any]) -> dict[str, Any]:
         "curves": [curve["name"] for curve in part["curves"]],
         "tables": [_table(title, rows) for title, rows in part["tables"].items() if rows],
         "skipped": [(heading(one["what"]), one["why"]) for one in part["skipped"]],
-        "seconds": number(part["seconds"], 2),
+        "ways": _ways(part),
     }
+
+
+def _ways(part: Mapping[str, Any]) -> str:
+    asked, possible = part.get("asked"), part.get("possible")
+    if asked is None or possible is None:  # a folder from before they were counted
+        return ""
+    return (
+        f"{many(asked, 'way')} asked"
+        if asked == possible
+        else f"{count(asked)} of {count(possible)} ways asked"
+    )
 
 
 def _table(title: str, rows: list[Mapping[str, Any]]) -> dict[str, Any]:
