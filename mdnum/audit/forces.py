@@ -13,7 +13,8 @@ from jaxtyping import Float
 
 from mdnum.audit.base import Curve, Part, Progress, Subject
 from mdnum.audit.digits import precision
-from mdnum.audit.noise import FEW, Noise, direction, displaced, of_all_kinds, settled
+from mdnum.audit.noise import FEW, Noise, direction, displaced, of_all_kinds, settled, steps
+from mdnum.audit.two_energies import two_energies
 from mdnum.references.findings import finding
 
 #: Å; each step of the ladder is a quarter of the one before: 0.064 Å down to 1e-6 Å.
@@ -22,6 +23,9 @@ _LADDER = 0.064 * 0.25 ** np.arange(9)
 _SIGNIFICANT = 10.0
 #: Of the root mean square force: below, a disagreement is one of tables or precision.
 _SMALL = 1e-4
+#: Of the root mean square force: noise above a tenth of it leaves nothing to be said of forces, and above the
+#: other is more than single precision explains.
+_DROWNED, _LOUD = 0.1, 1e-3
 _DIRECTIONS, _ATOMS = 3, 4
 #: Directions that are looked at however slow the calculator is, and seconds after which no more are.
 _FEWEST, _SECONDS = 3, 20.0
@@ -93,16 +97,23 @@ class Forces:
             found[place] = slope(worker, atoms, line, forces, noise, what)
         slopes = [found[place] for place in sorted(found)]
         sums = list(_sums(atoms, forces, noise))
+        drowned = _drowned(slopes, noise, scale, steps(worker, atoms).force)
+        first = min(found)
         told = [
+            *drowned,
             *_judged(slopes, scale),
             *_judged_sums(sums, scale),
-            *precision(worker, atoms, noise, np.random.default_rng(self.seed)),
+            *precision(worker, atoms, noise),
+            *two_energies(
+                worker, atoms, noise, wanted[first][1],
+                found[first].difference - found[first].force, found[first].error,
+            ),
         ]
         worst = max(slopes, key=lambda one: abs(one.difference - one.force) / one.error)
         return Part(
             name=self.name,
             title="Forces",
-            says=_says(slopes, worst, scale),
+            says=_says(slopes, worst, scale, bool(drowned)),
             findings=told,
             tables={
                 "Derivative of the energy along a direction": [_row(one) for one in slopes],
@@ -117,6 +128,7 @@ class Forces:
                 "rms_force": scale,
                 "step": worst.step,
                 "noise_energy": noise.energy,
+                "noise_force": noise.force,
             },
             skipped=skipped,
             seconds=time.perf_counter() - began,
@@ -227,6 +239,38 @@ def _sums(atoms: Atoms, forces: Float[np.ndarray, "atoms 3"], noise: Noise) -> I
         }
 
 
+def _drowned(slopes: list[Slope], noise: Noise, scale: float, step: float) -> list[dict[str, str]]:
+    """A finding where forces, or what differences can tell of them, are lost in noise that is no rounding.
+
+    Args:
+        slopes: of the energy.
+        noise: of the answers.
+        scale: root mean square of the forces, eV/Å.
+        step: in which forces go, eV/Å, which is another finding.
+    """
+    # of directions in which one atom moves: what is known of one force
+    single = [one.error for one in slopes if not one.what.startswith("all")]
+    known = float(np.median(single)) if single else 0.0
+    size = max(noise.force, known)
+    if size <= max(_DROWNED * scale, step):
+        size = noise.typical
+    if not scale or size <= max(_LOUD * scale, step):
+        return []
+    return [
+        finding(
+            "NOISE_FLOOR",
+            "error" if size > _DROWNED * scale else "warning",
+            "answers scatter by a large part of the forces",
+            f"Along a line of less than a thousandth of an Å forces scatter by up to {noise.force:.2g} eV/Å "
+            f"and the energy by {noise.energy:.2g} eV, at a root mean square force of {scale:.2g} eV/Å; "
+            f"differences of the energy tell the force on an atom to within {known:.2g} eV/Å. What is smaller "
+            "than that, no check here has seen.",
+            "Look first at whether the same question has the same answer twice; then at terms that are drawn "
+            "at random, solved for with a loose tolerance, or summed in a narrow format.",
+        )
+    ]
+
+
 def _judged(slopes: list[Slope], scale: float) -> Iterator[dict[str, str]]:
     steps = [one for one in slopes if one.jump]
     if steps:
@@ -286,7 +330,7 @@ def _row(one: Slope) -> dict[str, Any]:
     }
 
 
-def _says(slopes: list[Slope], worst: Slope, scale: float) -> str:
+def _says(slopes: list[Slope], worst: Slope, scale: float, drowned: bool) -> str:
     wrong = sum(not one.agrees for one in slopes)
     if wrong:
         return (
@@ -294,6 +338,12 @@ def _says(slopes: list[Slope], worst: Slope, scale: float) -> str:
             "to "
             f"{max(abs(one.difference - one.force) for one in slopes):.2g} eV/Å apart, at a root mean square "
             f"force of {scale:.3g} eV/Å."
+        )
+    if drowned:
+        return (
+            f"Along {len(slopes)} directions noise hides whether the forces are the derivative of the energy: "
+            f"the differences can tell to within {max(one.error for one in slopes):.1g} eV/Å, at a root mean "
+            f"square force of {scale:.3g} eV/Å."
         )
     return (
         f"Along {len(slopes)} directions the forces are the derivative of the energy to within "

@@ -134,7 +134,14 @@ def walk_pairs(subject: Subject, progress: Progress | None = None) -> PairWalks:
             except CalculatorError as error:
                 skipped.append((f"pair {pair.name}", error.message))
         _known[subject] = PairWalks(tuple(walks), tuple(skipped), _not_walked(subject, walks))
+        getattr(subject, "known", {})["walks"] = _known[subject]
     return _known[subject]
+
+
+def known_walks(subject: Subject) -> tuple[PairWalk, ...]:
+    """Walks of pairs that were made for an earlier question; none where none was."""
+    found = getattr(subject, "known", {}).get("walks")
+    return found.walks if found else ()
 
 
 def _not_walked(subject: Subject, walks: Sequence[PairWalk]) -> tuple[str, ...]:
