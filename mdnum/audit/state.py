@@ -358,7 +358,8 @@ class _Through:
             failed = failed and (isinstance(new, Refusal) or was_broken)
             row: dict[str, Any] = {
                 "sequence": self._word, "structure": asked.what, "before": previous, "atoms": asked.atoms,
-                "energy": 0.0, "force": 0.0, "allowed": 0.0, "remembers": False, "refused": None, "old": old,
+                "energy": 0.0, "force": 0.0, "allowed": 0.0, "remembers": False, "refused": None,
+                "old": old, "new": new,
                 "broken": was_broken and isinstance(old, Refusal),
             }  # fmt: skip
             if isinstance(new, Refusal):
@@ -405,8 +406,15 @@ def _again(subject: Subject, sequences: Mapping[str, list[Asked]], stale: list[d
     if isinstance(answer, Refusal) or isinstance(worst["old"], Refusal):
         return isinstance(answer, Refusal) and isinstance(worst["old"], Refusal)
     assert answer is not None
-    force = float(np.max(np.abs(answer.forces - worst["old"].forces), initial=0.0))
-    return force <= 0.5 * worst["force"] and abs(answer.energy - worst["old"].energy) <= 0.5 * worst["energy"]
+    new = ask(subject.fresh(), worst["atoms"])
+    if isinstance(new, Refusal):
+        return False
+    # both must come again: what objects in use say, and what new ones do
+    for found, before in ((answer, worst["old"]), (new, worst["new"])):
+        force = float(np.max(np.abs(found.forces - before.forces), initial=0.0))
+        if force > 0.5 * worst["force"] or abs(found.energy - before.energy) > 0.5 * worst["energy"]:
+            return False
+    return True
 
 
 def _repeated(subject: Subject, atoms: Atoms) -> dict[str, Any]:
@@ -479,20 +487,39 @@ def _unsteady(repeats: Mapping[str, Any], kT: float) -> Iterator[dict[str, str]]
 
 
 def _tolerance(subject: Subject, atoms: Atoms, rng: np.random.Generator) -> float:
-    """Å by which all atoms can be moved while one object's answer stays to the last bit; 0 if by nothing.
+    """Å by which atoms, or cell edges, can change while one object's answer stays to the last bit; 0 if none.
 
     Only where the answer ought to have changed by many of its last digits: what it changes by over the longest
     of the moves, in proportion.
     """
+    line = direction(len(atoms), rng)
+    ways: list[tuple[np.ndarray, Callable[[float], Atoms]]] = [
+        (_TINY, lambda place: displaced(atoms, place * line))
+    ]
+    if atoms.pbc.any():
+        edge = float(np.max(atoms.cell.lengths()))
+
+        def stretched(place: float) -> Atoms:
+            there = atoms.copy()
+            there.set_cell((1 + place / edge) * atoms.cell.array)
+            return there
+
+        ways.append((_TINY[::2], stretched))
+    return max(_kept_within(subject, sizes, at) for sizes, at in ways)
+
+
+def _kept_within(subject: Subject, sizes: np.ndarray, at: Callable[[float], Atoms]) -> float:
+    """The longest of some moves, one after the other, after which one object has given its last answer again."""
     used = subject.fresh()
     if isinstance(used, CalculatorSubject):
         used.forgets = False
-    line = direction(len(atoms), rng)
-    places = np.array([0.0, *np.cumsum(_TINY)])
+    places = np.array([0.0, *np.cumsum(sizes)])
     answers = []
     for place in places:
-        there = displaced(atoms, place * line)
-        answers.append(np.append(used.forces(there), used.energy(there)))
+        found = ask(used, at(place))
+        if isinstance(found, Refusal):
+            return 0.0
+        answers.append(np.append(found.forces, found.energy))
     values = np.array(answers)
     rate = np.abs(values[-1] - values[0]) / places[-1]
     read = digits(values[:, :-1])
@@ -500,7 +527,7 @@ def _tolerance(subject: Subject, atoms: Atoms, rng: np.random.Generator) -> floa
     last[-1] = np.inf  # forces are the finer measure
     kept = [
         moved
-        for moved, before, after in zip(_TINY, values, values[1:], strict=False)
+        for moved, before, after in zip(sizes, values, values[1:], strict=False)
         if (before == after).all() and (rate * moved > _KEPT * last)[last > 0].any()
     ]
     return float(max(kept, default=0.0))
@@ -512,7 +539,7 @@ def _kept(tolerance: float) -> Iterator[dict[str, str]]:
             "KEPT_ANSWER",
             "error" if tolerance > _HARMLESS else "warning",
             "the answer to another structure is given again",
-            f"Every atom moved by up to {tolerance:.0e} Å, and the object gave the energy and forces that it "
+            f"All atoms, or the cell, moved by up to {tolerance:.0e} Å, and the object gave the energy and forces that it "
             "had given before, to the last bit, where they ought to have changed by more than a hundred times "
             "that. Slow atoms, differences and relaxations see old forces.",
             "Compare positions, cell, species and periods bit by bit before an answer is given again, not "
