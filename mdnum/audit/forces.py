@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from mdnum.audit.base import Curve, Part, Progress, Subject
 from mdnum.audit.digits import precision
-from mdnum.audit.noise import FEW, Noise, direction, displaced, of_all_kinds, settled, steps
+from mdnum.audit.noise import FEW, Noise, Steps, direction, displaced, of_all_kinds, settled, steps
 from mdnum.audit.two_energies import two_energies
 from mdnum.references.findings import finding
 
@@ -97,13 +97,13 @@ class Forces:
             found[place] = slope(worker, atoms, line, forces, noise, what)
         slopes = [found[place] for place in sorted(found)]
         sums = list(_sums(atoms, forces, noise))
-        drowned = _drowned(slopes, noise, scale, steps(worker, atoms).force)
+        drowned = _drowned(slopes, noise, scale, steps(worker, atoms))
         first = min(found)
         told = [
             *drowned,
             *_judged(slopes, scale),
             *_judged_sums(sums, scale),
-            *precision(worker, atoms, noise),
+            *([] if drowned else precision(worker, atoms, noise)),
             *two_energies(
                 worker, atoms, noise, wanted[first][1],
                 found[first].difference - found[first].force, found[first].error,
@@ -113,7 +113,7 @@ class Forces:
         return Part(
             name=self.name,
             title="Forces",
-            says=_says(slopes, worst, scale, bool(drowned)),
+            says=_says(slopes, worst, scale, _known(slopes) > _DROWNED * scale),
             findings=told,
             tables={
                 "Derivative of the energy along a direction": [_row(one) for one in slopes],
@@ -239,22 +239,27 @@ def _sums(atoms: Atoms, forces: Float[np.ndarray, "atoms 3"], noise: Noise) -> I
         }
 
 
-def _drowned(slopes: list[Slope], noise: Noise, scale: float, step: float) -> list[dict[str, str]]:
+def _known(slopes: list[Slope]) -> float:
+    """To within what differences of the energy typically tell the force on one atom, eV/Å."""
+    # of directions in which one atom moves
+    single = [one.error for one in slopes if not one.what.startswith("all")]
+    return float(np.median(single)) if single else 0.0
+
+
+def _drowned(slopes: list[Slope], noise: Noise, scale: float, stairs: Steps) -> list[dict[str, str]]:
     """A finding where forces, or what differences can tell of them, are lost in noise that is no rounding.
 
     Args:
         slopes: of the energy.
         noise: of the answers.
         scale: root mean square of the forces, eV/Å.
-        step: in which forces go, eV/Å, which is another finding.
+        stairs: the steps in which answers go, which are another finding.
     """
-    # of directions in which one atom moves: what is known of one force
-    single = [one.error for one in slopes if not one.what.startswith("all")]
-    known = float(np.median(single)) if single else 0.0
-    size = max(noise.force, known)
-    if size <= max(_DROWNED * scale, step):
+    known = _known(slopes)
+    size = max(noise.force, 0.0 if stairs.energy else known)
+    if size <= max(_DROWNED * scale, stairs.force):
         size = noise.typical
-    if not scale or size <= max(_LOUD * scale, step):
+    if not scale or size <= max(_LOUD * scale, stairs.force):
         return []
     return [
         finding(

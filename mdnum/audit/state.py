@@ -17,7 +17,7 @@ from mdnum.audit.approaches import Asked, approaches
 from mdnum.audit.base import Part, Progress, Subject
 from mdnum.audit.digits import digits
 from mdnum.audit.ledger import Again
-from mdnum.audit.noise import FEW, Noise, direction, displaced, settled
+from mdnum.audit.noise import FEW, Noise, displaced, settled
 from mdnum.audit.subject import CalculatorError, CalculatorSubject, only_trying
 from mdnum.audit.threshold import Threshold
 from mdnum.audit.written import written
@@ -32,7 +32,7 @@ _AT_ONCE, _BETWEEN, _NEW = 6, 2, 6
 #: Of the root mean square force, and of kT: answers to one question that differ by more are no rounding.
 _LARGE = 1e-4
 _LARGE_ENERGY = 1e-3
-#: Å by which a structure is moved a little further each time.
+#: Å by which an atom is moved a little further each time.
 _TINY = 10.0 ** np.arange(-9, -1)
 #: An answer that should have changed by so many of its last digits, and has not at all, was kept.
 _KEPT = 100.0
@@ -93,7 +93,7 @@ class State:
                 questions = f"{through.left_out} questions of the sequence “{word}”"
                 late.append((questions, "new objects take long: the others were compared"))
         repeats = _repeated(subject, atoms)
-        tolerance = _tolerance(subject, atoms, rng)
+        tolerance = _tolerance(subject, atoms)
         lonely = alone(subject, atoms, noise)
         self.structures |= lonely.structures
         broken = [row for row in rows if row["remembers"] and row["broken"]]
@@ -463,8 +463,9 @@ def _unsteady(repeats: Mapping[str, Any], kT: float) -> Iterator[dict[str, str]]
     said += f"by {force:.2g} eV/Å, at a typical force of {repeats['typical force']:.2g} eV/Å."
     if chance:
         energy, force = max(energy, repeats["energies"]), max(force, repeats["forces"])
-        said = f"{chance} answers differ by up to {energy:.2g} eV and {force:.2g} eV/Å from those of other "
-        said += "objects to the same structures, and not when the same questions are asked again."
+        said = f"Answers of an object in use ({chance} of those compared) differ by up to {energy:.2g} eV and "
+        said += f"{force:.2g} eV/Å from those of new ones to the same structures, and do not when the same "
+        said += f"questions are asked again; a typical force is {repeats['typical force']:.2g} eV/Å."
     large = force > _LARGE * repeats["typical force"] or energy > _LARGE_ENERGY * kT
     yield finding(
         "NOT_REPEATABLE",
@@ -486,13 +487,15 @@ def _unsteady(repeats: Mapping[str, Any], kT: float) -> Iterator[dict[str, str]]
     )
 
 
-def _tolerance(subject: Subject, atoms: Atoms, rng: np.random.Generator) -> float:
-    """Å by which atoms, or cell edges, can change while one object's answer stays to the last bit; 0 if none.
+def _tolerance(subject: Subject, atoms: Atoms) -> float:
+    """Å by which an atom, or an edge of the cell, can move while one object's answer stays to the last bit; 0 if none.
 
     Only where the answer ought to have changed by many of its last digits: what it changes by over the longest
     of the moves, in proportion.
     """
-    line = direction(len(atoms), rng)
+    # one coordinate, the largest: a tolerance may be one of all atoms together, or a share of a coordinate
+    line = np.zeros((len(atoms), 3))
+    line.flat[np.argmax(np.abs(atoms.positions))] = 1.0
     ways: list[tuple[np.ndarray, Callable[[float], Atoms]]] = [
         (_TINY, lambda place: displaced(atoms, place * line))
     ]
@@ -539,7 +542,7 @@ def _kept(tolerance: float) -> Iterator[dict[str, str]]:
             "KEPT_ANSWER",
             "error" if tolerance > _HARMLESS else "warning",
             "the answer to another structure is given again",
-            f"All atoms, or the cell, moved by up to {tolerance:.0e} Å, and the object gave the energy and forces that it "
+            f"An atom, or the cell, moved by up to {tolerance:.0e} Å, and the object gave the energy and forces that it "
             "had given before, to the last bit, where they ought to have changed by more than a hundred times "
             "that. Slow atoms, differences and relaxations see old forces.",
             "Compare positions, cell, species and periods bit by bit before an answer is given again, not "
@@ -559,8 +562,12 @@ def _row(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _says(rows: list[dict[str, Any]], stale: list[dict[str, Any]], repeats: Mapping[str, Any]) -> str:
-    bits = "are" if repeats["bit-identical"] else "are not"
-    tail = f"Repeated calls {bits} bit-identical."
+    if not repeats["bit-identical"]:
+        tail = "Repeated calls are not bit-identical."
+    elif not repeats["bit-identical between objects"]:
+        tail = "Repeated calls are bit-identical, and those of new objects are not."
+    else:
+        tail = "Repeated calls are bit-identical."
     words = f"{len({row['sequence'] for row in rows})} sequences"
     if stale:
         sizes = [row["energy"] for row in stale if np.isfinite(row["energy"])]
@@ -568,5 +575,10 @@ def _says(rows: list[dict[str, Any]], stale: list[dict[str, Any]], repeats: Mapp
         return (
             f"{len(stale)} of {len(rows)} answers of an object in use differ from those of a new one, {by}: "
             f"the calculator remembers. {tail}"
+        )
+    if chance := repeats.get("by chance"):
+        return (
+            f"{chance} of {len(rows)} answers of an object in use differ from those of a new one by up to "
+            f"{repeats['energies']:.3g} eV, and not when they are asked for again: by chance. {tail}"
         )
     return f"Objects in use answered {len(rows)} questions of {words} as new ones do. {tail}"

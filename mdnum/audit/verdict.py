@@ -71,11 +71,12 @@ def _answer(question: str, parts: Sequence[Part]) -> Answer:
 
 def _headline(name: str, answers: Mapping[str, Answer], parts: Sequence[Part]) -> str:
     head = _said(name, answers["run"], answers["differentiate"])
+    found = [finding for part in parts for finding in part.findings]
     titles = [
         finding["title"]
         for severity in ("error", "warning")
-        for part in parts
-        for finding in part.findings
+        # where one question has two answers, no other finding of its severity is worth as much
+        for finding in sorted(found, key=lambda one: one["code"] != "NOT_REPEATABLE")
         if finding["severity"] == severity
     ]
     if not titles:
