@@ -103,7 +103,7 @@ class Forces:
             *drowned,
             *_judged(slopes, scale),
             *_judged_sums(sums, scale),
-            *([] if drowned else precision(worker, atoms, noise)),
+            *([] if any(one["severity"] == "error" for one in drowned) else precision(worker, atoms, noise)),
             *two_energies(
                 worker, atoms, noise, wanted[first][1],
                 found[first].difference - found[first].force, found[first].error,
@@ -264,7 +264,8 @@ def _drowned(slopes: list[Slope], noise: Noise, scale: float, stairs: Steps) -> 
     return [
         finding(
             "NOISE_FLOOR",
-            "error" if size > _DROWNED * scale else "warning",
+            # forces that are known well are not tested where the energy is not
+            "error" if max(noise.force, noise.typical) > _DROWNED * scale else "warning",
             "answers scatter by a large part of the forces",
             f"Along a line of less than a thousandth of an Å forces scatter by up to {noise.force:.2g} eV/Å "
             f"and the energy by {noise.energy:.2g} eV, at a root mean square force of {scale:.2g} eV/Å; "

@@ -130,6 +130,11 @@ def steps(subject: Subject, atoms: Atoms) -> Steps:
     climbs = np.abs(np.diff(energies)[moved])
     stays = (climbs == 0).sum() >= _STAYS and climbs.any()
     energy = float(np.median(climbs[climbs > 0])) if stays else 0.0
+    if not np.ptp(energies):
+        # as large as what the forces say it should have changed by, at least
+        along = forces @ line.ravel()
+        work = spacing * np.cumsum(0.5 * (along[1:] + along[:-1]))
+        energy = float(np.ptp(np.append(work, 0.0)))
     length = (_STEP_POINTS - 1) * spacing
     known[key] = Steps(energy, force, share, length, energies, forces)
     return known[key]

@@ -23,6 +23,8 @@ _SMALL = 1e-6
 _LARGE = 1e-3
 #: Å to either side, for the derivative of their difference.
 _STEP = 1e-3
+#: Of such a derivative: its error, roughly.
+_CENTRAL = 1e-3
 #: How far off a derivative may be, in units of its error, as in `mdnum.audit.forces`.
 _SIGNIFICANT = 10.0
 
@@ -107,7 +109,8 @@ def _jumps(subject: CalculatorSubject) -> list[tuple[str, float]]:
 
 def _belong(apart: float, slope: float, error: float) -> str:
     """Whose derivative the forces are, along a line on which the difference of the two has a slope."""
-    free, told = (abs(value) <= _SIGNIFICANT * error for value in (apart, apart + slope))
+    free = abs(apart) <= _SIGNIFICANT * error
+    told = abs(apart + slope) <= max(_SIGNIFICANT * error, _CENTRAL * abs(slope))
     if free and told:
         return "Where it was looked at, the forces are the derivative of both."
     if free or told:
