@@ -1,4 +1,4 @@
-"""Past the distances that are scanned closely: where an interaction that is still felt there ends, if it does.
+"""Past the distances that are scanned closely: where an interaction that is felt there ends, if it does.
 
 A few places in each of some geometric intervals tell a smooth decay from one that breaks off: the force
 through them is a polynomial to many digits, and its work is what the energy changes by, or something lies
@@ -35,7 +35,7 @@ _NODES = np.cos(np.pi * np.arange(8, -1, -1) / 8)
 """Places in an interval of -1 to 1 (Chebyshev-Lobatto): its ends are shared with the next."""
 
 _SMOOTH = 1e-6
-"""Of the force, and of the energy's change: what the highest terms of a smooth decay are far below (1e-10)."""
+"""Of the force, and of the energy's change: the highest terms of a smooth decay are far below (1e-10)."""
 
 _NARROW = 0.6
 """An interval in which something lies is halved to this width, and then scanned."""
@@ -154,7 +154,9 @@ def _edge(nodes: Float[np.ndarray, "nodes"], alive: Callable[[float], bool]) -> 
     return end_of(nodes, alive) if alive(float(nodes[0])) else None
 
 
-def _rough(curve: Curve, low: float, high: float, noise: Float[np.ndarray, "2"]) -> Iterator[tuple[float, float]]:
+def _rough(
+    curve: Curve, low: float, high: float, noise: Float[np.ndarray, "2"]
+) -> Iterator[tuple[float, float]]:
     """Narrow parts of an interval in which the force is no smooth decay, or the energy is not its work."""
     if high <= low or _smooth(curve, low, high, noise):
         return
@@ -177,9 +179,7 @@ def _smooth(curve: Curve, low: float, high: float, noise: Float[np.ndarray, "2"]
     return abs(change + work) <= _SMOOTH * max(abs(change), abs(work)) + 4 * noise[0]
 
 
-def _jumps(
-    pair: Pair, curve: Curve, low: float, high: float, step: float, until: float
-) -> list[Threshold]:
+def _jumps(pair: Pair, curve: Curve, low: float, high: float, step: float, until: float) -> list[Threshold]:
     jumps, _ = find_jumps(curve, low - 4 * step, high + 4 * step, step, until=until)
     return [at_jump(pair, jump) for jump in jumps]
 

@@ -94,8 +94,8 @@ def _no_end(walk: PairWalk, kT: float, units: Words) -> str:
     scanned = f"Up to {walk.scanned:.4g} {units.length} they were scanned step by step"
     if walk.further is None:
         return (
-            f"{scanned}; at {FARTHEST:g} {units.length} the two still feel one another. What is farther out was "
-            "not looked at: they may have a cutoff there."
+            f"{scanned}; at {FARTHEST:g} {units.length} the two still feel one another. What is farther out "
+            "was not looked at: they may have a cutoff there."
         )
     further = walk.further
     if not further.left:
@@ -104,16 +104,16 @@ def _no_end(walk: PairWalk, kT: float, units: Words) -> str:
             f"{further.reached:.4g} {units.length}."
         )
     told = (
-        f"{scanned}, and from there to {further.reached:.4g} {units.length} at a few places: there the two still "
-        f"feel one another (a force of {abs(further.force):.2g} {units.force}). "
+        f"{scanned}, and from there to {further.reached:.4g} {units.length} at a few places: there the two "
+        f"still feel one another (a force of {abs(further.force):.2g} {units.force}). "
     )
     if not np.isfinite(further.left):
         return told + "It does not fall off; a cutoff farther out was not looked for."
     size = f"{further.left * units.scale:.2g} {units.small}"
     kTs = f" ({further.left / kT:.1g} kT)" if kT else ""
     return told + (
-        f"As it falls off there, {size}{kTs} are left: a cutoff farther out was not looked for, and would be a "
-        "jump of no more than that."
+        f"As it falls off there, {size}{kTs} are left: a cutoff farther out was not looked for, and would be "
+        "a jump of no more than that."
     )
 
 

@@ -105,8 +105,12 @@ class Forces:
             *_judged_sums(sums, scale),
             *([] if any(one["severity"] == "error" for one in drowned) else precision(worker, atoms, noise)),
             *two_energies(
-                worker, atoms, noise, wanted[first][1],
-                found[first].difference - found[first].force, found[first].error,
+                worker,
+                atoms,
+                noise,
+                wanted[first][1],
+                found[first].difference - found[first].force,
+                found[first].error,
             ),
         ]
         worst = max(slopes, key=lambda one: abs(one.difference - one.force) / one.error)
@@ -269,8 +273,8 @@ def _drowned(slopes: list[Slope], noise: Noise, scale: float, stairs: Steps) -> 
             "answers scatter by a large part of the forces",
             f"Along a line of less than a thousandth of an Å forces scatter by up to {noise.force:.2g} eV/Å "
             f"and the energy by {noise.energy:.2g} eV, at a root mean square force of {scale:.2g} eV/Å; "
-            f"differences of the energy tell the force on an atom to within {known:.2g} eV/Å. What is smaller "
-            "than that, no check here has seen.",
+            f"differences of the energy tell the force on an atom to within {known:.2g} eV/Å. What is "
+            "smaller than that, no check here has seen.",
             "Look first at whether the same question has the same answer twice; then at terms that are drawn "
             "at random, solved for with a loose tolerance, or summed in a narrow format.",
         )
@@ -347,8 +351,8 @@ def _says(slopes: list[Slope], worst: Slope, scale: float, drowned: bool) -> str
         )
     if drowned:
         return (
-            f"Along {len(slopes)} directions noise hides whether the forces are the derivative of the energy: "
-            f"the differences can tell to within {max(one.error for one in slopes):.1g} eV/Å, at a root mean "
+            f"Along {len(slopes)} directions noise hides whether the forces are the derivative of the "
+            f"energy: the differences can tell to within {max(one.error for one in slopes):.1g} eV/Å, at a root mean "
             f"square force of {scale:.3g} eV/Å."
         )
     return (

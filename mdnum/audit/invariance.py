@@ -232,8 +232,8 @@ class Invariance:
         if silent:
             worst = max(silent, key=lambda one: one.energy)
             answered = (
-                f" Single atoms in another order are not refused: with {worst.same.what} the energy differs by "
-                f"{worst.energy:.3g} eV and a force by {worst.force:.3g} eV/Å, without a word."
+                f" Single atoms in another order are not refused: with {worst.same.what} the energy differs "
+                f"by {worst.energy:.3g} eV and a force by {worst.force:.3g} eV/Å, without a word."
             )
         judged.notes.append(
             finding(

@@ -23,8 +23,8 @@ FEW = 8
 #: Å between the points of the line along which steps are looked for, the wider ones where nothing moves.
 _STEP_SPACINGS = (1e-4, 1.6e-3, 2.5e-2)
 _STEP_POINTS = 17
-#: Places at which a value stays what it was, from which one that moves elsewhere goes in steps; and the share of
-#: the forces that do, from which forces do.
+#: Places at which a value stays what it was, from which one that moves elsewhere goes in steps; and the share
+#: of the forces that do, from which forces do.
 _STAYS, _STAIRS = 3, 0.1
 
 #: Of an energy: noise that rounding explains, of doubles and of numbers of single precision.
@@ -115,8 +115,9 @@ def steps(subject: Subject, atoms: Atoms) -> Steps:
     line = direction(len(atoms), np.random.default_rng(len(atoms)))
     for spacing in _STEP_SPACINGS:
         there = [displaced(atoms, k * spacing * line) for k in range(_STEP_POINTS)]
-        energies = np.array([subject.energy(one) for one in there])
-        forces = np.array([subject.forces(one).ravel() for one in there])
+        answers = [(subject.energy(one), subject.forces(one).ravel()) for one in there]
+        energies = np.array([energy for energy, _ in answers])
+        forces = np.array([force for _, force in answers])
         moved = (np.diff(energies) != 0) | (np.diff(forces, axis=0) != 0).any(axis=1)
         changes = np.diff(forces, axis=0)[moved]
         alive = (changes != 0).any(axis=0)
@@ -128,7 +129,7 @@ def steps(subject: Subject, atoms: Atoms) -> Steps:
     sizes = np.abs(changes[:, stairs])
     force = float(np.median(sizes[sizes > 0])) if share > _STAIRS else 0.0
     climbs = np.abs(np.diff(energies)[moved])
-    stays = (climbs == 0).sum() >= _STAYS and climbs.any()
+    stays = np.sum(climbs == 0) >= _STAYS and climbs.any()
     energy = float(np.median(climbs[climbs > 0])) if stays else 0.0
     if not np.ptp(energies):
         # as large as what the forces say it should have changed by, at least
@@ -231,9 +232,7 @@ def of_all_kinds(count: int) -> list[int]:
 
 def louder(one: Noise, other: Noise) -> Noise:
     """The larger of two, each part by itself."""
-    return Noise(
-        max(one.energy, other.energy), max(one.force, other.force), max(one.typical, other.typical)
-    )
+    return Noise(max(one.energy, other.energy), max(one.force, other.force), max(one.typical, other.typical))
 
 
 def _of_more_atoms(subject: Subject, atoms: Atoms, rng: np.random.Generator) -> Noise:

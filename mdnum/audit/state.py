@@ -26,9 +26,9 @@ from mdnum.references.findings import finding
 #: How many times the noise one object may differ from another by: a list that was built elsewhere sums its
 #: terms in another order.
 _ALLOWED = 40.0
-#: How often one structure is asked about again: by one object at once, by it with another structure between, and
-#: by new objects.
-_AT_ONCE, _BETWEEN, _NEW = 6, 2, 6
+#: How often one structure is asked about again: by one object at once, by it with another structure between,
+#: and by new objects.
+_AT_ONCE, _BETWEEN, _NEW = 4, 2, 3
 #: Of the root mean square force, and of kT: answers to one question that differ by more are no rounding.
 _LARGE = 1e-4
 _LARGE_ENERGY = 1e-3
@@ -456,14 +456,20 @@ def _unsteady(repeats: Mapping[str, Any], kT: float) -> Iterator[dict[str, str]]
     if repeats["bit-identical"] and repeats["bit-identical between objects"] and not chance:
         return
     within = not repeats["bit-identical"]
-    who, how = ("one object", "at once and later") if within else ("new objects", "each as its first question")
+    who, how = (
+        ("one object", "at once and later") if within else ("new objects", "each as its first question")
+    )
     energy = max(repeats["energies scatter by"], repeats["energies between objects"])
     force = max(repeats["forces scatter by"], repeats["forces between objects"])
-    said = f"Asked about one structure, {who} ({how}) gave energies that scatter by {energy:.2g} eV and forces "
+    said = (
+        f"Asked about one structure, {who} ({how}) gave energies that scatter by {energy:.2g} eV and forces "
+    )
     said += f"by {force:.2g} eV/Å, at a typical force of {repeats['typical force']:.2g} eV/Å."
     if chance:
         energy, force = max(energy, repeats["energies"]), max(force, repeats["forces"])
-        said = f"Answers of an object in use ({chance} of those compared) differ by up to {energy:.2g} eV and "
+        said = (
+            f"Answers of an object in use ({chance} of those compared) differ by up to {energy:.2g} eV and "
+        )
         said += f"{force:.2g} eV/Å from those of new ones to the same structures, and do not when the same "
         said += f"questions are asked again; a typical force is {repeats['typical force']:.2g} eV/Å."
     large = force > _LARGE * repeats["typical force"] or energy > _LARGE_ENERGY * kT
@@ -482,16 +488,16 @@ def _unsteady(repeats: Mapping[str, Any], kT: float) -> Iterator[dict[str, str]]
         "Look for memory that is read before it is written, for what is drawn at random, and for threads "
         "that write to one place."
         if large
-        else "Look for sums in the order of threads or of atomic additions, and for a list kept from the call "
-        "before.",
+        else "Look for sums in the order of threads or of atomic additions, and for a list kept from the "
+        "call before.",
     )
 
 
 def _tolerance(subject: Subject, atoms: Atoms) -> float:
-    """Å by which an atom, or an edge of the cell, can move while one object's answer stays to the last bit; 0 if none.
+    """Å by which an atom, or an edge of the cell, can move while one object's answer stays to the last bit, or 0.
 
-    Only where the answer ought to have changed by many of its last digits: what it changes by over the longest
-    of the moves, in proportion.
+    Only where the answer ought to have changed by many of its last digits: what it changes by over the
+    longest of the moves, in proportion.
     """
     # one coordinate, the largest: a tolerance may be one of all atoms together, or a share of a coordinate
     line = np.zeros((len(atoms), 3))
@@ -512,7 +518,7 @@ def _tolerance(subject: Subject, atoms: Atoms) -> float:
 
 
 def _kept_within(subject: Subject, sizes: np.ndarray, at: Callable[[float], Atoms]) -> float:
-    """The longest of some moves, one after the other, after which one object has given its last answer again."""
+    """The longest of some moves in a row after which one object has given its last answer again."""
     used = subject.fresh()
     if isinstance(used, CalculatorSubject):
         used.forgets = False
@@ -542,9 +548,9 @@ def _kept(tolerance: float) -> Iterator[dict[str, str]]:
             "KEPT_ANSWER",
             "error" if tolerance > _HARMLESS else "warning",
             "the answer to another structure is given again",
-            f"An atom, or the cell, moved by up to {tolerance:.0e} Å, and the object gave the energy and forces that it "
-            "had given before, to the last bit, where they ought to have changed by more than a hundred times "
-            "that. Slow atoms, differences and relaxations see old forces.",
+            f"An atom, or the cell, moved by up to {tolerance:.0e} Å, and the object gave the energy and forces "
+            "that it had given before, to the last bit, where they ought to have changed by more than a hundred "
+            "times that. Slow atoms, differences and relaxations see old forces.",
             "Compare positions, cell, species and periods bit by bit before an answer is given again, not "
             "within a tolerance (np.allclose allows 1e-5 of a coordinate).",
         )

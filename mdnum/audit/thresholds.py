@@ -237,7 +237,7 @@ def walk(subject: Subject, pair: Pair, step: float = STEP, seconds: float = np.i
     reach = distance[-1]
     if further:
         distance = np.append(distance, further.nodes)
-        values = np.append(values, [further.energies, further.forces], axis=1)
+        values = np.hstack([values, np.array([further.energies, further.forces])])
     quantum = _quantum(values, len(pair.second))
     if any(quantum):
         # nearly all that stands out of such a curve is a step of rounding

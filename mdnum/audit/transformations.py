@@ -180,7 +180,7 @@ def images_by_molecule(atoms: Atoms, rng: np.random.Generator) -> Same | None:
 
 
 def group(atoms: Atoms) -> int | None:
-    """Atoms in a molecule, where the structure is molecules of several species, one after the other; else None.
+    """Atoms in a molecule, where the structure is molecules of several species, one after another; else None.
 
     That species repeat in groups is not enough: so they do in a crystal of salt. Atoms of a group must be
     bonded, by their covalent radii, and to no others.

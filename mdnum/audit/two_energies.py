@@ -69,8 +69,8 @@ def two_energies(
         f"For {worst.formula} their difference is {worst.first:.6g} eV in one place and changes by "
         f"{worst.change:.3g} eV{kT}. {_belong(apart, slope, error)}"
         + (f" It changes where nothing may: {'; '.join(wrong)}." if wrong else "")
-        + " Every other check is about free_energy: what it finds, or does not, says nothing of energy, which "
-        "is what a run logs and a derivative of get_potential_energy() sees.",
+        + " Every other check is about free_energy: what it finds, or does not, says nothing of energy, "
+        "which is what a run logs and a derivative of get_potential_energy() sees.",
         "Where the two are meant to be one, hand over the same number; where they are not (an entropy of "
         "electrons), follow free_energy in runs: get_potential_energy(force_consistent=True).",
     )
