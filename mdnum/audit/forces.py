@@ -352,8 +352,8 @@ def _says(slopes: list[Slope], worst: Slope, scale: float, drowned: bool) -> str
     if drowned:
         return (
             f"Along {len(slopes)} directions noise hides whether the forces are the derivative of the "
-            f"energy: the differences can tell to within {max(one.error for one in slopes):.1g} eV/Å, at a root mean "
-            f"square force of {scale:.3g} eV/Å."
+            f"energy: the differences can tell to within {max(one.error for one in slopes):.1g} eV/Å, at a "
+            f"root mean square force of {scale:.3g} eV/Å."
         )
     return (
         f"Along {len(slopes)} directions the forces are the derivative of the energy to within "

@@ -120,12 +120,11 @@ def steps(subject: Subject, atoms: Atoms) -> Steps:
         forces = np.array([force for _, force in answers])
         moved = (np.diff(energies) != 0) | (np.diff(forces, axis=0) != 0).any(axis=1)
         changes = np.diff(forces, axis=0)[moved]
-        alive = (changes != 0).any(axis=0)
-        felt = (forces != 0).any(axis=0)
-        if (np.ptp(energies) > 0 and 2 * alive.sum() >= felt.sum()) or not felt.any():
+        alive, felt = np.any(changes != 0, axis=0), np.any(forces != 0, axis=0)
+        if (np.ptp(energies) > 0 and 2 * np.sum(alive) >= np.sum(felt)) or not felt.any():
             break
-    stairs = alive & ((changes == 0).sum(axis=0) >= _STAYS)
-    share = float(stairs.sum() / alive.sum()) if alive.any() else 0.0
+    stairs = alive & (np.sum(changes == 0, axis=0) >= _STAYS)
+    share = float(np.sum(stairs) / np.sum(alive)) if alive.any() else 0.0
     sizes = np.abs(changes[:, stairs])
     force = float(np.median(sizes[sizes > 0])) if share > _STAIRS else 0.0
     climbs = np.abs(np.diff(energies)[moved])

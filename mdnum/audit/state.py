@@ -494,7 +494,7 @@ def _unsteady(repeats: Mapping[str, Any], kT: float) -> Iterator[dict[str, str]]
 
 
 def _tolerance(subject: Subject, atoms: Atoms) -> float:
-    """Å by which an atom, or an edge of the cell, can move while one object's answer stays to the last bit, or 0.
+    """Å by which an atom, or an edge of the cell, can move while an answer stays to the last bit, or 0.
 
     Only where the answer ought to have changed by many of its last digits: what it changes by over the
     longest of the moves, in proportion.
@@ -548,9 +548,9 @@ def _kept(tolerance: float) -> Iterator[dict[str, str]]:
             "KEPT_ANSWER",
             "error" if tolerance > _HARMLESS else "warning",
             "the answer to another structure is given again",
-            f"An atom, or the cell, moved by up to {tolerance:.0e} Å, and the object gave the energy and forces "
-            "that it had given before, to the last bit, where they ought to have changed by more than a hundred "
-            "times that. Slow atoms, differences and relaxations see old forces.",
+            f"An atom, or the cell, moved by up to {tolerance:.0e} Å, and the object gave the energy "
+            "and forces that it had given before, to the last bit, where they ought to have changed by more "
+            "than a hundred times that. Slow atoms, differences and relaxations see old forces.",
             "Compare positions, cell, species and periods bit by bit before an answer is given again, not "
             "within a tolerance (np.allclose allows 1e-5 of a coordinate).",
         )
