@@ -111,7 +111,7 @@ class State:
             findings=[
                 *_unsteady(repeats, subject.kT),
                 *self._stale(stale),
-                *_kept(tolerance),
+                *_kept(tolerance, atoms),
                 *_broken(broken),
                 *self._not_finite(refused),
                 *written(subject, atoms),
@@ -532,25 +532,34 @@ def _kept_within(subject: Subject, sizes: np.ndarray, at: Callable[[float], Atom
     values = np.array(answers)
     rate = np.abs(values[-1] - values[0]) / places[-1]
     read = digits(values[:, :-1])
-    last = np.maximum(2.0**-read.bits * np.abs(values[0]), read.quantum)
-    last[-1] = np.inf  # forces are the finer measure
+    # forces are the finer measure; the smallest of them may have lost its digits to others
+    last = max(2.0**-read.bits * float(np.max(np.abs(values[0, :-1]), initial=0.0)), read.quantum)
+    felt = float(np.max(rate[:-1], initial=0.0)) * sizes > _KEPT * last
+    if read.bits <= 24:  # who answers in single precision may read positions so
+        felt &= sizes > 4 * _grain(at(0.0))
     kept = [
         moved
-        for moved, before, after in zip(sizes, values, values[1:], strict=False)
-        if (before == after).all() and (rate * moved > _KEPT * last)[last > 0].any()
+        for moved, seen, before, after in zip(sizes, felt, values, values[1:], strict=False)
+        if seen and (before == after).all()
     ]
     return float(max(kept, default=0.0))
 
 
-def _kept(tolerance: float) -> Iterator[dict[str, str]]:
+def _grain(atoms: Atoms) -> float:
+    """The last digit of the largest coordinate in single precision, Å."""
+    return float(np.spacing(np.float32(np.max(np.abs(atoms.positions), initial=1.0))))
+
+
+def _kept(tolerance: float, atoms: Atoms) -> Iterator[dict[str, str]]:
     if tolerance:
         yield finding(
             "KEPT_ANSWER",
-            "error" if tolerance > _HARMLESS else "warning",
+            "error" if tolerance > max(_HARMLESS, _grain(atoms)) else "warning",
             "the answer to another structure is given again",
             f"An atom, or the cell, moved by up to {tolerance:.0e} Å, and the object gave the energy "
             "and forces that it had given before, to the last bit, where they ought to have changed by more "
-            "than a hundred times that. Slow atoms, differences and relaxations see old forces.",
+            "than a hundred times that. Slow atoms, differences and relaxations see old forces. (Positions "
+            f"that are rounded to single precision move in steps of {_grain(atoms):.1g} Å here.)",
             "Compare positions, cell, species and periods bit by bit before an answer is given again, not "
             "within a tolerance (np.allclose allows 1e-5 of a coordinate).",
         )

@@ -233,6 +233,17 @@ def test_the_tolerance_is_told():
         assert codes(part)["KEPT_ANSWER"] == ("warning" if power == -8 else "error")
 
 
+def test_positions_in_single_precision_are_no_kept_answer():
+    """Far from the origin a coordinate of single precision has steps of 4e-6 Å."""
+
+    class Single(planted.Single):
+        def positions(self, atoms):
+            return super().positions(atoms).astype(np.float32).astype(float)
+
+    atoms = Atoms("Ar8", crystal().positions + 50.0)
+    assert "KEPT_ANSWER" not in codes(State(at_cutoff)(subject(Single, atoms)))
+
+
 @pytest.mark.parametrize("make", [planted.Attached, planted.ThroughAtoms])
 def test_who_answers_through_atoms_alone_is_asked_through_atoms(make):
     atoms = default_structure(Loaded("x", "x", make))
