@@ -117,7 +117,7 @@ def _no_end(walk: PairWalk, kT: float, units: Words) -> str:
     )
 
 
-def reach(walk: PairWalk, kT: float, units: Words) -> list[dict[str, str]]:
+def reach(walk: PairWalk, units: Words, kT: float) -> list[dict[str, str]]:
     found: list[dict[str, str]] = []
     if walk.cutoff is None and np.abs(walk.energy).max() > 0:
         found.append(

@@ -161,7 +161,8 @@ def dispersion(end: float, charge: float = 0.0):
 def walked(law) -> tuple[PairWalk, list[str]]:
     asked = laws.pair_subject(law)
     (walk,) = walk_pairs(asked).walks
-    return walk, [one["text"] for one in reach(walk, asked.kT, units_of(asked)) if one["code"] == "NO_CUTOFF"]
+    found = reach(walk, units_of(asked), asked.kT)
+    return walk, [one["text"] for one in found if one["code"] == "NO_CUTOFF"]
 
 
 @pytest.mark.parametrize(("end", "charge"), [(20.0, 1.44), (31.75, 0.0), (44.4, 0.0)])
