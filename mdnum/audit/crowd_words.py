@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mdnum.audit.base import Subject
+from mdnum.audit.probes import FARTHEST
 from mdnum.audit.provoke import Crowd
 from mdnum.audit.thresholds import PairWalk
 from mdnum.references.findings import finding
@@ -88,7 +89,35 @@ def caps(one: Crowd, kT: float, units: Words) -> list[dict[str, str]]:
     return found
 
 
-def reach(walk: PairWalk, units: Words) -> list[dict[str, str]]:
+def _no_end(walk: PairWalk, kT: float, units: Words) -> str:
+    """What was searched for an end that was not found, and no more."""
+    scanned = f"Up to {walk.scanned:.4g} {units.length} they were scanned step by step"
+    if walk.further is None:
+        return (
+            f"{scanned}; at {FARTHEST:g} {units.length} the two still feel one another. What is farther out "
+            "was not looked at: they may have a cutoff there."
+        )
+    further = walk.further
+    if not further.left:
+        return (
+            f"{scanned}, and farther out at a few places: what they feel is lost in rounding at "
+            f"{further.reached:.4g} {units.length}."
+        )
+    told = (
+        f"{scanned}, and from there to {further.reached:.4g} {units.length} at a few places: there the two "
+        f"still feel one another (a force of {abs(further.force):.2g} {units.force}). "
+    )
+    if not np.isfinite(further.left):
+        return told + "It does not fall off; a cutoff farther out was not looked for."
+    size = f"{further.left * units.scale:.2g} {units.small}"
+    kTs = f" ({further.left / kT:.1g} kT)" if kT else ""
+    return told + (
+        f"As it falls off there, {size}{kTs} are left: a cutoff farther out was not looked for, and would be "
+        "a jump of no more than that."
+    )
+
+
+def reach(walk: PairWalk, units: Words, kT: float) -> list[dict[str, str]]:
     found: list[dict[str, str]] = []
     if walk.cutoff is None and np.abs(walk.energy).max() > 0:
         found.append(
@@ -96,7 +125,7 @@ def reach(walk: PairWalk, units: Words) -> list[dict[str, str]]:
                 "NO_CUTOFF",
                 "info",
                 f"{walk.pair.name} interact at every distance tried",
-                f"At 30 {units.length} the two still feel one another: there is no cutoff to be crossed.",
+                _no_end(walk, kT, units),
             )
         )
     steep = _steepness(walk)

@@ -13,7 +13,8 @@ from jaxtyping import Float
 
 from mdnum.audit.base import TIME_UP, Curve, Part, Progress, Subject, TimeUp, meter_of
 from mdnum.audit.digits import precision
-from mdnum.audit.noise import FEW, Noise, direction, displaced, of_all_kinds, settled
+from mdnum.audit.noise import FEW, Noise, Steps, direction, displaced, of_all_kinds, settled, steps
+from mdnum.audit.two_energies import two_energies
 from mdnum.references.findings import finding
 
 #: Å; each step of the ladder is a quarter of the one before: 0.064 Å down to 1e-6 Å.
@@ -22,6 +23,9 @@ _LADDER = 0.064 * 0.25 ** np.arange(9)
 _SIGNIFICANT = 10.0
 #: Of the root mean square force: below, a disagreement is one of tables or precision.
 _SMALL = 1e-4
+#: Of the root mean square force: noise above a tenth of it leaves nothing to be said of forces, and above the
+#: other is more than single precision explains.
+_DROWNED, _LOUD = 0.1, 1e-3
 _DIRECTIONS, _ATOMS = 3, 4
 
 
@@ -94,16 +98,27 @@ class Forces:
             raise TimeUp
         slopes = [found[place] for place in sorted(found)]
         sums = list(_sums(atoms, forces, noise))
+        drowned = _drowned(slopes, noise, scale, steps(worker, atoms))
+        first = min(found)
         told = [
+            *drowned,
             *_judged(slopes, scale),
             *_judged_sums(sums, scale),
-            *precision(worker, atoms, noise, np.random.default_rng(self.seed)),
+            *([] if any(one["severity"] == "error" for one in drowned) else precision(worker, atoms, noise)),
+            *two_energies(
+                worker,
+                atoms,
+                noise,
+                wanted[first][1],
+                found[first].difference - found[first].force,
+                found[first].error,
+            ),
         ]
         worst = max(slopes, key=lambda one: abs(one.difference - one.force) / one.error)
         return Part(
             name=self.name,
             title="Forces",
-            says=_says(slopes, worst, scale),
+            says=_says(slopes, worst, scale, _known(slopes) > _DROWNED * scale),
             findings=told,
             tables={
                 "Derivative of the energy along a direction": [_row(one) for one in slopes],
@@ -118,6 +133,7 @@ class Forces:
                 "rms_force": scale,
                 "step": worst.step,
                 "noise_energy": noise.energy,
+                "noise_force": noise.force,
             },
             skipped=skipped,
             seconds=time.perf_counter() - began,
@@ -230,6 +246,44 @@ def _sums(atoms: Atoms, forces: Float[np.ndarray, "atoms 3"], noise: Noise) -> I
         }
 
 
+def _known(slopes: list[Slope]) -> float:
+    """To within what differences of the energy typically tell the force on one atom, eV/Å."""
+    # of directions in which one atom moves
+    single = [one.error for one in slopes if not one.what.startswith("all")]
+    return float(np.median(single)) if single else 0.0
+
+
+def _drowned(slopes: list[Slope], noise: Noise, scale: float, stairs: Steps) -> list[dict[str, str]]:
+    """A finding where forces, or what differences can tell of them, are lost in noise that is no rounding.
+
+    Args:
+        slopes: of the energy.
+        noise: of the answers.
+        scale: root mean square of the forces, eV/Å.
+        stairs: the steps in which answers go, which are another finding.
+    """
+    known = _known(slopes)
+    size = max(noise.force, 0.0 if stairs.energy else known)
+    if size <= max(_DROWNED * scale, stairs.force):
+        size = noise.typical
+    if not scale or size <= max(_LOUD * scale, stairs.force):
+        return []
+    return [
+        finding(
+            "NOISE_FLOOR",
+            # forces that are known well are not tested where the energy is not
+            "error" if max(noise.force, noise.typical) > _DROWNED * scale else "warning",
+            "answers scatter by a large part of the forces",
+            f"Along a line of less than a thousandth of an Å forces scatter by up to {noise.force:.2g} eV/Å "
+            f"and the energy by {noise.energy:.2g} eV, at a root mean square force of {scale:.2g} eV/Å; "
+            f"differences of the energy tell the force on an atom to within {known:.2g} eV/Å. What is "
+            "smaller than that, no check here has seen.",
+            "Look first at whether the same question has the same answer twice; then at terms that are drawn "
+            "at random, solved for with a loose tolerance, or summed in a narrow format.",
+        )
+    ]
+
+
 def _judged(slopes: list[Slope], scale: float) -> Iterator[dict[str, str]]:
     steps = [one for one in slopes if one.jump]
     if steps:
@@ -289,7 +343,7 @@ def _row(one: Slope) -> dict[str, Any]:
     }
 
 
-def _says(slopes: list[Slope], worst: Slope, scale: float) -> str:
+def _says(slopes: list[Slope], worst: Slope, scale: float, drowned: bool) -> str:
     wrong = sum(not one.agrees for one in slopes)
     if wrong:
         return (
@@ -297,6 +351,12 @@ def _says(slopes: list[Slope], worst: Slope, scale: float) -> str:
             "to "
             f"{max(abs(one.difference - one.force) for one in slopes):.2g} eV/Å apart, at a root mean square "
             f"force of {scale:.3g} eV/Å."
+        )
+    if drowned:
+        return (
+            f"Along {len(slopes)} directions noise hides whether the forces are the derivative of the "
+            f"energy: the differences can tell to within {max(one.error for one in slopes):.1g} eV/Å, at a "
+            f"root mean square force of {scale:.3g} eV/Å."
         )
     return (
         f"Along {len(slopes)} directions the forces are the derivative of the energy to within "

@@ -42,7 +42,8 @@ _MEANING: Mapping[str, tuple[str, str]] = {
     ),
     "ORDER": (
         "the answer depends on the order of the atoms",
-        "Look for a limit on the number of neighbors (max_num_neighbors), which keeps those that come first.",
+        "Look for a limit on the number of neighbors (max_num_neighbors), which keeps those that come first, "
+        "and for parameters that species get in the order in which they appear.",
     ),
     "CELL_ULP": (
         "the last bit of the cell changes the answer",
@@ -226,12 +227,21 @@ class Invariance:
                 return wrong
         except CalculatorError:
             return wrong
+        silent = wrong.get("ORDER", [])
+        answered = ""
+        if silent:
+            worst = max(silent, key=lambda one: one.energy)
+            answered = (
+                f" Single atoms in another order are not refused: with {worst.same.what} the energy differs "
+                f"by {worst.energy:.3g} eV and a force by {worst.force:.3g} eV/Å, without a word."
+            )
         judged.notes.append(
             finding(
                 "TOPOLOGY_BY_ORDER",
-                "info",
+                "warning" if silent else "info",
                 "molecules are told by the order of the atoms",
-                f"{grouped.what[0].upper()}{grouped.what[1:]} change nothing, single atoms may not be moved.",
+                f"{grouped.what[0].upper()}{grouped.what[1:]} change nothing, single atoms may not be moved."
+                + answered,
                 "Keep the atoms of a molecule together when a structure is written or sorted.",
             )
         )

@@ -20,7 +20,12 @@ _POINTS = 9
 RATTLE = 0.03
 #: Atoms below which symmetry may hide the noise.
 FEW = 8
-
+#: Å between the points of the line along which steps are looked for, the wider ones where nothing moves.
+_STEP_SPACINGS = (1e-4, 1.6e-3, 2.5e-2)
+_STEP_POINTS = 17
+#: Places at which a value stays what it was, from which one that moves elsewhere goes in steps; and the share
+#: of the forces that do, from which forces do.
+_STAYS, _STAIRS = 3, 0.1
 
 #: Of an energy: noise that rounding explains, of doubles and of numbers of single precision.
 _QUIET, _QUIET_SINGLE = 1e-11, 1e-6
@@ -35,10 +40,12 @@ class Noise:
     Attributes:
         energy: standard deviation, eV.
         force: standard deviation of a component, of the atom that scatters most, eV/Å.
+        typical: the same of the median component.
     """
 
     energy: float
     force: float
+    typical: float = 0.0
 
 
 def along_a_line(subject: Subject, atoms: Atoms, rng: np.random.Generator) -> Noise:
@@ -59,13 +66,78 @@ def along_a_line(subject: Subject, atoms: Atoms, rng: np.random.Generator) -> No
         energies.append(subject.energy(there))
         forces.append(subject.forces(there))
     energy = float(_scatter(np.array(energies)[:, None])[0])
-    force = float(np.max(_scatter(np.array(forces).reshape(_POINTS, -1))))
+    scatters = _scatter(np.array(forces).reshape(_POINTS, -1))
+    force = float(np.max(scatters))
     # values that round to the same number at every point still carry the rounding of one operation
     floor = np.finfo(float).eps
     return Noise(
         max(energy, floor * max(abs(value) for value in energies)),
         max(force, floor * float(np.max(np.abs(forces)))),
+        float(np.median(scatters)),
     )
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Whether answers go in steps, along a line on which smooth ones change from point to point.
+
+    Attributes:
+        energy: the size of a step, eV; 0 where there are none.
+        force: of a force component, eV/Å.
+        share: of force components that go in steps, of those that change at all.
+        length: of the line, Å.
+        energies: eV.
+        forces: eV/Å.
+    """
+
+    energy: float
+    force: float
+    share: float
+    length: float
+    energies: Float[np.ndarray, "points"]
+    forces: Float[np.ndarray, "points components"]
+
+
+def steps(subject: Subject, atoms: Atoms) -> Steps:
+    """Steps of energies and forces: values that stay the same to the last bit and then change.
+
+    A double, or a number of single precision, of something smooth is another one 1e-4 Å further on. Points
+    at which nothing at all has changed do not count: a calculator that has kept an answer looks like that.
+
+    Args:
+        subject: the calculator.
+        atoms: where the line begins.
+    """
+    known = getattr(subject, "known", {})
+    key = ("steps", atoms.positions.tobytes(), atoms.cell.array.tobytes())
+    if key in known:
+        return known[key]
+    line = direction(len(atoms), np.random.default_rng(len(atoms)))
+    for spacing in _STEP_SPACINGS:
+        there = [displaced(atoms, k * spacing * line) for k in range(_STEP_POINTS)]
+        answers = [(subject.energy(one), subject.forces(one).ravel()) for one in there]
+        energies = np.array([energy for energy, _ in answers])
+        forces = np.array([force for _, force in answers])
+        moved = (np.diff(energies) != 0) | (np.diff(forces, axis=0) != 0).any(axis=1)
+        changes = np.diff(forces, axis=0)[moved]
+        alive, felt = np.any(changes != 0, axis=0), np.any(forces != 0, axis=0)
+        if (np.ptp(energies) > 0 and 2 * np.sum(alive) >= np.sum(felt)) or not felt.any():
+            break
+    stairs = alive & (np.sum(changes == 0, axis=0) >= _STAYS)
+    share = float(np.sum(stairs) / np.sum(alive)) if alive.any() else 0.0
+    sizes = np.abs(changes[:, stairs])
+    force = float(np.median(sizes[sizes > 0])) if share > _STAIRS else 0.0
+    climbs = np.abs(np.diff(energies)[moved])
+    stays = np.sum(climbs == 0) >= _STAYS and climbs.any()
+    energy = float(np.median(climbs[climbs > 0])) if stays else 0.0
+    if not np.ptp(energies):
+        # as large as what the forces say it should have changed by, at least
+        along = forces @ line.ravel()
+        work = spacing * np.cumsum(0.5 * (along[1:] + along[:-1]))
+        energy = float(np.ptp(np.append(work, 0.0)))
+    length = (_STEP_POINTS - 1) * spacing
+    known[key] = Steps(energy, force, share, length, energies, forces)
+    return known[key]
 
 
 def _scatter(values: Float[np.ndarray, "points columns"]) -> Float[np.ndarray, "columns"]:
@@ -137,6 +209,9 @@ def settled(
     assert best is not None
     there, noise = best
     noise = louder(noise, _of_more_atoms(subject, there, rng))
+    # what goes in steps may not move at all on so short a line
+    stairs = steps(subject, there)
+    noise = louder(noise, Noise(0.5 * stairs.energy, 0.5 * stairs.force))
     known[key] = there.copy(), noise, rng.bit_generator.state
     return there, noise
 
@@ -156,7 +231,7 @@ def of_all_kinds(count: int) -> list[int]:
 
 def louder(one: Noise, other: Noise) -> Noise:
     """The larger of two, each part by itself."""
-    return Noise(max(one.energy, other.energy), max(one.force, other.force))
+    return Noise(max(one.energy, other.energy), max(one.force, other.force), max(one.typical, other.typical))
 
 
 def _of_more_atoms(subject: Subject, atoms: Atoms, rng: np.random.Generator) -> Noise:

@@ -140,7 +140,7 @@ def findings(
     found = [*_pair_findings(walks, around, kT, units)]
     found += _unexplained(around, kT, units, walks.not_walked)
     found += [one for crowded in crowds for one in caps(crowded, kT, units)]
-    found += [one for walk in walks.walks for one in reach(walk, units)]
+    found += [one for walk in walks.walks for one in reach(walk, units, kT)]
     return found
 
 

@@ -15,6 +15,8 @@ from mdnum.audit.alone import alone
 from mdnum.audit.answer import Answer, Refusal, ask
 from mdnum.audit.approaches import Asked, approaches
 from mdnum.audit.base import TIME_UP, Part, Progress, Subject, TimeUp, meter_of
+from mdnum.audit.digits import digits
+from mdnum.audit.ledger import Again
 from mdnum.audit.noise import FEW, Noise, displaced, settled
 from mdnum.audit.subject import CalculatorError, CalculatorSubject, only_trying
 from mdnum.audit.threshold import Threshold
@@ -24,7 +26,18 @@ from mdnum.references.findings import finding
 #: How many times the noise one object may differ from another by: a list that was built elsewhere sums its
 #: terms in another order.
 _ALLOWED = 40.0
-_REPEATS = 3
+#: How often one structure is asked about again: by one object at once, by it with another structure between,
+#: and by new objects.
+_AT_ONCE, _BETWEEN, _NEW = 4, 2, 3
+#: Of the root mean square force, and of kT: answers to one question that differ by more are no rounding.
+_LARGE = 1e-4
+_LARGE_ENERGY = 1e-3
+#: Å by which an atom is moved a little further each time.
+_TINY = 10.0 ** np.arange(-9, -1)
+#: An answer that should have changed by so many of its last digits, and has not at all, was kept.
+_KEPT = 100.0
+#: Å: what is kept within less is a matter of precision.
+_HARMLESS = 1e-7
 
 
 @dataclass
@@ -77,20 +90,27 @@ class State:
         if late and not rows:
             raise TimeUp
         repeats = _repeated(subject, atoms)
+        tolerance = _tolerance(subject, atoms)
         lonely = alone(subject, atoms, noise)
         self.structures |= lonely.structures
         broken = [row for row in rows if row["remembers"] and row["broken"]]
         stale = [row for row in rows if row["remembers"] and not row["broken"]]
+        if stale and not _again(subject, sequences, stale):
+            # another object on the same way does not go astray: it is chance, and no memory
+            worst = max(stale, key=lambda row: row["energy"])
+            repeats |= {"by chance": len(stale), "energies": worst["energy"], "forces": worst["force"]}
+            stale = []
         refused = [row for row in rows if row["refused"] and not row["remembers"]]
         return Part(
             name=self.name,
             title="Memory",
             says=_says(rows, stale, repeats),
             findings=[
+                *_unsteady(repeats, subject.kT),
                 *self._stale(stale),
+                *_kept(tolerance, atoms),
                 *_broken(broken),
                 *self._not_finite(refused),
-                *_unsteady(repeats),
                 *written(subject, atoms),
                 *lonely.findings(),
             ],
@@ -105,6 +125,7 @@ class State:
                 "largest": max((row["energy"] for row in rows), default=0.0),
                 "bit_identical": repeats["bit-identical"],
                 "bit_identical_objects": repeats["bit-identical between objects"],
+                "kept_within": tolerance,
             },
             skipped=[
                 *nothing,
@@ -310,7 +331,8 @@ class _Through:
         """A row for each answer that is compared."""
         used = self._subject.fresh()
         if isinstance(used, CalculatorSubject):
-            used.renews = False  # what an object does after it has failed is a question here
+            # what an object does after it has failed, and what it takes for unchanged, are questions here
+            used.renews = used.forgets = False
         before: Atoms | None = None
         known: dict[int, Answer | Refusal] = {}
         size, failed = 0.0, False
@@ -330,6 +352,7 @@ class _Through:
             row: dict[str, Any] = {
                 "sequence": self._word, "structure": asked.what, "before": previous, "atoms": asked.atoms,
                 "energy": 0.0, "force": 0.0, "allowed": 0.0, "remembers": False, "refused": None,
+                "old": old, "new": new,
                 "broken": was_broken and isinstance(old, Refusal),
             }  # fmt: skip
             if isinstance(new, Refusal):
@@ -353,24 +376,57 @@ def _apart(old: Answer, new: Answer, noise: Noise, share: float) -> dict[str, An
     return {"energy": change, "force": force, "allowed": allowed, "remembers": remembers}
 
 
+def _again(subject: Subject, sequences: Mapping[str, list[Asked]], stale: list[dict[str, Any]]) -> bool:
+    """Whether another object, on the way on which the worst difference showed, answers as that one did."""
+    worst = max(stale, key=lambda row: row["energy"])
+    used = subject.fresh()
+    if isinstance(used, CalculatorSubject):
+        used.renews = used.forgets = False
+    answer: Answer | Refusal | None = None
+    for asked in sequences[worst["sequence"]]:
+        answer = ask(used, asked.atoms)
+        if asked.atoms is worst["atoms"] and asked.what == worst["structure"]:
+            break
+    if isinstance(answer, Refusal) or isinstance(worst["old"], Refusal):
+        return isinstance(answer, Refusal) and isinstance(worst["old"], Refusal)
+    assert answer is not None
+    new = ask(subject.fresh(), worst["atoms"])
+    if isinstance(new, Refusal):
+        return False
+    # both must come again: what objects in use say, and what new ones do
+    for found, before in ((answer, worst["old"]), (new, worst["new"])):
+        force = float(np.max(np.abs(found.forces - before.forces), initial=0.0))
+        if force > 0.5 * worst["force"] or abs(found.energy - before.energy) > 0.5 * worst["energy"]:
+            return False
+    return True
+
+
 def _repeated(subject: Subject, atoms: Atoms) -> dict[str, Any]:
-    """The same structure again: of one object with another structure between, and of new objects."""
+    """The same structure again: of one object, with another structure between, and of new objects."""
     used = subject.fresh()
     aside = displaced(atoms, np.full((len(atoms), 3), 0.011))
     within = []
-    for _ in range(_REPEATS):
+    for number in range(_AT_ONCE + _BETWEEN):
         within.append((used.energy(atoms), used.forces(atoms)))
-        used.energy(aside)
+        if number >= _AT_ONCE:
+            used.energy(aside)
+        elif isinstance(used, CalculatorSubject):
+            used.forget()
     objects = [within[0]]
-    for _ in range(_REPEATS - 1):
+    for _ in range(_NEW - 1):
         new = subject.fresh()
         objects.append((new.energy(atoms), new.forces(atoms)))
+    everywhere = subject.ledger.new if isinstance(subject, CalculatorSubject) else Again()
     return {
         "bit-identical": _identical(within),
         "energies scatter by": float(np.ptp([energy for energy, _ in within])),
         "forces scatter by": float(np.max(np.ptp([force for _, force in within], axis=0), initial=0.0)),
-        "bit-identical between objects": _identical(objects),
-        "energies between objects": float(np.ptp([energy for energy, _ in objects])),
+        "bit-identical between objects": _identical(objects) and not everywhere.differ,
+        "energies between objects": max(float(np.ptp([energy for energy, _ in objects])), everywhere.energy),
+        "forces between objects": max(
+            float(np.max(np.ptp([force for _, force in objects], axis=0), initial=0.0)), everywhere.force
+        ),
+        "typical force": float(np.sqrt(np.mean(within[0][1] ** 2))),
     }
 
 
@@ -379,22 +435,118 @@ def _identical(answers: list[tuple[float, np.ndarray]]) -> bool:
     return all(energy == first[0] and force.tobytes() == first[1].tobytes() for energy, force in answers)
 
 
-def _unsteady(repeats: Mapping[str, Any]) -> Iterator[dict[str, str]]:
-    if repeats["bit-identical"] and repeats["bit-identical between objects"]:
+def _unsteady(repeats: Mapping[str, Any], kT: float) -> Iterator[dict[str, str]]:
+    chance = repeats.get("by chance", 0)
+    if repeats["bit-identical"] and repeats["bit-identical between objects"] and not chance:
         return
     within = not repeats["bit-identical"]
-    size = repeats["energies scatter by"] if within else repeats["energies between objects"]
+    who, how = (
+        ("one object", "at once and later") if within else ("new objects", "each as its first question")
+    )
+    energy = max(repeats["energies scatter by"], repeats["energies between objects"])
+    force = max(repeats["forces scatter by"], repeats["forces between objects"])
+    said = (
+        f"Asked about one structure, {who} ({how}) gave energies that scatter by {energy:.2g} eV and forces "
+    )
+    said += f"by {force:.2g} eV/Å, at a typical force of {repeats['typical force']:.2g} eV/Å."
+    if chance:
+        energy, force = max(energy, repeats["energies"]), max(force, repeats["forces"])
+        said = (
+            f"Answers of an object in use ({chance} of those compared) differ by up to {energy:.2g} eV and "
+        )
+        said += f"{force:.2g} eV/Å from those of new ones to the same structures, and do not when the same "
+        said += f"questions are asked again; a typical force is {repeats['typical force']:.2g} eV/Å."
+    large = force > _LARGE * repeats["typical force"] or energy > _LARGE_ENERGY * kT
     yield finding(
         "NOT_REPEATABLE",
-        "warning",
-        "the same question has not the same answer to the last bit",
-        f"Asked {_REPEATS} times about one structure, {'one object' if within else 'new objects'} gave "
-        "energies "
-        f"that scatter by {size:.2g} eV. Two runs of one input will part, as all that differ in a last bit "
-        "do.",
-        "Look for sums in the order of threads or of atomic additions, and for a list kept from the call "
-        "before.",
+        "error" if large else "warning",
+        "the same question has another answer each time"
+        if large
+        else "the same question has not the same answer to the last bit",
+        said
+        + (
+            " That is no rounding: no other number here is worth more than this."
+            if large
+            else " Two runs of one input will part, as all that differ in a last bit do."
+        ),
+        "Look for memory that is read before it is written, for what is drawn at random, and for threads "
+        "that write to one place."
+        if large
+        else "Look for sums in the order of threads or of atomic additions, and for a list kept from the "
+        "call before.",
     )
+
+
+def _tolerance(subject: Subject, atoms: Atoms) -> float:
+    """Å by which an atom, or an edge of the cell, can move while an answer stays to the last bit, or 0.
+
+    Only where the answer ought to have changed by many of its last digits: what it changes by over the
+    longest of the moves, in proportion.
+    """
+    # one coordinate, the largest: a tolerance may be one of all atoms together, or a share of a coordinate
+    line = np.zeros((len(atoms), 3))
+    line.flat[np.argmax(np.abs(atoms.positions))] = 1.0
+    ways: list[tuple[np.ndarray, Callable[[float], Atoms]]] = [
+        (_TINY, lambda place: displaced(atoms, place * line))
+    ]
+    if atoms.pbc.any():
+        edge = float(np.max(atoms.cell.lengths()))
+
+        def stretched(place: float) -> Atoms:
+            there = atoms.copy()
+            there.set_cell((1 + place / edge) * atoms.cell.array)
+            return there
+
+        ways.append((_TINY[::2], stretched))
+    return max(_kept_within(subject, sizes, at) for sizes, at in ways)
+
+
+def _kept_within(subject: Subject, sizes: np.ndarray, at: Callable[[float], Atoms]) -> float:
+    """The longest of some moves in a row after which one object has given its last answer again."""
+    used = subject.fresh()
+    if isinstance(used, CalculatorSubject):
+        used.forgets = False
+    places = np.array([0.0, *np.cumsum(sizes)])
+    answers = []
+    for place in places:
+        found = ask(used, at(place))
+        if isinstance(found, Refusal):
+            return 0.0
+        answers.append(np.append(found.forces, found.energy))
+    values = np.array(answers)
+    rate = np.abs(values[-1] - values[0]) / places[-1]
+    read = digits(values[:, :-1])
+    # forces are the finer measure; the smallest of them may have lost its digits to others
+    last = max(2.0**-read.bits * float(np.max(np.abs(values[0, :-1]), initial=0.0)), read.quantum)
+    felt = float(np.max(rate[:-1], initial=0.0)) * sizes > _KEPT * last
+    if read.bits <= 24:  # who answers in single precision may read positions so
+        felt &= sizes > 4 * _grain(at(0.0))
+    kept = [
+        moved
+        for moved, seen, before, after in zip(sizes, felt, values, values[1:], strict=False)
+        if seen and (before == after).all()
+    ]
+    return float(max(kept, default=0.0))
+
+
+def _grain(atoms: Atoms) -> float:
+    """The last digit of the largest coordinate in single precision, Å."""
+    return float(np.spacing(np.float32(np.max(np.abs(atoms.positions), initial=1.0))))
+
+
+def _kept(tolerance: float, atoms: Atoms) -> Iterator[dict[str, str]]:
+    if tolerance:
+        yield finding(
+            "KEPT_ANSWER",
+            "error" if tolerance > max(_HARMLESS, _grain(atoms)) else "warning",
+            "the answer to another structure is given again",
+            f"An atom, or the cell, moved by up to {tolerance:.0e} Å, and the object gave the energy "
+            "and forces that it had given before, to the last bit, where they ought to have changed by more "
+            "than a hundred times that. Slow atoms, differences and relaxations see old forces. (Positions "
+            f"that are rounded to single precision move in steps of {_grain(atoms):.1g} Å here.)",
+            "Compare positions, cell, species and periods bit by bit before an answer is given again, not "
+            "within a tolerance (np.allclose allows 1e-5 of a coordinate).",
+        )
 
 
 def _row(row: Mapping[str, Any]) -> dict[str, Any]:
@@ -409,8 +561,12 @@ def _row(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _says(rows: list[dict[str, Any]], stale: list[dict[str, Any]], repeats: Mapping[str, Any]) -> str:
-    bits = "are" if repeats["bit-identical"] else "are not"
-    tail = f"Repeated calls {bits} bit-identical."
+    if not repeats["bit-identical"]:
+        tail = "Repeated calls are not bit-identical."
+    elif not repeats["bit-identical between objects"]:
+        tail = "Repeated calls are bit-identical, and those of new objects are not."
+    else:
+        tail = "Repeated calls are bit-identical."
     words = f"{len({row['sequence'] for row in rows})} sequences"
     if stale:
         sizes = [row["energy"] for row in stale if np.isfinite(row["energy"])]
@@ -418,5 +574,10 @@ def _says(rows: list[dict[str, Any]], stale: list[dict[str, Any]], repeats: Mapp
         return (
             f"{len(stale)} of {len(rows)} answers of an object in use differ from those of a new one, {by}: "
             f"the calculator remembers. {tail}"
+        )
+    if chance := repeats.get("by chance"):
+        return (
+            f"{chance} of {len(rows)} answers of an object in use differ from those of a new one by up to "
+            f"{repeats['energies']:.3g} eV, and not when they are asked for again: by chance. {tail}"
         )
     return f"Objects in use answered {len(rows)} questions of {words} as new ones do. {tail}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -13,11 +14,14 @@ from ase import Atoms
 from jaxtyping import Float
 
 from mdnum.audit.base import Meter
+from mdnum.audit.ledger import Ledger
 from mdnum.errors import MdnumError
 from mdnum.units import METAL, Units
 
 #: A calculator that fails is asked hundreds of times; this many structures are kept.
 _MOST_SAVED = 20
+
+_objects = itertools.count()
 
 _ROOM_TEMPERATURE = 0.025852
 """k_B times 300 K, eV."""
@@ -51,7 +55,8 @@ class CalculatorSubject:
     ASE answers from its cache where no coordinate moved by more than 1e-15 Å, which is several
     representable distances near an atom at the origin: where the bits differ, the cache is dropped first.
     Bits that do not differ are answered from the cache, so that energy and forces cost one calculation;
-    `forget` makes the next question a calculation.
+    `forget` makes the next question a calculation. The calculator is attached to the atoms that it is asked
+    about, as in a run: some answer in no other way.
 
     Args:
         name: what the person called it.
@@ -76,6 +81,10 @@ class CalculatorSubject:
         self.units = units
         #: What checks have worked out about the calculator and its structure; new objects know it too.
         self.known: dict[Any, Any] = {}
+        #: What was answered to each question, by all objects of this audit.
+        self.ledger = Ledger()
+        #: Drop what a calculator's own test for changes calls unchanged, where a bit has changed.
+        self.forgets = True
         self.name = name
         self.atoms = _bare(atoms)
         self.kT = kT
@@ -89,12 +98,15 @@ class CalculatorSubject:
         self._calculator: Any = None
         self._last: tuple[np.ndarray, ...] | None = None
         self._saved = 0
+        #: Which object it is, and how many structures it has been asked about.
+        self._object, self._seen = 0, 0
 
     @property
     def calculator(self) -> Any:
         """The calculator object, made when first used."""
         if self._calculator is None:
             self._calculator = self._make()
+            self._object, self._seen = next(_objects), 0
         return self._calculator
 
     def fresh(self) -> CalculatorSubject:
@@ -103,14 +115,14 @@ class CalculatorSubject:
             self.name, self._make, self.atoms, kT=self.kT, folder=self.folder, units=self.units
         )
         other._saved, other.saving, other.known = self._saved, self.saving, self.known
-        other.meter = self.meter
+        other.meter, other.ledger = self.meter, self.ledger
         return other
 
     def about(self, atoms: Atoms) -> CalculatorSubject:
         """The same calculator object asked about another structure."""
         other = self.fresh()
         other.atoms, other._calculator, other._last = _bare(atoms), self.calculator, self._last
-        other.known = {}
+        other.known, other._object, other._seen = {}, self._object, self._seen
         return other
 
     def forget(self) -> None:
@@ -121,6 +133,7 @@ class CalculatorSubject:
         elif isinstance(getattr(self.calculator, "results", None), dict):
             self.calculator.results = {}
         self._last = None
+        self._seen += 1
 
     def energy(self, atoms: Atoms) -> float:
         """Potential energy in eV: the one the forces belong to where the calculator knows two.
@@ -128,14 +141,34 @@ class CalculatorSubject:
         Raises:
             CalculatorError: the calculator raised, or answered with nan; the structure has been saved.
         """
+        return self.energies(atoms)[0]
+
+    def energies(self, atoms: Atoms) -> tuple[float, float | None]:
+        """(the energy that forces belong to, the one that a run is told), eV.
+
+        ASE calls the first `free_energy` and the second `energy`; None where the calculator knows one alone.
+
+        Raises:
+            CalculatorError: as for `energy`.
+        """
         asked = self._ask(atoms)
-        value = self._answer(lambda: self._energy(asked), asked, "energy")
+        both = self._answer(lambda: self._energies(asked), asked, "energy")
+        energy, told = (value if value is None else self._number(value, asked) for value in both)
+        assert energy is not None
+        self.ledger.energy(asked, energy, told, *self._asked_as())
+        return energy, told
+
+    def _asked_as(self) -> tuple[tuple[int, int], bool]:
+        """(what tells this question from others, whether it is the first that this object was asked)."""
+        return (self._object, self._seen), self._seen == 1
+
+    def _number(self, value: Any, atoms: Atoms) -> float:
         try:
             energy = float(np.asarray(value, dtype=np.float64).reshape(()))
         except (TypeError, ValueError):
-            raise self._failed(asked, f"gave {value!r} as an energy, not one number") from None
+            raise self._failed(atoms, f"gave {value!r} as an energy, not one number") from None
         if not np.isfinite(energy):
-            raise self._failed(asked, f"gave an energy of {energy}")
+            raise self._failed(atoms, f"gave an energy of {energy}")
         return energy
 
     def forces(self, atoms: Atoms) -> Float[np.ndarray, "atoms 3"]:
@@ -145,7 +178,7 @@ class CalculatorSubject:
             CalculatorError: as for `energy`, or forces of another shape than the positions.
         """
         asked = self._ask(atoms)
-        value = self._answer(lambda: self.calculator.get_forces(asked), asked, "forces")
+        value = self._answer(lambda: asked.get_forces(), asked, "forces")
         forces = np.array(value, dtype=np.float64)
         if forces.shape != (len(asked), 3):
             raise self._failed(asked, f"gave forces of shape {forces.shape} for {len(asked)} atoms")
@@ -155,6 +188,7 @@ class CalculatorSubject:
             raise self._failed(
                 asked, f"gave a force of {forces[first].tolist()} on atom {first} ({asked.symbols[first]})"
             )
+        self.ledger.forces(asked, forces, *self._asked_as())
         return forces
 
     def writes(self, atoms: Atoms) -> list[str]:
@@ -165,8 +199,8 @@ class CalculatorSubject:
         """
         self.forget()
         asked = self._ask(atoms)
-        self._answer(lambda: self._energy(asked), asked, "energy")
-        self._answer(lambda: self.calculator.get_forces(asked), asked, "forces")
+        self._answer(lambda: self._energies(asked), asked, "energy")
+        self._answer(lambda: asked.get_forces(), asked, "forces")
         words = ("positions", "numbers", "cell", "periods")
         return [
             word
@@ -181,10 +215,13 @@ class CalculatorSubject:
             a.shape == b.shape and a.tobytes() == b.tobytes() for a, b in zip(bits, self._last, strict=True)
         )
         if not same:
-            if self._nearly(asked):
+            if self.forgets and self._nearly(asked):
                 self.forget()
             self.meter.count()
+        calculator = self.calculator
+        self._seen += not same or self._seen == 0
         self._last = bits
+        self._answer(lambda: setattr(asked, "calc", calculator), asked, "an answer")
         return asked
 
     def _nearly(self, atoms: Atoms) -> bool:
@@ -197,15 +234,19 @@ class CalculatorSubject:
         except Exception:  # a calculator's own test for changes; what it cannot answer is a change
             return False
 
-    def _energy(self, atoms: Atoms) -> Any:
-        if "free_energy" in (getattr(self.calculator, "implemented_properties", None) or ()):
-            from ase.calculators.calculator import PropertyNotImplementedError
+    def _energies(self, atoms: Atoms) -> tuple[Any, Any]:
+        if "free_energy" not in (getattr(self.calculator, "implemented_properties", None) or ()):
+            return atoms.get_potential_energy(), None
+        from ase.calculators.calculator import PropertyNotImplementedError
 
-            try:
-                return self.calculator.get_potential_energy(atoms, force_consistent=True)
-            except (PropertyNotImplementedError, TypeError):
-                pass  # named, and then not given
-        return self.calculator.get_potential_energy(atoms)
+        try:
+            consistent = atoms.get_potential_energy(force_consistent=True)
+        except (PropertyNotImplementedError, TypeError):  # named, and then not given
+            return atoms.get_potential_energy(), None
+        try:
+            return consistent, atoms.get_potential_energy()
+        except PropertyNotImplementedError:
+            return consistent, None
 
     def _answer(self, question: Callable[[], Any], atoms: Atoms, what: str) -> Any:
         try:

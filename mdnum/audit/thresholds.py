@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mdnum.audit.base import TIME_UP, Progress, Subject, TimeUp, meter_of
+from mdnum.audit.beyond import Beyond, beyond
 from mdnum.audit.curve import Curve, grid, scatter
 from mdnum.audit.digits import digits
 from mdnum.audit.ends import end_of, with_end
@@ -64,6 +65,8 @@ class PairWalk:
             (a table with cubic splines between its points); else 0.
         quantum: of energies (eV) and forces (eV/Å) that are rounded to decimals; 0 where they are not. No
             jump below a few of them is told.
+        further: what was found past the scan, where the two still feel one another at its end.
+        scanned: the farthest distance of the scan, length.
         steps: (from, to, half, all) of the scan within the range: between these distances, length, but not
             beside thresholds, a step of the force above `all`, eV/Å, is found, and one above `half` at half
             of them; None without a scan.
@@ -80,6 +83,8 @@ class PairWalk:
     quantum: tuple[float, float] = (0.0, 0.0)
     knots: int = 0
     steps: tuple[float, float, float, float] | None = None
+    further: Beyond | None = None
+    scanned: float = FARTHEST
 
 
 @dataclass(frozen=True)
@@ -146,7 +151,14 @@ def walk_pairs(subject: Subject, progress: Progress | None = None) -> PairWalks:
                 skipped.append((f"pair {pair.name}", TIME_UP))
                 left += 1
         _known[subject] = PairWalks(tuple(walks), tuple(skipped), _not_walked(subject, walks), possible, left)
+        getattr(subject, "known", {})["walks"] = _known[subject]
     return _known[subject]
+
+
+def known_walks(subject: Subject) -> tuple[PairWalk, ...]:
+    """Walks of pairs that were made for an earlier question; none where none was."""
+    found = getattr(subject, "known", {}).get("walks")
+    return found.walks if found else ()
 
 
 def _not_walked(subject: Subject, walks: Sequence[PairWalk]) -> tuple[str, ...]:
@@ -221,20 +233,30 @@ def walk(subject: Subject, pair: Pair, step: float = STEP, calls: float = np.inf
         thresholds, left_out = [one for one in thresholds if one.order < SMOOTH], 0
     if edge is not None:
         thresholds = with_end(pair, curve, edge, thresholds, near)
+    further = None
+    if edge is None and alive(far):
+        further = beyond(subject, pair, end + margin, noise, step, calls)
+    if further:
+        thresholds += further.thresholds
     thresholds = [
         one for one in thresholds if pair.moves == "molecule" or not _of_others(pair, one, thresholds)
     ]
     values = curve.many(distance)
+    reach = distance[-1]
+    if further:
+        distance = np.append(distance, further.nodes)
+        values = np.hstack([values, np.array([further.energies, further.forces])])
     quantum = _quantum(values, len(pair.second))
     if any(quantum):
         # nearly all that stands out of such a curve is a step of rounding
         thresholds, left_out = [kept for one in thresholds if (kept := _beyond(one, quantum))], 0
+    ended = edge is not None or (further is not None and further.edge is not None)
     known = [one.radius for one in thresholds]
     seen = None if smallest is None else _seen(*smallest, end, STEPS * quantum[1], known)
     return PairWalk(
         pair, tuple(sorted(thresholds, key=lambda one: one.radius)), distance, values[0] - energy_far,
-        values[1], thresholds[-1].radius if edge and thresholds else None, left_out, len(curve.known),
-        quantum, knots, seen,
+        values[1], thresholds[-1].radius if ended and thresholds else None, left_out, len(curve.known),
+        quantum, knots, seen, further, float(reach),
     )  # fmt: skip
 
 

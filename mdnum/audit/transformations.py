@@ -9,6 +9,8 @@ import numpy as np
 from ase import Atoms
 from jaxtyping import Float, Int
 
+from mdnum.audit.probes import molecules
+
 #: Coordinates that should be 0 and are not quite: a denormal-like displacement that was seen to cost 5 eV,
 #: one that is lost when it is added to a cell's length, and half an ulp of 1.
 _TINY = (1e-52, 1e-17, 2.0**-53)
@@ -150,35 +152,48 @@ def permuted(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
         yield Same("atoms in another order", "ORDER", atoms[order], order)
     order = np.arange(len(atoms))[::-1].copy()
     yield Same("atoms in reverse order", "ORDER", atoms[order], order)
+    # with another species at the head of the list: some number species as they meet them
+    for number in list(dict.fromkeys(atoms.numbers))[1:3]:
+        order = np.argsort(atoms.numbers != number, kind="stable")
+        yield Same(f"atoms of {Atoms([number]).symbols[0]} first", "ORDER", atoms[order], order)
 
 
 def by_molecule(atoms: Atoms, rng: np.random.Generator) -> Same | None:
-    """Whole groups of atoms in another order, where the species repeat in groups; None where they do not."""
+    """Whole molecules in another order, where the atoms come in molecules; None where they do not."""
     size = group(atoms)
     if size is None:
         return None
     order = (rng.permutation(len(atoms) // size)[:, None] * size + np.arange(size)).ravel()
-    return Same(f"groups of {size} atoms in another order", "ORDER", atoms[order], order)
+    return Same(f"molecules of {size} atoms in another order", "ORDER", atoms[order], order)
 
 
 def images_by_molecule(atoms: Atoms, rng: np.random.Generator) -> Same | None:
-    """Whole groups of atoms moved by lattice vectors of their own; None as for `by_molecule`."""
+    """Whole molecules moved by lattice vectors of their own; None as for `by_molecule`."""
     size = group(atoms)
     if size is None or not atoms.pbc.any():
         return None
     boxes = rng.integers(-2, 3, (len(atoms) // size, 3)) * atoms.pbc
     there = atoms.copy()
     there.positions += np.repeat(boxes, size, axis=0) @ atoms.cell.array
-    what = f"groups of {size} atoms moved by lattice vectors of their own"
+    what = f"molecules of {size} atoms moved by lattice vectors of their own"
     return Same(what, "IMAGES", there, np.arange(len(atoms)), rounding=_ulp(there, atoms))
 
 
 def group(atoms: Atoms) -> int | None:
-    """Atoms in a group, above 1, that the order of species repeats; None for one species, or no repeat."""
+    """Atoms in a molecule, where the structure is molecules of several species, one after another; else None.
+
+    That species repeat in groups is not enough: so they do in a crystal of salt. Atoms of a group must be
+    bonded, by their covalent radii, and to no others.
+    """
     numbers = atoms.numbers
     for size in range(2, len(atoms) // 2 + 1):
         if len(atoms) % size == 0 and np.array_equal(numbers[size:], numbers[:-size]):
-            return size if len(set(numbers[:size])) > 1 else None
+            if len(set(numbers[:size])) == 1:
+                return None
+            expected = np.arange(len(atoms)).reshape(-1, size)
+            found = sorted(molecules(atoms), key=lambda one: one[0])
+            alike = len(found) == len(expected) and all(map(np.array_equal, found, expected))
+            return size if alike else None
     return None
 
 

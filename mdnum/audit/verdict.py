@@ -102,7 +102,8 @@ def _headline(name: str, answers: Mapping[str, Answer], parts: Sequence[Part], l
     titles = [
         finding["title"]
         for severity in ("error", "warning")
-        for finding in alone
+        # where one question has two answers, no other finding of its severity is worth as much
+        for finding in sorted(alone, key=lambda one: one["code"] != "NOT_REPEATABLE")
         if finding["severity"] == severity
     ]
     if not titles:

@@ -358,3 +358,207 @@ class WrapsGiven(Good):
         super().calculate(atoms, properties, system_changes)
         assert isinstance(atoms, Atoms)
         atoms.wrap()
+
+
+class HalfPrecision(Good):
+    """Hands its forces over in a narrow format, whatever is done with them afterwards."""
+
+    unit = 1.0
+
+    def extra(self, atoms, energy, forces):
+        return energy, (forces / self.unit).astype(np.float16).astype(float) * self.unit
+
+
+class HalfInOtherUnits(HalfPrecision):
+    """The same before a factor, after which every bit of the doubles is used."""
+
+    unit = 0.0433641153087705
+
+
+class BrainFloat(Good):
+    """Keeps eight bits."""
+
+    def extra(self, atoms, energy, forces):
+        mantissa, power = np.frexp(forces)
+        return energy, np.ldexp(np.round(256 * mantissa) / 256, power)
+
+
+class Decimals(Good):
+    """Hands over a text of few digits."""
+
+    places = 4
+
+    def extra(self, atoms, energy, forces):
+        return energy, np.round(forces, self.places)
+
+
+class HalfEnergy(Good):
+    """An energy in a narrow format, the forces in full."""
+
+    def extra(self, atoms, energy, forces):
+        return float(np.float16(energy)), forces
+
+
+class Drops(Good):
+    """Leaves a pair out now and then, whichever."""
+
+    share = 0.3
+    rng = np.random.default_rng(7)
+
+    def pairs(self, positions, shifts, atoms):
+        i, j, vectors = super().pairs(positions, shifts, atoms)
+        if len(i) and self.rng.random() < self.share:
+            gone = self.rng.integers(len(i))
+            keep = np.arange(len(i)) != gone
+            return i[keep], j[keep], vectors[keep]
+        return i, j, vectors
+
+
+class ByAppearance(Good):
+    """Numbers species as it meets them, and takes their parameters by that number."""
+
+    def answer(self, atoms):
+        met = list(dict.fromkeys(atoms.numbers))
+        size = np.array([1.0 + 0.05 * met.index(number) for number in atoms.numbers])
+        positions, shifts = self.positions(atoms), self.shifts(atoms)
+        i, j, vectors = self.pairs(positions, shifts, atoms)
+        distances = np.linalg.norm(vectors, axis=1)
+        u, slope = self.pair(distances)
+        forces = np.zeros((len(atoms), 3))
+        np.add.at(forces, i, (size[i] * size[j] * slope / distances)[:, None] * vectors)
+        return 0.5 * float(np.sum(size[i] * size[j] * u)), forces
+
+
+class TwoEnergies(Good):
+    """Knows an energy beside the one its forces belong to."""
+
+    def other(self, atoms: Atoms, energy: float) -> float:
+        """A constant for each atom."""
+        return energy - 3.5 * len(atoms)
+
+    def calculate(self, atoms=None, properties=None, system_changes=all_changes):
+        super().calculate(atoms, properties, system_changes)
+        assert isinstance(self.atoms, Atoms)
+        self.results["energy"] = self.other(self.atoms, self.results["free_energy"])
+
+
+class Entropy(TwoEnergies):
+    """They differ by what changes smoothly with the positions, as with smeared electrons."""
+
+    def other(self, atoms, energy):
+        return 1.01 * energy
+
+
+class CutEnergy(TwoEnergies):
+    """The energy alone is cut where the free energy is smooth."""
+
+    def other(self, atoms, energy):
+        i, _, _ = self.pairs(self.positions(atoms), self.shifts(atoms), atoms)
+        return energy + 0.005 * len(i)
+
+
+class OrderedEnergy(TwoEnergies):
+    """The energy alone depends on the order of the atoms."""
+
+    def other(self, atoms, energy):
+        return energy + 0.01 * float(np.linalg.norm(atoms.positions[0] - atoms.positions[1]))
+
+
+class SwappedEnergies(TwoEnergies):
+    """What forces belong to is handed over as energy, and something else as free energy."""
+
+    def calculate(self, atoms=None, properties=None, system_changes=all_changes):
+        super().calculate(atoms, properties, system_changes)
+        assert isinstance(self.atoms, Atoms)
+        energy = 0.98 * self.results["free_energy"]
+        self.results |= {"energy": self.results["free_energy"], "free_energy": energy}
+
+
+class Keeps(Good):
+    """Answers as before where nothing has moved by more than a tolerance."""
+
+    tolerance = 1e-5
+    last: Any = None
+
+    def same(self, before: Atoms, atoms: Atoms) -> bool:
+        return bool(np.abs(before.positions - atoms.positions).max() < self.tolerance) and bool(
+            (before.cell.array == atoms.cell.array).all()
+        )
+
+    def answer(self, atoms):
+        if self.last is not None:
+            before, found = self.last
+            if (
+                len(before) == len(atoms)
+                and (before.numbers == atoms.numbers).all()
+                and (before.pbc == atoms.pbc).all()
+                and self.same(before, atoms)
+            ):
+                return found
+        found = super().answer(atoms)
+        self.last = atoms.copy(), found
+        return found
+
+
+class KeepsClose(Keeps):
+    """The same with numpy's idea of what is close: 1e-5 of a coordinate."""
+
+    def same(self, before, atoms):
+        return np.allclose(before.positions, atoms.positions) and np.array_equal(before.cell, atoms.cell)
+
+
+class KeepsCell(Keeps):
+    """Compares positions to the last bit, and the cell within a tolerance."""
+
+    def same(self, before, atoms):
+        return np.array_equal(before.positions, atoms.positions) and np.allclose(
+            before.cell.array, atoms.cell.array, rtol=1e-4
+        )
+
+
+class KeepsByRounding(Good):
+    """One table for all objects, by rounded positions."""
+
+    table: dict[Any, Any] = {}  # noqa: RUF012
+
+    def answer(self, atoms):
+        key = (
+            np.round(atoms.positions, 5).tobytes(), atoms.numbers.tobytes(), atoms.cell.array.tobytes(),
+            atoms.pbc.tobytes(),
+        )  # fmt: skip
+        if key not in self.table:
+            self.table[key] = super().answer(atoms)
+        return self.table[key]
+
+
+class KeepsByAse(Good):
+    """ASE's own test for changes with another tolerance."""
+
+    def check_state(self, atoms, tol=1e-15):
+        return super().check_state(atoms, tol=1e-5)
+
+
+class Attached:
+    """Answers about the atoms that it is attached to, and is no class of ASE's."""
+
+    implemented_properties = ("energy", "forces")
+    mine: Atoms | None = None
+
+    def set_atoms(self, atoms):
+        self.mine = atoms
+
+    def get_potential_energy(self, atoms=None, force_consistent=False):
+        assert self.mine is not None, "no atoms"
+        return Good().answer(self.mine)[0]
+
+    def get_forces(self, atoms=None):
+        assert self.mine is not None, "no atoms"
+        return Good().answer(self.mine)[1]
+
+
+class ThroughAtoms(Good):
+    """Looks for itself in the atoms that it is given."""
+
+    def calculate(self, atoms=None, properties=None, system_changes=all_changes):
+        assert atoms is not None and atoms.calc is self, "not attached"
+        super().calculate(atoms, properties, system_changes)

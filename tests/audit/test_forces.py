@@ -45,7 +45,7 @@ def test_answers_rounded_to_decimals_are_told_as_such():
             return round(energy, 5), np.round(forces, 4)
 
     (found,) = [one for one in Forces()(subject(Rounded)).findings if one["code"] == "QUANTIZED"]
-    assert "the energy to 5 (1e-05 eV), forces to 4 (1e-04 eV/Å)" in found["text"]
+    assert "the energy, in steps of 1e-05 eV; forces to 4 decimals, in steps of 0.0001 eV/Å" in found["text"]
 
 
 @pytest.mark.parametrize("check", [Forces, Curl])

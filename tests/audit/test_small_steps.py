@@ -119,7 +119,7 @@ def test_pairs_that_were_not_walked_are_named(monkeypatch: pytest.MonkeyPatch):
 
 
 def codes(walk, asked) -> dict[str, str]:
-    return {one["code"]: one["severity"] for one in reach(walk, units_of(asked))}
+    return {one["code"]: one["severity"] for one in reach(walk, units_of(asked), asked.kT)}
 
 
 def test_a_table_with_corners_has_more_kinks_than_are_looked_at():
@@ -234,7 +234,12 @@ def through_single(value):
     [
         ("energies", through_single, "LOW_PRECISION", "All energies are numbers of single precision"),
         ("forces", through_single, "LOW_PRECISION", "All forces are numbers of single precision"),
-        ("energies", lambda value: np.round(value, 5), "QUANTIZED", "the energy to 5 (1e-05 eV)"),
+        (
+            "energies",
+            lambda value: np.round(value, 5),
+            "QUANTIZED",
+            "the energy to 5 decimals, in steps of 1e-05 eV",
+        ),
     ],
     ids=["energies single", "forces single", "energies rounded"],
 )
@@ -243,5 +248,5 @@ def test_few_digits_of_energies_or_of_forces_alone_are_told(which, rounding, cod
         pass
 
     setattr(Some, which, staticmethod(rounding))
-    (found,) = precision(planted.subject(Some), planted.chain(), Noise(1e-8, 1e-8), np.random.default_rng(0))
+    (found,) = precision(planted.subject(Some), planted.chain(), Noise(1e-8, 1e-8))
     assert found["code"] == code and words in found["text"]
