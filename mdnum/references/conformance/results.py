@@ -72,6 +72,9 @@ class Report:
         ties: (counted, not counted) pairs at exactly r_cut.
         keeps_order: whether the same question gives the same rows in the same order.
         superset: pairs beyond the cutoff are part of what it gives.
+        padding: out to which a list that is kept has all pairs, in units of the skin that it is given; None
+            where it neither says so nor shows it.
+        said: it says so, rather than shows it.
         shifts: whether it gives the images that pairs are through.
         areas: tallies by area.
         aliased: the first case in which a call wrote to the arrays of the answer before it, or None.
@@ -88,6 +91,8 @@ class Report:
     ties: list[int] = field(default_factory=lambda: [0, 0])
     keeps_order: bool | None = None
     superset: bool = False
+    padding: float | None = None
+    said: bool = False
     shifts: bool = False
     areas: dict[str, Tally] = field(default_factory=dict)
     aliased: str | None = None
@@ -96,6 +101,15 @@ class Report:
     seconds: float = 0.0
     asking: float = 0.0
     large: tuple[int, float] | None = None
+
+    def reach(self, case: Case) -> float:
+        """How far the pairs may be that a list with pairs beyond the cutoff gives, length.
+
+        What is listed may have come as far as the skin lets it, from either side.
+        """
+        usual = case.r_cut + 2 * case.skin if case.skin else 1.5 * case.r_cut
+        own = 0.3 * (self.padding or 1.0)  # asked with a skin of 0.3 cutoffs
+        return usual if own < 0.31 else max(usual, (1 + 2 * own) * case.r_cut)
 
     @property
     def asked(self) -> int:

@@ -12,6 +12,7 @@ import numpy as np
 
 from mdnum.references.conformance.alike import looked_into
 from mdnum.references.conformance.case import AREAS, KEPT, Case, one
+from mdnum.references.conformance.catalog import gas
 from mdnum.references.conformance.crowds import LARGE_EDGE, SMALL_EDGE, lattice, vast
 from mdnum.references.conformance.judge import CODES, Conventions, Failure, judge, measures_well
 from mdnum.references.conformance.lists import Outcome, PairList, Session
@@ -28,8 +29,9 @@ CASES = 500
 _PATIENCE = 30.0
 #: Share of wrong answers above which one that would be right in float32 says nothing about precision.
 _MISTAKES = 0.1
-#: Failures of one code that are kept for shrinking; the rest are counted.
-_KEPT = 1
+#: Atoms, edge and seed of the crowd that shows how far a list that is kept has all pairs, and its skin.
+_CROWD = (160, 6.0, 130)
+_SKIN = 0.3
 
 
 class Examiner:
@@ -80,18 +82,38 @@ class Examiner:
                     break
             break
         report.how = Conventions(True if full is None else full, sign, toward, tested.unit or DOUBLE)
-        self.superset = self._has_more() if tested.superset is None and tested.kept else bool(tested.superset)
+        self.superset = bool(tested.superset)
+        if tested.kept:
+            self._look_at_skin()
         report.superset = self.superset
 
-    def _has_more(self) -> bool:
-        """Whether a list that is kept gives what its skin holds, rather than what is inside the cutoff."""
-        case = replace(one("a pair in the skin", "few", [[2.0, 2, 2], [3.15, 2, 2]], 5.0), skin=0.3)
-        if self.tested.limits.refusal(case) is not None:
-            case = replace(one("a free pair in the skin", "few", [[2.0, 2, 2], [3.15, 2, 2]]), skin=0.3)
-        answer = self.session.ask(case)[0].answer
-        more = answer is None or len(answer) > 0
-        self.report.found_out.append("with its skin" if more else "without its skin")
-        return more
+    def _look_at_skin(self) -> None:
+        """Whether a list that is kept gives what its skin holds, and how far it has all pairs.
+
+        Its padding is where the nearest pair is that it lacks, or what it says.
+        """
+        report, tested = self.report, self.tested
+        crowd = replace(one("a crowd", "few", gas(*_CROWD), _CROWD[1]), skin=_SKIN)
+        if tested.limits.refusal(crowd) is not None:
+            crowd = replace(one("a free crowd", "few", gas(*_CROWD)), skin=_SKIN)
+        outcome = self.session.ask(crowd)[0]
+        answer, edge, below = outcome.answer, np.inf, 0.0
+        if answer is not None:
+            right = truth(crowd, 0, reach=0.45 * _CROWD[1])
+            rows = np.concatenate([answer.i, answer.j]) * crowd.atoms + np.concatenate([answer.j, answer.i])
+            there = np.isin(right.i * crowd.atoms + right.j, rows)
+            edge = float(right.distance[~there].min(initial=np.inf))
+            below = float(right.distance[right.distance < edge].max(initial=0.0))
+        if tested.superset is None:
+            # what does not answer is taken for the usual
+            self.superset = answer is None or below > crowd.r_cut + 0.1 * _SKIN
+            report.found_out.append("with its skin" if self.superset else "without its skin")
+        if outcome.skin is not None:
+            report.padding, report.said = outcome.skin / _SKIN, True
+        elif self.superset and crowd.r_cut < edge < np.inf:
+            # the nearest pair that is lacking lies somewhat beyond the edge
+            whole = below < crowd.r_cut + _SKIN <= edge
+            report.padding = 1.0 if whole else (edge - crowd.r_cut) / _SKIN
 
     def unusable(self) -> str | None:
         """Why nothing can be learned from it: no plain question had an answer that is one; None otherwise.
@@ -151,15 +173,13 @@ class Examiner:
             [Failure("CHANGED_INPUT", f"the call wrote to its {outcome.changed}")] if outcome.changed else []
         )
         # what is listed may have come as far as the skin lets it, from either side
-        reach = case.r_cut + 2 * case.skin if self.superset else None
-        if self.superset and not case.skin:
-            reach = 1.5 * case.r_cut
+        reach = self.report.reach(case) if self.superset else None
         how = self.report.how
         right = truth(case, step, reach=reach, unit=how.unit)
         found = judge(outcome.answer, right, how)
         if found and step and self.superset and any(failure.code == "EXTRA" for failure in found):
             # a box that grows takes listed pairs further apart than any skin: harmless, and no phantoms
-            found = judge(outcome.answer, _with_earlier(case, step, right), how)
+            found = judge(outcome.answer, _with_earlier(case, step, right, reach or case.r_cut), how)
         # a list that is stale by a hair is not one in single precision
         new = step == 0 and not case.known and len(outcome.answer) > 0 and self._mostly_right()
         if found and new and self.tested.unit is None and how.unit == DOUBLE:
@@ -193,13 +213,13 @@ class Examiner:
             self.report.ties[0 if (i, j) in rows or (j, i) in rows else 1] += 1
 
 
-def _with_earlier(case: Case, step: int, right: Truth) -> Truth:
+def _with_earlier(case: Case, step: int, right: Truth, reach: float) -> Truth:
     """The truth at a step, where pairs that were listed rightly earlier in the list's life may still be."""
     rows = [(right.i, right.j, right.shift)]
     for before in range(step - 1, -1, -1):
         if len(case.stills[before].positions) != len(right.positions) or case.stills[before + 1].fresh:
             break
-        then = truth(case, before, reach=case.r_cut + case.skin)
+        then = truth(case, before, reach=max(case.r_cut + case.skin, case.r_cut + (reach - case.r_cut) / 2))
         rows.append((then.i, then.j, then.shift))
     i, j, shift = (np.concatenate([part[n] for part in rows]) for n in range(3))
     table = np.unique(np.column_stack([i, j, shift]), axis=0)
@@ -252,7 +272,7 @@ def examine(
     began = time.perf_counter()
     examiner = examiner or Examiner(tested, reuse=True, apart=apart)
     report = examiner.report
-    every = list(questions(tested, cases, seed, False) if asked is None else asked)
+    every = list(questions(tested, cases, seed, False, report.padding) if asked is None else asked)
     if asked is None and apart and tested.word:
         every += as_kept(tested, vast())
     total = len(every) + 2 * (large and asked is None)
@@ -328,8 +348,6 @@ def _asked(examiner: Examiner, case: Case) -> list[Failure]:
 
 def _order(examiner: Examiner) -> None:
     """Whether the same question has the same rows in the same order, twice in a row."""
-    from mdnum.references.conformance.catalog import gas
-
     for case in (one("order", "reuse", gas(40, 6.0, 120), 6.0), one("order", "reuse", gas(40, 3.0, 120))):
         case = replace(case, skin=0.3 if examiner.tested.kept else 0.0)
         if examiner.tested.limits.refusal(case) is None:
