@@ -435,8 +435,8 @@ def _drawn(count, share):
     return np.random.default_rng(count).random(count) < share
 
 
-#: Rebuild tests of another shape than "an atom has moved by half of the skin", by (moved, room): displacements
-#: since the build, length, shape (atoms, 3), and half of the skin. Each lets pairs of its own kind through.
+#: Rebuild tests of another shape than "an atom moved by half of the skin", of (moved, room): displacements
+#: since the build, shape (atoms, 3), and half of the skin. Each lets pairs of its own kind through.
 RULE_DEFECTS = {
     # each axis by itself
     "each axis by itself": lambda moved, room: np.abs(moved).max() > room,

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from mdnum.references.conformance.alike import Refusal
 from mdnum.references.conformance.case import Case
-from mdnum.references.conformance.judge import CODES, Conventions, Failure
+from mdnum.references.conformance.judge import CODES, SILENT, Conventions, Failure
 from mdnum.references.conformance.lists import PairList
 
 
@@ -55,6 +55,11 @@ class Tally:
     why: dict[str, int] = field(default_factory=dict)
 
     @property
+    def silent(self) -> int:
+        """Failed cases in which nothing came back that could be wrong."""
+        return sum(number for code, number in self.codes.items() if code in SILENT)
+
+    @property
     def passed(self) -> int:
         """Cases answered as they should be."""
         return self.asked - self.failed - self.refused
@@ -82,6 +87,9 @@ class Report:
         failed: the first failure of each kind and area, in the order in which they were met.
         seconds: in all; asking: of the list itself.
         large: (atoms, seconds) of its largest question.
+        questions: cases that there are, those that it does not claim to do included.
+        motions: against its rebuild rule, that it was asked; and calls: of it in those.
+        whole: all failures were shrunk as far as they are.
     """
 
     tested: PairList
@@ -101,6 +109,10 @@ class Report:
     seconds: float = 0.0
     asking: float = 0.0
     large: tuple[int, float] | None = None
+    questions: int = 0
+    motions: int = 0
+    calls: int = 0
+    whole: bool = True
 
     def reach(self, case: Case) -> float:
         """How far the pairs may be that a list with pairs beyond the cutoff gives, length.
@@ -115,6 +127,11 @@ class Report:
     def asked(self) -> int:
         """Cases that were asked."""
         return sum(tally.asked for tally in self.areas.values())
+
+    @property
+    def left(self) -> int:
+        """Cases that were not come to."""
+        return self.questions - sum(tally.asked + tally.skipped for tally in self.areas.values())
 
     @property
     def wrong(self) -> int:

@@ -23,8 +23,9 @@ from mdnum.references.conformance.catalog import gas
 _R, _SKIN = 1.0, 0.3
 #: What a pair starts beyond the padding and ends inside the cutoff by, in paddings.
 HAIR = 2e-3
-#: Paddings of a ladder, in paddings: it is not known which of them a list has that shows no pairs of its skin.
+#: Of a ladder, in paddings: which of them a list has that shows no pairs of its skin is not known.
 _RUNGS = np.geomspace(0.25, 3.0, 20)
+_BEYOND = int((_RUNGS >= 1).sum())  # of a list that has the padding it is taken to have
 #: What the atom of a pair that is named first does of the motion.
 _SHARES = (0.5, 1.0, 0.0, 0.3, 0.7)
 
@@ -166,7 +167,7 @@ def _in_turn(room: float, ways: list[ndarray]) -> Case:
 
 
 def _ladder(room: float, way: ndarray, n: int) -> Case:
-    """Pairs of all starts creep together: each comes inside when two atoms could just have used up its own."""
+    """Pairs from near and far creep together: each comes inside when its own start is just used up."""
     places = _places(len(_RUNGS), 12.0, n)
     rungs = room * _RUNGS[:, None]
     path = []
@@ -174,7 +175,7 @@ def _ladder(room: float, way: ndarray, n: int) -> Case:
         half = (_R + (1 + HAIR) * rungs - (1 + 2 * HAIR) * room * closed) / 2 * way
         path.append(np.vstack([places - half, places + half]))
     made = script(f"pairs from near and far creep together, {_told(way)}", "rule", path, 12.0, _R, _SKIN)
-    return replace(made, motions=len(_RUNGS))
+    return replace(made, motions=_BEYOND)
 
 
 def _one_by_one(room: float, way: ndarray, share: float, n: int) -> Case:
@@ -191,7 +192,7 @@ def _one_by_one(room: float, way: ndarray, share: float, n: int) -> Case:
         moved[second] -= (1 - share) * toward
         path.append(moved)
     name = f"pairs from near and far, one by one, {share:.0%} by an atom, {_told(way)}"
-    return replace(script(name, "rule", path, 12.0, _R, _SKIN), motions=count)
+    return replace(script(name, "rule", path, 12.0, _R, _SKIN), motions=_BEYOND)
 
 
 def _told(way: ndarray) -> str:
