@@ -235,7 +235,7 @@ calls = 0
 def nearest_image(positions, cell, pbc, r_cut):
     global calls
     calls += 1
-    if calls > 60 and Path("armed").exists():
+    if calls > 75 and Path("armed").exists():
         Path("armed").unlink()
         os.kill(os.getppid(), signal.SIGKILL)
     i, j = np.triu_indices(len(positions), 1)
@@ -243,6 +243,7 @@ def nearest_image(positions, cell, pbc, r_cut):
     if pbc.all():
         apart = apart - np.rint(apart @ np.linalg.inv(cell)) @ cell
     near = (apart**2).sum(axis=1) < r_cut**2
+    near &= apart.any(axis=1)
     return i[near], j[near]
 """
 
@@ -250,10 +251,20 @@ def nearest_image(positions, cell, pbc, r_cut):
 def test_an_examination_that_is_killed_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    """By SIGKILL in its middle: what was found is there, and its summary is that of one that was not stopped."""
+    """By SIGKILL: what was found is there, and its summary is that of one that was not stopped."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "ends.py").write_text(_ENDS)
-    asked = ("conform", "ends.py:nearest_image", "--cases", "5", "--no-large", "--no-report")
+    limits = "minimum-image,orthorhombic,all-axes"
+    asked = (
+        "conform",
+        "ends.py:nearest_image",
+        "--cases",
+        "5",
+        "--no-large",
+        "--no-report",
+        "--limits",
+        limits,
+    )
     assert call(*asked, "-o", "whole") == 1
     (tmp_path / "armed").touch()
     done = subprocess.run(
@@ -262,11 +273,11 @@ def test_an_examination_that_is_killed_goes_on(
     assert done.returncode == -9 and not (tmp_path / "armed").exists()
     kept = json.loads((tmp_path / "killed" / "answers.json").read_text())
     wrong = [one for one in kept["cases"].values() if one["failures"]]
-    assert 20 < len(kept["cases"]) < 100 and wrong
+    assert 20 < len(kept["cases"]) < 120 and wrong
     before = RunFolder.open("killed").summary
-    assert before["status"] == "stopped" and before["left"] > 50
+    assert before["status"] == "stopped" and before["left"] > 20
     assert call("report", "killed") == 0
-    assert RunFolder.open("killed").summary["verdict"].startswith("As far as asked (")
+    assert "As far as asked (" in (tmp_path / "killed" / "report.html").read_text()
     capsys.readouterr()
     assert call("conform", "mine", "--resume", "killed") == 2
     assert "so LIST cannot be given" in capsys.readouterr().err

@@ -186,8 +186,9 @@ def _one_by_one(room: float, way: ndarray, share: float, n: int) -> Case:
     path = [start]
     for rung, far in enumerate(_RUNGS):
         moved = start.copy()
-        first, second = (rung, rung + count) if rung % 2 else (rung + count, rung)
-        toward = (1.0 if rung % 2 else -1.0) * (1 + 2 * HAIR) * room * far * way
+        turned = (rung + n) % 2
+        first, second = (rung, rung + count) if turned else (rung + count, rung)
+        toward = (1.0 if turned else -1.0) * (1 + 2 * HAIR) * room * far * way
         moved[first] += share * toward
         moved[second] -= (1 - share) * toward
         path.append(moved)

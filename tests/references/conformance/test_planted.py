@@ -95,8 +95,6 @@ def test_a_rule_that_lets_pairs_through_is_found_out(defect: str):
 )
 def test_a_padding_of_its_own_hides_no_rule(defect: str, way: str, own: float):
     """Whatever skin it is given; where it neither shows nor says it, from one that was tried."""
-    if (defect, way, own) == ("a sample of nine in ten", "neither", 0.5):
-        pytest.skip("the scripts that wrap atoms find it; 20 atoms in turn do not")
     test = planted_lists.RULE_DEFECTS[defect]
     made = planted_lists.ruled(test, own, filtered=way != "shown", says=way == "said")
     report = _against_the_rule(made, stop=True, shrink=False)
@@ -120,7 +118,7 @@ def test_a_rule_that_loses_nothing_raises_no_alarm(rule: str, own: float | None,
     made = planted_lists.ruled(planted_lists.RULES[rule], own, filtered, says)
     report = _against_the_rule(made, shrink=False)
     assert not report.failed, [(one.case.name, one.worst.text) for one in report.failed]
-    assert report.motions > 250 and report.calls > 600
+    assert report.motions > 250 and report.calls > 500
 
 
 def test_a_lost_pair_is_followed_as_far_in_as_it_is_lost():
