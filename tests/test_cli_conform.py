@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -200,6 +201,38 @@ def test_what_ends_the_process_is_not_told_as_right():
     assert judged.headline == (
         "it ends the process in 1 of 2 cases; in the 1 that it answered, the pairs are right."
     )
+
+
+def test_what_fails_only_after_another_goes_below_it():
+    """A list that is left broken by a question that it fails: one cause, one finding."""
+    broken = []
+
+    def breaks(positions, cell, pbc, r_cut):
+        if len(positions) == 4:
+            broken.append(True)
+            return [0], [1]  # from one of its atoms only
+        return ([0, 1, 1], [1, 0, 0]) if broken and len(positions) == 2 else ([0, 1], [1, 0])
+
+    two = [[0.0, 0, 0], [0.5, 0, 0]]
+    cases = [
+        one("two", "few", two),
+        one("four", "few", [*two, [5.0, 0, 0], [9.0, 0, 0]]),
+        one("again", "outside", two),
+    ]
+    found = examine(from_object(breaks), asked=cases, large=False, shrink=False)
+    assert sorted(failed.code for failed in found.failed) == ["DUPLICATE", "ONE_SIDED"]
+    found.failed = [replace(failed, alone=failed.code == "ONE_SIDED") for failed in found.failed]
+    summary = _summary(found, ["1.py", "2.py"], 0)
+    judged = judge(cast(Any, SimpleNamespace(name="it", summary=summary)))
+    (finding,) = judged.findings
+    assert (
+        finding.code == "ONE_SIDED"
+        and "pairs are listed more than once (about outside; 2.py)" in finding.text
+    )
+    # by themselves they are two
+    found.failed = [replace(failed, alone=True) for failed in found.failed]
+    judged = judge(cast(Any, SimpleNamespace(name="it", summary=_summary(found, ["1.py", "2.py"], 0))))
+    assert len(judged.findings) == 2
 
 
 def test_time_that_is_up_is_told():

@@ -195,13 +195,16 @@ def _findings(run: Question) -> Iterator[Finding]:
     by_code: dict[str, list[Mapping[str, Any]]] = {}
     for row in summary["failures"]:
         by_code.setdefault(row["code"], []).append(row)
+    below = _below(by_code)
     for code, rows in by_code.items():
+        if code in below:
+            continue
         severity, title, remedy = _CODES[code]
-        first = min(rows, key=lambda row: (row["atoms"], row["steps"]))
-        total = _cases(summary, code)
+        # one that fails by itself says more than a smaller one that does not
+        first = min(rows, key=lambda row: (not row["alone"], row["atoms"], row["steps"]))
         if code == "CRASHED" and any("exit" in row["text"].lower() for row in rows):
             remedy = "Raise an exception instead: a program that calls it ends with it and loses its run."
-        text = f"In {many(total, 'case')}, {_about(summary, code)}. {_sentence(first)} "
+        text = f"In {many(_cases(summary, code), 'case')}, {_about(summary, code)}. {_sentence(first)} "
         text += f"Reproduced by {first['script']}."
         if code == "ONE_SIDED" and all(row["text"].startswith("within rounding") for row in rows):
             severity, title = "warning", "pairs within rounding of the cutoff are listed from one atom only"
@@ -209,8 +212,28 @@ def _findings(run: Question) -> Iterator[Finding]:
             text += f" {summary['known'][code]}"
         if not first["alone"]:
             text += " It fails only after other questions, so the script alone may not show it."
+        for other in [other for other, cause in below.items() if cause == code]:
+            text += (
+                f" After such questions, and not by themselves, {many(_cases(summary, other), 'case')} fail "
+            )
+            text += (
+                f"otherwise: {_CODES[other][1]} ({_about(summary, other)}; {by_code[other][0]['script']})."
+            )
         yield Finding(code, severity, title, text, remedy)  # type: ignore[arg-type]
     yield from _conduct(run)
+
+
+def _below(by_code: Mapping[str, list[Mapping[str, Any]]]) -> dict[str, str]:
+    """Codes that are met only after other questions, by the code of what failed by itself and is as bad."""
+    causes = [code for code, rows in by_code.items() if any(row["alone"] for row in rows)]
+    found = {}
+    for code, rows in by_code.items():
+        as_bad = [
+            cause for cause in causes if _CODES[cause][0] == "error" or _CODES[cause][0] == _CODES[code][0]
+        ]
+        if as_bad and not any(row["alone"] for row in rows):
+            found[code] = as_bad[0]
+    return found
 
 
 def _quoted(words: str) -> str:

@@ -46,7 +46,7 @@ class TestAdoptedKept(NeighborListConformance):
 
     def asked(self, tested, area):
         # the rest is asked of the list above
-        return super().asked(tested, area) if area in ("few", "motion", "strain") else []
+        return super().asked(tested, area) if area in ("few", "strain", "rule") else []
 
 
 @pytest.mark.parametrize("package", ["mdnum.references", "mdnum.references.conformance"])
