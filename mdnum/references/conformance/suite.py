@@ -102,7 +102,12 @@ class Examiner:
         crowd = replace(one("a crowd", "few", gas(*_CROWD), _CROWD[1]), skin=_SKIN)
         if tested.limits.refusal(crowd) is not None:
             crowd = replace(one("a free crowd", "few", gas(*_CROWD)), skin=_SKIN)
+        # an object of its own: what it keeps of a crowd must not be part of what the suite finds
+        reuse, self.session.reuse = self.session.reuse, False
         outcome = self.session.ask(crowd)[0]
+        self.session.reuse = reuse
+        if isinstance(self.session, Session):
+            self.session.close()
         answer, edge, below = outcome.answer, np.inf, 0.0
         if answer is not None:
             right = truth(crowd, 0, reach=0.45 * _CROWD[1])

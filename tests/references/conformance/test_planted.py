@@ -89,9 +89,16 @@ def test_a_rule_that_lets_pairs_through_is_found_out(defect: str):
 
 
 @pytest.mark.parametrize("own", [0.1, 0.5])
-@pytest.mark.parametrize("way", ["shown", "said", "neither"])
 @pytest.mark.parametrize(
-    "defect", ["each axis by itself", "a sample of nine in ten", "twice the mean of a few"]
+    ("defect", "way"),
+    [
+        ("each axis by itself", "shown"),
+        ("twice the mean of a few", "said"),
+        ("a sample of nine in ten", "shown"),
+        # few atoms that are ignored are found only where the padding is known
+        ("each axis by itself", "neither"),
+        ("twice the mean of a few", "neither"),
+    ],
 )
 def test_a_padding_of_its_own_hides_no_rule(defect: str, way: str, own: float):
     """Whatever skin it is given; where it neither shows nor says it, from one that was tried."""
