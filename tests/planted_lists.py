@@ -316,7 +316,7 @@ class Kept:
 
     def allocate(self, positions, cell, pbc, r_cut, skin):
         known = self.rows is not None and len(positions) == len(self.reference)
-        self.pbc, self.r_cut, self.skin = pbc, r_cut, skin
+        self.pbc, self.r_cut, self.padding = pbc, r_cut, skin
         if self.due_at is None or self.defect != "skin of the first":
             self.due_at = skin
         self.first, self.most, self.slots = (np.array(cell), np.array(positions)), None, None
@@ -355,7 +355,7 @@ class Kept:
         room = self.due_at if self.defect == "whole skin" else self.due_at / 2
         corner = float(np.abs((cell - self.cell).sum(axis=0)).max())
         if self.defect == "negative skin squared":
-            return most**2 > (0.5 * (self.skin - 2 * corner)) ** 2
+            return most**2 > (0.5 * (self.padding - 2 * corner)) ** 2
         blind = {"every 20 steps": 20, "skin for another frequency": 6}
         if self.defect in blind:
             return self.age >= blind[self.defect] or corner > 0
@@ -378,7 +378,7 @@ class Kept:
         if self.defect == "the caller's array":
             self.reference = positions
         self.previous = self.reference
-        rows = search(positions, cell, self.pbc, self.r_cut + self.skin)
+        rows = search(positions, cell, self.pbc, self.r_cut + self.padding)
         if self.defect == "images counted once":
             # as many images as the first box needed
             far = np.abs(rows["shift"]).max(axis=1, initial=0)
@@ -425,3 +425,103 @@ def kept(defect):
             super().__init__(defect)
 
     return KeptWithDefect
+
+
+def _length(moved):
+    return np.sqrt((moved**2).sum(axis=-1))
+
+
+def _drawn(count, share):
+    return np.random.default_rng(count).random(count) < share
+
+
+#: Rebuild tests of another shape than "an atom moved by half of the skin", of (moved, room): displacements
+#: since the build, shape (atoms, 3), and half of the skin. Each lets pairs of its own kind through.
+RULE_DEFECTS = {
+    # each axis by itself
+    "each axis by itself": lambda moved, room: np.abs(moved).max() > room,
+    "fourth powers": lambda moved, room: ((moved**4).sum(axis=1) ** 0.25).max() > room,
+    "each axis over all atoms": lambda moved, room: np.sqrt((moved**2).sum(axis=0)).max() > room,
+    "the furthest along each axis, averaged": lambda moved, room: np.sqrt(
+        (np.abs(moved).max(axis=0) ** 2).mean()
+    ) > room / 1.5,
+    # the norm of something else
+    "motion in the xy plane": lambda moved, room: _length(moved[:, :2]).max() > room,
+    "motion across the xy plane alone": lambda moved, room: np.maximum(
+        np.abs(moved[:, 2]), np.abs(moved[:, 0] + moved[:, 1]) / 2**0.5
+    ).max() > room,
+    "root mean square": lambda moved, room: np.sqrt((moved**2).sum(axis=1).mean()) > room,
+    "twice the mean": lambda moved, room: 2 * _length(moved).mean() > room,
+    "twice the mean of a few": lambda moved, room: (
+        2 * np.sort(_length(moved))[-10:].mean() > room if len(moved) > 9 else _length(moved).max() > room
+    ),
+    "the sum of all": lambda moved, room: (
+        _length(moved.sum(axis=0)) > room if len(moved) > 20 else _length(moved).max() > room
+    ),
+    "beyond the mean of all": lambda moved, room: _length(moved).max() - _length(moved.mean(axis=0)) > room,
+    "relative to the first atom": lambda moved, room: _length(moved - moved[:1]).max() > 2 * room,
+    "half of the spread along each axis": lambda moved, room: np.ptp(moved, axis=0).max() > 2 * room,
+    # a share of the atoms ignored
+    "every second atom": lambda moved, room: _length(moved[::2]).max() > room,
+    "every second atom, the odd ones": lambda moved, room: (
+        len(moved) < 2 or _length(moved[1::2]).max() > room
+    ),
+    "the first half": lambda moved, room: _length(moved[: (len(moved) + 1) // 2]).max() > room,
+    "all but the last": lambda moved, room: len(moved) < 2 or _length(moved[:-1]).max() > room,
+    "a sample of nine in ten": lambda moved, room: _length(
+        moved[_drawn(len(moved), 0.9)] if len(moved) > 9 else moved
+    ).max() > room,
+    "the 95th percentile": lambda moved, room: (
+        np.percentile(_length(moved), 95) if len(moved) > 19 else _length(moved).max()
+    ) > room,
+    "one in ten may go further": lambda moved, room: np.sort(_length(moved))[-1 - len(moved) // 10] > room,
+    # two atoms, and how they share what there is
+    "the larger of two, a third each": lambda moved, room: np.sort(_length(moved))[-1] > 1.2 * room,
+    "geometric mean of two": lambda moved, room: (
+        np.sqrt(np.prod(np.sort(_length(moved))[-2:])) > room if len(moved) > 1 else True
+    ),
+    "two percent late": lambda moved, room: _length(moved).max() > 1.02 * room,
+}  # fmt: skip
+
+#: Tests that lose nothing: what makes them fire differs.
+RULES = {
+    "an atom by half of the skin": lambda moved, room: _length(moved).max() > room,
+    "the two furthest by the skin": lambda moved, room: np.sort(_length(moved))[-2:].sum() > 2 * room,
+    "the sum of magnitudes": lambda moved, room: np.abs(moved).sum(axis=1).max() > room,
+    "beside a common drift": lambda moved, room: _length(moved - moved.mean(axis=0)).max() > room,
+    "always": lambda moved, room: True,
+    "at any motion": lambda moved, room: bool(moved.any()),
+}
+
+
+def ruled(test, own=None, filtered=False, says=False):
+    """A class of lists that are kept, rebuilt by a test of (moved, room).
+
+    Args:
+        own: a padding of its own in units of the cutoff, whatever skin it is given.
+        filtered: it gives what is inside the cutoff, and nothing of its skin.
+        says: it has an attribute `skin`.
+    """
+
+    class KeptByRule(Kept):
+        def allocate(self, positions, cell, pbc, r_cut, skin):
+            skin = skin if own is None else own * r_cut
+            if says:
+                self.skin = skin
+            return super().allocate(positions, cell, pbc, r_cut, skin)
+
+        def _due(self, positions, cell):
+            if not len(positions):
+                return True
+            moved = positions - self.reference
+            return not np.array_equal(cell, self.cell) or bool(test(moved, self.padding / 2))
+
+        def _pairs(self, positions, cell):
+            rows = super()._pairs(positions, cell)
+            if not filtered:
+                return rows
+            box = np.where(self.pbc[:, None], cell, 0.0)
+            apart = positions[rows["j"]] - positions[rows["i"]] + rows["shift"] @ box
+            return {name: part[_length(apart) < self.r_cut] for name, part in rows.items()}
+
+    return KeptByRule

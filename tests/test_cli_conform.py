@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -175,8 +176,162 @@ def test_what_answers_rightly_or_not_at_all_is_told_as_that():
 
     tested = [one("two", "few", [[0.0, 0, 0], [0.5, 0, 0]]), one("far", "outside", [[2.0, 0, 0]])]
     judged = _judged(far, tested)
-    assert judged.headline == "it gave no answer in 1 of 2 cases, and the right pairs wherever it answered."
+    assert judged.headline == (
+        "it raises an exception by accident in 1 of 2 cases; in the 1 that it answered, the pairs are right."
+    )
     assert any(line == "Where it fails: outside (1 of 1)." for line in judged.evidence)
+
+
+def test_what_ends_the_process_is_not_told_as_right():
+    """The headline is that of the worst below it, and its counts are those of the table."""
+
+    def leaves(positions, cell, pbc, r_cut):
+        if len(positions) == 3:
+            raise SystemExit(3)
+        return ([0, 1], [1, 0]) if len(positions) == 2 else ([], [])
+
+    two = [[0.0, 0, 0], [0.5, 0, 0]]
+    cases = [one("two", "few", two), one("four", "few", [*two, [0, 5, 0], [0, 9, 0]])]
+    cases.append(one("three", "outside", [*two, [5.0, 0, 0]]))
+    judged = _judged(leaves, cases)
+    assert judged.tone == "error"
+    assert judged.headline == "it failed 2 of 3 cases."  # the pair of the four is missing, too
+    judged = _judged(leaves, cases[::2])
+    assert judged.tone == "error"
+    assert judged.headline == (
+        "it ends the process in 1 of 2 cases; in the 1 that it answered, the pairs are right."
+    )
+
+
+def test_what_fails_only_after_another_goes_below_it():
+    """A list that is left broken by a question that it fails: one cause, one finding."""
+    broken = []
+
+    def breaks(positions, cell, pbc, r_cut):
+        if len(positions) == 4:
+            broken.append(True)
+            return [0], [1]  # from one of its atoms only
+        return ([0, 1, 1], [1, 0, 0]) if broken and len(positions) == 2 else ([0, 1], [1, 0])
+
+    two = [[0.0, 0, 0], [0.5, 0, 0]]
+    cases = [
+        one("two", "few", two),
+        one("four", "few", [*two, [5.0, 0, 0], [9.0, 0, 0]]),
+        one("again", "outside", two),
+    ]
+    found = examine(from_object(breaks), asked=cases, large=False, shrink=False)
+    assert sorted(failed.code for failed in found.failed) == ["DUPLICATE", "ONE_SIDED"]
+    found.failed = [replace(failed, alone=failed.code == "ONE_SIDED") for failed in found.failed]
+    summary = _summary(found, ["1.py", "2.py"], 0)
+    judged = judge(cast(Any, SimpleNamespace(name="it", summary=summary)))
+    (finding,) = judged.findings
+    assert (
+        finding.code == "ONE_SIDED"
+        and "pairs are listed more than once (about outside; 2.py)" in finding.text
+    )
+    # by themselves they are two
+    found.failed = [replace(failed, alone=True) for failed in found.failed]
+    judged = judge(cast(Any, SimpleNamespace(name="it", summary=_summary(found, ["1.py", "2.py"], 0))))
+    assert len(judged.findings) == 2
+
+
+def test_time_that_is_up_is_told():
+    """How many of how many were asked; and what was not asked is not called right."""
+
+    class TwoQuestions:
+        left = 3
+
+        @property
+        def passed(self) -> bool:
+            self.left -= 1
+            return self.left <= 0
+
+    def right(positions, cell, pbc, r_cut):
+        return ([0, 1], [1, 0]) if len(positions) == 2 else ([], [])
+
+    two = [[0.0, 0, 0], [0.5, 0, 0]]
+    cases = [one(f"{n}", "few", two) for n in range(5)]
+    found = examine(from_object(right), asked=cases, deadline=cast(Any, TwoQuestions()))
+    assert (found.asked, found.left, found.questions) == (2, 3, 5)
+    judged = judge(cast(Any, SimpleNamespace(name="it", summary=_summary(found, [], 0))))
+    assert judged.headline == "As far as asked (2 of 5 cases), it gave the right pairs in 2 cases."
+
+
+_ENDS = """
+import os, signal
+from pathlib import Path
+
+import numpy as np
+
+calls = 0
+
+def nearest_image(positions, cell, pbc, r_cut):
+    global calls
+    calls += 1
+    if calls > 75 and Path("armed").exists():
+        Path("armed").unlink()
+        os.kill(os.getppid(), signal.SIGKILL)
+    i, j = np.triu_indices(len(positions), 1)
+    apart = positions[j] - positions[i]
+    if pbc.all():
+        apart = apart - np.rint(apart @ np.linalg.inv(cell)) @ cell
+    near = (apart**2).sum(axis=1) < r_cut**2
+    near &= apart.any(axis=1)
+    return i[near], j[near]
+"""
+
+
+def test_an_examination_that_is_killed_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """By SIGKILL: what was found is there, and its summary is that of one that was not stopped."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "ends.py").write_text(_ENDS)
+    limits = "minimum-image,orthorhombic,all-axes"
+    asked = (
+        "conform",
+        "ends.py:nearest_image",
+        "--cases",
+        "5",
+        "--no-large",
+        "--no-report",
+        "--limits",
+        limits,
+    )
+    assert call(*asked, "-o", "whole") == 1
+    (tmp_path / "armed").touch()
+    done = subprocess.run(
+        [sys.executable, "-m", "mdnum", *asked, "-o", "killed"], capture_output=True, check=False
+    )
+    assert done.returncode == -9 and not (tmp_path / "armed").exists()
+    kept = json.loads((tmp_path / "killed" / "answers.json").read_text())
+    wrong = [one for one in kept["cases"].values() if one["failures"]]
+    assert 20 < len(kept["cases"]) < 120 and wrong
+    before = RunFolder.open("killed").summary
+    assert before["status"] == "stopped" and before["left"] > 20
+    assert call("report", "killed") == 0
+    assert "As far as asked (" in (tmp_path / "killed" / "report.html").read_text()
+    capsys.readouterr()
+    assert call("conform", "mine", "--resume", "killed") == 2
+    assert "so LIST cannot be given" in capsys.readouterr().err
+    assert call("conform", "--resume", "killed", "--no-report") == 1
+    whole, resumed = RunFolder.open("whole").summary, RunFolder.open("killed").summary
+    assert {**whole, "seconds": 0} == {**resumed, "seconds": 0} and whole["status"] == "complete"
+    for name in ("areas", "failures"):
+        assert RunFolder.open("whole").table(name).equals(RunFolder.open("killed").table(name))
+    scripts = sorted(path.name for path in (tmp_path / "whole").glob("reproduce-*.py"))
+    assert scripts and scripts == sorted(path.name for path in (tmp_path / "killed").glob("reproduce-*.py"))
+    # nothing is asked again of one that is whole
+    assert call("conform", "--resume", "killed", "--no-report", "--time", "1e-6") == 1
+    assert RunFolder.open("killed").summary["asked"] == whole["asked"]
+
+
+@pytest.mark.parametrize("text", ["", "[]", "3", "{}", '{"list": 1, "tested": 2, "options": 3}', "\0{"])
+def test_answers_that_cannot_be_read_are_told_in_a_line(text: str, tmp_path, capsys):
+    (tmp_path / "answers.json").write_text(text)
+    assert call("conform", "--resume", str(tmp_path)) == 2
+    told = capsys.readouterr().err
+    assert "answers.json" in told and told.count("\n") == 1
 
 
 def test_one_mistake_has_one_script_and_names_all_areas():

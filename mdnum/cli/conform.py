@@ -10,6 +10,7 @@ import typer
 
 from mdnum.cli import output
 from mdnum.cli.progress import watched
+from mdnum.errors import InputError
 
 
 def conform(
@@ -39,6 +40,12 @@ def conform(
         "free, wrapped, fixed-cell, right-handed, lower-triangular, whole-cell.",
     ),
     no_large: bool = typer.Option(False, "--no-large", help="Leave out 5,000 and 100,000 atoms."),
+    time: float | None = typer.Option(
+        None, metavar="MINUTES", help="Begin no case after that; what was not asked is told."
+    ),
+    resume: Path | None = typer.Option(
+        None, metavar="DIR", help="Go on with the examination in this folder, with its options."
+    ),
     out: Path | None = typer.Option(
         None, "-o", "--out", metavar="DIR", help="The folder; runs/conform-NAME-N by default."
     ),
@@ -46,12 +53,19 @@ def conform(
     as_json: bool = output.JSON_OPTION,
 ) -> int:
     """Put a neighbor list through a conformance suite: pairs, shifts, distances, and lists that go stale."""
-    if pairs is None:
+    if pairs is None and resume is None:
         return _names(as_json)
+    if resume is not None:
+        _refuse_beside_resume(
+            {
+                "LIST": pairs, "--cases": cases, "--seed": seed, "--full": full, "--precision": precision,
+                "--superset": superset, "--limits": limits, "--no-large": no_large, "--out": out,
+            }
+        )  # fmt: skip
     from mdnum.workflow.conform import conform as examine
 
     words = tuple(word.strip() for one in limits or () for word in one.split(",") if word.strip())
-    with watched() as progress:
+    with watched(lambda: _to_go_on(resume or out)) as progress:
         result = examine(
             pairs,
             cases=cases,
@@ -61,11 +75,29 @@ def conform(
             precision=precision,
             superset=superset or None,
             limits=words,
+            time=time,
             out=out,
+            resume=resume,
             report=not no_report,
             progress=progress,
         )
     return output.answer(result.folder, result.summary, _print, as_json=as_json)
+
+
+def _refuse_beside_resume(given: Mapping[str, Any]) -> None:
+    """Raises InputError for what a folder that is gone on with has already."""
+    told = [word for word, value in given.items() if value not in (None, False, 0)]
+    if told:
+        raise InputError(
+            f"--resume goes on with the list and the options of its folder, so {told[0]} cannot be given",
+            remedy="Leave it out, or begin in a new folder",
+        )
+
+
+def _to_go_on(folder: Path | None) -> str:
+    """What to do after control-C."""
+    name = folder or "DIR, which is the newest runs/conform-NAME-N"
+    return f"What was found is in the folder; go on with `mdnum conform --resume {name}`"
 
 
 def _names(as_json: bool) -> int:
@@ -94,13 +126,14 @@ def _print(summary: Mapping[str, Any]) -> None:
     """A row for each area, and the scripts."""
     output.print_table(
         "",
-        ("area", "asked", "right", "wrong", "refused", "not asked", "about"),
+        ("area", "asked", "right", "wrong", "no answer", "refused", "not asked", "about"),
         [
             (
                 row["area"],
                 row["asked"],
                 row["passed"],
-                row["failed"] or None,
+                row["failed"] - row["silent"] or None,
+                row["silent"] or None,
                 row["refused"] or None,
                 row["skipped"] or None,
                 row["about"],

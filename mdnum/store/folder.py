@@ -239,6 +239,14 @@ class RunFolder:
                 os.truncate(log, min(store["log"], log.stat().st_size))
         return state
 
+    def take(self) -> None:
+        """Makes this the only process that writes a folder which is gone on with from answers.json.
+
+        Raises:
+            FolderError: another process writes the folder.
+        """
+        self._take_lock()
+
     # -- reading ---------------------------------------------------------------------------------
 
     def table(self, name: str, columns: Sequence[str] | None = None, rows: int | None = None) -> pa.Table:

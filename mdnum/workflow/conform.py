@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from time import monotonic
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mdnum.errors import InputError
+from mdnum.errors import FolderError, InputError
 from mdnum.store import RunFolder
+from mdnum.store.atomic import write_text
 from mdnum.store.naming import default_folder
 from mdnum.workflow.fork_question import Log, Progress, finish
 
@@ -58,7 +61,7 @@ class ConformResult:
 
 
 def conform(
-    pairs: str | Callable[..., Any] | PairList,
+    pairs: str | Callable[..., Any] | PairList | None = None,
     *,
     cases: int | None = None,
     seed: int = 0,
@@ -67,17 +70,22 @@ def conform(
     precision: str | None = None,
     superset: bool | None = None,
     limits: tuple[str, ...] = (),
+    time: float | None = None,
     out: str | Path | None = None,
+    resume: str | Path | None = None,
     report: bool = True,
     progress: Progress | None = None,
 ) -> ConformResult:
     """Put a neighbor list through the conformance suite.
 
+    The folder is filled as answers come: one that was stopped, however, is gone on with by `resume`.
+
     Args:
         pairs: a name (`references.conformance.known`), `package.module:function`, `file.py:function`, or a
             function of (positions, cell, pbc, r_cut) that returns (i, j), (i, j, shift), (i, j, shift,
             distance) or a mapping; or a class with `allocate` and `update`. What has a name is called in a
-            process of its own, so that a crash is a finding.
+            process of its own, so that a crash is a finding. With `resume`, the list that was examined, where
+            it had no name; else none.
         cases: random cases beside those with a name; 500 by default.
         seed: of the random ones.
         large: ask about 5,000 and 100,000 atoms, too.
@@ -85,46 +93,160 @@ def conform(
         precision: of its arithmetic, "float64" or "float32"; found out by default.
         superset: pairs beyond the cutoff may be listed.
         limits: what it does not claim to do, words of `LIMITS`: such cases are not asked.
+        time: minutes, after which no case is begun and no failure shrunk.
         out: the new folder; default runs/conform-<name>-<n>.
+        resume: a folder to go on with instead, with the options that it was begun with.
         report: write report.html.
         progress: called now and then with cases done, cases and a dictionary of words.
 
     Raises:
-        InputError: there is no such list, or it cannot be called, or what it returns is no list of pairs.
+        InputError: there is no such list, or it cannot be called, or what it returns is no list of pairs; or
+            it is not the one that a folder was begun with.
         FolderError: the folder cannot be used.
     """
+    from mdnum.deadline import Deadline
     from mdnum.provenance import surroundings
     from mdnum.references.conformance.suite import CASES, Examiner, examine
 
-    tested = _declared(_loaded(pairs), full, precision, superset, limits)
+    deadline = Deadline(time)
+    kept = None if resume is None else _kept(Path(resume))
+    if kept is None:
+        options = {"cases": CASES if cases is None else cases, "seed": seed, "large": large, "full": full,
+                   "precision": precision, "superset": superset, "limits": list(limits)}  # fmt: skip
+    else:
+        options = dict(kept["options"])
+        pairs = pairs or kept["list"]
+    if not pairs:
+        raise InputError("no list is given", remedy="Give a name, package.module:function or a function")
+    tested = _declared(
+        _loaded(pairs), options["full"], options["precision"], options["superset"], tuple(options["limits"])
+    )
+    if kept is not None and [tested.name, tested.version] != kept["tested"]:
+        was, now = (
+            " ".join(filter(None, words)) for words in (kept["tested"], (tested.name, tested.version))
+        )
+        raise InputError(
+            f"was begun with {was}, not {now}", where=str(resume), remedy="Begin in a new folder"
+        )
     examiner = Examiner(tested, reuse=True, apart=True)
     try:
         if (why := examiner.unusable()) is not None:
             raise InputError(why, where=tested.name, remedy=_CONTRACT[tested.kept])
-        path = default_folder(f"conform-{_slug(tested.name)}") if out is None else out
-        folder = RunFolder.create(path, world="conform")
+        if resume is not None:
+            folder = _again(resume)
+        else:
+            path = default_folder(f"conform-{_slug(tested.name)}") if out is None else out
+            folder = RunFolder.create(path, world="conform")
     except BaseException:
         examiner.session.close()
         raise
     try:
-        folder.write_provenance(surroundings() | {"list": tested.name, "list_version": tested.version})
-        note = Log(folder, progress)
+        if kept is None:
+            folder.write_provenance(surroundings() | {"list": tested.name, "list_version": tested.version})
+        keeper = _Keeper(folder, examiner.report, tested, options, kept)
         found = examine(
             tested,
-            cases=CASES if cases is None else cases,
-            seed=seed,
-            large=large,
+            cases=options["cases"],
+            seed=options["seed"],
+            large=options["large"],
             apart=True,
-            progress=note,
+            progress=Log(folder, progress),
             examiner=examiner,
+            deadline=deadline,
+            answers=keeper.answers,
         )
-        scripts = _write(folder, found)
-        folder.finalize()
-        folder.write_summary(_summary(found, scripts, seed))
+        keeper.write(ended=True)
     except BaseException:
+        examiner.session.close()
         folder.close()
         raise
     return ConformResult(folder.path, found, finish(folder, report, progress))
+
+
+def _kept(path: Path) -> dict[str, Any]:
+    """What a folder holds to go on from.
+
+    Raises:
+        FolderError: nothing that can be gone on from.
+    """
+    folder, file = RunFolder.open(path), path / "answers.json"
+    if not file.is_file() or folder.summary.get("question", "conform") != "conform":
+        raise FolderError(
+            "holds no examination to go on with", where=str(path), remedy="Begin in a new folder"
+        )
+    try:
+        kept = json.loads(file.read_text(encoding="utf-8"))
+        wanted = {"list", "tested", "options", "cases", "shrunk"} <= set(kept)
+        wanted = wanted and {"cases", "seed", "large", "full", "limits"} <= set(kept["options"])
+    except (ValueError, TypeError, OSError) as error:
+        raise FolderError(
+            f"cannot be read ({error})", where=str(file), remedy="Begin in a new folder"
+        ) from error
+    if not wanted:
+        raise FolderError("holds no answers", where=str(file), remedy="Begin in a new folder")
+    return kept
+
+
+def _again(path: str | Path) -> RunFolder:
+    """A folder that is gone on with, without the tables that are written at the end."""
+    folder = RunFolder.open(path)
+    folder.world = "conform"
+    folder.take()
+    for name in ("areas", "failures"):
+        (folder.path / f"{name}.parquet").unlink(missing_ok=True)
+    return folder
+
+
+class _Keeper:
+    """Fills a folder while answers come: a kill, however hard, leaves what was found till then.
+
+    Args:
+        kept: what the folder held, of one that is gone on with.
+    """
+
+    def __init__(
+        self, folder: RunFolder, found: Report, tested: PairList, options: Any, kept: Mapping[str, Any] | None
+    ):
+        from mdnum.references.conformance.answers import Answers
+
+        self._folder, self._found, self._seed = folder, found, options["seed"]
+        self._head = {
+            "list": tested.word,
+            "tested": [tested.name, tested.version],
+            "options": options,
+        }
+        self._before = 0.0 if kept is None else float(kept.get("seconds", 0.0))
+        self._began, self._due, self._due_in_words = monotonic(), 0.0, 0.0
+        self.answers = Answers(kept, self._put)
+        self._write_answers()
+
+    def _put(self, urgent: bool) -> None:
+        """One more answer; what fails is on disk at once, the rest within a second."""
+        now = monotonic()
+        if urgent or now >= self._due:
+            self._write_answers()
+            # most of the time is for asking
+            self._due = monotonic() + max(1.0, 20 * (monotonic() - now))
+        if now >= self._due_in_words:
+            self.write(ended=False)
+            self._due_in_words = monotonic() + max(10.0, 20 * (monotonic() - now))
+
+    def write(self, ended: bool) -> None:
+        """Scripts, summary and, at the end, tables."""
+        found = self._found
+        found.seconds = self._before + monotonic() - self._began
+        scripts = _write_scripts(self._folder, found)
+        if ended:
+            self._write_answers()
+            _write_tables(self._folder, found, scripts)
+            self._folder.finalize()
+        status = "stopped" if not ended or found.left or not found.whole else "complete"
+        self._folder.write_summary(_summary(found, scripts, self._seed) | {"status": status})
+
+    def _write_answers(self) -> None:
+        seconds = self._before + monotonic() - self._began
+        text = json.dumps(self._head | {"seconds": seconds} | self.answers.plain(), allow_nan=False)
+        write_text(self._folder.path / "answers.json", text)
 
 
 def _loaded(pairs: Any) -> PairList:
@@ -157,11 +279,25 @@ def _slug(name: str) -> str:
     return name.replace(":", "-")
 
 
-def _write(folder: RunFolder, found: Report) -> list[str]:
-    """Puts areas and failures into tables, and a script for each failure beside them; their names."""
+def _write_scripts(folder: RunFolder, found: Report) -> list[str]:
+    """Writes a script for each failure, and removes those that stand for none; their names."""
     from mdnum.references.conformance.reproduction import script
-    from mdnum.store.atomic import write_text
 
+    scripts = []
+    for number, failed in enumerate(found.failed, 1):
+        scripts.append(f"reproduce-{number}-{failed.code.lower().replace('_', '-')}.py")
+        lines = script(found.tested, failed, found.how, found.superset, found.reach(failed.case))
+        path = folder.path / scripts[-1]
+        if not path.is_file() or path.read_text(encoding="utf-8") != lines:
+            write_text(path, lines)
+    for path in folder.path.glob("reproduce-*.py"):
+        if path.name not in scripts:
+            path.unlink()
+    return scripts
+
+
+def _write_tables(folder: RunFolder, found: Report, scripts: list[str]) -> None:
+    """Puts areas and failures into tables."""
     names = ("asked", "passed", "failed", "refused", "skipped")
     folder.append(
         "areas",
@@ -173,14 +309,9 @@ def _write(folder: RunFolder, found: Report) -> list[str]:
             },
         },
     )
-    scripts = []
-    for number, failed in enumerate(found.failed, 1):
-        scripts.append(f"reproduce-{number}-{failed.code.lower().replace('_', '-')}.py")
-        write_text(folder.path / scripts[-1], script(found.tested, failed, found.how, found.superset))
     if found.failed:
         rows = [_failure(failed, name) for failed, name in zip(found.failed, scripts, strict=True)]
         folder.append("failures", {key: np.array([row[key] for row in rows]) for key in rows[0]})
-    return scripts
 
 
 def _failure(failed: Any, script: str) -> dict[str, Any]:
@@ -200,6 +331,7 @@ def _failure(failed: Any, script: str) -> dict[str, Any]:
 def _summary(found: Report, scripts: list[str], seed: int) -> dict[str, Any]:
     """The content of summary.json, without headline and findings."""
     tested = found.tested
+    names = ("asked", "passed", "failed", "silent", "refused", "skipped")
     return {
         "world": "conform",
         "question": "conform",
@@ -229,12 +361,18 @@ def _summary(found: Report, scripts: list[str], seed: int) -> dict[str, Any]:
             }
             for one in found.refusals
         ],
+        "questions": found.questions,
+        "left": found.left,
+        "padding": found.padding,
+        "padding_said": found.said,
+        "rule": {"motions": found.motions, "calls": found.calls},
         "asked": found.asked,
         "wrong": found.wrong,
+        "silent": sum(tally.silent for tally in found.areas.values()),
         "conforms": found.conforms,
         "areas": [
             {"area": area, "about": _about(area), "why": _most(tally.why), "codes": tally.codes}
-            | {name: getattr(tally, name) for name in ("asked", "passed", "failed", "refused", "skipped")}
+            | {name: getattr(tally, name) for name in names}
             for area, tally in found.areas.items()
         ],
         "failures": [

@@ -24,7 +24,7 @@ from mdnum.references.conformance.lists import Limits, PairList
 from mdnum.references.conformance.loading import from_object, load
 from mdnum.references.conformance.questions import as_kept, questions
 from mdnum.references.conformance.reproduction import script
-from mdnum.references.conformance.suite import examine
+from mdnum.references.conformance.suite import Examiner, examine
 
 
 class NeighborListConformance:
@@ -63,7 +63,8 @@ class NeighborListConformance:
         if area == "large":
             return [lattice(edge) for edge in (SMALL_EDGE, LARGE_EDGE)] if self.large else []
         count = self.cases if area == "random" else 0
-        found = questions(replace(tested, affords=1.0), count, self.seed, large=False)
+        padding = Examiner(tested).report.padding if area == "rule" and tested.kept else None
+        found = questions(replace(tested, affords=1.0), count, self.seed, large=False, padding=padding)
         return [case for case in found if case.area == area]
 
     @pytest.mark.parametrize("area", AREAS)

@@ -29,11 +29,12 @@ AREAS: Mapping[str, str] = MappingProxyType(
         "motion": "a list in use while atoms move",
         "wrapping": "a list in use while atoms leave the box and come back on its other side",
         "strain": "a list in use while the box changes",
+        "rule": "a list in use while a pair comes inside by the smallest of motions",
     }
 )
 
 #: Areas of a list that is kept and brought up to date.
-KEPT = ("motion", "wrapping", "strain")
+KEPT = ("motion", "wrapping", "strain", "rule")
 
 
 @dataclass(frozen=True)
@@ -71,6 +72,7 @@ class Case:
         r_cut: cutoff, length.
         skin: of a list that is kept, length; the largest where it changes.
         known: the pairs of a single still where they are known without a search.
+        motions: how many of its steps bring a pair from beyond the list to inside the cutoff (`rule`).
     """
 
     name: str
@@ -80,6 +82,7 @@ class Case:
     r_cut: float
     skin: float = 0.0
     known: PairSet | None = field(default=None, repr=False, compare=False)
+    motions: int = 0
 
     @property
     def atoms(self) -> int:

@@ -70,6 +70,9 @@ CODES = (
     "RAISED",
 )
 
+#: Those of cases in which nothing came back.
+SILENT = ("CRASHED", "NO_ANSWER", "RAISED")
+
 
 def judge(answer: Answer, truth: Truth, how: Conventions) -> list[Failure]:
     """Everything that is wrong with an answer; nothing where it conforms.

@@ -23,7 +23,8 @@ class KeptList(Protocol):
 
     `allocate` starts anew and may be called again on the same object; `update` is told where the atoms are
     now. The pairs that are returned must hold every pair within r_cut of the positions of this call; pairs
-    somewhat further may be there, as the skin leaves them.
+    somewhat further may be there, as the skin leaves them. A list that keeps a padding of its own, whatever
+    skin it is given, says so in an attribute `skin` (length) that is read after each `allocate`.
     """
 
     def allocate(self, positions: ndarray, cell: ndarray, pbc: ndarray, r_cut: float, skin: float) -> Any:
@@ -195,6 +196,7 @@ class Outcome:
         crashed: how the process ended that made the call, or None.
         late: that it did not answer in time, or None.
         aliased: the rows of the answer before this one were other ones after this call.
+        skin: the padding that a list that is kept says that it has, length; None where it says nothing.
     """
 
     answer: Answer | None = None
@@ -205,6 +207,7 @@ class Outcome:
     crashed: str | None = None
     late: str | None = None
     aliased: bool = False
+    skin: float | None = None
 
 
 class Session:
@@ -287,7 +290,17 @@ class Session:
             for name, old, new in zip(names, before, (positions, cell, pbc), strict=True)
             if not np.array_equal(old, new)
         ]
-        return Outcome(_copied(answer), changed=changed[0] if changed else None, aliased=aliased)
+        said = _said(self._made) if self.tested.kept else None
+        return Outcome(_copied(answer), changed=changed[0] if changed else None, aliased=aliased, skin=said)
+
+
+def _said(made: Any) -> float | None:
+    """The padding that a list says that it has, length; None where it has no such attribute."""
+    try:
+        skin = float(made.skin)
+    except (AttributeError, TypeError, ValueError):
+        return None
+    return skin if np.isfinite(skin) and skin >= 0 else None
 
 
 def _same(one: ndarray, other: ndarray) -> bool:

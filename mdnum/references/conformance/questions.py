@@ -11,18 +11,23 @@ from mdnum.references.conformance.catalog import catalog
 from mdnum.references.conformance.crowds import LARGE_EDGE, SMALL_EDGE, crowds, lattice
 from mdnum.references.conformance.lists import PairList
 from mdnum.references.conformance.movers import movers, sequences
+from mdnum.references.conformance.rule import motions
 
 
-def questions(tested: PairList, count: int, seed: int, large: bool = True) -> Iterator[Case]:
+def questions(
+    tested: PairList, count: int, seed: int, large: bool = True, padding: float | None = None
+) -> Iterator[Case]:
     """The cases that a list is asked, in order.
 
     Args:
         count: random cases.
         seed: of the random cases.
         large: the 5,000 and the 100,000 atoms, too.
+        padding: of a list that is kept, in skins, where it is known; see `rule.motions`.
     """
     if tested.kept:
         yield from movers()
+        yield from motions(padding)
     yield from as_kept(tested, catalog())
     if not tested.kept:
         yield from sequences()

@@ -203,7 +203,9 @@ def in_order(parts):
 '''
 
 
-def script(tested: PairList, failed: Failed, how: Conventions, superset: bool = False) -> str:
+def script(
+    tested: PairList, failed: Failed, how: Conventions, superset: bool = False, reach: float | None = None
+) -> str:
     """Lines that call the list with the numbers of a failing case and compare it with brute force.
 
     It needs numpy and the list; it prints what is wrong and exits with 1, or with 0 once the list is right.
@@ -212,9 +214,11 @@ def script(tested: PairList, failed: Failed, how: Conventions, superset: bool = 
     Args:
         how: conventions of the list.
         superset: pairs beyond the cutoff may be listed.
+        reach: how far they may be, length; `Report.reach`.
     """
     case, worst = failed.case, failed.worst
-    reach = case.r_cut + (2 * case.skin if case.skin else 0.5 * case.r_cut) if superset else case.r_cut
+    usual = case.r_cut + (2 * case.skin if case.skin else 0.5 * case.r_cut)
+    reach = (usual if reach is None else reach) if superset else case.r_cut
     title = f"{tested.name}{f' {tested.version}' if tested.version else ''}: {worst.text}"
     case_words = f"Found by: {failed.asked.name}, at its step {worst.step}."
     # an exception may quote code, whose strings must not end this one

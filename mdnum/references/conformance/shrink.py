@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mdnum.deadline import Deadline
 from mdnum.references.conformance.case import Case
 from mdnum.references.conformance.judge import Failure
 from mdnum.references.conformance.lists import completed
@@ -24,13 +25,15 @@ LEAST_TRIES, PATIENCE = 80, 60.0
 _MOST_IMAGES = 3000
 
 
-def shrunk(examiner: Examiner, failed: Failed) -> Failed:
+def shrunk(examiner: Examiner, failed: Failed, deadline: Deadline | None = None) -> Failed:
     """The smallest case found that fails with the same code.
 
     Args:
         examiner: asks the list; a new object of a kept list for each try.
         failed: the case as it was met.
+        deadline: after which it is left as small as it is.
     """
+    deadline = deadline or Deadline()
     wanted, sought = failed.code, kind(failed.worst)
     least = min(1, failed.case.atoms)
     tries, began = 0, time.perf_counter()
@@ -49,7 +52,7 @@ def shrunk(examiner: Examiner, failed: Failed) -> Failed:
 
     def spent() -> bool:
         seconds = time.perf_counter() - began
-        return tries >= TRIES or seconds > (SECONDS if tries >= LEAST_TRIES else PATIENCE)
+        return deadline.passed or tries >= TRIES or seconds > (SECONDS if tries >= LEAST_TRIES else PATIENCE)
 
     case = failed.case
     if wanted == "NO_ANSWER":

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from mdnum.deadline import Deadline
 from mdnum.references.conformance.alike import looked_into
+from mdnum.references.conformance.answers import Answers, as_row
 from mdnum.references.conformance.case import AREAS, KEPT, Case, one
+from mdnum.references.conformance.catalog import gas
 from mdnum.references.conformance.crowds import LARGE_EDGE, SMALL_EDGE, lattice, vast
 from mdnum.references.conformance.judge import CODES, Conventions, Failure, judge, measures_well
 from mdnum.references.conformance.lists import Outcome, PairList, Session
@@ -28,8 +32,11 @@ CASES = 500
 _PATIENCE = 30.0
 #: Share of wrong answers above which one that would be right in float32 says nothing about precision.
 _MISTAKES = 0.1
-#: Failures of one code that are kept for shrinking; the rest are counted.
-_KEPT = 1
+#: Atoms, edge and seed of the crowd that shows how far a list that is kept has all pairs, and its skin.
+_CROWD = (160, 6.0, 130)
+_SKIN = 0.3
+#: How much of the smallest motion a lost pair is followed for.
+_FURTHEST = 2.5
 
 
 class Examiner:
@@ -49,6 +56,7 @@ class Examiner:
         self.report = Report(tested)
         # the smallest refused case by the words of the exception, but for numbers
         self.refused: dict[str, tuple[str, Case]] = {}
+        self._refused_at = 0
         # what became of the plainest questions
         self.opening: list[tuple[Case, Outcome]] = []
         self._find_conventions()
@@ -80,18 +88,43 @@ class Examiner:
                     break
             break
         report.how = Conventions(True if full is None else full, sign, toward, tested.unit or DOUBLE)
-        self.superset = self._has_more() if tested.superset is None and tested.kept else bool(tested.superset)
+        self.superset = bool(tested.superset)
+        if tested.kept:
+            self._look_at_skin()
         report.superset = self.superset
 
-    def _has_more(self) -> bool:
-        """Whether a list that is kept gives what its skin holds, rather than what is inside the cutoff."""
-        case = replace(one("a pair in the skin", "few", [[2.0, 2, 2], [3.15, 2, 2]], 5.0), skin=0.3)
-        if self.tested.limits.refusal(case) is not None:
-            case = replace(one("a free pair in the skin", "few", [[2.0, 2, 2], [3.15, 2, 2]]), skin=0.3)
-        answer = self.session.ask(case)[0].answer
-        more = answer is None or len(answer) > 0
-        self.report.found_out.append("with its skin" if more else "without its skin")
-        return more
+    def _look_at_skin(self) -> None:
+        """Whether a list that is kept gives what its skin holds, and how far it has all pairs.
+
+        Its padding is where the nearest pair is that it lacks, or what it says.
+        """
+        report, tested = self.report, self.tested
+        crowd = replace(one("a crowd", "few", gas(*_CROWD), _CROWD[1]), skin=_SKIN)
+        if tested.limits.refusal(crowd) is not None:
+            crowd = replace(one("a free crowd", "few", gas(*_CROWD)), skin=_SKIN)
+        # an object of its own: what it keeps of a crowd must not be part of what the suite finds
+        reuse, self.session.reuse = self.session.reuse, False
+        outcome = self.session.ask(crowd)[0]
+        self.session.reuse = reuse
+        if isinstance(self.session, Session):
+            self.session.close()
+        answer, edge, below = outcome.answer, np.inf, 0.0
+        if answer is not None:
+            right = truth(crowd, 0, reach=0.45 * _CROWD[1])
+            rows = np.concatenate([answer.i, answer.j]) * crowd.atoms + np.concatenate([answer.j, answer.i])
+            there = np.isin(right.i * crowd.atoms + right.j, rows)
+            edge = float(right.distance[~there].min(initial=np.inf))
+            below = float(right.distance[right.distance < edge].max(initial=0.0))
+        if tested.superset is None:
+            # what does not answer is taken for the usual
+            self.superset = answer is None or below > crowd.r_cut + 0.1 * _SKIN
+            report.found_out.append("with its skin" if self.superset else "without its skin")
+        if outcome.skin is not None:
+            report.padding, report.said = outcome.skin / _SKIN, True
+        elif self.superset and crowd.r_cut < edge < np.inf:
+            # the nearest pair that is lacking lies somewhat beyond the edge
+            whole = below < crowd.r_cut + _SKIN <= edge
+            report.padding = 1.0 if whole else (edge - crowd.r_cut) / _SKIN
 
     def unusable(self) -> str | None:
         """Why nothing can be learned from it: no plain question had an answer that is one; None otherwise.
@@ -124,9 +157,47 @@ class Examiner:
             if found:
                 return [failure.at(step) for failure in found], None
             if outcome.refused:
+                self._refused_at = step
                 self._remember(case.until(step + 1), str(outcome.raised))
                 return [], outcome
         return [], None
+
+    def told(self, case: Case) -> tuple[list[Failure], Outcome | None, dict[str, Any]]:
+        """`outcome`, and what of it an examination that goes on needs to know, for JSON."""
+        report = self.report
+        ties, asking = list(report.ties), report.asking
+        aliased, single = report.aliased, report.single
+        failures, refused = self.outcome(case)
+        kept = {
+            "case": case.name,
+            "failures": [as_row(one) for one in failures],
+            "refused": None if refused is None else [self._refused_at, str(refused.raised)],
+            "ties": [now - then for now, then in zip(report.ties, ties, strict=True)],
+            "aliased": report.aliased is not aliased,
+            "single": report.single is not single,
+            "seconds": report.asking - asking,
+        }
+        return failures, refused, kept
+
+    def recalled(self, case: Case, kept: Mapping[str, Any]) -> tuple[list[Failure], Outcome | None]:
+        """`outcome` as it was, without asking."""
+        report = self.report
+        report.asking += kept["seconds"]
+        report.ties = [have + more for have, more in zip(report.ties, kept["ties"], strict=True)]
+        if kept["aliased"] and report.aliased is None:
+            report.aliased = case.name
+        if kept["single"]:
+            self._take_for_single(case.until(1))
+        if kept["refused"] is not None:
+            step, words = kept["refused"]
+            self._remember(case.until(step + 1), words)
+            return [], Outcome(raised=words, refused=True)
+        return [Failure(*one) for one in kept["failures"]], None
+
+    def _take_for_single(self, case: Case) -> None:
+        """From here on it is taken for a list in float32, and told to be one."""
+        self.report.how, self.report.single = replace(self.report.how, unit=SINGLE), case
+        self.report.found_out.append("float32")
 
     def _remember(self, case: Case, words: str) -> None:
         """Keeps the smallest question that an exception was met at."""
@@ -151,15 +222,13 @@ class Examiner:
             [Failure("CHANGED_INPUT", f"the call wrote to its {outcome.changed}")] if outcome.changed else []
         )
         # what is listed may have come as far as the skin lets it, from either side
-        reach = case.r_cut + 2 * case.skin if self.superset else None
-        if self.superset and not case.skin:
-            reach = 1.5 * case.r_cut
+        reach = self.report.reach(case) if self.superset else None
         how = self.report.how
         right = truth(case, step, reach=reach, unit=how.unit)
         found = judge(outcome.answer, right, how)
         if found and step and self.superset and any(failure.code == "EXTRA" for failure in found):
             # a box that grows takes listed pairs further apart than any skin: harmless, and no phantoms
-            found = judge(outcome.answer, _with_earlier(case, step, right), how)
+            found = judge(outcome.answer, _with_earlier(case, step, right, reach or case.r_cut), how)
         # a list that is stale by a hair is not one in single precision
         new = step == 0 and not case.known and len(outcome.answer) > 0 and self._mostly_right()
         if found and new and self.tested.unit is None and how.unit == DOUBLE:
@@ -168,9 +237,7 @@ class Examiner:
             if not measures_well(outcome.answer, right, how) and not judge(
                 outcome.answer, truth(case, step, reach=reach, unit=SINGLE), coarse
             ):
-                # right for float32: from here on it is taken for a list in float32, and told to be one
-                self.report.how, self.report.single = coarse, case.until(step + 1)
-                self.report.found_out.append("float32")
+                self._take_for_single(case.until(step + 1))
                 found = []
         if not found and step == 0 and right.tie.any() and how.unit == DOUBLE:
             self._count_ties(outcome, right)
@@ -193,13 +260,13 @@ class Examiner:
             self.report.ties[0 if (i, j) in rows or (j, i) in rows else 1] += 1
 
 
-def _with_earlier(case: Case, step: int, right: Truth) -> Truth:
+def _with_earlier(case: Case, step: int, right: Truth, reach: float) -> Truth:
     """The truth at a step, where pairs that were listed rightly earlier in the list's life may still be."""
     rows = [(right.i, right.j, right.shift)]
     for before in range(step - 1, -1, -1):
         if len(case.stills[before].positions) != len(right.positions) or case.stills[before + 1].fresh:
             break
-        then = truth(case, before, reach=case.r_cut + case.skin)
+        then = truth(case, before, reach=max(case.r_cut + case.skin, case.r_cut + (reach - case.r_cut) / 2))
         rows.append((then.i, then.j, then.shift))
     i, j, shift = (np.concatenate([part[n] for part in rows]) for n in range(3))
     table = np.unique(np.column_stack([i, j, shift]), axis=0)
@@ -229,6 +296,8 @@ def examine(
     asked: Iterable[Case] | None = None,
     progress: Progress | None = None,
     examiner: Examiner | None = None,
+    deadline: Deadline | None = None,
+    answers: Answers | None = None,
 ) -> Report:
     """Put a list through the suite.
 
@@ -242,6 +311,9 @@ def examine(
         asked: instead of all questions.
         progress: called with (cases done, cases, words).
         examiner: that knows its conventions already, instead of a new one.
+        deadline: after which no case is begun; what was not asked by then is counted.
+        answers: of an earlier examination of the same questions, which are not asked again; each new one is
+            put there.
 
     Returns:
         what was asked and what came of it. A list may raise, return anything and write to its input: that is
@@ -252,51 +324,48 @@ def examine(
     began = time.perf_counter()
     examiner = examiner or Examiner(tested, reuse=True, apart=apart)
     report = examiner.report
-    every = list(questions(tested, cases, seed, False) if asked is None else asked)
+    deadline, answers = deadline or Deadline(), Answers() if answers is None else answers
+    every = list(questions(tested, cases, seed, False, report.padding) if asked is None else asked)
     if asked is None and apart and tested.word:
         every += as_kept(tested, vast())
-    total = len(every) + 2 * (large and asked is None)
+    edges = (SMALL_EDGE, LARGE_EDGE) if large and asked is None else ()
+    report.questions = total = len(every) + len(edges)
     seen: set[tuple[str, str]] = set()
-
-    def take(case: Case) -> bool:
-        """Asks one case; whether to go on."""
-        if case.area == "large" and _too_long(report, case):
-            return True
-        at = time.perf_counter()
-        failures = _asked(examiner, case)
-        if case.area == "large" and tested.limits.refusal(case) is None:
-            report.large = (case.atoms, time.perf_counter() - at)
-        if failures:
-            failed = Failed(case.until(failures[0].step + 1), tuple(failures), case)
-            key = (failed.code, case.area)
-            if key not in seen:
-                seen.add(key)
-                report.failed.append(failed)
-        return not (stop and failures)
-
     going = True
-    for number, case in enumerate(every):
+    for number, case in enumerate(itertools.chain(every, map(lattice, edges))):
         if progress is not None:
             progress(number, total, {"phase": "asking", "unit": "cases"})
-        going = take(case)
-        if not going:
-            break
-    if going:
-        _order(examiner)
-    if large and asked is None and going:
-        for edge in (SMALL_EDGE, LARGE_EDGE):
-            if not (going := take(lattice(edge))):
-                break
+        if going and (answers.of(number, case) is not None or not deadline.passed):
+            failures = _taken(examiner, case, number, answers)
+            if failures:
+                failed = Failed(case.until(failures[0].step + 1), tuple(failures), case)
+                key = (failed.code, case.area)
+                if key not in seen:
+                    seen.add(key)
+                    report.failed.append(failed)
+            going = not (stop and failures)
+        if number + 1 == len(every) and going and not deadline.passed:
+            _order(examiner)
     if shrink:
         examiner.session.reuse = False
-        refused = dict(examiner.refused.values())
-        report.refusals = looked_into(examiner, refused)
+        if not deadline.passed:
+            report.refusals = looked_into(examiner, dict(examiner.refused.values()))
         for number, failed in enumerate(report.failed):
             if progress is not None:
                 progress(number, len(report.failed), {"phase": "shrinking", "unit": "failures"})
-            # a new process: what the list kept from other questions must not be part of it
-            examiner.session.close()
-            report.failed[number] = shrunk(examiner, failed)
+            small = answers.shrunk(failed)
+            if small is None:
+                if deadline.passed:
+                    report.whole = False
+                    continue
+                # a new process: what the list kept from other questions must not be part of it
+                examiner.session.close()
+                small = _deepest(examiner, shrunk(examiner, failed, deadline))
+                if deadline.passed:
+                    report.whole = False
+                else:
+                    answers.put_shrunk(failed, small)
+            report.failed[number] = small
         report.failed = _distinct(report.failed)
     report.areas = {area: report.areas[area] for area in AREAS if area in report.areas}
     examiner.session.close()
@@ -304,17 +373,29 @@ def examine(
     return report
 
 
-def _asked(examiner: Examiner, case: Case) -> list[Failure]:
-    """The failures of a case, counted."""
+def _taken(examiner: Examiner, case: Case, number: int, answers: Answers) -> list[Failure]:
+    """The failures of a case, counted; asked only where there is no answer yet."""
     report = examiner.report
     tally = report.areas.setdefault(case.area, Tally())
+    kept = answers.of(number, case)
     why = examiner.tested.limits.refusal(case)
+    if why is None and kept is None and case.area == "large":
+        why = _too_long(report, case)
     if why is not None:
         tally.skipped += 1
         tally.why[why] = tally.why.get(why, 0) + 1
         return []
     tally.asked += 1
-    failures, refused = examiner.outcome(case)
+    if kept is None:
+        failures, refused, kept = examiner.told(case)
+        answers.put(number, kept)
+    else:
+        failures, refused = examiner.recalled(case, kept)
+    if case.area == "large":
+        report.large = (case.atoms, float(kept["seconds"]))
+    if case.motions:
+        report.motions += case.motions
+        report.calls += case.steps
     if failures:
         tally.failed += 1
         code = min((failure.code for failure in failures), key=CODES.index)
@@ -326,10 +407,27 @@ def _asked(examiner: Examiner, case: Case) -> list[Failure]:
     return failures
 
 
+def _deepest(examiner: Examiner, failed: Failed) -> Failed:
+    """A pair that is lost just inside the cutoff, followed as far in as it stays lost.
+
+    It moves on the way it went, so that what is told is how near a lost pair can be.
+    """
+    case = failed.case
+    if failed.code != "MISSING" or case.area != "rule" or case.steps != 2 or not failed.alone:
+        return failed
+    first, last = case.stills
+    for part in np.arange(1.02, _FURTHEST, 0.04):
+        moved = first.positions + part * (last.positions - first.positions)
+        further = replace(case, stills=(first, replace(last, positions=moved)))
+        found = tuple(one for one in examiner.failures(further) if one.code == "MISSING" and one.step == 1)
+        if not found:
+            break
+        failed = replace(failed, case=further, failures=found)
+    return failed
+
+
 def _order(examiner: Examiner) -> None:
     """Whether the same question has the same rows in the same order, twice in a row."""
-    from mdnum.references.conformance.catalog import gas
-
     for case in (one("order", "reuse", gas(40, 6.0, 120), 6.0), one("order", "reuse", gas(40, 3.0, 120))):
         case = replace(case, skin=0.3 if examiner.tested.kept else 0.0)
         if examiner.tested.limits.refusal(case) is None:
@@ -342,20 +440,14 @@ def _order(examiner: Examiner) -> None:
             return
 
 
-def _too_long(report: Report, case: Case) -> bool:
-    """Whether a large question would take longer than anybody wants to wait, by the one before it."""
+def _too_long(report: Report, case: Case) -> str | None:
+    """Why a large question is not asked: it would take longer than anybody waits, by the one before it."""
     if report.large is None:
-        return False
+        return None
     atoms, seconds = report.large
     # lists that are not linear in the number of atoms are squared in it
     expected = seconds * (case.atoms / atoms) ** (2 if seconds > 1.0 else 1)
-    if expected > _PATIENCE:
-        tally = report.areas.setdefault(case.area, Tally())
-        tally.skipped += 1
-        words = f"{case.atoms:,} atoms would take more than {_PATIENCE:.0f} s"
-        tally.why[words] = tally.why.get(words, 0) + 1
-        return True
-    return False
+    return f"{case.atoms:,} atoms would take more than {_PATIENCE:.0f} s" if expected > _PATIENCE else None
 
 
 def _distinct(failed: list[Failed]) -> list[Failed]:

@@ -8,7 +8,7 @@ from typing import Any
 from mdnum.report.fork.findings import Verdict
 from mdnum.report.fork.question import Question, verdict
 from mdnum.report.verdict import Finding
-from mdnum.report.words import count, listed, many, typeset
+from mdnum.report.words import count, listed, many, number, typeset
 
 #: (severity, title, remedy) by the code of a failure.
 _CODES: Mapping[str, tuple[str, str, str]] = {
@@ -59,27 +59,51 @@ _CODES: Mapping[str, tuple[str, str, str]] = {
 }  # fmt: skip
 
 
+#: What became of a case in which nothing came back, by the code of it.
+_SILENT = {
+    "CRASHED": "ends the process",
+    "NO_ANSWER": "gives no answer in time",
+    "RAISED": "raises an exception by accident",
+}
+
+
 def judge(run: Question) -> Verdict:
     """Headline, evidence and findings of an examination."""
-    found = list(_findings(run))
     summary = run.summary
-    answered = _answered(summary)
-    if not answered:
-        headline = f"{run.name} answered no question."
-    elif not summary["wrong"]:
-        headline = f"{run.name} gave the right pairs in all of {many(answered, 'case')}."
-    elif _silent(summary):
-        headline = f"{run.name} gave no answer in {count(summary['wrong'])} of "
-        headline += f"{many(summary['asked'], 'case')}, and the right pairs wherever it answered."
+    findings = list(_findings(run))
+    left = int(summary.get("left", 0))
+    all_of_them = "all of " if not left else ""
+    answered, failed = _answered(summary), int(summary["wrong"])
+    none = failed and all(silent(row) == row["failed"] for row in summary["areas"])
+    if left and not summary["asked"]:
+        said = "was asked nothing"
+    elif not answered:
+        said = "answered no question"
+    elif not failed:
+        said = f"gave the right pairs in {all_of_them}{many(answered, 'case')}"
+    elif none:
+        right = sum(row["passed"] for row in summary["areas"])
+        counts = [(words, _cases(summary, code)) for code, words in _SILENT.items()]
+        told = [f"{words} in {count(cases)}" for words, cases in counts if cases]
+        said = f"{listed(told)} of {many(summary['asked'], 'case')}; "
+        said += f"in the {count(right)} that it answered, the pairs are right" if right else "none is right"
     else:
-        headline = f"{run.name} failed {count(summary['wrong'])} of {many(summary['asked'], 'case')}."
-    return verdict(headline, _evidence(run), found, plain_tone="good")
+        said = f"failed {count(failed)} of {many(summary['asked'], 'case')}"
+    headline = f"{run.name} {said}."
+    if left:
+        asked = int(summary["questions"]) - left
+        headline = f"As far as asked ({count(asked)} of {many(summary['questions'], 'case')}), {headline}"
+    return verdict(headline, _evidence(run), findings, plain_tone="good")
 
 
-def _silent(summary: Mapping[str, Any]) -> bool:
-    """Whether every failure is that nothing came back: what came back was right."""
-    codes = {code for row in summary["areas"] for code in row["codes"]}
-    return codes <= {"CRASHED", "NO_ANSWER", "RAISED"}
+def silent(row: Mapping[str, Any]) -> int:
+    """Failed cases of an area in which nothing came back that could be wrong."""
+    return sum(number for code, number in row["codes"].items() if code in _SILENT)
+
+
+def _cases(summary: Mapping[str, Any], code: str) -> int:
+    """Cases whose worst failure has a code."""
+    return sum(row["codes"].get(code, 0) for row in summary["areas"])
 
 
 def _answered(summary: Mapping[str, Any]) -> int:
@@ -102,6 +126,9 @@ def _evidence(run: Question) -> Iterator[str]:
             f"{many(scripts, 'script')} beside this page reproduce{'s' * (scripts == 1)} the failures "
             f"without mdnum, the smallest with {many(least, 'atom')}."
         )
+    yield from _rule(summary)
+    if summary.get("status") == "stopped":
+        yield f"It was stopped; `mdnum conform --resume {run.path.name}` goes on with it."
     refused = sum(row["refused"] for row in summary["areas"])
     skipped = sum(row["skipped"] for row in summary["areas"])
     told = [f"it refused {many(refused, 'case')}"] * bool(refused)
@@ -111,6 +138,29 @@ def _evidence(run: Question) -> Iterator[str]:
     if told:
         words = "; ".join(told)
         yield f"{words[:1].upper()}{words[1:]}."
+
+
+def _rule(summary: Mapping[str, Any]) -> Iterator[str]:
+    """What was asked of the rule by which a list that is kept is rebuilt."""
+    asked = summary.get("rule") or {}
+    if not asked.get("motions"):
+        return
+    tried = many(asked["motions"], "motion") + " against its rebuild rule"
+    tried = f"{tried} ({many(asked['calls'], 'call')})"
+    failed = sum(row["failed"] for row in summary["areas"] if row["area"] == "rule")
+    if failed:
+        yield f"{tried}: it lets pairs through."
+        return
+    padding = summary.get("padding")
+    if padding is None:
+        reach = "it shows no pairs of its skin, so starts from 0.25 to 3 skins beyond the cutoff were tried"
+    else:
+        how = "as it says" if summary.get("padding_said") else "as its pairs show"
+        reach = f"its list reaches {number(padding, 3)} of the skin beyond the cutoff, {how}"
+    yield (
+        f"{tried}, each the smallest that takes a pair from 0.2 % of the skin beyond the list to 0.2 % of it "
+        f"inside the cutoff, lost no pair; {reach}."
+    )
 
 
 def conventions(run: Question) -> Iterator[tuple[str, str]]:
@@ -145,13 +195,16 @@ def _findings(run: Question) -> Iterator[Finding]:
     by_code: dict[str, list[Mapping[str, Any]]] = {}
     for row in summary["failures"]:
         by_code.setdefault(row["code"], []).append(row)
+    below = _below(by_code)
     for code, rows in by_code.items():
+        if code in below:
+            continue
         severity, title, remedy = _CODES[code]
-        first = min(rows, key=lambda row: (row["atoms"], row["steps"]))
-        total = sum(row["codes"].get(code, 0) for row in summary["areas"])
+        # one that fails by itself says more than a smaller one that does not
+        first = min(rows, key=lambda row: (not row["alone"], row["atoms"], row["steps"]))
         if code == "CRASHED" and any("exit" in row["text"].lower() for row in rows):
             remedy = "Raise an exception instead: a program that calls it ends with it and loses its run."
-        text = f"In {many(total, 'case')}, {_about(summary, code)}. {_sentence(first)} "
+        text = f"In {many(_cases(summary, code), 'case')}, {_about(summary, code)}. {_sentence(first)} "
         text += f"Reproduced by {first['script']}."
         if code == "ONE_SIDED" and all(row["text"].startswith("within rounding") for row in rows):
             severity, title = "warning", "pairs within rounding of the cutoff are listed from one atom only"
@@ -159,8 +212,28 @@ def _findings(run: Question) -> Iterator[Finding]:
             text += f" {summary['known'][code]}"
         if not first["alone"]:
             text += " It fails only after other questions, so the script alone may not show it."
+        for other in [other for other, cause in below.items() if cause == code]:
+            text += (
+                f" After such questions, and not by themselves, {many(_cases(summary, other), 'case')} fail "
+            )
+            text += (
+                f"otherwise: {_CODES[other][1]} ({_about(summary, other)}; {by_code[other][0]['script']})."
+            )
         yield Finding(code, severity, title, text, remedy)  # type: ignore[arg-type]
     yield from _conduct(run)
+
+
+def _below(by_code: Mapping[str, list[Mapping[str, Any]]]) -> dict[str, str]:
+    """Codes that are met only after other questions, by the code of what failed by itself and is as bad."""
+    causes = [code for code, rows in by_code.items() if any(row["alone"] for row in rows)]
+    found = {}
+    for code, rows in by_code.items():
+        as_bad = [
+            cause for cause in causes if _CODES[cause][0] == "error" or _CODES[cause][0] == _CODES[code][0]
+        ]
+        if as_bad and not any(row["alone"] for row in rows):
+            found[code] = as_bad[0]
+    return found
 
 
 def _quoted(words: str) -> str:
@@ -252,7 +325,9 @@ def _conduct(run: Question) -> Iterator[Finding]:
             "error",
             "no question was answered",
             f"Nothing is known about it. {often}".strip(),
-            "Ask it about fewer things with --limits, or look at what it raises.",
+            "Ask it about fewer things with --limits, or look at what it raises."
+            if summary["asked"] or not summary.get("left")
+            else "Give it more time, or go on with --resume.",
         )
     elif refused:
         many_of_them = total > 0.2 * summary["asked"]

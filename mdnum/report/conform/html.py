@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from mdnum.report.axes import PAGE_WIDTH, drawn
-from mdnum.report.conform.findings import conventions, judge
+from mdnum.report.conform.findings import conventions, judge, silent
 from mdnum.report.fork.findings import Verdict
 from mdnum.report.fork.question import Question, load, took, write_page
 from mdnum.report.svg import FIRST, INK, MUTED, SECOND
@@ -39,8 +39,8 @@ def write_report(folder: RunFolder | str | Path) -> Path:
         "conform/run.html.j2",
         {"areas": (title, partial(areas, run), [])},
         captions={
-            "areas": "Cases asked, by what they are about: right, wrong, and refused by the list itself. "
-            "Beside the bars, how many are wrong."
+            "areas": "Cases asked, by what they are about: right, wrong, without an answer, and refused by "
+            "the list itself. Beside the bars, how many are wrong or without an answer."
         },
         figures=list(_key_figures(run)),
         about=[_area(row) for row in run.summary["areas"]],
@@ -75,14 +75,14 @@ def _bars(run: Question, figure: Figure) -> None:
     # a share of each area: one of 100,000 atoms counts as much as 500 drawn at random
     for at, row in zip(place, rows, strict=True):
         left = 0.0
-        for name, color, alpha in (
-            ("passed", FIRST, 0.75),
-            ("refused", MUTED, 0.45),
-            ("failed", SECOND, 0.9),
+        for cases, color, alpha in (
+            (row["passed"], FIRST, 0.75),
+            (row["refused"], MUTED, 0.45),
+            (silent(row), SECOND, 0.45),
+            (row["failed"] - silent(row), SECOND, 0.9),
         ):
-            share = row[name] / row["asked"]
             # a case that fails is never too small to be seen
-            share = max(share, 0.006) if row[name] else share
+            share = max(cases / row["asked"], 0.006) if cases else 0.0
             axes.barh(at, share, left=left, height=0.6, color=color, alpha=alpha, lw=0)
             left += share
         text = f"{row['failed']:,} of {row['asked']:,}" if row["failed"] else f"{row['asked']:,}"
@@ -90,14 +90,16 @@ def _bars(run: Question, figure: Figure) -> None:
             text, (1.0, at), (6, 0), textcoords="offset points", fontsize=8, va="center", color=INK,
             annotation_clip=False,
         )  # fmt: skip
-    for name, color, alpha in (("right", FIRST, 0.75), ("refused", MUTED, 0.45), ("wrong", SECOND, 0.9)):
+    for name, color, alpha in (
+        ("right", FIRST, 0.75), ("refused", MUTED, 0.45), ("no answer", SECOND, 0.45), ("wrong", SECOND, 0.9),
+    ):  # fmt: skip
         axes.barh(0, 0, color=color, alpha=alpha, label=name)
     axes.set_yticks(place, [row["area"] for row in rows], fontsize=8.5)
     axes.set_xlim(0, 1.16 if figure.get_figwidth() >= PAGE_WIDTH else 1.3)
     axes.set_ylim(-0.7, len(rows) - 0.3)
     axes.set_xticks([0, 0.25, 0.5, 0.75, 1.0], ["0", "25 %", "50 %", "75 %", "100 %"])
     axes.set_xlabel("share of the cases asked", color=INK)
-    axes.legend(loc="lower center", bbox_to_anchor=(0.45, 1.0), ncols=3, frameon=False, fontsize=8)
+    axes.legend(loc="lower center", bbox_to_anchor=(0.45, 1.0), ncols=4, frameon=False, fontsize=8)
 
 
 def _key_figures(run: Question) -> Iterator[tuple[str, str, str]]:
@@ -106,7 +108,14 @@ def _key_figures(run: Question) -> Iterator[tuple[str, str, str]]:
     right = sum(row["passed"] for row in summary["areas"])
     yield "Right", count(right), f"of {many(summary['asked'], 'case')}"
     kinds = many(len(summary["failures"]), "kind")
-    yield "Wrong", count(summary["wrong"]), f"{kinds}, shrunk" if summary["failures"] else "nothing to show"
+    mute = sum(silent(row) for row in summary["areas"])
+    if mute:
+        yield "No answer", count(mute), "ends the process, takes too long or raises"
+    yield (
+        "Wrong",
+        count(summary["wrong"] - mute),
+        f"{kinds}, shrunk" if summary["failures"] else "nothing to show",
+    )
     skipped = sum(row["skipped"] for row in summary["areas"])
     yield "Not asked", count(skipped), "outside of what it claims"
     if summary["large"]:
@@ -126,7 +135,14 @@ def _area(row: Mapping[str, Any]) -> dict[str, Any]:
         "name": heading(row["area"]),
         "about": row["about"],
         "cells": [
-            count(row[name]) if row[name] else "–" for name in ("asked", "failed", "refused", "skipped")
+            count(cases) if cases else "–"
+            for cases in (
+                row["asked"],
+                row["failed"] - silent(row),
+                silent(row),
+                row["refused"],
+                row["skipped"],
+            )
         ],
         "bad": bool(row["failed"]),
         "why": "; ".join(why),

@@ -16,7 +16,8 @@ from mdnum.references.conformance.catalog import catalog
 from mdnum.references.conformance.crowds import LARGE_EDGE, SMALL_EDGE, lattice
 from mdnum.references.conformance.loading import from_object
 from mdnum.references.conformance.reproduction import script
-from mdnum.references.conformance.suite import Report, drawn, examine, questions
+from mdnum.references.conformance.rule import motions
+from mdnum.references.conformance.suite import Examiner, Report, drawn, examine, questions
 
 ROOT = Path(__file__).parents[3]
 # what needs more atoms than the small questions have
@@ -69,6 +70,74 @@ def test_a_list_made_anew_is_found_out(defect: str):
 def test_a_list_that_is_kept_is_found_out(defect: str):
     report = _found(defect, stop=True)
     assert report.failed, f"{defect} passed {report.asked} cases"
+
+
+def _against_the_rule(made, **options) -> Report:
+    """Asked the motions against its rebuild rule alone, scaled to the padding that it was seen to have."""
+    tested = from_object(made, "ruled")
+    examiner = Examiner(tested)
+    asked = list(motions(examiner.report.padding))
+    return examine(tested, asked=asked, examiner=examiner, large=False, **options)
+
+
+@pytest.mark.parametrize("defect", planted_lists.RULE_DEFECTS)
+def test_a_rule_that_lets_pairs_through_is_found_out(defect: str):
+    """Ten of these passed all scripts of motion that there were, which move atoms along x or at random."""
+    made = planted_lists.ruled(planted_lists.RULE_DEFECTS[defect])
+    report = _against_the_rule(made, stop=True, shrink=False)
+    assert [failed.code for failed in report.failed] == ["MISSING"], f"{report.calls} calls"
+
+
+@pytest.mark.parametrize("own", [0.1, 0.5])
+@pytest.mark.parametrize(
+    ("defect", "way"),
+    [
+        ("each axis by itself", "shown"),
+        ("twice the mean of a few", "said"),
+        ("a sample of nine in ten", "shown"),
+        # few atoms that are ignored are found only where the padding is known
+        ("each axis by itself", "neither"),
+        ("twice the mean of a few", "neither"),
+    ],
+)
+def test_a_padding_of_its_own_hides_no_rule(defect: str, way: str, own: float):
+    """Whatever skin it is given; where it neither shows nor says it, from one that was tried."""
+    test = planted_lists.RULE_DEFECTS[defect]
+    made = planted_lists.ruled(test, own, filtered=way != "shown", says=way == "said")
+    report = _against_the_rule(made, stop=True, shrink=False)
+    assert [failed.code for failed in report.failed] == ["MISSING"], f"{report.calls} calls"
+    assert report.said == (way == "said")
+    assert (report.padding is None) == (way == "neither")
+    assert report.padding is None or abs(report.padding * 0.3 / own - 1) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("rule", "own", "filtered", "says"),
+    [
+        ("an atom by half of the skin", None, False, False),
+        ("the two furthest by the skin", None, True, False),
+        ("the sum of magnitudes", 0.8, False, False),
+        ("beside a common drift", 0.1, False, True),
+        ("always", 0.5, True, False),
+        ("at any motion", None, False, False),
+    ],
+)
+def test_a_rule_that_loses_nothing_raises_no_alarm(rule: str, own: float | None, filtered: bool, says: bool):
+    made = planted_lists.ruled(planted_lists.RULES[rule], own, filtered, says)
+    report = _against_the_rule(made, shrink=False)
+    assert not report.failed, [(one.case.name, one.worst.text) for one in report.failed]
+    assert report.motions > 250 and report.calls > 500
+
+
+def test_a_lost_pair_is_followed_as_far_in_as_it_is_lost():
+    """Each axis by itself loses pairs along a diagonal until 3^(1/2) of the skin are used up, or 2^(1/2)."""
+    report = _against_the_rule(
+        planted_lists.ruled(planted_lists.RULE_DEFECTS["each axis by itself"]), stop=True
+    )
+    (failed,) = report.failed
+    assert (failed.case.atoms, failed.case.steps) == (2, 2)
+    far, near = (np.linalg.norm(np.subtract(*still.positions)) for still in failed.case.stills)
+    assert far > 1.3 and 0.77 < near < 0.9
 
 
 def test_rows_beyond_4096_are_found_lost():

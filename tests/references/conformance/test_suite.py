@@ -26,6 +26,7 @@ from mdnum.references.conformance.loading import from_object, installed, known, 
 from mdnum.references.conformance.movers import movers
 from mdnum.references.conformance.remote import RemoteSession
 from mdnum.references.conformance.results import Failed
+from mdnum.references.conformance.rule import motions
 from mdnum.references.conformance.strategies import PLACES, SHAPES, SIZES
 from mdnum.references.conformance.suite import Examiner, _distinct, drawn, examine, questions
 
@@ -45,7 +46,7 @@ class TestAdoptedKept(NeighborListConformance):
 
     def asked(self, tested, area):
         # the rest is asked of the list above
-        return super().asked(tested, area) if area in ("few", "motion", "strain") else []
+        return super().asked(tested, area) if area in ("few", "strain", "rule") else []
 
 
 @pytest.mark.parametrize("package", ["mdnum.references", "mdnum.references.conformance"])
@@ -94,7 +95,7 @@ def test_questions_are_what_they_were():
         one.stills[0].positions.tobytes() for one in drawn(30, 3)
     ]
     assert drawn(5, 3)[4].stills[0].positions.tobytes() != drawn(5, 4)[4].stills[0].positions.tobytes()
-    named = [*catalog(), *crowds(), *movers()]
+    named = [*catalog(), *crowds(), *movers(), *motions()]
     assert {case.area for case in named} | {"large", "random"} == set(AREAS)
     assert len({case.name for case in named}) > 150
     kinds = "; ".join(case.name for case in drawn(300, 0))
