@@ -16,8 +16,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from mdnum.gradients.adjoint import Trace
 from mdnum.gradients.diagnose.plain import Plain
@@ -53,6 +54,7 @@ class Turns(Plain):
             (turns, columns); NaN before the tangents have been there.
         shift: how far the distance is from that of other runs (another time step, another rounding), the
             largest of them, length; 0 before any was compared.
+        unseen: whether it is beyond the cutoff between two steps alone, which decided that it is not.
     """
 
     step: Int[np.ndarray, "turns"]
@@ -63,6 +65,7 @@ class Turns(Plain):
     weight: Float[np.ndarray, "turns"]
     moved: Float[np.ndarray, "turns columns"]
     shift: Float[np.ndarray, "turns"]
+    unseen: Bool[np.ndarray, "turns"]
 
     def __len__(self) -> int:
         return len(self.step)
@@ -80,17 +83,19 @@ class Turns(Plain):
 
     @property
     def within(self) -> np.ndarray:
-        """Which of them may be on the other side of their cutoff."""
-        return np.abs(self.gap) <= self.reach
+        """Which of them may be on the other side of their cutoff, or are and left no flip."""
+        return (np.abs(self.gap) <= self.reach) | self.unseen
 
     @property
     def term(self) -> Float[np.ndarray, "turns columns"]:
-        """What the two crossings add in the mean over depths up to the reach, magnitude; 0 out of reach."""
-        within = self.within
+        """What the two crossings add, magnitude: in the mean over depths up to the reach, or at the depth of
+        those that no step saw; 0 out of reach."""
         with np.errstate(divide="ignore", invalid="ignore"):
             mean = 2 / np.sqrt(2 * self.bend * self.reach)
-            terms = np.abs(2 * self.weight[:, None] * self.moved) * mean[:, None]
-        return np.where(within[:, None], terms, 0.0)
+            there = 1 / np.sqrt(2 * self.bend * np.abs(self.gap))
+            times = np.where(self.unseen & ~(np.abs(self.gap) <= self.reach), there, mean)
+            terms = np.abs(2 * self.weight[:, None] * self.moved) * times[:, None]
+        return np.where(self.within[:, None], terms, 0.0)
 
     def heaviest(self, words: tuple[str, ...], most: int = 10) -> list[dict[str, Any]]:
         """Those within reach with the largest terms, as plain rows."""
@@ -145,10 +150,10 @@ class Near:
             return (onto_v[row, :, atom] + half * onto_x[row, :, atom]) / masses[atom][:, None]
 
         along = np.sum(found.normal * (impulse(j) - impulse(i)), axis=1)
-        share = np.array(
-            [float(self.pace.share(step, simulation.integrator.timestep)) for step in found.step]
-        )
         by_energy, by_virial = (np.asarray(part)[row] for part in trace.frame)
+        timestep, share = simulation.integrator.timestep, np.zeros(len(row))
+        for step in np.unique(found.step[(by_energy != 0) | (by_virial != 0)]):
+            share[found.step == step] = float(self.pace.share(jnp.asarray(step), timestep))
         energy, force = (np.asarray(jump)[found.kind] for jump in simulation.jumps())
         radius = np.asarray(simulation.decider.r_cut)[found.kind]
         seen = share * (by_energy * energy + by_virial * force * radius)
@@ -214,6 +219,7 @@ class Near:
             column("weight")[order],
             (np.concatenate(moved) if moved else np.zeros((0, columns)))[order],
             column("shift")[order],
+            column("unseen", bool)[order],
         )
 
 
@@ -229,8 +235,7 @@ class Turning:
             of j.
         part: where between the two steps, 0 to 1.
         distances: at the two steps.
-        gap, bend: as in `Turns`.
-        weight, moved, shift: as in `Turns`.
+        gap, bend, unseen, weight, moved, shift: as in `Turns`.
     """
 
     step: np.ndarray
@@ -246,6 +251,7 @@ class Turning:
     distances: tuple[np.ndarray, np.ndarray]
     gap: np.ndarray
     bend: np.ndarray
+    unseen: np.ndarray
     weight: np.ndarray
     moved: np.ndarray | None
     shift: np.ndarray
@@ -321,20 +327,25 @@ def turning(simulation: Simulation, stretch: Stretch) -> Turning:
                 if len(turned):
                     part, there, bend = hermite(r0[turned], s0[turned], r[turned], rate[turned], time)
                     middle = d0[turned] + d[turned]
+                    side, ends = np.sign(bend), np.stack([r0[turned], r[turned]]) - cut[turned]
+                    gap = side * (there - cut[turned])
                     raw = (stretch.x[row][:, b[turned]] - stretch.x[row][:, a[turned]]).T.astype(np.float64)
                     rows.append((
                         np.full(len(turned), row), a[turned], b[turned], which[turned],
                         middle / np.linalg.norm(middle, axis=1, keepdims=True), d[turned] - raw, part,
-                        r0[turned], r[turned], np.sign(bend) * (there - cut[turned]), np.abs(bend),
+                        r0[turned], r[turned], gap, np.abs(bend),
+                        (gap < 0) & (side * ends > 0).all(axis=0),
                     ))  # fmt: skip
             before = (r, rate, d)
     if not rows:
         whole, none, three = np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3))
-        rows.append((whole, whole, whole, whole, three, three, none, none, none, none, none))
-    row, a, b, which, normal, lattice, part, r0, r1, gap, bend = map(np.concatenate, zip(*rows, strict=True))
+        rows.append((whole,) * 4 + (three,) * 2 + (none,) * 5 + (np.zeros(0, bool),))
+    row, a, b, which, normal, lattice, part, r0, r1, gap, bend, unseen = map(
+        np.concatenate, zip(*rows, strict=True)
+    )
     inverse = np.asarray(simulation.cell.inverse, np.float64)
     nothing = np.zeros(len(row))
     return Turning(
         stretch.first + row, row, a, b, order[a], order[b], which, normal, np.rint(lattice @ inverse), part,
-        (r0, r1), gap, bend, nothing, None, nothing.copy(),
+        (r0, r1), gap, bend, unseen, nothing, None, nothing.copy(),
     )  # fmt: skip

@@ -46,7 +46,7 @@ class Comparison(Plain):
         method, reference: words of the two methods.
         size: Euclidean norm of the reference's derivative (a scalar's magnitude).
         difference: norm of the difference; signed (method minus reference) for a scalar.
-        relative: |difference| over the larger norm of the two; 0 where both are 0.
+        relative: |difference| over `size`; infinite where only the reference is 0.
         means: "agree", "missing saltation", "rounding", "truncation and noise", "events between shifts",
             "another program", "an average", "statistical" or "unexplained".
         says: the same in a sentence.

@@ -203,8 +203,8 @@ def trust(
         limits.append(Limit(SCATTER, None, False, "Not looked at: it takes other starts of the same system."))
     skipped = [name for name in full if name not in kept]
     chaotic = growth.word != WORDS[0] or gain(growth) > GROWN * max(1.0, problem.steps / CLOCK_STEPS)
-    verdict, horizon, limited, unknown = _verdict(limits, problem.steps, chaotic, gain(growth), skipped)
-    digits = {} if shorter is None else {name: _digits(steps[name][-1], apart[name][-1]) for name in kept}
+    verdict, horizon, limited, unknown = verdict_of(limits, problem.steps, chaotic, gain(growth), skipped)
+    digits = {} if shorter is None else {name: _digits(*steps[name][-2:], apart[name][-1]) for name in kept}
     half = {} if shorter is None else {name: part[-1] for name, part in shorter.by_name().items()}
     says = _says(verdict, horizon, limited, unknown, limits, problem.steps, bool(replicas))
     return Trust(
@@ -213,7 +213,7 @@ def trust(
     )  # fmt: skip
 
 
-def _verdict(
+def verdict_of(
     limits: Sequence[Limit], steps: int, chaotic: bool, grown: float, skipped: Sequence[str]
 ) -> tuple[str, int, str, tuple[str, ...]]:
     """The verdict, how far no limit was met, which limit was met first, and what is not known."""
@@ -266,7 +266,7 @@ def _digits(*relative: float) -> int:
 def _time_step(at, own: Horizons, shorter: Horizons | None, steps, tolerance: float, why: str) -> Limit:
     if shorter is None:
         return Limit(STEP, None, False, f"Half the time step was not looked at: {why}.")
-    horizon, reached = last_below(at, list(steps.values()), tolerance)
+    horizon, reached = last_agreeing(at, list(steps.values()), tolerance)
     told = "; ".join(
         f"by {column} {own.gradient[-1, k]:.4g} and {shorter.gradient[-1, k]:.4g}"
         for k, column in list(enumerate(own.columns))[:4]
@@ -319,15 +319,15 @@ def _missed(
         near = f"the nearest of {len(turns)} looked at" if len(turns) else "none turned around near it"
         return Limit(NEAR, problem.steps, False, f"No pair turned around within reach of its cutoff: {near}.")
     heavy, column = np.unravel_index(int(np.argmax(share)), share.shape)
-    beyond = turns.gap[heavy] < 0
-    side = "beyond" if beyond else "short of"
+    gap, held, count = turns.gap[heavy], size[column], int(kept.sum())
+    unseen = "unseen between two steps, " if turns.unseen[heavy] else ""
+    side = "short of" if gap > 0 else f"{unseen}beyond"
+    part = f"{100 * share[heavy, column]:.3g} % of" if held else f"{turns.term[heavy, column]:.3g} to"
     told = (
-        f"{int(kept.sum())} pairs turned around within reach of their cutoff; the heaviest, "
-        f"({turns.i[heavy]}, {turns.j[heavy]}) before step {turns.step[heavy]}, {abs(turns.gap[heavy]):.2g} "
-        f"{side} it where half the time step or rounding moves it by up to "
-        f"{turns.reach[heavy]:.2g}, {'has' if beyond else 'would add'} some "
-        f"{100 * share[heavy, column]:.3g} % "
-        f"of the derivative by {own.columns[column]}"
+        f"{count} pair{'' if count == 1 else 's'} turned around within reach of the cutoff; the heaviest, "
+        f"({turns.i[heavy]}, {turns.j[heavy]}) before step {turns.step[heavy]}, {abs(gap):.2g} {side} it, "
+        f"and half the time step or another rounding moves it by up to {turns.reach[heavy]:.2g}: its "
+        f"crossings {'would add' if gap > 0 else 'add'} some {part} the derivative by {own.columns[column]}"
     )
     if not len(over):
         return Limit(NEAR, problem.steps, False, f"{told}.")
@@ -387,6 +387,21 @@ def last_below(
         return int(at[-1]), False
     first = int(np.argmax(lasting))
     return (int(at[first - 1]) if first else 0), True
+
+
+def last_agreeing(
+    at: Int[np.ndarray, "points"], values: Sequence[Float[np.ndarray, "points"]], limit: float
+) -> tuple[int, bool]:
+    """The longest horizon at which no value passes a limit, and whether it is short of the last one.
+
+    Shorter horizons count for nothing: the error of a time step does not only grow, and what few flips add is
+    coarse where there is little else. A horizon alone among others beyond the limit agrees by chance.
+    """
+    within = np.max(np.stack(list(values)), axis=0) <= limit
+    if len(within) > 1:
+        within &= np.append(False, within[:-1]) | (np.append(within[1:], False) & (at < at[-1]))
+    where = np.flatnonzero(within)
+    return (int(at[where[-1]]) if len(where) else 0), not within[-1]
 
 
 def _rounding(at, apart, tolerance: float, shadow: Shadow, differ: int | None) -> Limit:
