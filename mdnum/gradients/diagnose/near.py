@@ -168,11 +168,12 @@ class Near:
             return
         simulation, stretch = self.simulation, part.stretch
         along = directions(simulation, part.columns)
-        assert part.x is not None and part.v is not None
+        x, v = part.x, part.v
+        assert x is not None and v is not None
         late = (1 - found.part) * float(simulation.integrator.timestep)
 
         def moved(atom):
-            rows = part.x[found.row, :, :, atom] - late[:, None, None] * part.v[found.row, :, :, atom]
+            rows = x[found.row, :, :, atom] - late[:, None, None] * v[found.row, :, :, atom]
             images = stretch.images[found.row, :, atom].astype(np.float64)
             return rows - np.einsum("cab,ra->rcb", np.asarray(along.matrix), images)
 

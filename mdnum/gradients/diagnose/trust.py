@@ -10,8 +10,9 @@ rounding the time step.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -168,14 +169,8 @@ def trust(
             progress=None if progress is None else told,
         )  # fmt: skip
 
-    def beside(per: int):
-        if near is None:
-            return None
-
-        def each(stretch: Stretch) -> None:
-            near.compared(stretch, per)
-
-        return each
+    def beside(per: int) -> Callable[[Stretch], None] | None:
+        return None if near is None else partial(near.compared, per=per)
 
     own = follow(problem, "the run", watch=None if near is None else near.tangents)
     shadow = shadow_of(simulation)
@@ -242,7 +237,9 @@ def _says(
     if verdict == LIMITED:
         why = next(one.says for one in limits if one.what == limited)
         until = f"beyond step {horizon} of {steps}" if horizon else f"at any of {steps} steps"
-        return f"Not trusted {until}; the limit is {limited}. {why}{open_}"
+        also = [one for one in limits if one.reached and one.what != limited]
+        further = "".join(f" Nor beyond step {one.horizon} for {one.what}: {one.says}" for one in also)
+        return f"Not trusted {until}; the limit is {limited}. {why}{further}{open_}"
     if verdict == UNDECIDED:
         return f"Undecided: not limited by {free}, over all {steps} steps.{open_}"
     starts = "" if replicas else "; of this start, others were not looked at"
@@ -312,7 +309,8 @@ def _missed(
         [np.full(part.shape[1], np.linalg.norm(part[-1])) for part in own.by_name().values()]
     )
     with np.errstate(divide="ignore", invalid="ignore"):
-        share = np.where(turns.term > 0, turns.term / size, 0.0)
+        # a term that is not known weighs
+        share = np.where(turns.term == 0, 0.0, np.nan_to_num(turns.term / size, nan=np.inf))
     weighs = np.sqrt(np.cumsum(np.square(share), axis=0))
     over = np.flatnonzero(~(weighs <= tolerance).all(axis=1))
     if not kept.any():

@@ -288,7 +288,7 @@ def _off_the_motion(run: Question) -> Iterator[Finding]:
     """Methods that do not give the derivative of the exact motion, where that is known."""
     if not run.summary.get("exact"):
         return
-    off = [row for row in run.summary["comparisons"] if not row["relative"] <= _CLOSE]
+    off = [row for row in run.summary["comparisons"] if row["relative"] is None or row["relative"] > _CLOSE]
     if not off:
         return
     aware = [row for row in off if row["method"] == "event-aware"]

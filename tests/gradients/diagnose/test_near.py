@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from ase import Atoms
@@ -28,7 +30,7 @@ def u(r):
 
 
 #: A dimer that is let go compressed stretches up to here: its energy is conserved.
-FARTHEST = brentq(lambda r: u(r) - u(START), 1.13, 2.0, xtol=1e-15)
+FARTHEST: Any = brentq(lambda r: u(r) - u(START), 1.13, 2.0, xtol=1e-15)
 
 
 def problem(gap: float, timestep: float, time: float = 0.6, radius: float = R_CUT, loss=None):
@@ -36,7 +38,7 @@ def problem(gap: float, timestep: float, time: float = 0.6, radius: float = R_CU
     middle = np.array([6.0, 7.0, 7.0])
     x = middle + np.array([[-START / 2, 0, 0], [START / 2, 0, 0], [FARTHEST / 2 + R_CUT + gap, 0, 0]])
     atoms = Atoms("Ar3", positions=x, velocities=np.zeros((3, 3)), cell=[14.0] * 3, pbc=True)
-    atoms.set_masses([1.0] * 3)
+    atoms.set_masses(np.ones(3))
     atoms.set_momenta(np.zeros((3, 3)) + 1e-300)
     dynamics = {"kind": "nve", "timestep": timestep}
     cutoff = {"kind": "hard", "radius": radius}
@@ -79,6 +81,7 @@ def test_a_near_miss_that_no_time_step_tried_shows_is_not_trusted():
     near = limit(found, "near miss")
     assert near.reached and near.horizon == 35 and found.verdict == "limited"
     assert "rusted over" not in found.says
+    assert found.turns is not None
     (row,) = found.turns.heaviest(found.columns)
     assert (row["i"], row["j"]) == (1, 2)
     # what it is short of the cutoff by is known from the steps alone
@@ -114,7 +117,7 @@ def test_a_pair_that_is_inside_between_two_steps_alone_is_seen():
     closest, speed, timestep = R_CUT - 1e-3, 1.0, 0.2
     x = np.array([[3.0, 7.0, 7.0], [3.0 + speed * 1.5 * timestep, 7.0 + closest, 7.0]])
     atoms = Atoms("Ar2", positions=x, cell=[14.0] * 3, pbc=True)
-    atoms.set_masses([1.0] * 2)
+    atoms.set_masses(np.ones(2))
     atoms.set_momenta([[speed, 0, 0], [0, 0, 0]])
     dynamics = {"kind": "nve", "timestep": timestep}
     cutoff = {"kind": "hard", "radius": R_CUT}
