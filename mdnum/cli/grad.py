@@ -35,6 +35,11 @@ def grad(
     also: list[str] | None = typer.Option(
         None, metavar="WORD,WORD", help="Further parts of the diagnosis: spectrum, edges, scaling, or all."
     ),
+    no_half_step: bool = typer.Option(
+        False,
+        "--no-half-step",
+        help="Do not make the gradient at half the time step too; then nothing is called trusted.",
+    ),
     settings: list[str] | None = output.SET_OPTION,
     out: Path | None = typer.Option(
         None, "-o", "--out", metavar="DIR", help="The gradient folder; runs/grad-NAME-N by default."
@@ -55,6 +60,7 @@ def grad(
             methods=methods or None,
             replicas=replicas,
             also=also or (),
+            half_step=not no_half_step,
             out=out,
             overrides=overrides,
             report=not no_report,

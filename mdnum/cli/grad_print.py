@@ -38,6 +38,8 @@ def _print_methods(summary: Mapping[str, Any]) -> None:
     names = [one["name"] for one in summary["parameters"]]
     apart = {(row["method"], row["name"]): row for row in summary["comparisons"]}
     reference = summary["reference"]
+    trust = summary.get("trust") or {}
+    half, digits = trust.get("half"), trust.get("digits") or {}
     table = []
     if exact := summary.get("exact"):
         table.append(
@@ -46,8 +48,12 @@ def _print_methods(summary: Mapping[str, Any]) -> None:
     for one in sorted(summary["methods"], key=lambda one: one["method"] != reference):
         cells = []
         for name in names:
-            cells += [_slope(one, name), _apart(apart.get((one["method"], name)))]
+            cells += [_slope(one, name, digits.get(name)), _apart(apart.get((one["method"], name)))]
         table.append((one["method"], *cells))
+        if half and one["method"] == reference:
+            shorter = {"gradient": half, "error": {}}
+            cells = [cell for name in names for cell in (_slope(shorter, name, digits.get(name)), "")]
+            table.append(("  at half the time step", *cells))
     heads = [_head(one) for one in summary["parameters"]]
     columns = [part for head in heads for part in (head, f"from {reference}")]
     output.print_table("", ("method", *columns), table)
@@ -66,14 +72,16 @@ def _head(parameter: Mapping[str, Any]) -> str:
     return f"d/d {parameter['name']}" + (f" ({', '.join(entries)})" if entries else "")
 
 
-def _slope(found: Mapping[str, Any], name: str) -> str:
+def _slope(found: Mapping[str, Any], name: str, digits: int | None = None) -> str:
+    """A derivative, with the digits that half the time step leaves (one at least) where that is known."""
     value = found["gradient"].get(name)
+    kept = 8 if digits is None else min(max(digits, 1), 8)
     if isinstance(value, Mapping):
-        return f"norm {value['norm']:.8g}"
+        return f"norm {value['norm']:.{kept}g}"
     if isinstance(value, list):
-        return ", ".join(f"{entry:.8g}" for entry in value)
+        return ", ".join(f"{entry:.{kept}g}" for entry in value)
     error = found["error"].get(name)
-    text = "-" if value is None else f"{value:.8g}"
+    text = "-" if value is None else f"{value:.{kept}g}"
     return f"{text} ± {error:.2g}" if isinstance(error, float) else text
 
 

@@ -68,6 +68,7 @@ class Trace(NamedTuple):
             (room, 3, atoms).
         model, integrator, scale, r_cut: as in `Carry`, with a leading axis of rows: what the steps from here
             to the end have added.
+        frame: as in `Carry`, each of shape (room,).
     """
 
     x: Float[Array, "room 3 atoms"]
@@ -76,6 +77,7 @@ class Trace(NamedTuple):
     integrator: Any
     scale: Float[Array, "room"]
     r_cut: Float[Array, "room types"]
+    frame: tuple[Float[Array, "room"], Float[Array, "room"]]
 
 
 def reverse(
@@ -318,7 +320,9 @@ def transposed(
                 jnp.where(see, onto_virial.astype(jnp.float64), carry.frame[1]),
             ),
         )
-        trace = Trace(after.x, after.v, model, numbers_bar, scale, carry.r_cut) if traced else None
+        trace = None
+        if traced:
+            trace = Trace(after.x, after.v, model, numbers_bar, scale, carry.r_cut, after.frame)
         weights = jnp.zeros(0)
         if met is not None:
             # the forces are there wherever the derivative by scale is wanted

@@ -193,6 +193,7 @@ def _summary(
 
 
 def _relative(value: float, right: float) -> float:
-    """The difference over the larger of the two; 0 where both are 0."""
-    largest = max(abs(value), abs(right))
-    return abs(value - right) / largest if largest else 0.0
+    """The difference over what is right, as the page says; infinite where only that is 0."""
+    if value == right:
+        return 0.0
+    return abs(value - right) / abs(right) if right else float("inf")

@@ -114,6 +114,7 @@ def run(
     progress: Progress,
     replicas: int = 0,
     also: Sequence[str] = (),
+    half_step: bool = True,
 ) -> Diagnosis:
     """Every method of a plan, how the gradient grows, what flips add, and how far it is trusted.
 
@@ -124,6 +125,7 @@ def run(
         progress: called with what is done, of how much, and a dictionary with the phase.
         replicas: starts for the standard error; 0 leaves it out.
         also: further parts, words of `ALSO`.
+        half_step: make the gradient at half the time step too, where trust is told.
 
     Raises:
         InputError: no method applies, with the reason of each. NumericalError: the run blew up.
@@ -142,7 +144,7 @@ def run(
 
     found = diagnose(
         problem, names, parts=parts, methods=plan.methods, edges_of=scalars if EDGES in also else (),
-        replicas=replicas, progress=tell,
+        replicas=replicas, half_step=half_step, progress=tell,
     )  # fmt: skip
     if found.agreement is None:
         raise InputError(found.failed["agreement"], where=where)

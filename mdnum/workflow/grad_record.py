@@ -118,8 +118,9 @@ def _entries(simulation: Simulation, name: str) -> list[str] | None:
 
 
 def _trust(found: Trust) -> dict[str, Any]:
-    """How far a gradient is trusted, without the rows of trust.parquet."""
-    return {key: value for key, value in found.plain().items() if key not in ("at", "relative", "error")}
+    """How far a gradient is trusted, without the rows of trust.parquet; derivatives as methods tell them."""
+    half = {name: value[0] if len(value) == 1 else value.tolist() for name, value in found.half.items()}
+    return {**found.plain(), "half": plain(half)}
 
 
 def _method(opinion: Opinion, found: Gradient) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from report.test_html import Tags
 from mdnum import report
 from mdnum.report.fork.question import load
 from mdnum.report.grad import figures, findings
+from mdnum.report.grad.words import apart, resolved
 from mdnum.store import RunFolder
 
 
@@ -105,8 +106,54 @@ def test_findings_follow_the_numbers(tmp_path):
     assert judged(tmp_path / "k", methods=departs)["ANOTHER_PRIMAL"].severity == "warning"
 
     trust = {"horizon": 300, "limited_by": "rounding", "tolerance": 0.01, "says": "Rounding limits it."}
-    assert judged(tmp_path / "f", trust=trust)["BEYOND_TRUST"].title == "trusted up to 300 steps of 500"
-    assert "BEYOND_TRUST" not in judged(tmp_path / "g", trust={**trust, "limited_by": ""})
+    assert judged(tmp_path / "f", trust=trust)["BEYOND_TRUST"].severity == "warning"
+
+
+TRUST = {
+    "verdict": "limited", "horizon": 300, "limited_by": "near miss", "limits": [], "unknown": [],
+    "tolerance": 0.01, "shadow": "", "says": "A pair nearly flipped.",
+    "half": {NAMES[0]: 4.02, NAMES[1]: 0.9},
+    "digits": {NAMES[0]: 2, NAMES[1]: 0},
+    "near": {"turns": 9, "within": 1, "heaviest": [
+        {"step": 77, "i": 3, "j": 5, "gap": 3e-5, "reach": 8e-5, "term": {NAMES[0]: 0.1, NAMES[1]: 1.9}},
+    ]},
+}  # fmt: skip
+
+
+def headline(tmp_path, **changes):
+    """The tone and the headline of a folder with these entries."""
+    _, run = load(write(tmp_path / "one", **changes), "grad", "grad")
+    found = findings.judge(run)
+    return found.tone, found.headline
+
+
+def test_trusted_is_said_where_all_of_it_was_looked_at_alone(tmp_path):
+    tone, words = headline(tmp_path / "a", trust=TRUST)
+    assert tone == "warning" and "not trusted beyond step 300: near miss" in words
+    # the digits that half the time step leaves, and no more
+    assert "epsilon = 4.0 σ²/ε" in words and "radius = 2 σ²/σ (no digit holds)" in words
+    open_ = {**TRUST, "verdict": "undecided", "limited_by": "", "unknown": ["whether other starts agree"]}
+    tone, words = headline(tmp_path / "b", trust=open_)
+    assert tone == "warning" and "undecided, other starts not known" in words
+    free = {**TRUST, "verdict": "trusted", "limited_by": ""}
+    tone, words = headline(tmp_path / "c", trust=free)
+    assert tone == "good" and words.endswith("; trusted.")
+    # a folder from before the time step was looked at, and one that nobody asked
+    old = {"horizon": 500, "limited_by": "", "tolerance": 0.01, "says": "Trusted over all 500 steps."}
+    assert headline(tmp_path / "d", trust=old)[0] == "warning"
+    tone, words = headline(tmp_path / "e")
+    assert tone == "info" and "trust" not in words
+
+
+def test_the_half_time_step_stands_beside_and_near_misses_below(tmp_path):
+    folder = write(tmp_path / "run", trust=TRUST)
+    report.write(folder.path)
+    page = (folder.path / "report.html").read_text(encoding="utf-8")
+    text = re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", page))
+    assert "event-aware at half the time step" in text and " 4.0 0.9 " in text
+    assert "3–5 77 3.0 × 10⁻⁵ 8.0 × 10⁻⁵ 0.10 1.9" in text.replace("\N{NO-BREAK SPACE}", " ")
+    assert resolved(43517.0, 2) == "4.4 × 10⁴".replace(" ", "\N{NO-BREAK SPACE}")
+    assert resolved(0.0444, 1) == "0.04" and resolved(-4.898, 0) == "−5" and resolved(22.06, 2) == "22"
 
 
 def test_a_ball_far_from_its_closed_form_is_told(tmp_path):
@@ -118,3 +165,6 @@ def test_a_ball_far_from_its_closed_form_is_told(tmp_path):
     assert "event-located" in off.remedy
     near = judged(tmp_path / "b", comparisons=[{**row, "relative": 0.009}], **told)
     assert "NOT_THE_MOTION" not in near
+    # relative to the first row, as its caption says
+    assert apart({**row, "relative": 5.8}) == "580 % off"
+    assert apart({**row, "relative": None, "size": 0.0}) == "where the other is 0"

@@ -162,9 +162,9 @@ def compare(name: str, one: Gradient, reference: Gradient, scale: Scale, *, jump
     size = float(np.maximum(np.linalg.norm(a), np.linalg.norm(b)))
     relative = 0.0 if size == 0 else abs(apart) / size
     means, says = _meaning(name, one, reference, apart, relative, scale, jumps)
-    return Comparison(
-        name, one.method, reference.method, float(np.linalg.norm(b)), apart, relative, means, says
-    )
+    right = float(np.linalg.norm(b))
+    off = abs(apart) / right if right else float("inf") if apart else 0.0
+    return Comparison(name, one.method, reference.method, right, apart, off, means, says)
 
 
 def _meaning(

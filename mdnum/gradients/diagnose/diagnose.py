@@ -6,8 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
 from mdnum.errors import InputError, MdnumError
 from mdnum.gradients import parameters
 from mdnum.gradients.base import Gradient, Method, Problem, Progress, independent
@@ -15,7 +13,8 @@ from mdnum.gradients.diagnose.agreement import agreement
 from mdnum.gradients.diagnose.detective import detective
 from mdnum.gradients.diagnose.edges import edges
 from mdnum.gradients.diagnose.flips import flips
-from mdnum.gradients.diagnose.growth import GrowthWatch
+from mdnum.gradients.diagnose.growth import GrowthWatch, gain
+from mdnum.gradients.diagnose.near import Near
 from mdnum.gradients.diagnose.passes import Passed, passed
 from mdnum.gradients.diagnose.results import Diagnosis, Growth
 from mdnum.gradients.diagnose.scaling import ScalingWatch
@@ -23,6 +22,7 @@ from mdnum.gradients.diagnose.spectrum import spectrum
 from mdnum.gradients.diagnose.trust import TOLERANCE, trust
 from mdnum.gradients.registry import METHODS, by_word
 from mdnum.gradients.symmetric import GUARD, EventAware, Symmetric, aware
+from mdnum.gradients.tape import pace_of
 
 #: Parts of a diagnosis by their words; `edges` takes some dozens of runs and is asked for by name.
 PARTS = ("growth", "agreement", "flips", "trust", "spectrum", "detective", "scaling")
@@ -36,6 +36,7 @@ def diagnose(
     methods: Sequence[str | Method] | None = None,
     edges_of: Sequence[str] = (),
     replicas: int = 0,
+    half_step: bool = True,
     tolerance: float = TOLERANCE,
     format: str = "float16",
     budget: int = 2**29,
@@ -51,6 +52,7 @@ def diagnose(
             event-aware, or of symmetric where only that applies or is asked for.
         edges_of: parameters whose nearest boundaries of decisions are searched for.
         replicas: starts for the standard error in the trust horizon; 0 leaves it out.
+        half_step: make the run and its gradient at half the time step too; else nothing is called trusted.
         tolerance: relative difference of two precisions that is put up with.
         format: narrow type that the cotangents are held against.
         budget: bytes of the recorded run that are kept.
@@ -74,18 +76,25 @@ def diagnose(
     notes: dict[str, str] = {}
     known: dict[str, Gradient] = {}
     growing: Growth | None = None
+    near: Near | None = None
     saltation = isinstance(base, EventAware)
     if base is not None:
         growth_watch = GrowthWatch(problem.simulation, full, problem.steps)
         # its counts grow with the steps
         scaling_watch = ScalingWatch(problem.steps, format) if "scaling" in parts else None
+        if saltation and "trust" in parts:
+            near = Near(problem.simulation, pace_of(problem.loss, problem.steps))
         made = passed(
             problem,
             full,
             saltation=saltation,
             guard=base.guard if isinstance(base, EventAware) else GUARD,
             budget=budget,
-            watches=[growth_watch, *([] if scaling_watch is None else [scaling_watch])],
+            watches=[
+                growth_watch,
+                *([] if scaling_watch is None else [scaling_watch]),
+                *([] if near is None else [near.reverse]),
+            ],
             progress=progress,
         )
         known[base.name] = _as_method(base, problem, made)
@@ -113,10 +122,10 @@ def diagnose(
         except MdnumError as error:
             failed[part] = str(error)
 
-    gain = 1.0 if growing is None else _gain(growing)
+    grown = 1.0 if growing is None else gain(growing)
     attempt(
         "agreement",
-        lambda: agreement(problem, full, methods, known=known, growth=gain, progress=progress),
+        lambda: agreement(problem, full, methods, known=known, growth=grown, progress=progress),
     )
     attempt("flips", lambda: flips(problem, full, made=made, progress=progress))
     attempt(
@@ -127,7 +136,11 @@ def diagnose(
             tolerance=tolerance,
             saltation=saltation,
             replicas=replicas,
+            half_step=half_step,
             budget=budget,
+            made=made,
+            near=near,
+            growth=growing,
             progress=progress,
         ),
     )
@@ -202,9 +215,3 @@ def _as_method(method: EventAware | Symmetric, problem: Problem, made: Passed) -
         details = {"stretches": len(made.tape), "made again": made.tape.replayed}
         notes = independent(problem, made.gradient, saltation=False)
     return Gradient(method.name, method.says, made.tape.value, made.gradient, notes, details)
-
-
-def _gain(growing: Growth) -> float:
-    """How much the gradient by the state grew, from the first horizon that has one."""
-    there = growing.size[np.isfinite(growing.size) & (growing.size > 0)]
-    return float(there.max() / there[0]) if len(there) else 1.0

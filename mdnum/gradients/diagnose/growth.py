@@ -147,6 +147,12 @@ def log_rate(log: Float[np.ndarray, "rows"]) -> tuple[float, float, bool]:
     return rate, error, bool(rate > 2 * linear and rate > _SIGNIFICANT * error)
 
 
+def gain(growing: Growth) -> float:
+    """How much the gradient by the state grew, from the first horizon that has one; 1 where none has."""
+    there = growing.size[np.isfinite(growing.size) & (growing.size > 0)]
+    return float(there.max() / there[0]) if len(there) else 1.0
+
+
 def forward_bounded(speed: Float[np.ndarray, "rows"]) -> bool:
     """Whether the rms speeds of a run stay within a factor of the usual one."""
     usual = float(np.median(speed))

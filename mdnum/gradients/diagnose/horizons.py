@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,13 +12,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from mdnum.errors import InputError
 from mdnum.events import Ledger
+from mdnum.gradients import parameters
 from mdnum.gradients.base import Problem, Progress
 from mdnum.gradients.directions import Column, columns_of
 from mdnum.gradients.losses import Loss
 from mdnum.gradients.symmetric import GUARD, in_phase, radial_speed
-from mdnum.gradients.tangents import tangents
-from mdnum.gradients.tape import Tape
+from mdnum.gradients.tangents import Tangents, tangents
+from mdnum.gradients.tape import Stretch, Tape
+
+#: The parameter by which derivatives at half the time step are twice as large.
+TIMESTEP = "dynamics.timestep"
 
 
 class Shorter(Loss):
@@ -62,6 +67,37 @@ class Shorter(Loss):
         return self.inner.value(jax.tree.map(lambda leaf: leaf[k], total), self.counts[k])
 
 
+class Halved(Loss):
+    """A loss of a run at half the time step: it looks at the same times, every other step."""
+
+    name = "halved"
+    inner: Loss = eqx.field(kw_only=True)
+
+    def looks_at(self, steps, last):
+        """Where the loss does, in steps of twice the length."""
+        return (steps % 2 == 0) & self.inner.looks_at(steps // 2, last // 2)
+
+    def observe(self, frame, origin, around):
+        return self.inner.observe(
+            frame._replace(step=frame.step // 2), origin, around._replace(timestep=2 * around.timestep)
+        )
+
+    def value(self, total, frames):
+        """That of the loss."""
+        return self.inner.value(total, frames)
+
+    def why_not(self, around):
+        """Where the loss has none."""
+        return self.inner.why_not(around)
+
+
+def halved(problem: Problem) -> Problem:
+    """The same loss over the same time, in twice as many steps of half the length."""
+    timestep = parameters.value(problem.simulation, TIMESTEP) / 2
+    simulation = parameters.with_values(problem.simulation, {TIMESTEP: timestep})
+    return Problem(simulation, Halved(inner=problem.loss), 2 * problem.steps)
+
+
 @dataclass(frozen=True)
 class Horizons:
     """Losses and gradients of runs of several lengths.
@@ -90,7 +126,15 @@ class Horizons:
 def spread(problem: Problem, points: int) -> Int[np.ndarray, "points"]:
     """Horizons at which the loss of a run so long looks at something, evenly spread, T the last."""
     steps = np.unique(np.round(np.linspace(0, problem.steps, points + 1)).astype(np.int64))[1:]
-    return np.array([h for h in steps if problem.loss.looks_at(np.arange(h + 1), int(h)).any()], np.int64)
+
+    def looks(h: int) -> bool:
+        try:
+            return bool(problem.loss.looks_at(np.arange(h + 1), h).any())
+        except InputError:
+            # a slope or an integral that needs a longer run
+            return False
+
+    return np.array([h for h in steps if looks(int(h))], np.int64)
 
 
 def horizons(
@@ -101,6 +145,8 @@ def horizons(
     saltation: bool = True,
     guard: float = GUARD,
     budget: int = 2**29,
+    each: Callable[[Stretch], None] | None = None,
+    watch: Callable[[Tangents], None] | None = None,
     progress: Progress | None = None,
 ) -> Horizons:
     """The gradient of the loss of every shorter run from the same start.
@@ -112,6 +158,8 @@ def horizons(
         saltation: whether flips count.
         guard: as a share of the rms radial speed of a pair.
         budget: bytes of the recorded run that are kept.
+        each: called with every stretch when it has been made.
+        watch: called with the tangents of every stretch, those of each step among them.
         progress: called with the steps done, all steps, and a phase in words.
 
     Raises:
@@ -123,14 +171,23 @@ def horizons(
     rows = np.arange(last + 1)
     table = np.stack([problem.loss.looks_at(rows, int(h)) & (rows <= h) for h in at], axis=1)
     loss = Shorter(inner=problem.loss, table=jnp.asarray(table))
-    tape = Tape(simulation, loss, last, flips=True, budget=budget, progress=in_phase(progress, "run"))
+    tape = Tape(
+        simulation, loss, last, flips=True, budget=budget, each=each, progress=in_phase(progress, "run")
+    )
     speed = guard * radial_speed(simulation)
     total: Any = None
     ledgers = []
     for part in tangents(
-        tape, names, saltation=saltation, guard=speed, progress=in_phase(progress, "tangents")
+        tape,
+        names,
+        saltation=saltation,
+        guard=speed,
+        states=watch is not None,
+        progress=in_phase(progress, "tangents"),
     ):
         total = part.total
+        if watch is not None:
+            watch(part)
         assert part.stretch.ledger is not None
         ledgers.append(part.stretch.ledger)
     values, slopes = [], []

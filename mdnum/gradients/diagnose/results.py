@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mdnum.gradients.base import Gradient
+from mdnum.gradients.diagnose.near import Turns
 from mdnum.gradients.diagnose.places import Edges, Flips, NotFinite, Scaling
 from mdnum.gradients.diagnose.plain import Plain, plain
 
@@ -45,7 +46,7 @@ class Comparison(Plain):
         method, reference: words of the two methods.
         size: Euclidean norm of the reference's derivative (a scalar's magnitude).
         difference: norm of the difference; signed (method minus reference) for a scalar.
-        relative: |difference| over the larger norm of the two; 0 where both are 0.
+        relative: |difference| over `size`; infinite where only the reference is 0.
         means: "agree", "missing saltation", "rounding", "truncation and noise", "events between shifts",
             "another program", "an average", "statistical" or "unexplained".
         says: the same in a sentence.
@@ -190,7 +191,8 @@ class Limit(Plain):
     """One of the things that end trust in a gradient.
 
     Attributes:
-        what: "rounding", "standard error" or "ambiguous decision".
+        what: "rounding", "time step", "near miss", "flips left out", "ambiguous decision" or
+            "standard error".
         horizon: the longest horizon, in steps, at which it did no harm; None where it was not looked at.
         reached: whether it was met within the horizon asked for; else trust holds at least that far.
         says: what was compared with what, and what was seen.
@@ -207,32 +209,58 @@ class Trust(Plain):
     """How far a gradient can be trusted.
 
     Attributes:
+        verdict: "trusted" where every limit was looked at and none was met, "limited" where one was met, else
+            "undecided".
         horizon: the shortest of the limits that were looked at, steps.
         limited_by: which it is; empty where none was met.
         limits: all of them.
-        tolerance: relative difference above which two precisions disagree.
+        unknown: what was not looked at, in words.
+        tolerance: relative difference above which two precisions, or two time steps, disagree.
         shadow: what the run's precision was compared with, in words.
         at: horizons that were compared, shape (points,).
-        relative: relative difference of the two gradients there, by parameter, each of shape (points,).
+        relative: relative difference of the two precisions' gradients there, by parameter, each of shape
+            (points,).
+        step: the same of the time step and its half; empty where that was not looked at.
         error: standard error over the mean there, by parameter; empty without an ensemble.
+        half: the gradient at half the time step, by parameter, each of shape (entries,).
+        digits: digits of the gradient that half the time step and another rounding leave, by parameter.
+        turns: pairs that turned around near their cutoff; None where that was not looked at.
+        columns: the numbers whose terms these have, in words.
         says: all in a sentence.
     """
 
+    verdict: str
     horizon: int
     limited_by: str
     limits: tuple[Limit, ...]
+    unknown: tuple[str, ...]
     tolerance: float
     shadow: str
     at: Int[np.ndarray, "points"]
     relative: dict[str, Float[np.ndarray, "points"]]
+    step: dict[str, Float[np.ndarray, "points"]]
     error: dict[str, Float[np.ndarray, "points"]]
+    half: dict[str, Float[np.ndarray, "entries"]]
+    digits: dict[str, int]
+    turns: Turns | None
+    columns: tuple[str, ...]
     says: str
 
     def table(self) -> dict[str, np.ndarray]:
         """A row for each horizon that was compared."""
         out = {"horizon": self.at}
-        out |= {f"relative.{name}": values for name, values in self.relative.items()}
-        return out | {f"error.{name}": values for name, values in self.error.items()}
+        for key in ("relative", "step", "error"):
+            out |= {f"{key}.{name}": values for name, values in getattr(self, key).items()}
+        return out
+
+    def plain(self) -> dict[str, Any]:
+        """Without the rows."""
+        rows = ("at", "relative", "step", "error", "turns", "columns")
+        kept = {one.name: plain(getattr(self, one.name)) for one in fields(self) if one.name not in rows}
+        if self.turns is None:
+            return kept | {"near": None}
+        near = {"turns": len(self.turns), "within": int(self.turns.within.sum())}
+        return kept | {"near": near | {"heaviest": self.turns.heaviest(self.columns)}}
 
 
 @dataclass(frozen=True)

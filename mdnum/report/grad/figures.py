@@ -60,10 +60,10 @@ def _column(table: Mapping[str, np.ndarray], name: str) -> np.ndarray | None:
 
 
 def _horizons(run: Question) -> Iterator[tuple[float, str]]:
-    """How far the gradient is trusted, where that was asked."""
+    """Where trust in the gradient ends, where that was asked."""
     found = run.summary.get("trust")
     if found and found["limited_by"]:
-        yield found["horizon"], "trusted to here"
+        yield found["horizon"], f"limit: {found['limited_by']}"
 
 
 def state(run: Question) -> Plot | None:
@@ -98,16 +98,18 @@ def trust(run: Question) -> Plot | None:
     if found is None or not len(table["horizon"]):
         return None
     series = [
-        Series(f"{words}, {name}", table["horizon"], table[f"{key}.{name}"], mark="line+points", role=role,
-               dashed=key == "error")
-        for key, words in (("relative", "other rounding"), ("error", "standard error / mean"))
+        Series(f"{words}, {name}", table["horizon"], table[f"{key}.{name}"], role=role, dashed=key == "error",
+               mark="line" if key == "step" else "line+points")
+        for key, words in (
+            ("relative", "other rounding"), ("step", "half the step"), ("error", "standard error / mean"),
+        )
         for role, name in zip(ROLES, (one["name"] for one in run.summary["parameters"]), strict=False)
         if f"{key}.{name}" in table
     ]  # fmt: skip
     if not series:
         return None
     return Plot(
-        "What other roundings and other starts make of the gradient, against the horizon",
+        "What other roundings, time steps and starts make of the gradient, against the horizon",
         "horizon (steps)",
         "relative difference",
         tuple(series),
@@ -212,8 +214,8 @@ def captions(run: Question) -> dict[str, str]:
         "pass. Times the parameter's value, a derivative is what a relative change of it does to the loss.",
         "state": "What the loss makes of a change of the state so many steps before the end; velocities are "
         "turned into lengths by a time of 30 steps.",
-        "trust": f"Solid: gradients of {shadow}. Dashed: the standard error over starts against the mean, "
-        "where there were several.",
+        "trust": f"Points: gradients of {shadow}. Lines: of the time step and its half. Dashed: the standard "
+        "error over starts against the mean, where there were several.",
         "ranked": "Where a line is flat, many flips add alike; where it falls from the start, few decide.",
         "spectrum": "An orthonormal frame of changes carried along with decisions held; slopes are "
         "finite-time Lyapunov exponents.",

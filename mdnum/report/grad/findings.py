@@ -10,7 +10,7 @@ import numpy as np
 
 from mdnum.report.fork.findings import Verdict
 from mdnum.report.fork.question import Question, verdict
-from mdnum.report.grad.words import apart, by, size, slope, slope_unit
+from mdnum.report.grad.words import apart, by, digits_of, size, slope, slope_unit
 from mdnum.report.verdict import Finding
 from mdnum.report.words import count, listed, many, number, percent
 
@@ -23,6 +23,10 @@ _FURTHER = {
     "rounding": "or run in wider formats: --set precision.state=float64 and the like",
     "standard error": "or average over more starts with --replicas",
     "ambiguous decision": "or see with mdnum fork what the other decision would do",
+    "time step": "or take a smaller time step, and see whether the digits settle",
+    "near miss": "or take a smaller time step, average over starts with --replicas, or take a cutoff without "
+    "a jump: --set cutoff.kind=switched",
+    "flips left out": "or ask event-aware, or take a cutoff without a jump: --set cutoff.kind=switched",
 }
 #: Relative difference from a closed form within which a derivative is that of the exact motion.
 _CLOSE = 0.01
@@ -31,8 +35,17 @@ _CLOSE = 0.01
 def judge(run: Question) -> Verdict:
     """Headline, evidence and findings of a gradient."""
     found = list(_findings(run))
-    quiet = not any(one.severity != "info" for one in found)
-    return verdict(_headline(run), _evidence(run), found, plain_tone="good" if quiet else "info")
+    known = run.summary.get("exact") or trust_of(run) == "trusted"
+    return verdict(_headline(run), _evidence(run), found, plain_tone="good" if known else "info")
+
+
+def trust_of(run: Question) -> str:
+    """The verdict on trust; "" where nobody asked. A folder from before half the time step was looked at says
+    nothing of it."""
+    trust = run.summary.get("trust")
+    if not trust:
+        return ""
+    return trust.get("verdict") or ("limited" if trust["limited_by"] else "undecided")
 
 
 def _headline(run: Question) -> str:
@@ -41,12 +54,22 @@ def _headline(run: Question) -> str:
     parts = []
     for one in summary["parameters"][:3]:
         short = one["name"].rpartition(".")[2]
-        value = f"{slope(reference, one['name'], 4)} {slope_unit(summary, one)}".rstrip()
-        parts.append(f"d {summary['loss']['word']} / d {short} = {value}")
-    trust = summary.get("trust") or {"limited_by": "", "horizon": run.steps}
-    limited = trust["limited_by"] and trust["horizon"] < run.steps
-    until = f"; trusted up to {many(trust['horizon'], 'step')}" if limited else ""
-    return f"After {many(run.steps, 'step')}, {listed(parts)}{until}."
+        value = f"{slope(summary, reference, one['name'], 4)} {slope_unit(summary, one)}".rstrip()
+        none = " (no digit holds)" if digits_of(summary, one["name"]) == 0 else ""
+        parts.append(f"d {summary['loss']['word']} / d {short} = {value}{none}")
+    trust = summary.get("trust")
+    end = {
+        "trusted": "; trusted",
+        "limited": trust and f"; not trusted{_beyond(trust)}: {trust['limited_by']}",
+        "undecided": "; whether to trust it is undecided",
+    }.get(trust_of(run), "")
+    if trust and any("other starts" in one for one in trust.get("unknown") or ()):
+        end += ", other starts not known"
+    return f"After {many(run.steps, 'step')}, {listed(parts)}{end}."
+
+
+def _beyond(trust: Mapping[str, Any]) -> str:
+    return f" beyond step {count(trust['horizon'])}" if trust["horizon"] else ""
 
 
 def _evidence(run: Question) -> Iterator[str]:
@@ -137,13 +160,26 @@ def _loss_jumps(run: Question) -> Iterator[Finding]:
 def _short(run: Question) -> Iterator[Finding]:
     """A gradient that is not trusted as far as it was asked for."""
     trust = run.summary.get("trust")
-    if trust and trust["limited_by"] and trust["horizon"] < run.steps:
+    judged = trust_of(run)
+    if trust and judged == "limited":
         yield Finding(
             "BEYOND_TRUST",
             "warning",
-            f"trusted up to {many(trust['horizon'], 'step')} of {count(run.steps)}",
+            f"not trusted{_beyond(trust)}: {trust['limited_by']}",
             trust["says"],
             f"Ask for a shorter horizon, {_FURTHER[trust['limited_by']]}.",
+        )
+    elif trust and judged == "undecided":
+        unknown = trust.get("unknown") or ["what half the time step gives"]
+        starts = any("other starts" in one for one in unknown)
+        yield Finding(
+            "UNDECIDED",
+            "warning",
+            "whether to trust it is undecided",
+            trust["says"],
+            "Average over starts with --replicas."
+            if starts
+            else "Look at what is not known, or ask without it.",
         )
 
 
@@ -252,7 +288,7 @@ def _off_the_motion(run: Question) -> Iterator[Finding]:
     """Methods that do not give the derivative of the exact motion, where that is known."""
     if not run.summary.get("exact"):
         return
-    off = [row for row in run.summary["comparisons"] if not row["relative"] <= _CLOSE]
+    off = [row for row in run.summary["comparisons"] if row["relative"] is None or row["relative"] > _CLOSE]
     if not off:
         return
     aware = [row for row in off if row["method"] == "event-aware"]

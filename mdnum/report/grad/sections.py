@@ -9,7 +9,7 @@ import numpy as np
 
 from mdnum.report.browse import Browse, Column, plain_rows
 from mdnum.report.fork.question import Question
-from mdnum.report.grad.words import apart, slope_unit
+from mdnum.report.grad.words import apart, digits_of, resolved, slope_unit
 from mdnum.report.words import count, number, typeset
 
 #: Rows of the table of flips that the page carries.
@@ -47,10 +47,15 @@ def shares(run: Question) -> list[dict[str, object]]:
             {
                 "name": name,
                 "parts": [_percent(parts[key]) for key in ("smooth", "pair enters", "pair leaves")],
-                "total": f"{number(found['total'][name], 4)} {unit}".rstrip(),
+                "total": f"{_total(run, name, found['total'][name])} {unit}".rstrip(),
             }
         )
     return rows
+
+
+def _total(run: Question, name: str, value: float) -> str:
+    held = digits_of(run.summary, name.partition("[")[0])
+    return number(value, 4) if held is None else resolved(value, min(held, 4))
 
 
 def _percent(share: float | None) -> str:

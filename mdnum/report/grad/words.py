@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
 from mdnum.report.fork.question import Question
-from mdnum.report.words import number, percent
+from mdnum.report.words import MINUS, number, percent, power
 
 #: Which derivative a closed form gives.
 EXACT = "the derivative of the exact motion"
@@ -28,17 +29,48 @@ def size(value: Any) -> float | None:
     return value
 
 
-def slope(found: Mapping[str, Any] | None, name: str, digits: int = 6) -> str:
-    """A derivative as text."""
+def digits_of(summary: Mapping[str, Any], name: str) -> int | None:
+    """Digits of a derivative that half the time step leaves; None where that was not looked at."""
+    return ((summary.get("trust") or {}).get("digits") or {}).get(name)
+
+
+def half(summary: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    """The reference's derivatives at half the time step, as those of a method."""
+    found = (summary.get("trust") or {}).get("half")
+    if not found:
+        return None
+    says = "the same time in twice as many steps: the digits that agree are those that are told"
+    return {"method": f"{summary['reference']} at half the time step", "says": says, "gradient": found}
+
+
+def resolved(value: float | None, digits: int) -> str:
+    """A number with so many digits, one at least; in powers of ten where zeros would look like more."""
+    digits = max(digits, 1)
+    if value is None or not math.isfinite(value) or value == 0:
+        return number(value, digits)
+    mantissa, exponent = f"{abs(value):.{digits - 1}e}".split("e")
+    if int(exponent) < digits:
+        return number(value, digits)
+    return (
+        f"{MINUS if value < 0 else ''}{mantissa}\N{NO-BREAK SPACE}×\N{NO-BREAK SPACE}{power(int(exponent))}"
+    )
+
+
+def slope(summary: Mapping[str, Any], found: Mapping[str, Any] | None, name: str, digits: int = 6) -> str:
+    """A derivative as text, with the digits that half the time step leaves where that is known."""
     if found is None or name not in found["gradient"]:
         return "–"
-    value = found["gradient"][name]
+    value, held = found["gradient"][name], digits_of(summary, name)
+
+    def told(entry: float | None) -> str:
+        return number(entry, digits) if held is None else resolved(entry, min(held, digits))
+
     if isinstance(value, Mapping):
-        return f"norm {number(value['norm'], digits)}"
+        return f"norm {told(value['norm'])}"
     if isinstance(value, list):
-        return ", ".join(number(entry, digits) for entry in value)
+        return ", ".join(told(entry) for entry in value)
     error = (found.get("error") or {}).get(name)
-    return number(value, digits) + (f" ± {number(error, 2)}" if isinstance(error, float) else "")
+    return told(value) + (f" ± {number(error, 2)}" if isinstance(error, float) else "")
 
 
 def slope_unit(summary: Mapping[str, Any], parameter: Mapping[str, Any]) -> str:
@@ -81,7 +113,7 @@ def apart(row: Mapping[str, Any]) -> str:
     """A relative difference as people say it."""
     relative = row["relative"]
     if relative is None:
-        return "not finite"
+        return "not finite" if row["size"] else "where the other is 0"
     if relative == 0:
         return "the same"
     return percent(relative) + " off" if relative >= 1e-3 else f"{number(relative, 2)} off"

@@ -14,7 +14,16 @@ from small_systems import LENNARD_JONES, crystal, make
 from mdnum.errors import InputError
 from mdnum.gradients import Problem
 from mdnum.gradients.diagnose.horizons import Horizons, first_difference, horizons, spread
-from mdnum.gradients.diagnose.trust import ambiguity, last_below, shadow_of, standard_error, trust
+from mdnum.gradients.diagnose.results import Limit
+from mdnum.gradients.diagnose.trust import (
+    ambiguity,
+    last_agreeing,
+    last_below,
+    shadow_of,
+    standard_error,
+    trust,
+    verdict_of,
+)
 from mdnum.gradients.differences import richardson
 from mdnum.gradients.directions import Column
 from mdnum.gradients.losses import MeanPotential, MeanSquaredDisplacement
@@ -60,6 +69,29 @@ def test_a_single_point_beyond_a_limit_does_not_end_trust():
     assert last_below(at, [np.full(5, 2.0)], 1.0) == (0, True)
 
 
+def test_half_the_time_step_is_judged_where_the_gradient_is_asked_for():
+    at = np.array([10, 20, 30, 40, 50])
+    assert last_agreeing(at, [np.array([5, 5, 0, 0, 0.0])], 1.0) == (50, False)
+    assert last_agreeing(at, [np.array([0, 0, 0, 5, 5.0])], 1.0) == (30, True)
+    # by chance
+    assert last_agreeing(at, [np.array([0, 0, 5, 5, 0.0])], 1.0) == (20, True)
+    assert last_agreeing(at, [np.zeros(5), np.array([0, 0, 0, 0, np.nan])], 1.0) == (40, True)
+    assert last_agreeing(at[:1], [np.zeros(1)], 1.0) == (10, False)
+
+
+def test_a_gradient_that_grew_is_not_trusted_before_other_starts_were_looked_at():
+    fine = [Limit(what, 2000, False, "fine") for what in ("rounding", "time step", "near miss")]
+    alone = [*fine, Limit("standard error", None, False, "not looked at")]
+    word, _, _, unknown = verdict_of(alone, 2000, True, 2880.0, ())
+    assert word == "undecided" and "other starts" in unknown[0] and "2.88e+03-fold" in unknown[0]
+    assert verdict_of(alone, 2000, False, 3.0, ())[0] == "trusted"
+    assert verdict_of(alone, 2000, False, 3.0, ("initial.velocities",))[0] == "undecided"
+    several = [*fine, Limit("standard error", 2000, False, "fine")]
+    assert verdict_of(several, 2000, True, 2880.0, ())[:3] == ("trusted", 2000, "")
+    scattered = [*fine, Limit("standard error", 350, True, "passes the mean")]
+    assert verdict_of(scattered, 2000, True, 2880.0, ())[:3] == ("limited", 350, "standard error")
+
+
 def test_the_standard_error_is_that_of_the_mean():
     runs = [made([1.0, 1.0]), made([1.0, -1.0]), made([1.0, 3.0])]
     found = standard_error(runs)["q"]
@@ -101,10 +133,15 @@ def test_rounding_limits_a_narrow_run_where_it_has_grown_to_the_tolerance():
     simulation = build(make(crystal(), LENNARD_JONES, QUINTIC, **NARROW))
     problem = Problem(simulation, MeanSquaredDisplacement(), 400)
     found = trust(problem, ("sigma",), tolerance=1e-4, points=20)
-    rounding, ambiguous, scatter = found.limits
-    assert rounding.horizon is not None and ambiguous.horizon is not None
+    rounding, step, near, ambiguous, scatter = found.limits
+    assert rounding.horizon is not None and ambiguous.horizon is not None and step.horizon is not None
     assert rounding.reached and 100 < rounding.horizon < 400 and scatter.horizon is None
+    # a cutoff without a jump: no pair that turns around near it, or near its onset, adds anything
+    assert near.horizon == 400 and not near.reached and len(found.turns) == 0
     apart = found.relative["potential.sigma"]
     assert np.all(apart[found.at <= rounding.horizon] <= 1e-4) and apart[0] < 1e-5
-    assert found.horizon == min(rounding.horizon, ambiguous.horizon) and found.limited_by in found.says
+    assert (
+        found.horizon == min(rounding.horizon, ambiguous.horizon, step.horizon)
+        and found.limited_by in found.says
+    )
     assert len(found.table()["relative.potential.sigma"]) == 20

@@ -1,0 +1,352 @@
+"""Pairs that turn around near their cutoff: what the flips that did not happen would have added.
+
+Where a pair turns back just outside its cutoff it leaves no flip; had it come a little further it would have
+entered and left, at a radial speed near zero, and both crossings would have added terms that go with one
+over that speed. A gradient that hangs on such a pair is another one at another time step. So every turning
+point within reach of the cutoff counts, on either side of it and between two steps too: those beyond the
+cutoff have their term in the gradient, and would lose it.
+
+Near the turning point r(t) = r_m + a (t - t_m)² / 2. A pair that comes a depth d beyond the cutoff crosses it
+twice with the speed sqrt(2 a d), and the two crossings add 2 w / sqrt(2 a d), where w is what a crossing adds
+at unit speed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from mdnum.gradients.adjoint import Trace
+from mdnum.gradients.diagnose.plain import Plain
+from mdnum.gradients.directions import directions
+from mdnum.gradients.tangents import Tangents
+from mdnum.gradients.tape import Pace, Stretch
+from mdnum.md.cell import HostCell
+from mdnum.systems.build import Simulation
+
+#: Turning points are listed up to so far from the cutoff, as a share of it; a run whose distances move
+#: further at another time step is another run.
+LOOK = 0.02
+#: Rows that share one choice of pairs.
+_BLOCK = 8
+#: How much further than seen a distance is taken to move: two runs at one time step and its half are apart by
+#: 3/4 of the error of the longer one.
+REACH = 2.0
+#: Turning points, in the order of their steps, over which the typical move of a distance is taken.
+_NEIGHBORS = 20
+
+
+@dataclass(frozen=True)
+class Turns(Plain):
+    """Turning points of pairs near their cutoff; a row for each, in the order of steps.
+
+    Attributes:
+        step: it lies between this step and the one before, shape (turns,).
+        i, j: the pair, i < j.
+        gap: how far it is short of the cutoff, length; negative where the pair is beyond it for a while.
+        bend: magnitude of the second derivative of the distance there, length per internal time².
+        weight: derivative of the loss by the cutoff of one crossing there, times its radial speed.
+        moved: how far the cutoff moves ahead of the pair, by number that is differentiated by, shape
+            (turns, columns); NaN before the tangents have been there.
+        shift: how far the distance is from that of other runs (another time step, another rounding), the
+            largest of them, length; 0 before any was compared.
+        unseen: whether it is beyond the cutoff between two steps alone, which decided that it is not.
+    """
+
+    step: Int[np.ndarray, "turns"]
+    i: Int[np.ndarray, "turns"]
+    j: Int[np.ndarray, "turns"]
+    gap: Float[np.ndarray, "turns"]
+    bend: Float[np.ndarray, "turns"]
+    weight: Float[np.ndarray, "turns"]
+    moved: Float[np.ndarray, "turns columns"]
+    shift: Float[np.ndarray, "turns"]
+    unseen: Bool[np.ndarray, "turns"]
+
+    def __len__(self) -> int:
+        return len(self.step)
+
+    @property
+    def reach(self) -> Float[np.ndarray, "turns"]:
+        """How far the distance may move: from its own shift and from those of the turning points around."""
+        if not len(self):
+            return np.zeros(0)
+        sums = np.concatenate([[0.0], np.cumsum(np.square(self.shift))])
+        last = np.clip(np.arange(len(self)) + _NEIGHBORS // 2, min(_NEIGHBORS, len(self)), len(self))
+        first = np.maximum(last - _NEIGHBORS, 0)
+        typical = np.sqrt((sums[last] - sums[first]) / (last - first))
+        return REACH * np.maximum(self.shift, typical)
+
+    @property
+    def within(self) -> np.ndarray:
+        """Which of them may be on the other side of their cutoff, or are and left no flip."""
+        return (np.abs(self.gap) <= self.reach) | self.unseen
+
+    @property
+    def term(self) -> Float[np.ndarray, "turns columns"]:
+        """What the two crossings add, magnitude: in the mean over depths up to the reach, or at the depth of
+        those that no step saw; 0 out of reach."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            mean = 2 / np.sqrt(2 * self.bend * self.reach)
+            there = 1 / np.sqrt(2 * self.bend * np.abs(self.gap))
+            times = np.where(self.unseen & ~(np.abs(self.gap) <= self.reach), there, mean)
+            terms = np.abs(2 * self.weight[:, None] * self.moved) * times[:, None]
+        return np.where(self.within[:, None], terms, 0.0)
+
+    def heaviest(self, words: tuple[str, ...], most: int = 10) -> list[dict[str, Any]]:
+        """Those within reach with the largest terms, as plain rows."""
+        kept = np.flatnonzero(self.within)
+        term, reach = self.term, self.reach
+        share = term[kept] / np.maximum(term.max(axis=0, initial=0.0), 1e-300)
+        order = kept[np.argsort(-share.max(axis=1, initial=0.0), kind="stable")][:most]
+        return [
+            {
+                "step": int(self.step[k]), "i": int(self.i[k]), "j": int(self.j[k]),
+                "gap": float(self.gap[k]), "reach": float(reach[k]),
+                "term": {word: float(value) for word, value in zip(words, term[k], strict=True)},
+            }
+            for k in order
+        ]  # fmt: skip
+
+
+@dataclass
+class Near:
+    """Collects turning points while a reverse pass, tangents and other runs go by.
+
+    Attributes:
+        simulation: the system as objects.
+        pace: how often the loss looks.
+        rows: of the longest stretch.
+    """
+
+    simulation: Simulation
+    pace: Pace
+    rows: int = 0
+    _found: list[Turning] = field(default_factory=list)
+    _at: dict[int, Turning] = field(default_factory=dict)
+
+    @property
+    def jumps(self) -> bool:
+        """Whether a crossing adds anything at all: force or energy of a pair jump."""
+        return self.simulation.pairwise and bool(np.any(np.asarray(self.simulation.jumps())))
+
+    def reverse(self, stretch: Stretch, trace: Trace) -> None:
+        """One stretch of the event-aware reverse pass, last first: its turning points and their weights."""
+        if not self.jumps:
+            return
+        simulation = self.simulation
+        self.rows = max(self.rows, len(stretch.x))
+        found = turning(simulation, stretch)
+        row, i, j = found.row, found.i, found.j
+        half = 0.5 * float(simulation.integrator.timestep)
+        masses = simulation.masses[stretch.table.order]
+        onto_x, onto_v = (np.asarray(part) for part in (trace.x, trace.v))
+
+        def impulse(atom):
+            return (onto_v[row, :, atom] + half * onto_x[row, :, atom]) / masses[atom][:, None]
+
+        along = np.sum(found.normal * (impulse(j) - impulse(i)), axis=1)
+        by_energy, by_virial = (np.asarray(part)[row] for part in trace.frame)
+        timestep, share = simulation.integrator.timestep, np.zeros(len(row))
+        for step in np.unique(found.step[(by_energy != 0) | (by_virial != 0)]):
+            share[found.step == step] = float(self.pace.share(jnp.asarray(step), timestep))
+        energy, force = (np.asarray(jump)[found.kind] for jump in simulation.jumps())
+        radius = np.asarray(simulation.decider.r_cut)[found.kind]
+        seen = share * (by_energy * energy + by_virial * force * radius)
+        found = replace(found, weight=force * along + seen)
+        self._found.append(found)
+        self._at[stretch.first] = found
+
+    def tangents(self, part: Tangents) -> None:
+        """One stretch of the tangents: how far each distance moves."""
+        found = self._at.get(part.stretch.first)
+        if found is None:
+            return
+        simulation, stretch = self.simulation, part.stretch
+        along = directions(simulation, part.columns)
+        x, v = part.x, part.v
+        assert x is not None and v is not None
+        late = (1 - found.part) * float(simulation.integrator.timestep)
+
+        def moved(atom):
+            rows = x[found.row, :, :, atom] - late[:, None, None] * v[found.row, :, :, atom]
+            images = stretch.images[found.row, :, atom].astype(np.float64)
+            return rows - np.einsum("cab,ra->rcb", np.asarray(along.matrix), images)
+
+        apart = moved(found.j) - moved(found.i)
+        apart = apart + np.einsum("cab,ra->rcb", np.asarray(along.matrix), found.images)
+        dr = np.einsum("rcb,rb->rc", apart, found.normal)
+        found.moved = np.asarray(along.r_cut).T[found.kind] - dr
+
+    def compared(self, stretch: Stretch, per: int) -> None:
+        """One stretch of another run, which makes `per` steps where this one makes one."""
+        cell, place = HostCell(self.simulation.cell), np.argsort(stretch.table.order)
+        for found in self._found:
+            for before, distance in ((1, found.distances[0]), (0, found.distances[1])):
+                row = per * (found.step - before) - stretch.first
+                here = np.flatnonzero((row >= 0) & (row < stretch.rows))
+                if not len(here):
+                    continue
+                a, b = (
+                    stretch.x[row[here], :, place[label[here]]].astype(np.float64)
+                    for label in (found.first, found.second)
+                )
+                r = np.linalg.norm(np.stack(cell.displacement(a, b), axis=1), axis=1)
+                found.shift[here] = np.maximum(found.shift[here], np.abs(r - distance[here]))
+
+    def turns(self, columns: int) -> Turns:
+        """All of them, in the order of their steps."""
+        found = self._found[::-1]
+
+        def column(name: str, dtype: type = np.float64) -> np.ndarray:
+            parts = [getattr(one, name) for one in found]
+            return np.concatenate(parts) if parts else np.zeros(0, dtype)
+
+        moved = [
+            np.full((len(one.step), columns), np.nan) if one.moved is None else one.moved for one in found
+        ]
+        step = column("step", np.int64)
+        order = np.argsort(step, kind="stable")
+        return Turns(
+            step[order],
+            column("first", np.int64)[order],
+            column("second", np.int64)[order],
+            column("gap")[order],
+            column("bend")[order],
+            column("weight")[order],
+            (np.concatenate(moved) if moved else np.zeros((0, columns)))[order],
+            column("shift")[order],
+            column("unseen", bool)[order],
+        )
+
+
+@dataclass
+class Turning:
+    """The turning points of one stretch.
+
+    Attributes:
+        step: the step that each comes before. row: its row in the stretch.
+        i, j: atoms in the order of the stretch's list. first, second: user labels, first < second.
+        kind: pair type.
+        normal: from i to j, shape (turns, 3). images: lattice vectors from the wrapped to the nearest image
+            of j.
+        part: where between the two steps, 0 to 1.
+        distances: at the two steps.
+        gap, bend, unseen, weight, moved, shift: as in `Turns`.
+    """
+
+    step: np.ndarray
+    row: np.ndarray
+    i: np.ndarray
+    j: np.ndarray
+    first: np.ndarray
+    second: np.ndarray
+    kind: np.ndarray
+    normal: np.ndarray
+    images: np.ndarray
+    part: np.ndarray
+    distances: tuple[np.ndarray, np.ndarray]
+    gap: np.ndarray
+    bend: np.ndarray
+    unseen: np.ndarray
+    weight: np.ndarray
+    moved: np.ndarray | None
+    shift: np.ndarray
+
+
+def hermite(
+    r0: np.ndarray, s0: np.ndarray, r1: np.ndarray, s1: np.ndarray, time: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where the cubic through two distances with their rates turns, between rates of unlike signs.
+
+    Args:
+        r0, s0, r1, s1: distance and its rate at the two ends.
+        time: between them.
+
+    Returns:
+        where between the ends (0 to 1), the distance there, and its second derivative by time.
+
+    Error: of the distance, r'''' time⁴ / 384.
+    """
+    first, last = time * s0, time * s1
+    square, cube = 3 * (r1 - r0) - 2 * first - last, first + last - 2 * (r1 - r0)
+    u = first / (first - last)
+    for _ in range(4):
+        slope, bend = first + u * (2 * square + 3 * u * cube), 2 * square + 6 * u * cube
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u = np.clip(np.where(bend != 0, u - slope / bend, u), 0.0, 1.0)
+    return u, r0 + u * (first + u * (square + u * cube)), (2 * square + 6 * u * cube) / time**2
+
+
+def turning(simulation: Simulation, stretch: Stretch) -> Turning:
+    """The turning points of pairs near their cutoff within a stretch, from distances and their rates."""
+    order, index = stretch.table.order, stretch.table.index
+    slots, i = np.nonzero(index < simulation.atoms)
+    j = index[slots, i]
+    once = order[i] < order[j]
+    i, j = i[once], j[once]
+    kind = np.asarray(simulation.type_of(order[i], order[j]), np.int64)
+    radius = np.asarray(simulation.decider.r_cut, np.float64)[kind]
+    time = float(simulation.integrator.timestep)
+    cell = HostCell(simulation.cell)
+
+    def apart(x, i, j):
+        return np.stack(cell.displacement(x[:, i].T, x[:, j].T), axis=1)
+
+    rows: list[tuple[np.ndarray, ...]] = []
+    for low in range(0, stretch.rows, _BLOCK):
+        high = min(low + _BLOCK, stretch.rows)
+        v = stretch.v[low:high].astype(np.float64)
+        fastest = float(np.sqrt(np.max(np.sum(v * v, axis=1), initial=0.0)))
+        x = [stretch.x_before if low == 0 else stretch.x[low - 1], *stretch.x[low:high]]
+        far = np.linalg.norm(apart(x[1].astype(np.float64), i, j), axis=1)
+        # nobody outruns twice the fastest atom of the block
+        near = np.abs(far - radius) < LOOK * radius + 2.5 * fastest * time * (high - low)
+        a, b, cut, which = i[near], j[near], radius[near], kind[near]
+        before = None
+        for row in range(low - 1, high):
+            if row < 0 and stretch.first == 0:
+                continue
+            d = apart(x[row - low + 1].astype(np.float64), a, b)
+            r = np.linalg.norm(d, axis=1)
+            rate = None
+            if row >= 0:
+                u = stretch.v[row].astype(np.float64)
+                rate = np.sum(d * (u[:, b] - u[:, a]).T, axis=1) / r
+            if before is not None:
+                assert rate is not None
+                r0, s0, d0 = before
+                # of the step before the stretch the velocities are gone
+                s0 = 2 * (r - r0) / time - rate if s0 is None else s0
+                turned = np.flatnonzero(
+                    (s0 * rate < 0) & (np.minimum(abs(r0 - cut), abs(r - cut)) < LOOK * cut)
+                )
+                if len(turned):
+                    part, there, bend = hermite(r0[turned], s0[turned], r[turned], rate[turned], time)
+                    middle = d0[turned] + d[turned]
+                    side, ends = np.sign(bend), np.stack([r0[turned], r[turned]]) - cut[turned]
+                    gap = side * (there - cut[turned])
+                    raw = (stretch.x[row][:, b[turned]] - stretch.x[row][:, a[turned]]).T.astype(np.float64)
+                    rows.append((
+                        np.full(len(turned), row), a[turned], b[turned], which[turned],
+                        middle / np.linalg.norm(middle, axis=1, keepdims=True), d[turned] - raw, part,
+                        r0[turned], r[turned], gap, np.abs(bend),
+                        (gap < 0) & (side * ends > 0).all(axis=0),
+                    ))  # fmt: skip
+            before = (r, rate, d)
+    if not rows:
+        whole, none, three = np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3))
+        rows.append((whole,) * 4 + (three,) * 2 + (none,) * 5 + (np.zeros(0, bool),))
+    row, a, b, which, normal, lattice, part, r0, r1, gap, bend, unseen = map(
+        np.concatenate, zip(*rows, strict=True)
+    )
+    inverse = np.asarray(simulation.cell.inverse, np.float64)
+    nothing = np.zeros(len(row))
+    return Turning(
+        stretch.first + row, row, a, b, order[a], order[b], which, normal, np.rint(lattice @ inverse), part,
+        (r0, r1), gap, bend, unseen, nothing, None, nothing.copy(),
+    )  # fmt: skip

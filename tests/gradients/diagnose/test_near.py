@@ -1,0 +1,154 @@
+"""Pairs that nearly flipped: planted ones, against energy conservation and runs in which they flip."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from ase import Atoms
+from scipy.optimize import brentq
+from small_systems import LENNARD_JONES, make
+
+from mdnum.gradients import Problem
+from mdnum.gradients.diagnose import trust
+from mdnum.gradients.diagnose.horizons import halved, spread
+from mdnum.gradients.diagnose.near import Near
+from mdnum.gradients.diagnose.passes import passed
+from mdnum.gradients.losses import EinsteinDiffusion, MeanPotential, MeanSquaredDisplacement
+from mdnum.gradients.symmetric import EventAware
+from mdnum.gradients.tape import pace_of
+from mdnum.systems import build
+
+R_CUT, START = 2.5, 1.05
+
+NAMES = ("r_cut", "sigma", "dt")
+
+
+def u(r):
+    return 4 * (r**-12 - r**-6)
+
+
+#: A dimer that is let go compressed stretches up to here: its energy is conserved.
+FARTHEST: Any = brentq(lambda r: u(r) - u(START), 1.13, 2.0, xtol=1e-15)
+
+
+def problem(gap: float, timestep: float, time: float = 0.6, radius: float = R_CUT, loss=None):
+    """A dimer along x, and a third atom: the nearer of the two would come to within `gap` of the cutoff."""
+    middle = np.array([6.0, 7.0, 7.0])
+    x = middle + np.array([[-START / 2, 0, 0], [START / 2, 0, 0], [FARTHEST / 2 + R_CUT + gap, 0, 0]])
+    atoms = Atoms("Ar3", positions=x, velocities=np.zeros((3, 3)), cell=[14.0] * 3, pbc=True)
+    atoms.set_masses(np.ones(3))
+    atoms.set_momenta(np.zeros((3, 3)) + 1e-300)
+    dynamics = {"kind": "nve", "timestep": timestep}
+    cutoff = {"kind": "hard", "radius": radius}
+    simulation = build(make(atoms, LENNARD_JONES, cutoff, dynamics=dynamics))
+    return Problem(simulation, loss or MeanSquaredDisplacement(), round(time / timestep))
+
+
+def limit(found, what):
+    return next(one for one in found.limits if one.what == what)
+
+
+def farthest(timestep: float) -> float:
+    """Largest distance that steps of the dimer alone reach, by velocity Verlet written out."""
+    r, v, steps = START, 0.0, round(0.6 / timestep)
+
+    def a(r):
+        return 2 * (48 * r**-13 - 24 * r**-7)
+
+    seen = []
+    for _ in range(steps):
+        half = v + timestep / 2 * a(r)
+        r += timestep * half
+        v = half + timestep / 2 * a(r)
+        seen.append((r, v))
+    k = int(np.argmax([one[0] for one in seen]))
+    # a parabola through the three steps around it
+    y = np.array([seen[k + n][0] for n in (-1, 0, 1)])
+    return float(y[1] - (y[2] - y[0]) ** 2 / (8 * (y[2] - 2 * y[1] + y[0])))
+
+
+def test_a_near_miss_that_no_time_step_tried_shows_is_not_trusted():
+    """At this time step and at half of it nothing flips; the exact motion enters: its gradient is not 0."""
+    timestep = 0.01
+    short = (FARTHEST - farthest(timestep / 2)) / 2
+    assert 0 < short < (FARTHEST - farthest(timestep)) / 2 < 1e-3
+    planted = problem(-0.5 * short, timestep)
+    found = trust(planted, NAMES)
+    assert EventAware()(planted, ("r_cut",)).details["crossings"] == 0
+    assert found.half["cutoff.radius"].tolist() == [0.0]
+    near = limit(found, "near miss")
+    assert near.reached and near.horizon == 35 and found.verdict == "limited"
+    assert "rusted over" not in found.says
+    assert found.turns is not None
+    (row,) = found.turns.heaviest(found.columns)
+    assert (row["i"], row["j"]) == (1, 2)
+    # what it is short of the cutoff by is known from the steps alone
+    missed = (FARTHEST - farthest(timestep)) / 2 - 0.5 * short
+    assert row["gap"] == pytest.approx(missed, rel=0.02) and row["gap"] < row["reach"]
+    # with a time step at which it does enter, the derivative is of the size that was told
+    true = float(EventAware()(problem(-0.5 * short, timestep / 16), ("r_cut",)).gradient["cutoff.radius"])
+    assert true != 0 and 0.2 < abs(row["term"]["cutoff.radius"] / true) < 5
+    # at a fixed number of steps, twice as many of half the length move with it as far as one of them
+    own = EventAware()(planted, ("dt",)).gradient["dynamics.timestep"]
+    assert found.half["dynamics.timestep"][0] == pytest.approx(float(own), rel=0.02)
+
+
+@pytest.mark.parametrize("loss", [None, MeanPotential()])
+def test_the_weight_of_a_near_miss_is_what_its_flips_add_when_it_flips(loss):
+    """Of a pair that is deep inside for a while the gradient itself has both terms."""
+    gap, depth, timestep = 5e-4, 2e-3, 0.002
+    missed = problem(gap, timestep, loss=loss)
+    near = Near(missed.simulation, pace_of(missed.loss, missed.steps))
+    passed(missed, ("cutoff.radius",), watches=[near.reverse])
+    turns = near.turns(0)
+    (k,) = np.flatnonzero((turns.i == 1) & (turns.j == 2) & (turns.gap > 0) & (turns.gap < 1e-3))
+    assert turns.gap[k] == pytest.approx(gap, rel=0.02)
+    inside = problem(gap, timestep, radius=R_CUT + gap + depth, loss=loss)
+    true = EventAware()(inside, ("r_cut",))
+    assert true.details["crossings"] == 2
+    told = 2 * turns.weight[k] / np.sqrt(2 * turns.bend[k] * depth)
+    assert told == pytest.approx(float(true.gradient["cutoff.radius"]), rel=0.1)
+
+
+def test_a_pair_that_is_inside_between_two_steps_alone_is_seen():
+    """Two free atoms that pass each other: no time step and no rounding moves them."""
+    closest, speed, timestep = R_CUT - 1e-3, 1.0, 0.2
+    x = np.array([[3.0, 7.0, 7.0], [3.0 + speed * 1.5 * timestep, 7.0 + closest, 7.0]])
+    atoms = Atoms("Ar2", positions=x, cell=[14.0] * 3, pbc=True)
+    atoms.set_masses(np.ones(2))
+    atoms.set_momenta([[speed, 0, 0], [0, 0, 0]])
+    dynamics = {"kind": "nve", "timestep": timestep}
+    cutoff = {"kind": "hard", "radius": R_CUT}
+    simulation = build(make(atoms, LENNARD_JONES, cutoff, dynamics=dynamics))
+    passing = Problem(simulation, MeanSquaredDisplacement(), 4)
+    near = Near(simulation, pace_of(passing.loss, passing.steps))
+    made = passed(passing, ("cutoff.radius",), watches=[near.reverse])
+    assert sum(map(len, made.crossings)) == 0
+    turns = near.turns(1)
+    assert turns.unseen.tolist() == turns.within.tolist() == [True] and turns.step.tolist() == [2]
+    assert turns.gap[0] == pytest.approx(-1e-3, rel=1e-3)
+    assert turns.bend[0] == pytest.approx(speed**2 / closest, rel=0.01)
+
+
+def test_nothing_is_trusted_that_was_not_looked_at():
+    wide = problem(0.01, 0.01)
+    found = trust(wide, NAMES, tolerance=0.03)
+    assert found.verdict == "trusted" and found.says.startswith("Trusted over all 60 steps")
+    assert found.digits["potential.sigma"] == 1 and not limit(found, "near miss").reached
+    blind = trust(wide, NAMES, tolerance=0.03, half_step=False)
+    assert blind.verdict == "undecided" and "rusted" not in blind.says and not blind.digits
+    assert limit(blind, "time step").horizon is None and limit(blind, "near miss").horizon is None
+    # the third atom is inside for a while
+    crossing = trust(problem(-0.02, 0.01), NAMES, tolerance=0.03, saltation=False)
+    assert crossing.verdict == "limited" and crossing.limited_by == "flips left out"
+
+
+@pytest.mark.parametrize("loss", [MeanPotential(every=7, first=5), EinsteinDiffusion(every=10)])
+def test_half_the_time_step_looks_at_the_same_times(loss):
+    whole = problem(0.01, 0.002, loss=loss)
+    half = halved(whole)
+    assert half.steps == 2 * whole.steps
+    assert half.value() == pytest.approx(whole.value(), rel=1e-3)
+    assert len(spread(whole, 10)) > 3
