@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -105,12 +104,11 @@ def load(folder: RunFolder | str | Path) -> Run:
         raise FolderError(
             "holds no step of a run", remedy="Resume the run, or run again", where=str(folder.path)
         )
-    toml = folder.system_toml
     return Run(
         path=folder.path,
         summary=folder.summary,
-        system=tomllib.loads(toml),
-        system_toml=toml,
+        system=folder.system,
+        system_toml=folder.system_toml,
         provenance=folder.provenance,
         series=series,
         epochs=folder.read("epochs"),

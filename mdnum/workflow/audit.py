@@ -93,6 +93,7 @@ def audit(
     from mdnum.audit.verdict import judge
     from mdnum.provenance import surroundings
     from mdnum.store import RunFolder
+    from mdnum.store.atomic import write_text
     from mdnum.store.naming import default_folder
     from mdnum.workflow import audit_record
 
@@ -127,9 +128,7 @@ def audit(
         audit_record.write_structures(folder.path, pairs)
         if pairs:
             names = [name.removesuffix("-before") for name in pairs if name.endswith("-before")]
-            (folder.path / audit_record.SCRIPT).write_text(
-                audit_record.script(loaded.name, names), encoding="utf-8"
-            )
+            write_text(folder.path / audit_record.SCRIPT, audit_record.script(loaded.name, names))
         folder.finalize()
         units = (subject.units.length, subject.units.energy)
         summary = audit_record.summarize(

@@ -10,7 +10,7 @@ import numpy as np
 
 from mdnum.references.findings import plain
 from mdnum.store import RunFolder
-from mdnum.store.atomic import write_text
+from mdnum.store.atomic import subfolder, write_text
 
 if TYPE_CHECKING:
     from ase import Atoms
@@ -47,7 +47,7 @@ def write_structures(folder: Path, structures: Mapping[str, Atoms]) -> None:
     from mdnum.audit.subject import exact_extxyz
 
     if structures:
-        (folder / STRUCTURES).mkdir(exist_ok=True)
+        subfolder(folder, STRUCTURES)
     for name, atoms in structures.items():
         write_text(folder / STRUCTURES / f"{name}.extxyz", exact_extxyz(atoms))
 
