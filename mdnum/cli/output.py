@@ -104,6 +104,15 @@ def print_error(error: MdnumError, *, as_json: bool) -> None:
         )
 
 
+def print_notes(*folders: str | Path, of: Sequence[str] | None = None) -> None:
+    """A line on stderr for each file of a folder that is not as it was written; of some only, where given."""
+    from mdnum.store import RunFolder
+
+    for folder in dict.fromkeys(map(Path, folders)):
+        for line in RunFolder.open(folder).noted(of):
+            typer.echo("mdnum: " + " ".join(line.split()), err=True)
+
+
 def console() -> Console:
     """rich's console on stdout, made when first needed because importing rich is slow."""
     from rich.console import Console

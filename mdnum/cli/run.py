@@ -56,9 +56,16 @@ def run(
     folder = resume or out
 
     def go_on() -> str | None:
-        written = folder is not None and folder.exists()
-        return f"Continue with `mdnum run --resume {folder}`" if written else None
+        if folder is None or not folder.exists():
+            return None
+        from mdnum.store.manifest import resumable
 
+        if resumable(folder):
+            return f"Continue with `mdnum run --resume {folder}`"
+        return "Nothing was computed yet: give the command again"
+
+    if resume is not None:
+        output.print_notes(resume, of=("log.txt",))
     with watched(go_on) as progress:
         result = run_system(
             system,

@@ -22,7 +22,7 @@ from mdnum.errors import FolderError, MdnumError
 from mdnum.store import checkpoint, manifest
 from mdnum.store.atomic import SUBFOLDERS, disk_errors, opened, read_text, refuse_link, write_text
 from mdnum.store.frames import FrameFile
-from mdnum.store.tables import COLUMNS, TABLES, TableStream
+from mdnum.store.tables import COLUMNS, TABLES, VERBS, TableStream
 
 if TYPE_CHECKING:
     from ase import Atoms
@@ -221,6 +221,7 @@ class RunFolder:
             self._write_checkpoint(self._pending[0])
         for name in dict.fromkeys((*TABLES[self.world], *self._streams)):
             self._stream(name).merge()
+        self._owner = True
         self._list_files(finished=True)
         parts = self.path / "parts"
         if parts.is_dir() and not any(parts.iterdir()):
@@ -367,6 +368,16 @@ class RunFolder:
         return self._read_json("summary.json")
 
     @property
+    def verb(self) -> str:
+        """What of the command line made it."""
+        return VERBS.get(self.world, "run")
+
+    @property
+    def again(self) -> str:
+        """What can be done about a folder that was not finished, an imperative sentence."""
+        return _again(self.path)
+
+    @property
     def provenance(self) -> dict[str, Any]:
         """provenance.json; empty if it was not written."""
         return self._read_json("provenance.json")
@@ -422,13 +433,33 @@ class RunFolder:
                 where=str(self.path),
             ) from error
 
-    def noted(self) -> list[str]:
-        """A line for each file that is not as it was written, and for a folder in which that is unknown."""
+    def check_start(self) -> None:
+        """Compares what a run begins with, its system and what belongs to it, with the manifest.
+
+        Raises:
+            FolderError: it was changed, so that a run of it would be another one.
+        """
+        for name in self._listed():
+            if name in ("system.toml", "structure.extxyz") or (
+                name not in _FILES and "/" not in name and not _FURTHER.fullmatch(name)
+            ):
+                self.check(name)
+
+    def noted(self, of: Sequence[str] | None = None) -> list[str]:
+        """A line for each file that is not as it was written, and for a folder in which that is unknown.
+
+        Args:
+            of: of these files only.
+        """
         if not (self.path / manifest.NAME).exists():
             return [
                 f"{self.path}: has no {manifest.NAME}, so that nothing in it could be checked for damage."
             ]
-        return [f"{self.path / name}: {wrong}." for name, wrong in self.damaged().items()]
+        return [
+            f"{self.path / name}: {wrong}."
+            for name, wrong in self.damaged().items()
+            if name in (of or (name,))
+        ]
 
     # -- inside ----------------------------------------------------------------------------------
 
@@ -490,7 +521,12 @@ class RunFolder:
             if name in ("log.txt", "trajectory.traj")
             or (name not in listed and (name in fixed or _FURTHER.fullmatch(name)))
         ]
-        manifest.update(self.path, manifest.listed_files(self.path, names), finished=finished)
+        now = manifest.listed_files(self.path, names)
+        for name, allowed in listed.items():
+            # what was about to be replaced has been
+            if len(allowed) > 1 and name not in now and (one := manifest.digest(self.path / name)) in allowed:
+                now[name] = [one]
+        manifest.update(self.path, now, finished=finished)
 
     def _rows(self) -> dict[str, int]:
         return {name: stream.rows for name, stream in self._streams.items()}
@@ -516,7 +552,7 @@ class RunFolder:
     def _read_checkpoint(self) -> tuple[dict[str, Any], dict[str, Any]]:
         if not self.has_checkpoint():
             raise FolderError(
-                "has no checkpoint to resume from", remedy="Run again in a new folder", where=str(self.path)
+                "has no checkpoint to resume from", remedy=f"{_again(self.path)}", where=str(self.path)
             )
         self.check("checkpoint.npz")
         path = self.path / "checkpoint.npz"
@@ -590,13 +626,22 @@ def _refuse_to_overwrite(path: Path, present: Sequence[str]) -> None:
             where=str(path),
         )
     made = manifest.load(path)
-    if manifest.resumable(path):
-        remedy = f"Continue it with `mdnum run --resume {path}`, or choose another folder"
-    elif made is not None and not made.finished:
-        remedy = "It was stopped and cannot be continued: remove it, or choose another folder"
-    else:
-        remedy = "Choose another folder, or remove this one"
+    stopped = made is not None and not made.finished
+    remedy = _again(path) if stopped or manifest.resumable(path) else "Choose another folder, or remove it"
     raise FolderError("already holds a run", remedy=remedy, where=str(path))
+
+
+def _again(path: Path) -> str:
+    """What can be done about a folder that was not finished."""
+    made = manifest.load(path)
+    verb = f"mdnum {VERBS.get(made.world, 'run')}" if made is not None else "mdnum run"
+    if manifest.resumable(path):
+        return f"Continue it with `mdnum run --resume {path}`, or choose another folder"
+    if (path / "answers.json").exists():
+        return f"Continue it with `{verb} --resume {path}`, or choose another folder"
+    if _came_to_nothing(path, [entry.name for entry in path.iterdir()]):
+        return f"Nothing was computed in it yet: give the `{verb}` command again"
+    return f"It cannot be continued: give the `{verb}` command again for another folder, or remove this one"
 
 
 def _plain(value: Any) -> Any:

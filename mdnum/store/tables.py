@@ -191,6 +191,15 @@ TABLES: Mapping[str, tuple[str, ...]] = MappingProxyType(
     }
 )
 
+#: The verb of the command line that makes a folder of a world.
+VERBS: Mapping[str, str] = MappingProxyType(
+    {
+        **dict.fromkeys(TABLES, "fork"),
+        "md": "run", "ball": "ball", "audit": "audit", "grad": "grad", "conform": "conform", "flips": "flips",
+        "flips-compare": "flips",
+    }
+)  # fmt: skip
+
 # rows held back before a part is written without waiting for a checkpoint: bounds the memory of a run
 _BUFFER_ROWS = 100_000
 # fixed, so that the merged file has the same bytes however the run was cut into parts
