@@ -75,7 +75,7 @@ def _fork(path: Path) -> None:
 
 
 def _grad(path: Path) -> None:
-    mdnum.grad("pair/leaving-well", of="potential", steps=40, out=path, report=False)
+    mdnum.grad("pair/leaving-well", of="potential", wrt="potential.epsilon", steps=40, out=path, report=False)
 
 
 def _ball(path: Path, steps: int = 60) -> None:

@@ -111,7 +111,8 @@ def refuse_other_systems(first: RunFolder, second: RunFolder, programs: list[Dif
     """
     where = f"{first.path} and {second.path}"
     atoms = [folder.summary.get("atoms") for folder in (first, second)]
-    if atoms[0] != atoms[1]:
+    # a run that was killed has no summary; its structure is compared with the other's
+    if None not in atoms and atoms[0] != atoms[1]:
         raise InputError(
             f"the runs have {atoms[0]} and {atoms[1]} atoms", where=where, remedy="Compare runs of one system"
         )
