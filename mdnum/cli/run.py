@@ -64,8 +64,12 @@ def run(
             return f"Continue with `mdnum run --resume {folder}`"
         return "Nothing was computed yet: give the command again"
 
+    notes = []
     if resume is not None:
-        output.print_notes(resume, of=("log.txt",))
+        from mdnum.store import RunFolder
+
+        # before it goes on and is listed anew; told when nothing worse was found
+        notes = RunFolder.open(resume).noted(("log.txt",))
     with watched(go_on) as progress:
         result = run_system(
             system,
@@ -78,6 +82,7 @@ def run(
             report=not no_report,
             progress=progress,
         )
+    output.print_lines(notes)
     return output.answer(result.folder, result.summary, _print_rows, as_json=as_json)
 
 
