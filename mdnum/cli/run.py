@@ -64,12 +64,12 @@ def run(
             return f"Continue with `mdnum run --resume {folder}`"
         return "Nothing was computed yet: give the command again"
 
-    notes = []
-    if resume is not None:
+    notes: list[str] = []
+    if resume is not None and resume.is_dir():
         from mdnum.store import RunFolder
 
         # before it goes on and is listed anew; told when nothing worse was found
-        notes = RunFolder.open(resume).noted(("log.txt",))
+        notes = RunFolder.open(resume).noted()
     with watched(go_on) as progress:
         result = run_system(
             system,

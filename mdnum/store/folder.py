@@ -445,21 +445,13 @@ class RunFolder:
             ):
                 self.check(name)
 
-    def noted(self, of: Sequence[str] | None = None) -> list[str]:
-        """A line for each file that is not as it was written, and for a folder in which that is unknown.
-
-        Args:
-            of: of these files only.
-        """
+    def noted(self) -> list[str]:
+        """A line for each file that is not as it was written, and for a folder in which that is unknown."""
         if not (self.path / manifest.NAME).exists():
             return [
                 f"{self.path}: has no {manifest.NAME}, so that nothing in it could be checked for damage."
             ]
-        return [
-            f"{self.path / name}: {wrong}."
-            for name, wrong in self.damaged().items()
-            if name in (of or (name,))
-        ]
+        return [f"{self.path / name}: {wrong}." for name, wrong in self.damaged().items()]
 
     # -- inside ----------------------------------------------------------------------------------
 
