@@ -27,6 +27,7 @@ import zipfile
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -223,14 +224,16 @@ def _gone(path: Path, other: Path, rng: np.random.Generator) -> None:
 def _archive(path: Path, other: Path, rng: np.random.Generator) -> None:
     """A checkpoint that names files elsewhere, or unpacks to far more than itself."""
     with np.load(path) as held:
-        members = {name: held[name] for name in held.files}
+        members: dict[str, Any] = {name: held[name] for name in held.files}
     which = int(rng.integers(3))
     if which == 0:
         store = json.loads(str(members["mdnum store"]))
         store["rows"]["../outside/precious"] = 0
-        np.savez(path, **(members | {"mdnum store": np.array(json.dumps(store))}))
+        members["mdnum store"] = np.array(json.dumps(store))
+        np.savez(path, allow_pickle=False, **members)
     elif which == 1:
-        np.savez_compressed(path, **(members | {"large": np.zeros(1 << 24)}))
+        members["large"] = np.zeros(1 << 24)
+        np.savez_compressed(path, allow_pickle=False, **members)
     else:
         with zipfile.ZipFile(path) as held:
             files = {one.filename: held.read(one) for one in held.infolist()}

@@ -549,13 +549,12 @@ class RunFolder:
         self.check("checkpoint.npz")
         path = self.path / "checkpoint.npz"
         state, store = checkpoint.read(path)
-        rows, mark, log = (store.get(key) for key in ("rows", "frames", "log"))
-        counts = [*(rows.values() if isinstance(rows, dict) else [None]), *(mark or [None]), log]
+        rows, mark, log = store.get("rows"), store.get("frames"), store.get("log")
         # names of tables become names of files
         if (
-            not all(isinstance(count, int) and count >= 0 for count in counts)
+            not (isinstance(rows, dict) and isinstance(mark, list) and len(mark) == 3)
             or not set(rows) <= set(COLUMNS)
-            or len(mark) != 3
+            or not all(isinstance(count, int) and count >= 0 for count in (*rows.values(), *mark, log))
         ):
             raise FolderError(
                 "counts what no folder of mdnum has", remedy="Run again in a new folder", where=str(path)
