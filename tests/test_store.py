@@ -177,7 +177,7 @@ def test_failed_run_keeps_the_rows_after_its_checkpoint(tmp_path):
     assert len(resumed.read("series")["step"]) == 100
 
 
-@pytest.mark.parametrize("killed_at", range(1, 8))
+@pytest.mark.parametrize("killed_at", range(1, 20))
 def test_merge_killed_anywhere_loses_and_doubles_nothing(tmp_path, monkeypatch, killed_at):
     folder = RunFolder.create(tmp_path / "run")
     write_run(folder, 0, 60, chunk=20)
@@ -196,7 +196,7 @@ def test_merge_killed_anywhere_loses_and_doubles_nothing(tmp_path, monkeypatch, 
         return wrapper
 
     with monkeypatch.context() as patch:
-        patch.setattr(tables.os, "replace", dies(os.replace))
+        patch.setattr(atomic.os, "replace", dies(os.replace))
         patch.setattr(tables.Path, "unlink", dies(tables.Path.unlink))
         with pytest.raises(Killed):
             folder.finalize()
@@ -306,7 +306,9 @@ def test_existing_folders_are_not_overwritten(tmp_path, whole):
 
     (whole.path / "notes.md").write_text("mine")
     again = RunFolder.create(whole.path, overwrite=True)
-    assert sorted(path.name for path in again.path.iterdir() if path.is_file()) == [".lock", "notes.md"]
+    assert sorted(path.name for path in again.path.iterdir() if path.is_file()) == [
+        ".lock", "manifest.json", "notes.md",
+    ]  # fmt: skip
 
 
 def test_two_writers_are_refused(tmp_path):
@@ -323,6 +325,9 @@ def test_changed_folder_is_not_resumed(tmp_path):
     write_run(folder, 0, 30)
     folder.close()
     (folder.path / "parts" / "series-000000000010.parquet").unlink()
+    with pytest.raises(FolderError, match=r"series-000000000010\.parquet: is missing"):
+        RunFolder.open(folder.path).resume()
+    (folder.path / "manifest.json").unlink()
     with pytest.raises(FolderError, match="rows 10 to 19 of table 'series' are missing"):
         RunFolder.open(folder.path).resume()
 

@@ -94,6 +94,7 @@ def folders(a: str, b: Path, *, as_json: bool) -> int | None:
     from mdnum.forks.bounce.folders import compare_folders
 
     found = compare_folders(*runs)
+    output.print_notes(a, b)
     if as_json:
         output.print_json({"question": "folders", **output.plain(found)})
         return output.EXIT_FINE

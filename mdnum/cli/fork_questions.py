@@ -45,6 +45,7 @@ def folders(a: Path, b: Path, *, as_json: bool) -> int:
     from mdnum.forks.folders import compare_folders
 
     found = compare_folders(a, b)
+    output.print_notes(a, b)
     if as_json:
         output.print_json({"question": "folders", **output.plain(found)})
         return output.EXIT_FINE

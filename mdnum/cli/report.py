@@ -17,6 +17,7 @@ def report(
     from mdnum.report import write
 
     written = write(folder)
+    output.print_notes(folder)
     if as_json:
         output.print_json({"folder": folder, "report": written})
     else:

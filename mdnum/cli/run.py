@@ -56,9 +56,20 @@ def run(
     folder = resume or out
 
     def go_on() -> str | None:
-        written = folder is not None and folder.exists()
-        return f"Continue with `mdnum run --resume {folder}`" if written else None
+        if folder is None or not folder.exists():
+            return None
+        from mdnum.store.manifest import resumable
 
+        if resumable(folder):
+            return f"Continue with `mdnum run --resume {folder}`"
+        return "Nothing was computed yet: give the command again"
+
+    notes: list[str] = []
+    if resume is not None and resume.is_dir():
+        from mdnum.store import RunFolder
+
+        # before it goes on and is listed anew; told when nothing worse was found
+        notes = RunFolder.open(resume).noted()
     with watched(go_on) as progress:
         result = run_system(
             system,
@@ -71,6 +82,7 @@ def run(
             report=not no_report,
             progress=progress,
         )
+    output.print_lines(notes)
     return output.answer(result.folder, result.summary, _print_rows, as_json=as_json)
 
 

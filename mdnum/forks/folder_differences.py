@@ -6,7 +6,6 @@ another box, another potential. Every number and every choice of a program is a 
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -36,7 +35,7 @@ _SAME = 1e-6
 
 def of_programs(first: RunFolder, second: RunFolder) -> list[Difference]:
     """Keys of the system files whose values differ, as (key, in A, in B)."""
-    one, other = (flat(tomllib.loads(folder.system_toml)) for folder in (first, second))
+    one, other = (flat(folder.system) for folder in (first, second))
     found = _different(one, other)
     return [row for row in found if row[0] not in _WORDS and row[0].split(".")[0] not in _WORD_TABLES]
 
@@ -112,7 +111,8 @@ def refuse_other_systems(first: RunFolder, second: RunFolder, programs: list[Dif
     """
     where = f"{first.path} and {second.path}"
     atoms = [folder.summary.get("atoms") for folder in (first, second)]
-    if atoms[0] != atoms[1]:
+    # a run that was killed has no summary; its structure is compared with the other's
+    if None not in atoms and atoms[0] != atoms[1]:
         raise InputError(
             f"the runs have {atoms[0]} and {atoms[1]} atoms", where=where, remedy="Compare runs of one system"
         )

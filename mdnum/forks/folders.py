@@ -85,6 +85,11 @@ def compare_folders(a: RunFolder | str | Path, b: RunFolder | str | Path) -> Fol
     """
     first, second = (folder if isinstance(folder, RunFolder) else RunFolder.open(folder) for folder in (a, b))
     check_runs(first, second)
+    with first.explained(), second.explained():
+        return _compared(first, second)
+
+
+def _compared(first: RunFolder, second: RunFolder) -> FolderFork:
     programs = folder_differences.of_programs(first, second)
     folder_differences.refuse_other_systems(first, second, programs)
     starts = folder_differences.of_starts(first, second, programs)

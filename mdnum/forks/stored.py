@@ -13,9 +13,10 @@ def check_runs(*folders: RunFolder) -> None:
     """Refuse the folder of an answered question, which has two runs in it or none.
 
     Raises:
-        InputError: names the folder.
+        InputError: names the folder. FolderError: its system was changed, or it is damaged.
     """
     for folder in folders:
+        folder.check_start()
         if folder.summary.get("world") == "fork" or folder.world not in _RUNS:
             raise InputError(
                 "this is a fork folder, the answer of `mdnum fork`, and no run",

@@ -39,7 +39,9 @@ def write(folder: RunFolder | str | Path) -> Path:
     Raises:
         FolderError: no run in the folder, or it cannot be written.
     """
-    return _modules(folder)[1].write_report(folder)
+    opened, _, writes = _modules(folder)
+    with opened.explained():
+        return writes.write_report(opened)
 
 
 def judge(folder: RunFolder | str | Path) -> None:
@@ -48,17 +50,26 @@ def judge(folder: RunFolder | str | Path) -> None:
     Raises:
         FolderError: no run in the folder, or it cannot be written.
     """
-    _modules(folder)[0].record(folder)
+    opened, judges, _ = _modules(folder)
+    with opened.explained():
+        judges.record(opened)
 
 
-def _modules(folder: RunFolder | str | Path) -> tuple[Any, Any]:
-    """What judges a folder, and what writes its page."""
+def _modules(folder: RunFolder | str | Path) -> tuple[RunFolder, Any, Any]:
+    """A folder, what judges it, and what writes its page."""
+    from mdnum.errors import FolderError
     from mdnum.store import RunFolder
 
     folder = folder if isinstance(folder, RunFolder) else RunFolder.open(folder)
     summary = folder.summary
+    if not summary and folder.world != "md":
+        raise FolderError(
+            f"holds no answer: `mdnum {folder.verb}` was stopped before it had one",
+            remedy=folder.again,
+            where=str(folder.path),
+        )
     # a folder from before there were two worlds does not say; one that was killed has its tables alone
     kinds = (summary.get("question"), summary.get("world"), folder.world)
-    kind = next(kind for kind in kinds if kind in _MODULES)
+    kind = next(kind for kind in kinds if isinstance(kind, str) and kind in _MODULES)
     judges, writes = (importlib.import_module(name) for name in _MODULES[kind])
-    return judges, writes
+    return folder, judges, writes

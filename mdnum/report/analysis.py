@@ -16,21 +16,31 @@ class Stays:
     """How long pairs keep a decision, in steps, between two flips of the same pair.
 
     Attributes:
-        inside: from entering to leaving.
-        outside: from leaving to entering again.
+        inside: from entering to leaving: how many stays last 0, 1, 2, ... steps.
+        outside: from leaving to entering again, likewise.
     """
 
-    inside: Int[np.ndarray, "stays"]
-    outside: Int[np.ndarray, "stays"]
+    inside: Int[np.ndarray, "lengths"]
+    outside: Int[np.ndarray, "lengths"]
 
     @property
-    def all(self) -> Int[np.ndarray, "stays"]:
-        """Both."""
-        return np.concatenate([self.inside, self.outside])
+    def total(self) -> int:
+        """Stays of both kinds."""
+        return int(self.inside.sum() + self.outside.sum())
 
     def undone_within(self, steps: int) -> int:
         """Chatter: flips that the same pair takes back within so many steps."""
-        return int(np.count_nonzero(self.inside <= steps) + np.count_nonzero(self.outside <= steps))
+        return int(self.inside[: steps + 1].sum() + self.outside[: steps + 1].sum())
+
+
+def median(counts: Int[np.ndarray, "lengths"]) -> float | None:
+    """The median length, of how many last 0, 1, 2, ... steps; None of none."""
+    total = int(counts.sum())
+    if not total:
+        return None
+    up_to = np.cumsum(counts)
+    middle = np.searchsorted(up_to, [(total - 1) // 2 + 1, total // 2 + 1])
+    return float(middle.mean())
 
 
 @dataclass(frozen=True)
@@ -42,33 +52,122 @@ class PairCounts:
     flips: Int[np.ndarray, "pairs"]
 
 
-def stays(flips: Flips) -> Stays:
-    """Residence times of pairs on either side of the cutoff.
+class Scan:
+    """What a table of flips says, of a table that is larger than memory, seen a part at a time.
 
-    The stay before a pair's first flip and after its last one are not seen whole and not counted,
-    so that long stays are underrepresented in a run that is not much longer than they are.
+    Kept are a row for each pair, a count for each step and length of a stay, the rows nearest to their
+    threshold, and of each flip one number: its margin.
+
+    Args:
+        steps: rows of the run's series; a flip is at one of the steps 0 to steps - 1.
+        nearest: how many rows of the flips nearest to their threshold are kept.
     """
-    order = _by_pair(flips)
-    key = _pair_key(flips)[order]
-    step, entered = flips["step"][order], flips["entered"][order]
-    same = key[1:] == key[:-1]
-    length = (step[1:] - step[:-1])[same]
-    began_inside = entered[:-1][same]
-    return Stays(inside=length[began_inside], outside=length[~began_inside])
+
+    def __init__(self, steps: int, nearest: int = 0):
+        self._most = nearest
+        self.total = 0
+        #: Pairs that entered and left at each step.
+        self.entered, self.left = np.zeros(steps, np.int64), np.zeros(steps, np.int64)
+        #: Whether every pair's flips enter and leave in turn: one that does not has a flip missing.
+        self.alternates = True
+        # (outside, inside): stays by their length
+        self._lengths = np.zeros((2, steps), np.int64)
+        # of each pair: its key, its flips, and the last of them
+        self._key, self._count, self._step = (np.zeros(0, np.int64) for _ in range(3))
+        self._inside = np.zeros(0, bool)
+        self._ratios: list[np.ndarray] = []
+        #: Rows nearest to their threshold in the order of the table, by column.
+        self.nearest: dict[str, np.ndarray] = {}
+
+    def take(self, flips: Flips) -> None:
+        """The next rows of the table.
+
+        Raises:
+            ValueError: a flip is at a step that the run did not make, or before one that came earlier.
+        """
+        step, steps = flips["step"], len(self.entered)
+        self.total += len(step)
+        if not len(step):
+            self._keep_nearest(flips, np.zeros(0))
+            return
+        if step.min() < 0 or step.max() >= steps:
+            raise ValueError(f"flips at steps {step.min()} to {step.max()} of a run of {steps} rows")
+        came = flips["entered"].astype(bool)
+        self.entered += np.bincount(step[came], minlength=steps)
+        self.left += np.bincount(step[~came], minlength=steps)
+        ratio = margins_in_bounds(flips)
+        self._ratios.append(ratio)
+        self._keep_nearest(flips, ratio)
+        self._follow(_pair_key(flips), step, came)
+
+    @property
+    def ratios(self) -> Float[np.ndarray, "flips"]:
+        """|margin| of each flip over its rounding bound."""
+        self._ratios = [np.concatenate(self._ratios or [np.zeros(0)])]
+        return self._ratios[0]
+
+    @property
+    def stays(self) -> Stays:
+        """Residence times of pairs on either side of the cutoff.
+
+        The stay before a pair's first flip and after its last one are not seen whole and not counted,
+        so that long stays are underrepresented in a run that is not much longer than they are.
+        """
+        return Stays(inside=self._lengths[1], outside=self._lengths[0])
+
+    @property
+    def busiest(self) -> PairCounts:
+        """The pairs that flipped, those that did so most often first."""
+        order = np.argsort(-self._count, kind="stable")
+        key = self._key[order]
+        return PairCounts(i=key >> 32, j=key & 0xFFFFFFFF, flips=self._count[order])
+
+    def matches(self, series: Mapping[str, np.ndarray]) -> Bool[np.ndarray, "steps"]:
+        """At each step, whether the table of flips has as many as the series counted there."""
+        return (self.entered == series["entered"]) & (self.left == series["left"])
+
+    def _follow(self, key: np.ndarray, step: np.ndarray, came: np.ndarray) -> None:
+        # flips are written in the order of their steps, which a stable sort keeps within each pair
+        order = np.argsort(key, kind="stable")
+        key, step, came = key[order], step[order], came[order]
+        same = key[1:] == key[:-1]
+        self._add((step[1:] - step[:-1])[same], came[:-1][same], came[1:][same])
+        first = np.flatnonzero(np.r_[True, ~same])
+        last = np.r_[first[1:], len(key)] - 1
+        pairs = key[first]
+        at = np.searchsorted(self._key, pairs)
+        known = np.zeros(len(pairs), bool)
+        inner = at < len(self._key)
+        known[inner] = self._key[at[inner]] == pairs[inner]
+        seen = at[known]
+        self._add(step[first[known]] - self._step[seen], self._inside[seen], came[first[known]])
+        self._count[seen] += (last - first + 1)[known]
+        self._step[seen], self._inside[seen] = step[last[known]], came[last[known]]
+        new = ~known
+        self._count = np.insert(self._count, at[new], (last - first + 1)[new])
+        self._step = np.insert(self._step, at[new], step[last[new]])
+        self._inside = np.insert(self._inside, at[new], came[last[new]])
+        self._key = np.insert(self._key, at[new], pairs[new])
+
+    def _add(self, length: np.ndarray, inside: np.ndarray, then: np.ndarray) -> None:
+        """Stays that began inside or not, and where the flips lead that end them."""
+        self.alternates = self.alternates and not np.any(inside == then)
+        for side in (0, 1):
+            self._lengths[side] += np.bincount(length[inside == side], minlength=self._lengths.shape[1])
+
+    def _keep_nearest(self, flips: Flips, ratio: np.ndarray) -> None:
+        rows = {**flips, "ratio": ratio}
+        if self.nearest:
+            rows = {name: np.concatenate([self.nearest[name], values]) for name, values in rows.items()}
+        kept = np.sort(closest(rows["ratio"], self._most))
+        self.nearest = {name: values[kept] for name, values in rows.items()}
 
 
-def alternates(flips: Flips) -> bool:
-    """Whether every pair's flips enter and leave in turn: one that does not has a flip missing."""
-    order = _by_pair(flips)
-    key, entered = _pair_key(flips)[order], flips["entered"][order]
-    return not np.any((key[1:] == key[:-1]) & (entered[1:] == entered[:-1]))
-
-
-def busiest_pairs(flips: Flips) -> PairCounts:
-    """The pairs that flipped, those that did so most often first."""
-    key, counts = np.unique(_pair_key(flips), return_counts=True)
-    order = np.argsort(-counts, kind="stable")
-    return PairCounts(i=key[order] >> 32, j=key[order] & 0xFFFFFFFF, flips=counts[order])
+def scan(flips: Flips, steps: int | None = None, nearest: int = 0) -> Scan:
+    """A table of flips that is in memory, seen at once."""
+    made = Scan(int(np.max(flips["step"], initial=-1)) + 1 if steps is None else steps, nearest)
+    made.take(flips)
+    return made
 
 
 def margins_in_bounds(flips: Flips) -> Float[np.ndarray, "flips"]:
@@ -116,18 +215,5 @@ def algebra_holds(series: Mapping[str, np.ndarray]) -> Bool[np.ndarray, "steps"]
     return pairs == pairs[0] + net - net[0]
 
 
-def flips_match_series(series: Mapping[str, np.ndarray], flips: Flips) -> Bool[np.ndarray, "steps"]:
-    """At each step, whether the table of flips has as many as the series counted there."""
-    first, size = series["step"][0], len(series["step"])
-    entered = np.bincount(flips["step"][flips["entered"]] - first, minlength=size)[:size]
-    left = np.bincount(flips["step"][~flips["entered"]] - first, minlength=size)[:size]
-    return (entered == series["entered"]) & (left == series["left"])
-
-
 def _pair_key(flips: Flips) -> Int[np.ndarray, "flips"]:
     return (flips["i"].astype(np.int64) << 32) | flips["j"].astype(np.int64)
-
-
-def _by_pair(flips: Flips) -> Int[np.ndarray, "flips"]:
-    # flips are written in the order of their steps, which a stable sort keeps within each pair
-    return np.argsort(_pair_key(flips), kind="stable")

@@ -9,7 +9,6 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
-from mdnum.report import analysis
 from mdnum.report.axes import PAGE_WIDTH, POINTS, drawn, envelope, legend, line, log_ticks, y_label
 from mdnum.report.run import Run
 from mdnum.report.svg import BAD, FIRST, MUTED, SECOND, THIRD
@@ -72,7 +71,7 @@ def margins(run: Run, figure: Figure) -> None:
     counts, _ = np.histogram(np.log10(np.maximum(ratio, 0.1001)), edges)
     axes.stairs(counts, edges, color=FIRST, fill=True, alpha=0.35)
     axes.stairs(counts, edges, color=FIRST, lw=1.1, label="flips")
-    expected = analysis.expected_ambiguous(run.margins)
+    expected = run.expected_ambiguous
     if expected > 0:
         # a density that is even near zero puts counts in proportion to the width of a bin
         width = 10.0 ** edges[1:] - 10.0 ** edges[:-1]
@@ -102,10 +101,11 @@ def residence(run: Run, figure: Figure) -> None:
     """How long a pair keeps a decision between two flips."""
     axes = figure.subplots()
     lengths = run.stays
-    longest = max(lengths.inside.max(initial=10), lengths.outside.max(initial=10))
+    steps = np.arange(len(lengths.inside))
+    longest = max(10, *(np.flatnonzero(each).max(initial=0) for each in (lengths.inside, lengths.outside)))
     edges = np.unique(np.round(np.geomspace(1, longest + 1, 36)))
     for values, color, label in ((lengths.inside, FIRST, "inside"), (lengths.outside, SECOND, "outside")):
-        counts, _ = np.histogram(values, edges)
+        counts, _ = np.histogram(steps, edges, weights=values)
         # per step of width: bins of a few steps would otherwise look fuller than they are
         axes.stairs(
             counts / np.diff(edges), edges, color=color, lw=1.3, label=f"stays {label}", baseline=None

@@ -53,24 +53,21 @@ def sharpness(run: Run) -> tuple[float, float] | None:
 
 def summarize(run: Run) -> dict[str, Any]:
     """Numbers on flips that the report shows beside its figures."""
-    flips = run.flips
     lengths = run.stays
     ratio = run.margins
     finite = ratio[np.isfinite(ratio)]
-    loaded = len(flips["step"])
     undone = lengths.undone_within(CHATTER_STEPS)
     return {
         "total": run.flips_total,
-        "loaded": loaded,
         "per_step": run.flips_total / run.steps if run.steps else 0.0,
         "undone": undone,
-        "undone_share": undone / loaded if loaded else 0.0,
-        "inside_median": float(np.median(lengths.inside)) if len(lengths.inside) else None,
-        "outside_median": float(np.median(lengths.outside)) if len(lengths.outside) else None,
+        "undone_share": undone / run.flips_total if run.flips_total else 0.0,
+        "inside_median": analysis.median(lengths.inside),
+        "outside_median": analysis.median(lengths.outside),
         "pairs": len(run.busiest.i),
         "ratio_min": float(finite.min()) if len(finite) else None,
         "ratio_median": float(np.median(finite)) if len(finite) else None,
-        "expected_ambiguous": analysis.expected_ambiguous(ratio),
+        "expected_ambiguous": run.expected_ambiguous,
     }
 
 

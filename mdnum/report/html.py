@@ -8,18 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from mdnum.report import analysis, figures, findings, page
+from mdnum.report import figures, findings, page
 from mdnum.report.browse import Browse, Column, plain_rows
 from mdnum.report.page import picture
 from mdnum.report.rules import CHATTER_STEPS, residual
-from mdnum.report.run import FLIPS_LOADED, Run, load
+from mdnum.report.run import Run, load
 from mdnum.report.verdict import Verdict
 from mdnum.report.words import count, many, number, plain
 from mdnum.store import RunFolder
 from mdnum.store.atomic import write_text
 
-#: Rows of the flip table that the page carries.
-TABLE_ROWS = 5_000
 _BUSIEST = 10
 
 
@@ -71,7 +69,6 @@ def render(run: Run, verdict: Verdict, pictures: Mapping[str, str]) -> str:
         ase=list(_ase(run)),
         browsed=browsed,
         scripted=bool(browsed.rows),
-        flips_loaded=FLIPS_LOADED,
         provenance=list(page.flat(run.provenance)),
     )
 
@@ -81,7 +78,7 @@ def _titles(run: Run) -> dict[str, str]:
     # without a bound (whole numbers are compared) there is no unit to measure margins in
     if np.isfinite(run.margins).any():
         titles["margins"] = "Histogram of margins in units of the rounding bound"
-    if len(run.stays.all) > 1:
+    if run.stays.total > 1:
         titles["residence"] = "Histogram of the steps between two flips of a pair"
     if len(run.epochs["epoch"]):
         titles["lists"] = "Skin consumed and steps per neighbor list"
@@ -206,15 +203,12 @@ def _ase(run: Run) -> Iterator[tuple[str, str, str]]:
 
 def _browsed(run: Run) -> Browse:
     """The flips nearest to the threshold, in the order of steps."""
-    flips = run.flips
-    chosen = np.sort(analysis.closest(run.margins, TABLE_ROWS))
-    columns: list[tuple[np.ndarray, int | None]] = [
-        (flips[name][chosen], None) for name in ("step", "i", "j")
-    ]
-    columns.append((flips["entered"][chosen].astype(int), None))
+    flips = run.flips.nearest
+    columns: list[tuple[np.ndarray, int | None]] = [(flips[name], None) for name in ("step", "i", "j")]
+    columns.append((flips["entered"].astype(int), None))
     for name, digits in (("distance", 9), ("margin", 4), ("radial_speed", 4), ("energy_jump", 4)):
-        columns.append((flips[name][chosen], digits))
-    columns.append((run.margins[chosen], 3))
+        columns.append((flips[name], digits))
+    columns.append((flips["ratio"], 3))
     units = run.units
     return Browse(
         name="flips",

@@ -15,7 +15,7 @@ from markupsafe import Markup
 from mdnum.report import svg
 from mdnum.report.axes import PAGE_WIDTH, PHONE_WIDTH
 from mdnum.report.words import count, heading, many, number, percent, plain, typeset
-from mdnum.store.atomic import disk_errors, write_text
+from mdnum.store.atomic import subfolder, write_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -60,9 +60,7 @@ def picture(folder: Path, name: str, title: str, draw: Callable[[float], Figure]
     """
     page = svg.markup(draw(PAGE_WIDTH), name)
     phone = svg.markup(draw(PHONE_WIDTH), f"{name}-phone")
-    with disk_errors(folder / "figures"):
-        (folder / "figures").mkdir(exist_ok=True)
-    write_text(folder / "figures" / f"{name}.svg", svg.standalone(page))
+    write_text(subfolder(folder, "figures") / f"{name}.svg", svg.standalone(page))
     return Markup(
         f'<div class="wide">{svg.inline(page, title)}</div>'
         f'<div class="narrow">{svg.inline(phone, title)}</div>'

@@ -115,14 +115,13 @@ def _ledger(run: Run) -> Iterator[Finding]:
         text = f"The steps count {many(counted, 'flip')}; the table has {count(run.flips_total)}."
         yield Finding("LEDGER_INCOMPLETE", "error", title, text, "Run again in a new folder.")
         return
-    if len(run.flips["step"]) == run.flips_total:
-        wrong = np.flatnonzero(~analysis.flips_match_series(run.series, run.flips))
-        if len(wrong):
-            where = _step(run, wrong[0])
-            text = f"Steps and table count different flips at {many(len(wrong), 'step')}, first at {where}."
-            yield Finding("LEDGER_INCOMPLETE", "error", title, text, "Run again in a new folder.")
-            return
-    if not analysis.alternates(run.flips):
+    wrong = np.flatnonzero(~run.flips.matches(run.series))
+    if len(wrong):
+        where = _step(run, wrong[0])
+        text = f"Steps and table count different flips at {many(len(wrong), 'step')}, first at {where}."
+        yield Finding("LEDGER_INCOMPLETE", "error", title, text, "Run again in a new folder.")
+        return
+    if not run.flips.alternates:
         text = "A pair enters or leaves twice in a row; between the two there was a flip the other way."
         yield Finding("LEDGER_INCOMPLETE", "error", title, text, _remedy(run, _RECORDER))
 
@@ -168,7 +167,7 @@ def _ambiguous(run: Run) -> Iterator[Finding]:
         f"{many(ambiguous, 'decision')} came out as {'it' if ambiguous == 1 else 'they'} did by rounding: "
         "another order of summation, compiler or machine may decide otherwise, and follow another trajectory "
         f"from there. Atoms that cross the cutoff freely would give "
-        f"{number(analysis.expected_ambiguous(run.margins), 2)}."
+        f"{number(run.expected_ambiguous, 2)}."
     )
     remedy = "Move cutoff.radius between two neighbor shells."
     title = f"{many(ambiguous, 'decision')} within rounding of the cutoff"
@@ -176,7 +175,7 @@ def _ambiguous(run: Run) -> Iterator[Finding]:
 
 
 def _chatter(run: Run) -> Iterator[Finding]:
-    flips = len(run.flips["step"])
+    flips = run.flips_total
     undone = run.stays.undone_within(CHATTER_STEPS)
     # a handful of flips says nothing about the cutoff
     if flips < 20 or undone < CHATTER_SHARE * flips:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,8 +17,8 @@ from mdnum.report import analysis
 from mdnum.store import RunFolder
 from mdnum.units import Units
 
-#: Flips that are loaded; the counts per step come from the series and cover all of them.
-FLIPS_LOADED = 10_000_000
+#: Rows of the flip table that the page carries: those nearest to their threshold.
+TABLE_ROWS = 5_000
 
 
 @dataclass(frozen=True)
@@ -29,8 +28,7 @@ class Run:
     Attributes:
         summary, system, provenance: as written.
         series, epochs: arrays by column name.
-        flips: as series; the first `FLIPS_LOADED` of them.
-        flips_total: all flips in the table.
+        flips: what the table of flips says, which may be larger than memory.
     """
 
     path: Path
@@ -40,8 +38,7 @@ class Run:
     provenance: Mapping[str, Any]
     series: Mapping[str, np.ndarray]
     epochs: Mapping[str, np.ndarray]
-    flips: Mapping[str, np.ndarray]
-    flips_total: int
+    flips: analysis.Scan
 
     @property
     def name(self) -> str:
@@ -68,20 +65,30 @@ class Run:
         """Whether the total energy should stay what it was."""
         return (self.system.get("dynamics") or {}).get("kind", "nve") == "nve"
 
-    @cached_property
+    @property
+    def flips_total(self) -> int:
+        """All flips in the table."""
+        return self.flips.total
+
+    @property
     def stays(self) -> analysis.Stays:
         """Residence times of pairs on either side of the cutoff."""
-        return analysis.stays(self.flips)
+        return self.flips.stays
 
-    @cached_property
+    @property
     def margins(self) -> Float[np.ndarray, "flips"]:
         """|margin| of each flip in units of its rounding bound."""
-        return analysis.margins_in_bounds(self.flips)
+        return self.flips.ratios
 
     @cached_property
     def busiest(self) -> analysis.PairCounts:
         """Pairs by the number of their flips, most first."""
-        return analysis.busiest_pairs(self.flips)
+        return self.flips.busiest
+
+    @cached_property
+    def expected_ambiguous(self) -> float:
+        """Flips that one expects within their rounding bound."""
+        return analysis.expected_ambiguous(self.margins)
 
     @cached_property
     def budget(self) -> dict[str, np.ndarray]:
@@ -102,18 +109,26 @@ def load(folder: RunFolder | str | Path) -> Run:
         folder = RunFolder.open(folder)
     series = folder.read("series")
     if not len(series["step"]):
-        raise FolderError(
-            "holds no step of a run", remedy="Resume the run, or run again", where=str(folder.path)
-        )
-    toml = folder.system_toml
+        raise FolderError("holds no step of a run", remedy=folder.again, where=str(folder.path))
     return Run(
         path=folder.path,
         summary=folder.summary,
-        system=tomllib.loads(toml),
-        system_toml=toml,
+        system=folder.system,
+        system_toml=folder.system_toml,
         provenance=folder.provenance,
         series=series,
         epochs=folder.read("epochs"),
-        flips=folder.read("flips", rows=FLIPS_LOADED),
-        flips_total=folder.rows("flips"),
+        flips=_flips(folder, len(series["step"])),
     )
+
+
+_COLUMNS = ("step", "i", "j", "entered", "distance", "margin", "radial_speed", "energy_jump", "bound")
+
+
+def _flips(folder: RunFolder, steps: int) -> analysis.Scan:
+    seen = analysis.Scan(steps, TABLE_ROWS)
+    for batch in folder.batches("flips", _COLUMNS):
+        seen.take({name: batch[name].to_numpy() for name in _COLUMNS})
+    if not seen.nearest:
+        seen.take(folder.read("flips", _COLUMNS, rows=1))
+    return seen

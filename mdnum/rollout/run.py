@@ -344,11 +344,13 @@ def _finished(path: Path, steps: int | None) -> RunResult | None:
     if summary.get("status") != "complete" or not folder.has_checkpoint():
         return None
     saved = folder.load_checkpoint()
-    wanted = int(saved["steps"]) if steps is None else steps
-    if summary["steps"] != wanted:
-        return None
-    frames = (np.asarray(saved["first"], np.float64), np.asarray(saved["last"], np.float64))
-    return RunResult(path, summary, build(load(path / "system.toml")), frames)
+    with folder.explained():
+        wanted = int(saved["steps"]) if steps is None else steps
+        if summary["steps"] != wanted:
+            return None
+        folder.check_start()
+        frames = (np.asarray(saved["first"], np.float64), np.asarray(saved["last"], np.float64))
+        return RunResult(path, summary, build(load(path / "system.toml")), frames)
 
 
 def _resumed(path: Path, steps: int | None, progress, began) -> Rollout:
@@ -360,11 +362,18 @@ def _resumed(path: Path, steps: int | None, progress, began) -> Rollout:
             remedy="Start a new run with a shorter dynamics.timestep",
         )
     # a run that is refused stays as it is: resuming drops what was written after its checkpoint
-    if steps is not None and steps < int(np.asarray(folder.load_checkpoint()["state_step"])) - 1:
-        raise FolderError(f"has run past step {steps} already", where=str(path))
-    saved = folder.resume()
-    simulation = build(load(path / "system.toml"))
-    last = int(saved["steps"]) if steps is None else steps
-    rollout = Rollout(simulation, folder, last, int(saved["save_every"]), progress, began)
-    rollout.restore(saved)
+    with folder.explained():
+        state = folder.load_checkpoint()
+        if steps is not None and steps < int(np.asarray(state["state_step"])) - 1:
+            raise FolderError(f"has run past step {steps} already", where=str(path))
+        folder.check_start()
+        simulation = build(load(path / "system.toml"))
+        last = int(state["steps"]) if steps is None else steps
+        rollout = Rollout(simulation, folder, last, int(state["save_every"]), progress, began)
+        rollout.restore(state)
+    try:
+        folder.resume()
+    except BaseException:
+        folder.close()
+        raise
     return rollout

@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import os
+import re
 import sys
 import time
-from collections.abc import Mapping, Sequence
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 import numpy as np
 import pyarrow as pa
 
-from mdnum.errors import FolderError
-from mdnum.store import checkpoint
-from mdnum.store.atomic import disk_errors, write_text
+from mdnum.errors import FolderError, MdnumError
+from mdnum.store import checkpoint, manifest
+from mdnum.store.atomic import SUBFOLDERS, disk_errors, opened, read_text, refuse_link, write_text
 from mdnum.store.frames import FrameFile
-from mdnum.store.tables import COLUMNS, TABLES, TableStream
+from mdnum.store.tables import COLUMNS, TABLES, VERBS, TableStream
 
 if TYPE_CHECKING:
     from ase import Atoms
@@ -29,6 +33,22 @@ _FILES = (
     *(f"{name}.parquet" for name in COLUMNS),
 )  # fmt: skip
 _LOCK = ".lock"
+# of those, what nothing is read from: each report writes it anew
+_WRITTEN_ANEW = "report.html"
+# further files that numbers are read from, or that a page shows
+_FURTHER = re.compile(r"reproduce[\w.-]*\.py|structures/[^/]+\.extxyz")
+# what may be in a folder whose writing came to nothing
+_NOTHING_YET = (
+    "system.toml",
+    "structure.extxyz",
+    "provenance.json",
+    "log.txt",
+    manifest.NAME,
+    _LOCK,
+    "parts",
+)
+# what people do with system.toml and log.txt changes no number that was recorded
+_EDITED = ("system.toml", "log.txt")
 
 
 class RunFolder:
@@ -52,6 +72,14 @@ class RunFolder:
         self._frames = FrameFile(path / "trajectory.traj")
         self._log: TextIO | None = None
         self._lock: TextIO | None = None
+        # whether this object writes the folder, and not only something about it
+        self._owner = False
+        # names that were there before the folder was this one's
+        self._foreign: frozenset[str] = frozenset()
+        # what was compared with the manifest, by name: its size and time then, and what was wrong
+        self._checked: dict[str, tuple[tuple[int, int], str]] = {}
+        # what the manifest lists, and which file that was read from
+        self._manifest: tuple[tuple[int, int], dict[str, list[str]]] | None = None
         self._began = time.monotonic()
         self._written = -math.inf
         # the state that came too soon after the last checkpoint, and the rows there were then
@@ -74,15 +102,8 @@ class RunFolder:
             raise FolderError("is a file, not a folder", remedy="Choose another folder", where=str(path))
         present = sorted(entry.name for entry in folder.path.iterdir()) if folder.path.is_dir() else []
         present = [name for name in present if name != _LOCK]
-        if present and not overwrite:
-            holds_run = any(name in (*_FILES, "parts") for name in present)
-            raise FolderError(
-                "already holds a run" if holds_run else f"is not empty (it holds {present[0]!r})",
-                remedy="Choose another folder, resume that run or allow it to be overwritten"
-                if holds_run
-                else "Choose an empty or a new folder",
-                where=str(path),
-            )
+        if present and not overwrite and not _came_to_nothing(folder.path, present):
+            _refuse_to_overwrite(folder.path, present)
         try:
             folder.path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -91,11 +112,25 @@ class RunFolder:
             ) from error
         with disk_errors(folder.path):
             folder._take_lock()
-            for name in _FILES:
-                (folder.path / name).unlink(missing_ok=True)
-            for pattern in ("parts/*.parquet", "figures/*.svg", ".*.part", "parts/.*.part"):
+            for name in SUBFOLDERS:
+                # through a link, the files of somebody else would be removed
+                refuse_link(folder.path / name / "any")
+            made = manifest.load(folder.path) if present and not overwrite else None
+            for name in (*_FILES, manifest.NAME, *(made.files if made is not None else ())):
+                if (folder.path / name).parent == folder.path:
+                    (folder.path / name).unlink(missing_ok=True)
+            for pattern in (
+                "parts/*.parquet",
+                "figures/*.svg",
+                "structures/*.extxyz",
+                ".*.part",
+                "parts/.*.part",
+            ):
                 for file in folder.path.glob(pattern):
                     file.unlink()
+            folder._foreign = frozenset(entry.name for entry in folder.path.iterdir())
+            folder._owner = True
+            manifest.save(folder.path, manifest.Manifest(world))
         return folder
 
     @classmethod
@@ -111,11 +146,16 @@ class RunFolder:
         if not any((folder.path / name).exists() for name in (*_FILES, "parts")):
             raise FolderError("holds no run", remedy="Give the folder of a run", where=str(path))
 
+        made = manifest.load(folder.path)
+        if made is not None and made.world in TABLES:
+            folder.world = made.world
+            return folder
+
         def share(world: str) -> float:
             there = [(folder.path / f"{name}.parquet").exists() for name in TABLES[world]]
             return sum(there) / len(there)
 
-        # some tables are those of two worlds, and a folder from before has not all that there are now
+        # from before there were manifests: some tables are those of two worlds, and some came later
         likeliest = max(TABLES, key=share)
         folder.world = likeliest if share(likeliest) > 0 else folder.world
         return folder
@@ -142,7 +182,7 @@ class RunFolder:
         path = self.path / "log.txt"
         with disk_errors(path):
             if self._log is None:
-                self._log = open(path, "a", encoding="utf-8")  # noqa: SIM115
+                self._log = io.TextIOWrapper(opened(path, "ab"), encoding="utf-8")
             self._log.write(line.rstrip("\n") + "\n")
             self._log.flush()
 
@@ -181,6 +221,8 @@ class RunFolder:
             self._write_checkpoint(self._pending[0])
         for name in dict.fromkeys((*TABLES[self.world], *self._streams)):
             self._stream(name).merge()
+        self._owner = True
+        self._list_files(finished=True)
         parts = self.path / "parts"
         if parts.is_dir() and not any(parts.iterdir()):
             parts.rmdir()
@@ -201,10 +243,22 @@ class RunFolder:
     def write_summary(self, summary: Mapping[str, Any]) -> None:
         """Writes summary.json (NaN and infinity, which JSON does not have, become null)."""
         self._write_json("summary.json", summary)
+        made = manifest.load(self.path) if self._owner else None
+        if made is not None and made.finished:
+            # a summary is written last, so that scripts and the like are there by now
+            self._list_files()
 
     def write_provenance(self, provenance: Mapping[str, Any]) -> None:
-        """Writes provenance.json."""
+        """Writes provenance.json, when everything that a run starts from is in the folder."""
         self._write_json("provenance.json", provenance)
+        if self._owner:
+            names = {entry.name for entry in self.path.iterdir() if not entry.name.startswith(".")}
+            names -= {*self._foreign, *SUBFOLDERS, "log.txt", manifest.NAME}
+            manifest.update(self.path, manifest.listed_files(self.path, names))
+
+    def drop_checkpoint(self) -> None:
+        """Removes the checkpoint of what is finished and would never be resumed."""
+        manifest.remove(self.path / "checkpoint.npz")
 
     # -- resuming --------------------------------------------------------------------------------
 
@@ -229,14 +283,23 @@ class RunFolder:
         self._take_lock()
         state, store = self._read_checkpoint()
         with disk_errors(self.path):
+            # nothing is dropped from a folder that will not be resumed
+            for name in ("trajectory.traj", "log.txt"):
+                refuse_link(self.path / name, in_place=True)
+            for name in self._listed():
+                if name not in ("log.txt", "summary.json"):
+                    self.check(name)
+            self._owner = True
+            manifest.update(self.path, {}, ["trajectory.traj", "log.txt", "summary.json"], finished=False)
             for pattern in (".*.part", "parts/.*.part"):
                 for file in self.path.glob(pattern):
                     file.unlink()
             for name, rows in store["rows"].items():
                 self._stream(name).truncate(rows)
-            self._frames.truncate(tuple(store["frames"]))
+            self._frames.truncate(store["frames"])
             if (log := self.path / "log.txt").exists():
-                os.truncate(log, min(store["log"], log.stat().st_size))
+                with opened(log, "r+b") as file:
+                    os.ftruncate(file.fileno(), min(store["log"], log.stat().st_size))
         return state
 
     def take(self) -> None:
@@ -256,20 +319,34 @@ class RunFolder:
             columns: only these.
             rows: at most the first rows.
         """
-        return TableStream(self.path, name, self.world).read(
-            columns, min(self.rows(name), rows or sys.maxsize)
-        )
+        return self._reader(name).read(columns, min(self.rows(name), rows or sys.maxsize))
+
+    def batches(self, name: str, columns: Sequence[str] | None = None) -> Iterator[pa.Table]:
+        """The rows of `table` a part at a time, for a table that is larger than memory.
+
+        Args:
+            columns: only these.
+        """
+        left = self.rows(name)
+        for batch in self._reader(name).batches(columns):
+            if left <= 0:
+                return
+            yield batch.slice(0, left)
+            left -= batch.num_rows
 
     def read(
         self, name: str, columns: Sequence[str] | None = None, rows: int | None = None
     ) -> dict[str, np.ndarray]:
         """As `table`, a numpy array by column name."""
         table = self.table(name, columns, rows)
+        empty = [key for key in table.column_names if table[key].null_count]
+        if empty:
+            raise FolderError(f"column {empty[0]!r} of table {name!r} has gaps", where=str(self.path))
         return {key: table[key].to_numpy() for key in table.column_names}
 
     def rows(self, name: str) -> int:
         """Rows of a table that `table` gives."""
-        stream = TableStream(self.path, name, self.world)
+        stream = self._reader(name)
         if stream.parts() and self.has_checkpoint():
             # series and flips of an unfinished run agree with one another only at a checkpoint
             return self._read_checkpoint()[1]["rows"].get(name, 0)
@@ -278,7 +355,20 @@ class RunFolder:
     @property
     def system_toml(self) -> str:
         """The text of system.toml."""
-        return self._read_text("system.toml")
+        return read_text(self.path / "system.toml")
+
+    @property
+    def system(self) -> dict[str, Any]:
+        """The tables of system.toml; empty if there is none.
+
+        Raises:
+            FolderError: it is no TOML.
+        """
+        try:
+            return tomllib.loads(self.system_toml)
+        except (ValueError, RecursionError) as error:
+            where = str(self.path / "system.toml")
+            raise FolderError(f"is damaged: not valid TOML ({error})", where=where) from error
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -286,9 +376,90 @@ class RunFolder:
         return self._read_json("summary.json")
 
     @property
+    def verb(self) -> str:
+        """What of the command line made it."""
+        return VERBS.get(self.world, "run")
+
+    @property
+    def again(self) -> str:
+        """What can be done about a folder that was not finished, an imperative sentence."""
+        return _again(self.path)
+
+    @property
     def provenance(self) -> dict[str, Any]:
         """provenance.json; empty if it was not written."""
         return self._read_json("provenance.json")
+
+    def damaged(self) -> dict[str, str]:
+        """Files that are not as they were written: what is wrong with them, by name.
+
+        Raises:
+            FolderError: the manifest itself is damaged.
+        """
+        return {name: wrong for name in self._listed() if (wrong := self._wrong(name))}
+
+    def check(self, name: str) -> None:
+        """Compares a file with the manifest; one that is not listed is not compared.
+
+        Raises:
+            FolderError: it changed since it was written, or is gone.
+        """
+        if wrong := self._wrong(name):
+            others = self.damaged()
+            tables = [each for each in self._listed() if each.endswith((".parquet", ".traj"))]
+            # part files by their number only
+            sound = [each for each in tables if each not in others and "/" not in each]
+            told = f"; {', '.join(sound)} can still be read" if sound else ""
+            raise FolderError(
+                f"{wrong}{told}",
+                remedy="Restore it from a copy, or run again in a new folder",
+                where=str(self.path / name),
+            )
+
+    @contextmanager
+    def explained(self) -> Iterator[None]:
+        """Whatever goes wrong in here because the folder is not what was written is told in one line.
+
+        Raises:
+            FolderError: the folder is damaged, or unfinished, or has no manifest. What goes wrong with one
+                whose files are all as they were written is a mistake of mdnum and remains what it is.
+        """
+        try:
+            yield
+        except (MdnumError, OSError):
+            raise
+        except Exception as error:
+            made = manifest.load(self.path)
+            wrong = self.damaged()
+            if made is not None and made.finished and not wrong and "summary.json" in made.files:
+                raise
+            seen = " ".join(str(error).split())[:200]
+            names = f" (damaged: {', '.join(wrong)})" if wrong else ""
+            raise FolderError(
+                f"what it holds is not what mdnum writes{names}: {type(error).__name__} {seen}".rstrip(),
+                remedy="Restore it from a copy, or run again in a new folder",
+                where=str(self.path),
+            ) from error
+
+    def check_start(self) -> None:
+        """Compares what a run begins with, its system and what belongs to it, with the manifest.
+
+        Raises:
+            FolderError: it was changed, so that a run of it would be another one.
+        """
+        for name in self._listed():
+            if name in ("system.toml", "structure.extxyz") or (
+                name not in _FILES and "/" not in name and not _FURTHER.fullmatch(name)
+            ):
+                self.check(name)
+
+    def noted(self) -> list[str]:
+        """A line for each file that is not as it was written, and for a folder in which that is unknown."""
+        if not (self.path / manifest.NAME).exists():
+            return [
+                f"{self.path}: has no {manifest.NAME}, so that nothing in it could be checked for damage."
+            ]
+        return [f"{self.path / name}: {wrong}." for name, wrong in self.damaged().items()]
 
     # -- inside ----------------------------------------------------------------------------------
 
@@ -296,6 +467,66 @@ class RunFolder:
         if name not in self._streams:
             self._streams[name] = TableStream(self.path, name, self.world)
         return self._streams[name]
+
+    def _reader(self, name: str) -> TableStream:
+        merged = f"{name}.parquet"
+        if not (self.path / merged).exists():
+            self.check(merged)
+        return TableStream(self.path, name, self.world, lambda path: self.check(manifest.place(path)[1]))
+
+    def _listed(self) -> dict[str, list[str]]:
+        path = self.path / manifest.NAME
+        try:
+            seen = os.lstat(path)
+        except FileNotFoundError:
+            return {}
+        # it is replaced, never written in place
+        state = (seen.st_ino, seen.st_mtime_ns)
+        if self._manifest is None or self._manifest[0] != state:
+            made = manifest.load(self.path)
+            self._manifest = (state, {} if made is None else made.files)
+        return self._manifest[1]
+
+    def _wrong(self, name: str) -> str:
+        """What is wrong with a file that the manifest lists; nothing where it does not."""
+        allowed = self._listed().get(name)
+        if allowed is None:
+            return ""
+        path = self.path / name
+        refuse_link(path)
+        try:
+            seen = path.stat()
+        except (FileNotFoundError, NotADirectoryError):
+            return "" if manifest.ABSENT in allowed else "is missing"
+        state = (seen.st_size, seen.st_mtime_ns)
+        if self._checked.get(name, ((), ""))[0] != state:
+            found = manifest.digest(path)
+            while found not in allowed and (now := self._listed().get(name, [found])) != allowed:
+                # a run that goes on replaced the file meanwhile
+                allowed, found = now, manifest.digest(path)
+            edited = "was changed since it was written"
+            wrong = edited if name in _EDITED else "is damaged: its bytes are not those that were written"
+            self._checked[name] = (state, "" if found in allowed else wrong)
+        return self._checked[name][1]
+
+    def _list_files(self, finished: bool | None = None) -> None:
+        """Lists the files of this folder that nobody else lists, those that grew since anew."""
+        listed = self._listed()
+        there = [f"structures/{entry.name}" for entry in (self.path / "structures").glob("*.extxyz")]
+        there += [entry.name for entry in self.path.iterdir() if entry.name not in self._foreign]
+        fixed = {name for name in _FILES if name != _WRITTEN_ANEW and not name.endswith(".parquet")}
+        names = [
+            name
+            for name in there
+            if name in ("log.txt", "trajectory.traj")
+            or (name not in listed and (name in fixed or _FURTHER.fullmatch(name)))
+        ]
+        now = manifest.listed_files(self.path, names)
+        for name, allowed in listed.items():
+            # what was about to be replaced has been
+            if len(allowed) > 1 and name not in now and (one := manifest.digest(self.path / name)) in allowed:
+                now[name] = [one]
+        manifest.update(self.path, now, finished=finished)
 
     def _rows(self) -> dict[str, int]:
         return {name: stream.rows for name, stream in self._streams.items()}
@@ -310,23 +541,40 @@ class RunFolder:
             "frames": self._frames.mark(),
             "log": log.stat().st_size if log.exists() else 0,
         }
-        checkpoint.write(self.path / "checkpoint.npz", state, store)
+        written = {}
+        for stream in self._streams.values():
+            written |= {name: each for name, each in stream.written.items() if name.startswith("parts/")}
+            stream.written = {}
+        checkpoint.write(self.path / "checkpoint.npz", state, store, written)
         self._written = time.monotonic()
         self._pending = None
 
     def _read_checkpoint(self) -> tuple[dict[str, Any], dict[str, Any]]:
         if not self.has_checkpoint():
             raise FolderError(
-                "has no checkpoint to resume from", remedy="Run again in a new folder", where=str(self.path)
+                "has no checkpoint to resume from", remedy=f"{_again(self.path)}", where=str(self.path)
             )
-        return checkpoint.read(self.path / "checkpoint.npz")
+        self.check("checkpoint.npz")
+        path = self.path / "checkpoint.npz"
+        state, store = checkpoint.read(path)
+        rows, mark, log = store.get("rows"), store.get("frames"), store.get("log")
+        # names of tables become names of files
+        if (
+            not (isinstance(rows, dict) and isinstance(mark, list) and len(mark) == 3)
+            or not set(rows) <= set(COLUMNS)
+            or not all(isinstance(count, int) and count >= 0 for count in (*rows.values(), *mark, log))
+        ):
+            raise FolderError(
+                "counts what no folder of mdnum has", remedy="Run again in a new folder", where=str(path)
+            )
+        return state, {"rows": rows, "frames": tuple(mark), "log": log}
 
     def _take_lock(self) -> None:
         if os.name != "posix":
             return
         import fcntl
 
-        lock = open(self.path / _LOCK, "w")  # noqa: SIM115
+        lock = io.TextIOWrapper(opened(self.path / _LOCK, "ab"))
         try:
             # the system frees it when the process dies, however it dies
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -345,16 +593,54 @@ class RunFolder:
         text = json.dumps(_plain(value), indent=2, ensure_ascii=False, allow_nan=False)
         write_text(self.path / name, text + "\n")
 
-    def _read_text(self, name: str) -> str:
-        path = self.path / name
-        return path.read_text(encoding="utf-8") if path.exists() else ""
-
     def _read_json(self, name: str) -> dict[str, Any]:
-        text = self._read_text(name)
+        self.check(name)
+        text = read_text(self.path / name)
         try:
-            return json.loads(text) if text else {}
-        except json.JSONDecodeError as error:
-            raise FolderError(f"not valid JSON ({error})", where=str(self.path / name)) from error
+            held = json.loads(text) if text else {}
+        except (ValueError, RecursionError) as error:
+            raise FolderError(f"is damaged: not valid JSON ({error})", where=str(self.path / name)) from error
+        if not isinstance(held, dict):
+            raise FolderError("is damaged: holds no JSON object", where=str(self.path / name))
+        return held
+
+
+def _came_to_nothing(path: Path, present: Sequence[str]) -> bool:
+    """Whether a folder holds what a start left behind that was stopped before anything was computed."""
+    made = manifest.load(path)
+    if made is None or made.finished or (path / "parts").is_symlink():
+        return False
+    known = {*_NOTHING_YET, *made.files}
+    return all(name in known or re.fullmatch(r"\.[0-9a-f]{16}\.part", name) for name in present) and not (
+        "checkpoint.npz" in present or any((path / "parts").glob("*.parquet"))
+    )
+
+
+def _refuse_to_overwrite(path: Path, present: Sequence[str]) -> None:
+    """Raises what there is to say of a folder that is not empty."""
+    if not any(name in (*_FILES, "parts", manifest.NAME) for name in present):
+        raise FolderError(
+            f"is not empty (it holds {present[0]!r})",
+            remedy="Choose an empty or a new folder",
+            where=str(path),
+        )
+    made = manifest.load(path)
+    stopped = made is not None and not made.finished
+    remedy = _again(path) if stopped or manifest.resumable(path) else "Choose another folder, or remove it"
+    raise FolderError("already holds a run", remedy=remedy, where=str(path))
+
+
+def _again(path: Path) -> str:
+    """What can be done about a folder that was not finished."""
+    made = manifest.load(path)
+    verb = f"mdnum {VERBS.get(made.world, 'run')}" if made is not None else "mdnum run"
+    if manifest.resumable(path):
+        return f"Continue it with `mdnum run --resume {path}`, or choose another folder"
+    if (path / "answers.json").exists():
+        return f"Continue it with `{verb} --resume {path}`, or choose another folder"
+    if _came_to_nothing(path, [entry.name for entry in path.iterdir()]):
+        return f"Nothing was computed in it yet: give the `{verb}` command again"
+    return f"It cannot be continued: give the `{verb}` command again for another folder, or remove this one"
 
 
 def _plain(value: Any) -> Any:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mdnum.errors import FolderError
-from mdnum.store.atomic import disk_errors
+from mdnum.store.atomic import disk_errors, opened, refuse_link
 
 if TYPE_CHECKING:
     from ase import Atoms
@@ -33,6 +33,7 @@ class FrameFile:
         """
         from ase.io.trajectory import TrajectoryWriter
 
+        refuse_link(self.path, in_place=True)
         mark = self.mark()
         with disk_errors(self.path):
             try:
@@ -48,7 +49,7 @@ class FrameFile:
         """(frames, position of the offset table, bytes) of the file now; zeros before the first frame."""
         if not self.path.exists() or self.path.stat().st_size < _FRAMES_AT + _HEADER.size:
             return (0, 0, 0)
-        with open(self.path, "rb") as file:
+        with opened(self.path) as file:
             file.seek(_FRAMES_AT)
             frames, table = _HEADER.unpack(file.read(_HEADER.size))
         return (frames, table, self.path.stat().st_size)
@@ -69,11 +70,11 @@ class FrameFile:
                 remedy="The folder was changed since; run again in a new folder",
                 where=str(self.path),
             )
-        with disk_errors(self.path), open(self.path, "r+b") as file:
+        with disk_errors(self.path), opened(self.path, "r+b") as file:
             file.seek(_FRAMES_AT)
             file.write(_HEADER.pack(frames, table))
             file.flush()
-            os.truncate(self.path, size)
+            os.ftruncate(file.fileno(), size)
 
     def close(self) -> None:
         """Closes the file; the next frame opens it again."""

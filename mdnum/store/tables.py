@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import io
-import os
-from collections.abc import Iterator, Mapping, Sequence
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -14,7 +14,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from mdnum.errors import FolderError
-from mdnum.store.atomic import disk_errors, write_bytes
+from mdnum.store import manifest
+from mdnum.store.atomic import disk_errors, opened, replacing, subfolder
 
 _FLOAT, _INT, _SHORT, _BOOL, _TEXT = pa.float64(), pa.int64(), pa.int32(), pa.bool_(), pa.string()
 
@@ -190,10 +191,21 @@ TABLES: Mapping[str, tuple[str, ...]] = MappingProxyType(
     }
 )
 
+#: The verb of the command line that makes a folder of a world.
+VERBS: Mapping[str, str] = MappingProxyType(
+    {
+        **dict.fromkeys(TABLES, "fork"),
+        "md": "run", "ball": "ball", "audit": "audit", "grad": "grad", "conform": "conform", "flips": "flips",
+        "flips-compare": "flips",
+    }
+)  # fmt: skip
+
 # rows held back before a part is written without waiting for a checkpoint: bounds the memory of a run
 _BUFFER_ROWS = 100_000
 # fixed, so that the merged file has the same bytes however the run was cut into parts
 _GROUP_ROWS = 262_144
+# every page carries a checksum, which whoever reads the file can ask for
+_WRITTEN: Mapping[str, Any] = MappingProxyType({"compression": "zstd", "write_page_checksum": True})
 
 
 class TableStream:
@@ -203,8 +215,14 @@ class TableStream:
     leaves a folder whose rows cannot be told apart, wherever it was killed.
     """
 
-    def __init__(self, root: Path, name: str, world: str = "md"):
+    def __init__(self, root: Path, name: str, world: str = "md", check: Callable[[Path], None] | None = None):
+        if not re.fullmatch(r"[a-z][a-z_]*", name):
+            raise FolderError(f"no table is called {name!r}", where=str(root))
         self.name = name
+        self._root = root
+        self._check = check
+        #: digests of the part files that were written, by name
+        self.written: dict[str, list[str]] = {}
         self._known = columns_of(world, name)
         self.merged_path = root / f"{name}.parquet"
         self.parts_folder = root / "parts"
@@ -214,7 +232,8 @@ class TableStream:
         files = self.files()
         self.flushed = sum(rows for _, rows in files)
         if files:
-            self._schema = pq.read_schema(files[0][0])
+            with _parquet(files[0][0]) as file:
+                self._schema = file.schema_arrow
 
     @property
     def rows(self) -> int:
@@ -224,14 +243,15 @@ class TableStream:
     def parts(self) -> list[tuple[int, Path]]:
         """(first row, path) of the part files, in order."""
         found = self.parts_folder.glob(f"{self.name}-*.parquet")
-        return sorted((int(path.stem.rsplit("-", 1)[1]), path) for path in found)
+        named = re.compile(re.escape(self.name) + r"-(\d{12,})\.parquet")
+        return sorted((int(match[1]), path) for path in found if (match := named.fullmatch(path.name)))
 
     def files(self) -> list[tuple[Path, int]]:
         """(path, rows) of the files that make up the table, gap-free; parts already merged are skipped."""
         files: list[tuple[Path, int]] = []
         rows = 0
         if self.merged_path.exists():
-            rows = _row_count(self.merged_path)
+            rows = self._row_count(self.merged_path)
             files.append((self.merged_path, rows))
         for start, path in self.parts():
             if start < rows:
@@ -242,7 +262,7 @@ class TableStream:
                     remedy="A part file was removed; run again in a new folder",
                     where=str(self.parts_folder),
                 )
-            count = _row_count(path)
+            count = self._row_count(path)
             files.append((path, count))
             rows += count
         return files
@@ -266,11 +286,8 @@ class TableStream:
         if not self._buffered:
             return
         table = pa.concat_tables(self._buffer).combine_chunks()
-        with disk_errors(self.parts_folder):
-            self.parts_folder.mkdir(exist_ok=True)
-        sink = io.BytesIO()
-        pq.write_table(table, sink, compression="zstd")
-        write_bytes(self.parts_folder / f"{self.name}-{self.flushed:012d}.parquet", sink.getbuffer())
+        subfolder(self._root, "parts")
+        self._replace(self.parts_folder / f"{self.name}-{self.flushed:012d}.parquet", [table])
         self.flushed += self._buffered
         self._buffer, self._buffered = [], 0
 
@@ -286,19 +303,20 @@ class TableStream:
                 where=str(self.merged_path.parent),
             )
         # parts of a merge that was killed before it removed them: their rows are in the merged file
-        for _, path in self.parts():
-            if path not in [used for used, _ in files]:
-                path.unlink()
+        used = {path for path, _ in files}
+        gone = [path for _, path in self.parts() if path not in used]
         first = 0
         for path, count in files:
             if first >= rows:
-                path.unlink()
+                gone.append(path)
             elif rows < first + count:
-                sink = io.BytesIO()
-                with pq.ParquetFile(path) as file:
-                    pq.write_table(file.read().slice(0, rows - first), sink, compression="zstd")
-                write_bytes(path, sink.getbuffer())
+                with _parquet(path) as file:
+                    kept = file.read().slice(0, rows - first)
+                self._replace(path, [kept])
             first += count
+        manifest.update(self._root, {}, [manifest.place(path)[1] for path in gone])
+        for path in gone:
+            path.unlink()
         self.flushed = rows
 
     def merge(self) -> None:
@@ -308,24 +326,20 @@ class TableStream:
             return
         if self._schema is None:
             self._schema = pa.schema(list(self._known.items()))
-        temporary = self.merged_path.with_name(f".{self.merged_path.name}.part")
-        with disk_errors(self.merged_path):
-            try:
-                with pq.ParquetWriter(temporary, self._schema, compression="zstd") as writer:
-                    for group in _regroup(self.batches(), _GROUP_ROWS):
-                        writer.write_table(group, row_group_size=_GROUP_ROWS)
-                os.replace(temporary, self.merged_path)
-            except OSError:
-                temporary.unlink(missing_ok=True)
-                raise
-            for _, path in self.parts():
+        self._replace(self.merged_path, _regroup(self.batches(), _GROUP_ROWS))
+        parts = [path for _, path in self.parts()]
+        merged = self.merged_path.name
+        # rows of parts that are in the merged file are not looked at any more
+        manifest.update(self._root, {merged: self.written[merged]}, [f"parts/{path.name}" for path in parts])
+        with disk_errors(self.parts_folder):
+            for path in parts:
                 path.unlink()
 
     def batches(self, columns: Sequence[str] | None = None) -> Iterator[pa.Table]:
         """The rows on disk in order, a file or row group at a time."""
         for path, _ in self.files():
-            # partitioning is off: pyarrow would otherwise read meaning into the folder's name
-            with pq.ParquetFile(path) as file:
+            with _parquet(path) as file:
+                self._refuse_columns(path, file.schema_arrow, columns)
                 for group in range(file.num_row_groups):
                     yield file.read_row_group(group, columns=columns)
 
@@ -349,6 +363,39 @@ class TableStream:
             return pa.schema([(name, fields[name]) for name in names]).empty_table()
         table = pa.concat_tables(tables)
         return table if rows is None else table.slice(0, rows)
+
+    def _row_count(self, path: Path) -> int:
+        if self._check is not None:
+            self._check(path)
+        with _parquet(path) as file:
+            return file.metadata.num_rows
+
+    def _replace(self, path: Path, tables: Iterable[pa.Table]) -> None:
+        """Writes rows into a file of this table, which the manifest expects before it is there."""
+        schema = self._schema
+        with replacing(path) as file:
+            with pq.ParquetWriter(file, schema, **_WRITTEN) as writer:
+                for table in tables:
+                    writer.write_table(table, row_group_size=_GROUP_ROWS)
+            file.flush()
+            found = manifest.digest_of_file(file)
+            root, name = manifest.place(path)
+            if path == self.merged_path:
+                manifest.update(root, {name: [manifest.digest(path), found]})
+            elif path.exists():
+                manifest.foretell(path, found)
+        self.written[name] = [found]
+
+    def _refuse_columns(self, path: Path, schema: pa.Schema, wanted: Sequence[str] | None) -> None:
+        """Refuses columns of another type than this table's, and a file without those that are wanted."""
+        found = {field.name: field.type for field in schema}
+        other = [name for name, kind in self._known.items() if found.get(name, kind) != kind]
+        missing = [name for name in wanted or () if name not in found]
+        if other or missing:
+            seen = f"column {other[0]!r} holds {found[other[0]]}" if other else f"no column {missing[0]!r}"
+            raise FolderError(
+                f"is not a table of {self.name} ({seen})", remedy="Run again in a new folder", where=str(path)
+            )
 
     def _table(self, columns: Mapping[str, Any]) -> pa.Table:
         schema = self._schema
@@ -377,12 +424,18 @@ def _array(values: Any, kind: pa.DataType) -> pa.Array:
     return pa.array(values, from_pandas=False).cast(kind) if values.size else pa.array([], kind)
 
 
-def _row_count(path: Path) -> int:
+@contextmanager
+def _parquet(path: Path) -> Iterator[pq.ParquetFile]:
+    """A parquet file whose pages are compared with their checksums as they are read."""
     try:
-        return pq.read_metadata(path).num_rows
-    except (OSError, pa.ArrowInvalid) as error:
+        with opened(path) as raw, pq.ParquetFile(raw, page_checksum_verification=True) as file:
+            yield file
+    except (OSError, pa.ArrowException, MemoryError) as error:
+        seen = " ".join(str(error).split())[:200]
         raise FolderError(
-            f"not a readable parquet file ({error})", where=str(path), remedy="Run again in a new folder"
+            f"is damaged: not a readable parquet file ({seen})",
+            where=str(path),
+            remedy="Restore it from a copy, or run again in a new folder",
         ) from error
 
 

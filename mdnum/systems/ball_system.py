@@ -11,7 +11,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from mdnum.errors import InputError
-from mdnum.store.atomic import disk_errors
+from mdnum.store.atomic import disk_errors, write_text
 from mdnum.systems import ball_checks, messages, overrides, toml
 from mdnum.systems.ball import BallSpec, ValuesControl
 from mdnum.systems.find import SYSTEM_FILE
@@ -131,8 +131,8 @@ class BallSystem:
         target = Path(folder)
         with disk_errors(target):
             target.mkdir(parents=True, exist_ok=True)
-            path = target / SYSTEM_FILE
-            path.write_text(self.to_toml(), encoding="utf-8")
+        path = target / SYSTEM_FILE
+        write_text(path, self.to_toml())
         return path
 
 

@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from mdnum import units as unit_systems
 from mdnum.errors import InputError
-from mdnum.store.atomic import disk_errors
+from mdnum.store.atomic import disk_errors, replacing, write_text
 from mdnum.systems import messages, pairs, schema, structures, toml
 from mdnum.systems import overrides as overrides_module
 from mdnum.systems.ball_system import BALL_SCHEMA, BallSystem, Source, kind_first
@@ -113,10 +113,11 @@ class System:
             target.mkdir(parents=True, exist_ok=True)
             for table in self.tables:
                 if table.resolve() != (target / table.name).resolve():
-                    shutil.copyfile(table, target / table.name)
-            (target / STRUCTURE_FILE).write_text(structures.to_extxyz(self.atoms), encoding="utf-8")
-            path = target / SYSTEM_FILE
-            path.write_text(self.to_toml(), encoding="utf-8")
+                    with replacing(target / table.name) as file:
+                        file.write(table.read_bytes())
+        path = target / SYSTEM_FILE
+        write_text(target / STRUCTURE_FILE, structures.to_extxyz(self.atoms))
+        write_text(path, self.to_toml())
         return path
 
 

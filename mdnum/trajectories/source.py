@@ -163,6 +163,9 @@ def open_trajectory(
         raise InputError(f"frames are named twice, by @{words} and by {slice!r}", remedy="Name them once")
     frames = parse_slice(slice or words, where=str(path))
     if file.is_dir() and (file / "trajectory.traj").exists():
+        from mdnum.store import RunFolder
+
+        RunFolder.open(file).check("trajectory.traj")
         file = file / "trajectory.traj"
     if file.is_dir():
         if (file / "summary.json").exists():

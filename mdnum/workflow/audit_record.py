@@ -13,8 +13,8 @@ import numpy as np
 from mdnum.audit.causes import grouped
 from mdnum.errors import FolderError, InputError
 from mdnum.references.findings import plain
-from mdnum.store import RunFolder
-from mdnum.store.atomic import write_text
+from mdnum.store import RunFolder, manifest
+from mdnum.store.atomic import subfolder, write_text
 from mdnum.units import METAL
 
 if TYPE_CHECKING:
@@ -217,7 +217,7 @@ def open_again(path: str | Path, calculator: Any, load: Callable[[Any], Loaded])
     try:
         for file in (folder.path / STRUCTURES).glob("failed-*.extxyz"):
             if file.name not in state["files"]:
-                file.unlink()
+                manifest.remove(file)
         atoms = decode(state["atoms"])
         if not isinstance(atoms, Atoms):
             raise FolderError("has no structure in its checkpoint", where=str(path))
@@ -293,7 +293,7 @@ def write_structures(folder: Path, structures: Mapping[str, Atoms]) -> None:
     from mdnum.audit.subject import exact_extxyz
 
     if structures:
-        (folder / STRUCTURES).mkdir(exist_ok=True)
+        subfolder(folder, STRUCTURES)
     for name, atoms in structures.items():
         write_text(folder / STRUCTURES / f"{name}.extxyz", exact_extxyz(atoms))
 

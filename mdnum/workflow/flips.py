@@ -153,7 +153,7 @@ def _look(
             if coded is not None:
                 told[-1][name] = [_as_asked(row, coded, groups) for row in told[-1][name]]
     folder.finalize()
-    (folder.path / "checkpoint.npz").unlink(missing_ok=True)
+    folder.drop_checkpoint()
     folder.write_summary(
         {
             **about(trajectory, "flips"),

@@ -142,7 +142,7 @@ def _look(
     ]  # fmt: skip
     found = _follow(folder, sets, groups, Log(folder, progress))
     folder.finalize()
-    (folder.path / "checkpoint.npz").unlink(missing_ok=True)
+    folder.drop_checkpoint()
     a, b = both
     table = folder.read("apart", ["time", "furthest", "bound"])
     differing = folder.read("differing")

@@ -94,7 +94,7 @@ def leave(folder: RunFolder) -> None:
     if any((folder.path / "parts").glob("*.parquet")):
         return
     with suppress(OSError):
-        for name in ("provenance.json", "log.txt", ".lock"):
+        for name in ("provenance.json", "log.txt", "manifest.json", ".lock"):
             (folder.path / name).unlink(missing_ok=True)
         folder.path.rmdir()
         # `runs` too, where it was made for this

@@ -52,11 +52,16 @@ def run(
 
     if isinstance(system, BallSystem):
         raise InputError("this system is a ball", where=system.name, remedy="Use mdnum.bounce")
-    if resume is not None and Path(resume).is_dir() and RunFolder.open(resume).world == "ball":
+    if resume is not None and Path(resume).is_dir() and (folder := RunFolder.open(resume)).world != "md":
+        ball = folder.world == "ball"
         raise InputError(
-            "is a run of the ball, which takes seconds and leaves nothing to resume",
+            "is a run of the ball, which takes seconds and leaves nothing to resume"
+            if ball
+            else f"is the folder of `mdnum {folder.verb}`, and no run",
             where=str(resume),
-            remedy=f"Run it again with `mdnum ball {resume}`",
+            remedy=f"Run it again with `mdnum ball {resume}`"
+            if ball
+            else f"`mdnum report {resume}` shows it",
         )
     try:
         result = roll_out(

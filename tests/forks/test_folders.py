@@ -19,6 +19,11 @@ from mdnum.rollout.run import run
 STEPS = 260
 
 
+def copied(folder: Path, to: Path) -> Path:
+    """A copy that may be edited: its manifest, which would tell, is left out."""
+    return Path(shutil.copytree(folder, to, ignore=shutil.ignore_patterns("manifest.json")))
+
+
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory):
     root = tmp_path_factory.mktemp("folders")
@@ -35,7 +40,7 @@ def folders(tmp_path_factory):
     plain = made("plain")
 
     def edited(name, *words):
-        copy = Path(shutil.copytree(plain, root / name))
+        copy = copied(plain, root / name)
         text = (copy / "system.toml").read_text()
         for old, new in words:
             assert old in text
@@ -109,7 +114,7 @@ def test_other_starts_are_said_and_are_a_difference(folders):
 
 def test_other_systems_are_refused_by_what_differs(folders, tmp_path):
     other = tmp_path / "other"
-    shutil.copytree(folders["plain"], other)
+    copied(folders["plain"], other)
     system = (other / "system.toml").read_text()
     (other / "system.toml").write_text(system.replace('"lennard-jones"', '"soft-sphere"'))
     with pytest.raises(InputError, match=r"potential\.kind is lennard-jones in the first and soft-sphere"):
@@ -142,7 +147,7 @@ def test_fork_folders_are_told_from_runs(folders, tmp_path):
 def test_a_planted_flip_is_found(folders, tmp_path):
     """One row taken out of a copy of a run's flips."""
     copy = tmp_path / "planted"
-    shutil.copytree(folders["plain"], copy)
+    copied(folders["plain"], copy)
     table = pq.ParquetFile(copy / "flips.parquet").read()
     keep = np.ones(len(table), bool)
     keep[len(table) // 2] = False

@@ -19,13 +19,19 @@ def table(
             "margin": np.full(size, margin), "bound": np.full(size, bound)}  # fmt: skip
 
 
+def lengths(counts: np.ndarray) -> list[int]:
+    return np.repeat(np.arange(len(counts)), counts).tolist()
+
+
 FLIPS = table([(1, 0, 5, True), (2, 0, 7, False), (3, 0, 5, False), (9, 0, 5, True), (9, 0, 7, True)])
 
 
 def test_stays_are_counted_between_two_flips_of_one_pair():
-    stays = analysis.stays(FLIPS)
-    assert stays.inside.tolist() == [2]
-    assert sorted(stays.outside.tolist()) == [6, 7]
+    stays = analysis.scan(FLIPS).stays
+    assert lengths(stays.inside) == [2]
+    assert lengths(stays.outside) == [6, 7]
+    assert stays.total == 3
+    assert (analysis.median(stays.inside), analysis.median(stays.outside)) == (2, 6.5)
     assert stays.undone_within(1) == 0
     assert stays.undone_within(6) == 2
 
@@ -33,8 +39,8 @@ def test_stays_are_counted_between_two_flips_of_one_pair():
 def test_pairs_of_large_indices_are_kept_apart():
     big = 2**31 - 2
     flips = table([(1, 0, big, True), (2, 1, big, True), (3, 0, big, False), (4, big - 1, big, True)])
-    assert analysis.stays(flips).inside.tolist() == [2]
-    pairs = analysis.busiest_pairs(flips)
+    assert lengths(analysis.scan(flips).stays.inside) == [2]
+    pairs = analysis.scan(flips).busiest
     assert next(zip(pairs.i, pairs.j, pairs.flips, strict=True)) == (0, big, 2)
     assert sorted(zip(pairs.i.tolist(), pairs.j.tolist(), strict=True)) == [
         (0, big),
@@ -44,15 +50,15 @@ def test_pairs_of_large_indices_are_kept_apart():
 
 
 def test_busiest_pairs_come_first():
-    pairs = analysis.busiest_pairs(FLIPS)
+    pairs = analysis.scan(FLIPS).busiest
     assert (pairs.i.tolist(), pairs.j.tolist(), pairs.flips.tolist()) == ([0, 0], [5, 7], [3, 2])
 
 
 @given(st.integers(0, 4))
 def test_a_flip_taken_out_of_the_middle_breaks_the_alternation(pair):
     rows = [(step, pair, 9, step % 2 == 0) for step in range(7)]
-    assert analysis.alternates(table(rows))
-    assert not analysis.alternates(table(rows[:3] + rows[4:]))
+    assert analysis.scan(table(rows)).alternates
+    assert not analysis.scan(table(rows[:3] + rows[4:])).alternates
 
 
 def test_margins_in_units_of_rounding():
@@ -84,17 +90,54 @@ def test_event_algebra():
 def test_flips_are_matched_with_the_series_step_by_step():
     series = {"step": np.arange(10), "entered": np.array([0, 1, 0, 0, 0, 0, 0, 0, 0, 2]),
               "left": np.array([0, 0, 1, 1, 0, 0, 0, 0, 0, 0])}  # fmt: skip
-    assert analysis.flips_match_series(series, FLIPS).all()
+    assert analysis.scan(FLIPS, 10).matches(series).all()
     # the same number in all, at another step
     series["left"] = np.roll(series["left"], 1)
-    assert np.flatnonzero(~analysis.flips_match_series(series, FLIPS)).tolist() == [2, 4]
+    assert np.flatnonzero(~analysis.scan(FLIPS, 10).matches(series)).tolist() == [2, 4]
 
 
 def test_a_run_without_flips():
     empty = {key: values[:0] for key, values in FLIPS.items()}
-    assert len(analysis.stays(empty).all) == 0
-    assert analysis.alternates(empty)
-    assert len(analysis.busiest_pairs(empty).i) == 0
+    seen = analysis.scan(empty)
+    assert seen.stays.total == 0 and analysis.median(seen.stays.inside) is None
+    assert seen.alternates
+    assert len(seen.busiest.i) == 0
     ratio = analysis.margins_in_bounds(empty)
     assert analysis.expected_ambiguous(ratio) == 0
     assert len(analysis.closest(ratio, 5)) == 0
+
+
+@given(st.integers(1, 400), st.integers(0, 2**32 - 1))
+def test_a_table_seen_in_parts_says_what_it_says_as_a_whole(size, seed):
+    rng = np.random.default_rng(seed)
+    step = np.sort(rng.integers(0, 50, 400))
+    flips = table([(int(s), *map(int, rng.integers(0, 6, 2)), bool(rng.integers(2))) for s in step])
+    flips["margin"] = rng.normal(size=400)
+    whole, parts = analysis.scan(flips, 50, 20), analysis.Scan(50, 20)
+    for first in range(0, 400, size):
+        parts.take({name: values[first : first + size] for name, values in flips.items()})
+    # by hand: the stays of each pair, one pair at a time
+    stays = {True: [], False: []}
+    last: dict[tuple[int, int], tuple[int, bool]] = {}
+    turned = True
+    rows = zip(*(flips[name].tolist() for name in ("step", "i", "j", "entered")), strict=True)
+    for s, *pair, entered in rows:
+        if tuple(pair) in last:
+            before, inside = last[tuple(pair)]
+            stays[inside].append(s - before)
+            turned = turned and inside != entered
+        last[tuple(pair)] = (s, entered)
+    for seen in (whole, parts):
+        assert lengths(seen.stays.inside) == sorted(stays[True])
+        assert lengths(seen.stays.outside) == sorted(stays[False])
+        assert seen.alternates == turned
+        assert analysis.median(seen.stays.inside) == pytest.approx(np.median(stays[True]))
+        assert sorted(seen.nearest["ratio"]) == sorted(seen.ratios)[:20]
+        assert seen.total == seen.busiest.flips.sum() == 400
+    assert whole.busiest.flips.tolist() == parts.busiest.flips.tolist()
+    assert whole.nearest["step"].tolist() == parts.nearest["step"].tolist()
+
+
+def test_a_flip_at_a_step_that_was_not_made_is_refused():
+    with pytest.raises(ValueError, match="of a run of 9 rows"):
+        analysis.scan(FLIPS, 9)

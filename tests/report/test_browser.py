@@ -53,7 +53,7 @@ document.body.append(result);
 def test_sort_search_and_pages(tmp_path):
     run = load(make_run(tmp_path / "run", steps=120, candidates=300))
     page = html.write_report(run.path)
-    i, j = int(run.flips["i"][0]), int(run.flips["j"][0])
+    i, j = int(run.flips.nearest["i"][0]), int(run.flips.nearest["j"][0])
     script = SCRIPT.replace("PAIR", f'"{j}-{i}"').replace("ATOM", f'"{i}"')
     page.write_text(page.read_text(encoding="utf-8").replace("</body>", script + "</body>"), encoding="utf-8")
     done = subprocess.run(
@@ -68,18 +68,18 @@ def test_sort_search_and_pages(tmp_path):
 
     total = run.flips_total
     assert 25 < total < html.TABLE_ROWS
-    assert seen["start"] == [str(step) for step in run.flips["step"][:25]]
+    assert seen["start"] == [str(step) for step in run.flips.nearest["step"][:25]]
     assert seen["sorted"] == "ascending"
     assert seen["ratio"] != seen["ratio_down"]
     assert [exponent(text) for text in seen["ratio"]] == sorted(exponent(text) for text in seen["ratio"])
     assert exponent(seen["ratio_down"][0]) >= exponent(seen["ratio"][-1])
-    assert seen["second_page"] == [str(step) for step in run.flips["step"][25:50]]
+    assert seen["second_page"] == [str(step) for step in run.flips.nearest["step"][25:50]]
     assert seen["pages"] == f"page 2 of {-(-total // 25)}"
-    assert seen["entered"] == f"{int(run.flips['entered'].sum()):,} of {total:,} rows"
+    assert seen["entered"] == f"{int(run.flips.nearest['entered'].sum()):,} of {total:,} rows"
     assert set(seen["entered_words"]) == {"entered"}
     assert set(seen["pairs"]) == {f"{i}–{j}"}
     assert all(str(i) in pair.split("–") for pair in seen["atoms"])
-    within = (run.flips["step"] >= 10) & (run.flips["step"] <= 12)
+    within = (run.flips.nearest["step"] >= 10) & (run.flips.nearest["step"] <= 12)
     assert seen["steps"] == f"{int(within.sum()):,} of {total:,} rows"
     assert set(seen["step_cells"]) <= {"10", "11", "12"}
     assert seen["none"] == f"0 of {total:,} rows"

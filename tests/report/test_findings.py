@@ -54,7 +54,8 @@ def test_a_good_run(good):
 
 
 def test_every_planted_defect_is_found(good):
-    flips = {name: np.delete(values, 40) for name, values in good.flips.items()}
+    table = {name: np.delete(values, 40) for name, values in RunFolder.open(good.path).read("flips").items()}
+    flips = analysis.scan(table, len(good.series["step"]))
     kicks = 1e4 * good.series["energy_jump"]
     kicked = {"energy_jump": kicks + good.series["energy_jump"]}
     kicked |= {name: good.series[name] + np.cumsum(kicks) for name in ("total", "conserved")}
@@ -64,7 +65,7 @@ def test_every_planted_defect_is_found(good):
         "LOST_PAIRS": epochs(good, lost_pairs=3, lost_pair_steps=11, first_lost_step=25),
         "DANGEROUS_BUILDS": epochs(good, dangerous=True),
         "EVENT_ALGEBRA": series(good, 77, pairs=1),
-        "LEDGER_INCOMPLETE": {"flips": flips, "flips_total": len(flips["step"])},
+        "LEDGER_INCOMPLETE": {"flips": flips},
         "BUDGET_OPEN": summary(good, energy_budget_closes=False),
         "TIE_AT_CUTOFF": series(good, 0, min_margin=0.0),
         "AMBIGUOUS_DECISIONS": summary(good, ambiguous=2),
@@ -120,7 +121,7 @@ def test_a_flip_dropped_by_the_recorder_is_noticed(tmp_path):
 
 
 def test_chatter_is_a_matter_of_the_cutoff(good):
-    flips = {name: values[:40].copy() for name, values in good.flips.items()}
+    flips = {name: values[:40] for name, values in RunFolder.open(good.path).read("flips").items()}
     flips |= {
         "step": np.arange(1, 41),
         "i": np.full(40, 3),
@@ -131,7 +132,7 @@ def test_chatter_is_a_matter_of_the_cutoff(good):
     for name, inside in (("entered", flips["entered"]), ("left", ~flips["entered"])):
         columns[name] = np.bincount(flips["step"][inside], minlength=len(columns["step"]))
     columns["pairs"] = 100 + np.cumsum(columns["entered"] - columns["left"])
-    run = dataclasses.replace(good, flips=flips, flips_total=40, series=columns)
+    run = dataclasses.replace(good, flips=analysis.scan(flips, len(columns["step"])), series=columns)
     [hard] = [finding for finding in findings.judge(run).findings if finding.code == "CHATTER"]
     assert hard.severity == "warning"
     assert "pair 3–8 alone flips 40 times" in hard.text

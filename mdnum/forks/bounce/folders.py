@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -77,9 +76,14 @@ def compare_folders(a: RunFolder | str | Path, b: RunFolder | str | Path) -> Bal
     first, second = (folder if isinstance(folder, RunFolder) else RunFolder.open(folder) for folder in (a, b))
     where = f"{first.path} and {second.path}"
     check_runs(first, second)
+    with first.explained(), second.explained():
+        return _compared(first, second, where)
+
+
+def _compared(first: RunFolder, second: RunFolder, where: str) -> BallFolderFork:
     if not first.world == second.world == "ball":
         raise InputError("one of these is no run of a ball", where=where, remedy="Compare runs of one world")
-    different = _different(*(dict(_flat(tomllib.loads(folder.system_toml))) for folder in (first, second)))
+    different = _different(*(dict(_flat(folder.system)) for folder in (first, second)))
     balls = [folder.summary.get("balls") for folder in (first, second)]
     if balls[0] != balls[1]:
         raise InputError(f"the runs have {balls[0]} and {balls[1]} balls", where=where,

@@ -16,6 +16,7 @@ from mdnum.report.fork.question import Question, declared, load, verdict, write_
 from mdnum.report.verdict import Finding, restore
 from mdnum.report.words import count, heading, many, number, typeset
 from mdnum.store import RunFolder
+from mdnum.store.atomic import read_text
 
 _ROLES = ("first", "second", "third", "bad", "muted", "ink")
 #: Rows of a table that are shown at once; the others unfold.
@@ -196,5 +197,4 @@ def _what(run: Question) -> Iterator[tuple[str, str]]:
 
 
 def _script(folder: Path) -> str:
-    path = folder / "reproduce.py"
-    return path.read_text(encoding="utf-8") if path.exists() else ""
+    return read_text(folder / "reproduce.py")

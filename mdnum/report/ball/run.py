@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -132,12 +131,11 @@ def load(folder: RunFolder | str | Path) -> BallFolder:
     series = folder.read("steps")
     if not len(series.get("step", ())):
         raise FolderError("holds no step of a ball’s run", remedy="Run again", where=str(folder.path))
-    toml = folder.system_toml
     return BallFolder(
         path=folder.path,
         summary=folder.summary,
-        system=tomllib.loads(toml),
-        system_toml=toml,
+        system=folder.system,
+        system_toml=folder.system_toml,
         provenance=folder.provenance,
         series=series,
         contacts=_table(folder, "contacts"),

@@ -17,6 +17,7 @@ from mdnum.report.fork.question import Question, load, took, write_page
 from mdnum.report.svg import FIRST, INK, MUTED, SECOND
 from mdnum.report.words import count, heading, many, number
 from mdnum.store import RunFolder
+from mdnum.store.atomic import read_text
 
 _TOLD = 3  # reasons of not answering that a row tells
 
@@ -151,12 +152,13 @@ def _area(row: Mapping[str, Any]) -> dict[str, Any]:
 
 def _failure(folder: Path, row: Mapping[str, Any]) -> dict[str, Any]:
     """A failure with its script."""
-    path = folder / row["script"]
+    # a name of a file, wherever else the table would have it
+    path = folder / Path(row["script"]).name
     size = many(row["atoms"], "atom") + (f", {many(row['steps'], 'step')}" if row["steps"] > 1 else "")
     return {
         **row,
         "size": size,
-        "lines": path.read_text(encoding="utf-8") if path.exists() else "",
+        "lines": read_text(path),
     }
 
 

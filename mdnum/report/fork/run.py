@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -108,12 +107,11 @@ def load(folder: RunFolder | str | Path) -> ForkFolder:
         raise FolderError(
             "holds no finished comparison", remedy="Run `mdnum fork` again", where=str(folder.path)
         )
-    toml = folder.system_toml
     return ForkFolder(
         path=folder.path,
         summary=summary,
-        system=tomllib.loads(toml),
-        system_toml=toml,
+        system=folder.system,
+        system_toml=folder.system_toml,
         provenance=folder.provenance,
         series=folder.read("separation"),
         flips=folder.read("cross_flips", rows=ROWS_LOADED),

@@ -1,0 +1,304 @@
+"""A folder of somebody else: nothing is written out of it, and no damage of it goes unsaid."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import runpy
+import sys
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from test_store import frame, series_rows, state_at, write_run
+
+from mdnum.errors import FolderError
+from mdnum.report import page
+from mdnum.store import RunFolder, atomic, checkpoint, manifest
+
+PRECIOUS = b"somebody's only copy"
+
+
+@pytest.fixture
+def killed(tmp_path) -> Path:
+    folder = RunFolder.create(tmp_path / "killed")
+    folder.write_system("units = 'lj'\n")
+    folder.write_provenance({"versions": {}})
+    write_run(folder, 0, 40)
+    folder.close()
+    return folder.path
+
+
+@pytest.fixture
+def finished(killed) -> Path:
+    folder = RunFolder.open(killed)
+    folder.resume()
+    folder.finalize()
+    folder.write_summary({"status": "complete", "atoms": 4})
+    folder.close()
+    return killed
+
+
+def led_out(path: Path, link=os.symlink) -> Path:
+    """A file elsewhere that path now leads to."""
+    target = path.parent / f"../precious-{path.name}"
+    target = Path(os.path.normpath(target))
+    target.write_bytes(path.read_bytes() if path.exists() else PRECIOUS)
+    path.unlink(missing_ok=True)
+    link(target, path)
+    return target
+
+
+@pytest.mark.parametrize("link", [os.symlink, os.link])
+@pytest.mark.parametrize("name", [".lock", "log.txt", "trajectory.traj"])
+def test_what_is_written_in_place_is_not_written_through_a_link(killed, name, link):
+    target = led_out(killed / name, link)
+    before = target.read_bytes()
+    with pytest.raises(FolderError, match=rf"{name}: (is a link|has a second name)"):
+        RunFolder.open(killed).resume()
+    assert target.read_bytes() == before
+    # and nothing of the run was dropped for it
+    assert len(list((killed / "parts").iterdir())) == 12
+
+
+@pytest.mark.parametrize("name", ["series.parquet", "checkpoint.npz", "system.toml", "report.html"])
+def test_what_is_replaced_is_replaced_and_not_what_it_leads_to(finished, name):
+    target = led_out(finished / name)
+    before = target.read_bytes()
+    if name != "report.html":
+        with pytest.raises(FolderError, match="is a link"):
+            RunFolder.open(finished).resume()
+    (finished / "manifest.json").unlink()
+    atomic.write_text(finished / name, "new")
+    assert target.read_bytes() == before
+    assert not (finished / name).is_symlink() and (finished / name).read_text() == "new"
+
+
+@pytest.mark.parametrize("name", ["parts", "figures", "structures"])
+def test_a_folder_in_the_folder_that_leads_out_is_refused(tmp_path, killed, name):
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    for precious in ("energy.svg", "series-000000000000.parquet", "a.extxyz"):
+        (outside / precious).write_bytes(PRECIOUS)
+    if (killed / name).exists():
+        (killed / name).rename(tmp_path / "moved")
+    (killed / name).symlink_to(outside)
+    with pytest.raises(FolderError, match="is a link"):
+        RunFolder.create(killed, overwrite=True)
+    with pytest.raises(FolderError, match="is a link"):
+        atomic.write_text(killed / name / "energy.svg", "new")
+    with pytest.raises(FolderError, match="is a link"):
+        atomic.subfolder(killed, name)
+    assert {path.read_bytes() for path in outside.iterdir()} == {PRECIOUS} and len(
+        list(outside.iterdir())
+    ) == 3
+
+
+def test_temporary_names_cannot_be_foreseen(tmp_path, monkeypatch):
+    (tmp_path / "precious").write_bytes(PRECIOUS)
+    for name in (".report.html.part", ".summary.json.part"):
+        (tmp_path / name).symlink_to(tmp_path / "precious")
+    names = []
+    replace = os.replace
+    monkeypatch.setattr(
+        atomic.os, "replace", lambda one, other: (names.append(one.name), replace(one, other))
+    )
+    page.publish(tmp_path, [], lambda pictures, notes: "page")
+    atomic.write_text(tmp_path / "summary.json", "{}")
+    assert (tmp_path / "precious").read_bytes() == PRECIOUS
+    assert len(set(names)) == 2 and not {".report.html.part", ".summary.json.part"} & set(names)
+
+
+@pytest.mark.parametrize("name", ["../precious", "nothing", "series/../../precious"])
+def test_a_checkpoint_names_tables_and_no_files(tmp_path, killed, name):
+    (tmp_path / "precious.parquet").write_bytes(PRECIOUS)
+    state, store = checkpoint.read(killed / "checkpoint.npz")
+    (killed / "manifest.json").unlink()
+    checkpoint.write(killed / "checkpoint.npz", state, {**store, "rows": {**store["rows"], name: 0}}, {})
+    with pytest.raises(FolderError, match="counts what no folder of mdnum has"):
+        RunFolder.open(killed).resume()
+    assert (tmp_path / "precious.parquet").read_bytes() == PRECIOUS
+
+
+def test_a_checkpoint_unpacks_to_no_more_than_itself(tmp_path):
+    path = tmp_path / "checkpoint.npz"
+    np.savez_compressed(path, large=np.zeros(1 << 22))
+    assert path.stat().st_size < 1 << 16
+    with pytest.raises(FolderError, match="it is packed"):
+        checkpoint.read(path)
+    np.savez(path, small=np.zeros(7))
+    data = path.read_bytes()
+    for claim in (b"(99999999999999999,), ", b"(7, 9999999999999999),"):
+        path.write_bytes(data.replace(b"(7,), }" + b" " * (len(claim) - 6), claim + b"}"))
+        with pytest.raises(FolderError, match="not a readable checkpoint"):
+            checkpoint.read(path)
+
+
+@pytest.mark.parametrize("name", ["series.parquet", "flips.parquet", "summary.json", "checkpoint.npz"])
+def test_a_flipped_bit_is_told_with_what_is_left(finished, name):
+    data = bytearray((finished / name).read_bytes())
+    data[len(data) // 2] ^= 4
+    (finished / name).write_bytes(data)
+    folder = RunFolder.open(finished)
+    assert list(folder.damaged()) == [name]
+    with pytest.raises(FolderError, match=rf"{name}: is damaged.*epochs\.parquet.* can still be read"):
+        folder.resume() if name == "checkpoint.npz" else folder.summary and folder.read(Path(name).stem)
+    assert len(folder.read("epochs")["epoch"]) == 4
+
+
+def test_a_flipped_bit_of_a_page_is_told_where_there_is_no_manifest(tmp_path):
+    folder = RunFolder.create(tmp_path / "run")
+    rng = np.random.default_rng(0)
+    values = rng.normal(size=50_000)
+    folder.append("separations", {"variant": ["a"] * 50_000, "step": np.arange(50_000), "separation": values})
+    folder.finalize()
+    (folder.path / "manifest.json").unlink()
+    path = folder.path / "separations.parquet"
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(FolderError, match=r"separations\.parquet: is damaged"):
+        RunFolder.open(folder.path).read("separations")
+
+
+def test_what_is_gone_or_foreign_is_told(finished):
+    (finished / "epochs.parquet").unlink()
+    with pytest.raises(FolderError, match=r"epochs\.parquet: is missing"):
+        RunFolder.open(finished).read("epochs")
+    (finished / "manifest.json").unlink()
+    pq.write_table(pa.table({"step": ["a", "b"]}), finished / "series.parquet")
+    with pytest.raises(FolderError, match=r"is not a table of series \(column 'step' holds string\)"):
+        RunFolder.open(finished).read("series")
+    for text in ("[]", "3", "[" * 50_000, "\x00"):
+        (finished / "summary.json").write_text(text)
+        with pytest.raises(FolderError, match=r"summary\.json: is damaged"):
+            _ = RunFolder.open(finished).summary
+
+
+def test_the_manifest_is_told_when_it_is_damaged_and_lists_nothing_elsewhere(finished):
+    path = finished / "manifest.json"
+    text = path.read_text()
+    path.write_text(text.replace('"finished": true', '"finished": false'))
+    with pytest.raises(FolderError, match=r"manifest\.json: is damaged"):
+        RunFolder.open(finished)
+    made = manifest.Manifest("md", True, {"../precious": ["0"]})
+    manifest.save(finished, made)
+    with pytest.raises(FolderError, match=r"manifest\.json: is damaged"):
+        RunFolder.open(finished)
+    path.unlink()
+    assert "has no manifest.json" in RunFolder.open(finished).noted()[0]
+
+
+def test_a_log_that_somebody_wrote_into_is_said_and_no_reason_to_refuse(finished):
+    with open(finished / "log.txt", "a") as log:
+        log.write("my note\n")
+    folder = RunFolder.open(finished)
+    assert folder.noted() == [f"{finished / 'log.txt'}: was changed since it was written."]
+    assert folder.resume()["step"] == 40
+    folder.append_frame(frame(40))
+    folder.finalize()
+    assert RunFolder.open(finished).damaged() == {}
+
+
+def test_an_edited_system_is_said_by_who_reads_and_refused_by_who_goes_on(finished):
+    with open(finished / "system.toml", "a") as file:
+        file.write("# mine\n")
+    folder = RunFolder.open(finished)
+    assert folder.system == {"units": "lj"}
+    assert list(folder.damaged()) == ["system.toml"]
+    with pytest.raises(FolderError, match=r"system\.toml: was changed since"):
+        folder.check_start()
+    with pytest.raises(FolderError, match=r"system\.toml: was changed since"):
+        folder.resume()
+
+
+@pytest.mark.parametrize("killed_at", range(1, 9))
+def test_a_kill_while_a_file_is_replaced_leaves_no_damage(finished, monkeypatch, killed_at):
+    class Killed(BaseException):
+        pass
+
+    calls = iter(range(1, 100))
+    fsync = os.fsync
+
+    def dies(*args):
+        if next(calls) == killed_at:
+            raise Killed
+        return fsync(*args)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(atomic.os, "fsync", dies)
+        with pytest.raises(Killed):
+            for atoms in range(4):
+                RunFolder.open(finished).write_summary({"status": "complete", "atoms": atoms})
+    folder = RunFolder.open(finished)
+    assert folder.damaged() == {} and folder.summary["status"] == "complete"
+
+
+def test_what_came_to_nothing_is_begun_again_and_what_did_not_is_kept(tmp_path, killed):
+    started = RunFolder.create(tmp_path / "started")
+    started.write_system("units = 'lj'\n")
+    (started.path / "cu.eam.alloy").write_text("a table that belongs to the system")
+    started.write_provenance({})
+    started.log("compile")
+    started.close()
+    with pytest.raises(
+        FolderError, match="Nothing was computed in it yet: give the `mdnum run` command again"
+    ):
+        RunFolder.open(started.path).resume()
+    (started.path / "mine.md").write_text("mine")
+    with pytest.raises(FolderError, match="already holds a run"):
+        RunFolder.create(started.path)
+    (started.path / "mine.md").unlink()
+    again = RunFolder.create(started.path)
+    assert {path.name for path in again.path.iterdir()} == {".lock", "manifest.json"}
+    again.close()
+    with pytest.raises(FolderError, match="Continue it with `mdnum run --resume"):
+        RunFolder.create(killed)
+    # what was never mdnum's is not taken for it
+    (tmp_path / "own").mkdir()
+    (tmp_path / "own/system.toml").write_text("units = 'lj'\n")
+    with pytest.raises(FolderError, match="already holds"):
+        RunFolder.create(tmp_path / "own")
+
+
+def test_a_full_disk_gives_advice_that_can_be_followed(tmp_path, monkeypatch):
+    def full(*args):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    folder = RunFolder.create(tmp_path / "run")
+    other = RunFolder.create(tmp_path / "grad", world="grad")
+    with monkeypatch.context() as patch:
+        patch.setattr(atomic.os, "fsync", full)
+        for each in (folder, other):
+            with pytest.raises(FolderError, match="Free some space, then give the command again"):
+                each.checkpoint(state_at(0), force=True)
+    folder.append("series", series_rows(0, 3))
+    folder.checkpoint(state_at(3), force=True)
+    with monkeypatch.context() as patch:
+        patch.setattr(atomic.os, "fsync", full)
+        with pytest.raises(FolderError, match="then continue with --resume"):
+            folder.checkpoint(state_at(3), force=True)
+
+
+def test_answers_are_listed_as_soon_as_they_are_written(tmp_path):
+    folder = RunFolder.create(tmp_path / "run", world="audit")
+    for text in ("{}", '{"a": 1}', '{"a": 1, "b": 2}'):
+        atomic.write_text(folder.path / "answers.json", text)
+        folder.check("answers.json")
+    (folder.path / "answers.json").write_text('{"a": 1, "b": 3}')
+    with pytest.raises(FolderError, match=r"answers\.json: is damaged"):
+        folder.check("answers.json")
+
+
+def test_no_damage_of_a_campaign_is_a_traceback_or_goes_unsaid(tmp_path, monkeypatch):
+    scripts = Path(__file__).resolve().parents[1] / "scripts"
+    monkeypatch.syspath_prepend(str(scripts))
+    monkeypatch.setattr(sys, "argv", ["damaged_folders.py"])
+    script = runpy.run_path(str(scripts / "damaged_folders.py"), run_name="damaged_folders")
+    rows = script["campaign"](tmp_path, ("killed", "ball"), 30, seed=1)
+    mistakes = [json.dumps(row) for row in rows if row["outcome"] in script["MISTAKES"]]
+    assert not mistakes
+    assert {row["outcome"] for row in rows} == {"one line", "said, rest read", "same result"}
