@@ -223,7 +223,8 @@ def test_version_and_help(capsys: pytest.CaptureFixture[str]):
     assert "Usage: mdnum" in capsys.readouterr().out
 
 
-def test_python_m_mdnum_is_mdnum():
+@pytest.mark.usefixtures("strangers_folder")
+def test_python_m_mdnum_is_mdnum_and_runs_no_file_of_the_current_folder():
     done = subprocess.run([sys.executable, "-m", "mdnum", "run"], capture_output=True, text=True, timeout=60)
     assert done.returncode == 2
     assert done.stderr.startswith("mdnum: no system given")
