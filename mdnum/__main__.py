@@ -9,7 +9,7 @@ if __name__ == "__main__" and not sys.flags.safe_path and sys.path[:1] == [os.ge
     # Python puts the current folder first; off it goes before a package is looked for there
     del sys.path[0]
 
-from mdnum.cli import main  # noqa: E402
+from mdnum.cli import main
 
 if __name__ == "__main__":
     main()

@@ -23,7 +23,7 @@ def python(*words: str) -> list[str]:
 
 
 def environment(**changes: str) -> dict[str, str]:
-    """This process's environment with some variables changed, in which a child finds mdnum as it was found here.
+    """The environment of a child, in which it finds mdnum where this process found it.
 
     Args:
         changes: variables of the child.

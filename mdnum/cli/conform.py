@@ -83,10 +83,10 @@ def _names(as_json: bool) -> int:
         ("list", "version", "what"),
         [(row["list"], row["version"] or "not installed", row["what"]) for row in rows],
     )
-    typer.echo("\nYour own: mdnum conform package.module:function, or file.py:function.")
-    typer.echo("It takes (positions, cell, pbc, r_cut) and returns (i, j), (i, j, shift), ... or a mapping;")
-    typer.echo("a class with allocate(positions, cell, pbc, r_cut, skin) and update(positions, cell) is a")
-    typer.echo("list that is kept.")
+    output.say("\nYour own: mdnum conform package.module:function, or file.py:function.")
+    output.say("It takes (positions, cell, pbc, r_cut) and returns (i, j), (i, j, shift), ... or a mapping;")
+    output.say("a class with allocate(positions, cell, pbc, r_cut, skin) and update(positions, cell) is a")
+    output.say("list that is kept.")
     return output.EXIT_FINE
 
 
