@@ -3,10 +3,10 @@
     python scripts/malformed_input.py [--cases 300] [--seed 1]
 
 Each case damages a system or its structure (bits, numbers, nesting, control characters, long lines, wrong
-types, odd boxes and coordinates) and goes through `mdnum systems check`; what that accepts is shown and run for
-two steps. Fine is: refused in one printable line with exit code 2, or accepted and run to exit code 0 or 1, or
-stopped with such a line. Everything else is counted by name and must be 0. The cases run in a process of their
-own, so that a crash is counted too.
+types, odd boxes and coordinates) and goes through `mdnum systems check`; what that accepts is shown and run
+for two steps. Fine is: refused in one printable line with exit code 2, or accepted and run to exit code 0 or
+1, or stopped with such a line. Everything else is counted by name and must be 0. The cases run in a process
+of their own, so that a crash is counted too.
 """
 
 from __future__ import annotations
@@ -192,8 +192,12 @@ def words(rng: random.Random) -> Files:
     """A key, a value or a table is called something that a terminal, or a reader, would act on."""
     text, word = _base(rng), rng.choice(TEXTS)
     quoted = json.dumps(word, ensure_ascii=rng.random() < 0.5).replace("\x7f", "\\u007f")
+    kind = rng.randrange(6)
+    if kind > 3:
+        # a name that is printed where the file is fine
+        found = _line(rng, ATOMS, r"^(name|about) = (.+)$")
+        return _files(ATOMS[: found.start(2)] + quoted + ATOMS[found.end(2) :])
     found = _line(rng, text)
-    kind = rng.randrange(4)
     if kind == 0:
         return _files(text[: found.start(2)] + quoted + text[found.end(2) :])
     if kind == 1:
@@ -244,9 +248,14 @@ def coordinates(rng: random.Random) -> Files:
 
 def boxes(rng: random.Random) -> Files:
     """A cell that is vast, flat, inside out, skewed or none."""
-    number = lambda: rng.choice(("22.0", "22.0", "0.0", "-22.0", *COORDINATES[:9], "1e-300", "40", "3e8"))  # noqa: E731
-    cell = " ".join(number() for _ in range(rng.choice((9, 9, 9, 9, 3, 8))))
-    return _files(structure=re.sub('Lattice="[^"]*"', f'Lattice="{cell}"', STRUCTURE))
+    cell = ["22.0", "0.0", "0.0", "0.0", "22.0", "0.0", "0.0", "0.0", "22.0"]
+    for _ in range(rng.choice((1, 1, 2, 9))):
+        cell[rng.randrange(9)] = rng.choice(
+            ("0.0", "-22.0", "9.0", "-30", *COORDINATES[:9], "1e-300", "40", "3e8")
+        )
+    if rng.random() < 0.1:
+        cell = cell[: rng.choice((1, 3, 8))]
+    return _files(structure=re.sub('Lattice="[^"]*"', f'Lattice="{" ".join(cell)}"', STRUCTURE))
 
 
 def structures(rng: random.Random) -> Files:

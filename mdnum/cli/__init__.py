@@ -92,6 +92,12 @@ def main(arguments: list[str] | None = None) -> NoReturn:
         sys.exit(EXIT_USAGE)
     except (KeyboardInterrupt, typer.Abort):
         sys.exit(EXIT_STOPPED)
+    except MemoryError as error:
+        asked = InputError(
+            f"more memory is needed than there is ({error})", remedy="Ask for fewer atoms, balls or steps"
+        )
+        print_error(asked, as_json=as_json)
+        sys.exit(EXIT_USAGE)
     except RuntimeError as error:
         platforms = os.environ.get("JAX_PLATFORMS")
         if not platforms or "backend" not in str(error):
