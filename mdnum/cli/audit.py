@@ -41,7 +41,10 @@ def audit(
     no_report: bool = typer.Option(False, "--no-report", help="Do not write report.html."),
     as_json: bool = output.JSON_OPTION,
 ) -> int:
-    """Ask any ASE calculator: is it smooth, invariant, conservative, forgetful, and does it keep energy?"""
+    """Ask any ASE calculator: is it smooth, invariant, conservative, forgetful, and does it keep energy?
+
+    Runs the Python that makes the calculator. No other verb but `conform` runs Python that it is given.
+    """
     from mdnum.workflow.audit import AuditStopped
     from mdnum.workflow.audit import audit as ask
 

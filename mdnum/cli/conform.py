@@ -45,7 +45,10 @@ def conform(
     no_report: bool = typer.Option(False, "--no-report", help="Do not write report.html."),
     as_json: bool = output.JSON_OPTION,
 ) -> int:
-    """Put a neighbor list through a conformance suite: pairs, shifts, distances, and lists that go stale."""
+    """Put a neighbor list through a conformance suite: pairs, shifts, distances, and lists that go stale.
+
+    Runs the Python of the list. No other verb but `audit` runs Python that it is given.
+    """
     if pairs is None:
         return _names(as_json)
     from mdnum.workflow.conform import conform as examine
