@@ -490,7 +490,7 @@ def table(found: list[tuple[str, str, str]]) -> str:
 
 def main() -> int:
     """Runs the campaign and prints its table; 1 where an outcome was not fine."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--cases", type=int, default=300)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)

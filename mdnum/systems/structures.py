@@ -309,7 +309,7 @@ def _nearest(
         distance (inf where there is none) and index of the nearest, and the number of pairs.
     """
     from ase.geometry import complete_cell
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     whole = complete_cell(np.asarray(atoms.cell))
     at = atoms.positions @ np.linalg.inv(whole)
@@ -326,7 +326,7 @@ def _nearest(
         at, index = np.concatenate([at, images]), np.concatenate([index, index[low], index[high]])
     places = at @ whole
     count = len(atoms)
-    everything, own = cKDTree(places, balanced_tree=False), cKDTree(places[:count], balanced_tree=False)
+    everything, own = KDTree(places, balanced_tree=False), KDTree(places[:count], balanced_tree=False)
     near, who = everything.query(places[:count], k=2, distance_upper_bound=np.nextafter(within, np.inf))
     column = np.where(index[np.minimum(who[:, 0], len(index) - 1)] == np.arange(count), 1, 0)
     rows = np.arange(count)
