@@ -327,7 +327,8 @@ def _nearest(
     places = at @ whole
     count = len(atoms)
     everything, own = KDTree(places, balanced_tree=False), KDTree(places[:count], balanced_tree=False)
-    near, who = everything.query(places[:count], k=2, distance_upper_bound=np.nextafter(within, np.inf))
+    found = everything.query(places[:count], k=2, distance_upper_bound=np.nextafter(within, np.inf))
+    near, who = (np.asarray(part) for part in found)
     column = np.where(index[np.minimum(who[:, 0], len(index) - 1)] == np.arange(count), 1, 0)
     rows = np.arange(count)
     pairs = (int(own.count_neighbors(everything, within)) - count) // 2
