@@ -2,11 +2,56 @@
 
 from __future__ import annotations
 
+import json
+import re
+from collections.abc import Callable
 from pathlib import Path
+
+# control characters, what turns or hides text, and halves of characters that no terminal can be given
+_CONTROL = re.compile(
+    "[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\ufff9-\ufffb"
+    "\ud800-\udfff\U000e0000-\U000e007f]"
+)
+_LONG_WORD = re.compile(r"\S{200,}")
+_LONGEST = 800
+
+
+def python_escape(character: str) -> str:
+    """As Python writes a character that it does not print."""
+    return character.encode("unicode_escape").decode()
+
+
+def json_escape(character: str) -> str:
+    """As JSON writes a character by its number."""
+    return json.dumps(character)[1:-1]
+
+
+def printable(text: str, escape: Callable[[str], str] = python_escape) -> str:
+    """Text that came from a stranger's file, with nothing in it that a terminal would act on.
+
+    Escape sequences, other control characters (but line ends and tabs) and characters that reorder or hide
+    text are written as Python writes them, such as ``\\x1b``.
+    """
+    return _CONTROL.sub(lambda found: escape(found[0]), text)
+
+
+def shortened(text: str) -> str:
+    """A sentence that quotes no more than can be read: long words and long texts lose their middle."""
+    text = _LONG_WORD.sub(lambda found: _without_middle(found[0], 100), text)
+    return _without_middle(text, _LONGEST)
+
+
+def _without_middle(text: str, kept: int) -> str:
+    half = kept // 2
+    if len(text) <= kept:
+        return text
+    return f"{text[:half]}[{len(text) - 2 * half:,} more]{text[-half:]}"
 
 
 class MdnumError(Exception):
     """Base of every error that mdnum raises on purpose.
+
+    Control characters in what it quotes are escaped, and long quotes are shortened.
 
     Args:
         message: what was seen and what was expected.
@@ -17,9 +62,9 @@ class MdnumError(Exception):
     exit_code = 2
 
     def __init__(self, message: str, *, remedy: str | None = None, where: str | None = None):
-        self.message = message
-        self.remedy = remedy
-        self.where = where
+        self.message = message = shortened(printable(message))
+        self.remedy = remedy = remedy and shortened(printable(remedy))
+        self.where = where = where and _without_middle(printable(where), 500)
         parts = [f"{where}: {message}" if where else message]
         if remedy:
             parts.append(remedy)

@@ -91,3 +91,17 @@ def strict_dtypes(request: pytest.FixtureRequest) -> Iterator[None]:
     promotion = "standard" if request.node.get_closest_marker("jax_md") else "strict"
     with jax.numpy_dtype_promotion(promotion):
         yield
+
+
+@pytest.fixture
+def strangers_folder(
+    tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Path]:
+    """The current folder, in which files with the names of packages tell that they were run."""
+    folder = tmp_path_factory.mktemp("stranger")
+    ran = folder / "ran"
+    for name in ("jax", "numpy", "ase", "pydantic", "typer", "typing_extensions", "vesin", "matplotlib"):
+        (folder / f"{name}.py").write_text(f"open({str(ran)!r}, 'a').write('{name} ')\nraise ImportError\n")
+    monkeypatch.chdir(folder)
+    yield folder
+    assert not ran.exists(), f"run beside a stranger's files: {ran.read_text()}"

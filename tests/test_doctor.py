@@ -166,6 +166,7 @@ def test_elementwise_sees_a_single_wrong_bit(monkeypatch: pytest.MonkeyPatch):
     assert "add" not in row.seen
 
 
+@pytest.mark.usefixtures("strangers_folder")
 def test_another_process_with_other_bits_is_unsafe():
     here = crystal.digest()
     same = installation.Child.start(installation.DIGEST_CODE)

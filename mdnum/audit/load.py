@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mdnum.errors import InputError
+from mdnum.safe_path import search_last
 from mdnum.units import METAL, Units
 
 if TYPE_CHECKING:
@@ -95,9 +96,8 @@ def _stem(call: str) -> str:
 
 
 def _of_module(module: str, call: str, text: str) -> Any:
-    here = str(Path.cwd())
-    sys.path.insert(0, here)  # a module beside the person, as `python -m` finds it
     try:
+        search_last(".", module)  # a module beside the person is found, too
         found = importlib.import_module(module)
     except ModuleNotFoundError as error:
         missing = error.name or module
@@ -116,9 +116,6 @@ def _of_module(module: str, call: str, text: str) -> Any:
         raise InputError(
             f"importing {module} failed: {_told(error)}", where=text, remedy="Import it in Python to see why"
         ) from error
-    finally:
-        if here in sys.path:
-            sys.path.remove(here)
     return _call(call, found, module, text)
 
 
@@ -129,19 +126,16 @@ def _of_file(path: Path, after: str) -> Any:
     if spec is None or spec.loader is None:
         raise InputError("cannot be run as a Python file", where=str(path), remedy=_WAYS)
     module = importlib.util.module_from_spec(spec)
-    folder = str(path.resolve().parent)
     sys.modules[name] = module  # dataclasses and pickles look a module up by name
-    sys.path.insert(0, folder)  # so that it can import its neighbors, as `python file.py` does
     try:
+        # so that it can import its neighbors; unlike with `python file.py`, none of them hides a package
+        search_last(path.parent)
         spec.loader.exec_module(module)
     except Exception as error:  # whatever a file raises
         del sys.modules[name]
         raise InputError(
             f"running it failed: {_told(error)}", where=str(path), remedy=f"See that `python {path}` runs"
         ) from error
-    finally:
-        if folder in sys.path:
-            sys.path.remove(folder)
     if after:
         return _call(after, module, str(path), f"{path}:{after}")
     for word in _NAMES:

@@ -5,13 +5,14 @@ Every verb is a function that returns its exit code: 0 fine, 1 findings, 2 a mis
 
 from __future__ import annotations
 
+import os
 import sys
 from typing import Any, NoReturn
 
 import typer
 
 from mdnum.cli import audit, ball, check, conform, doctor, flips, fork, grad, report, run, systems
-from mdnum.cli.output import EXIT_STOPPED, EXIT_USAGE, print_error
+from mdnum.cli.output import EXIT_STOPPED, EXIT_USAGE, print_error, say
 from mdnum.errors import InputError, MdnumError
 
 # rich's help formatting and tracebacks cost more than the whole of --help may take
@@ -84,13 +85,29 @@ def main(arguments: list[str] | None = None) -> NoReturn:
         place = error.ctx.command_path if error.ctx else "mdnum"
         # no arguments at all is a request for help, which click raises as a usage error
         if type(error).__name__ == "NoArgsIsHelpError":
-            typer.echo(error.format_message())
+            say(error.format_message())
             sys.exit(EXIT_USAGE)
         asked = InputError(error.format_message(), remedy=f"See `{place} --help`")
         print_error(asked, as_json=as_json)
         sys.exit(EXIT_USAGE)
     except (KeyboardInterrupt, typer.Abort):
         sys.exit(EXIT_STOPPED)
+    except MemoryError as error:
+        asked = InputError(
+            f"more memory is needed than there is ({error})", remedy="Ask for fewer atoms, balls or steps"
+        )
+        print_error(asked, as_json=as_json)
+        sys.exit(EXIT_USAGE)
+    except RuntimeError as error:
+        platforms = os.environ.get("JAX_PLATFORMS")
+        if not platforms or "backend" not in str(error):
+            raise
+        asked = InputError(
+            f"jax cannot use JAX_PLATFORMS={platforms!r} ({str(error).splitlines()[0]})",
+            remedy="Set it to cpu, or unset it",
+        )
+        print_error(asked, as_json=as_json)
+        sys.exit(EXIT_USAGE)
     except OSError as error:
         # a full disk, a folder without write permission: the person's to mend, not a bug to trace
         where = str(error.filename) if error.filename else None

@@ -175,7 +175,7 @@ def _list(as_json: bool) -> int:
         return output.EXIT_FINE
     lines = [(row["name"], row["balls"], row["about"].partition(". ")[0]) for row in rows]
     output.print_table("systems: `mdnum ball NAME`", ("name", "balls", "about"), lines)
-    typer.echo("")
+    output.say("")
     title = "demonstrations: `mdnum ball --demo NAME`, or all"
     output.print_table(title, ("name", "about"), [(name, _about(name)) for name in NAMES])
     return output.EXIT_FINE
@@ -223,7 +223,7 @@ def _demonstrate(name: str, out: Path | None, no_report: bool, as_json: bool) ->
         for one in done:
             _print_demo(one, brief=name == "all")
         if page is not None:
-            typer.echo(f"wrote {page}")
+            output.say(f"wrote {page}")
     return output.EXIT_FINE if ok else output.EXIT_FINDINGS
 
 

@@ -49,5 +49,5 @@ def _check(function: str, title: str, name: str, settings: list[str] | None, as_
     else:
         output.print_records(f"{system.name}: {title}", report.rows())
         output.print_findings(report.findings)
-        typer.echo("agrees" if report.ok else "does not agree")
+        output.say("agrees" if report.ok else "does not agree")
     return output.exit_code(report.findings, ok=report.ok)

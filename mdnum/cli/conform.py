@@ -52,7 +52,11 @@ def conform(
     no_report: bool = typer.Option(False, "--no-report", help="Do not write report.html."),
     as_json: bool = output.JSON_OPTION,
 ) -> int:
-    """Put a neighbor list through a conformance suite: pairs, shifts, distances, and lists that go stale."""
+    """Put a neighbor list through a conformance suite: pairs, shifts, distances, and lists that go stale.
+
+    Runs the Python of the list, with --resume of the list that the folder names. No other verb but `audit` runs
+    Python that it is given.
+    """
     if pairs is None and resume is None:
         return _names(as_json)
     if resume is not None:
@@ -115,10 +119,10 @@ def _names(as_json: bool) -> int:
         ("list", "version", "what"),
         [(row["list"], row["version"] or "not installed", row["what"]) for row in rows],
     )
-    typer.echo("\nYour own: mdnum conform package.module:function, or file.py:function.")
-    typer.echo("It takes (positions, cell, pbc, r_cut) and returns (i, j), (i, j, shift), ... or a mapping;")
-    typer.echo("a class with allocate(positions, cell, pbc, r_cut, skin) and update(positions, cell) is a")
-    typer.echo("list that is kept.")
+    output.say("\nYour own: mdnum conform package.module:function, or file.py:function.")
+    output.say("It takes (positions, cell, pbc, r_cut) and returns (i, j), (i, j, shift), ... or a mapping;")
+    output.say("a class with allocate(positions, cell, pbc, r_cut, skin) and update(positions, cell) is a")
+    output.say("list that is kept.")
     return output.EXIT_FINE
 
 

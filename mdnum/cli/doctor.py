@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import typer
-
 from mdnum.cli import output
 
 
@@ -19,7 +17,7 @@ def doctor(as_json: bool = output.JSON_OPTION) -> int:
         output.print_table("", ("status", "test", "seen"), rows)
         for row in diagnosis.rows:
             if row.remedy:
-                typer.echo(f"{row.name}: {row.remedy}")
+                output.say(f"{row.name}: {row.remedy}")
         verdict = "safe" if diagnosis.ok else "UNSAFE: do not trust numbers computed here"
-        typer.echo(f"this installation is {verdict} ({diagnosis.seconds:.1f} s)")
+        output.say(f"this installation is {verdict} ({diagnosis.seconds:.1f} s)")
     return output.EXIT_FINE if diagnosis.ok else output.EXIT_FINDINGS

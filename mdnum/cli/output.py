@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from mdnum.errors import InputError, MdnumError
+from mdnum.errors import InputError, MdnumError, json_escape, printable
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -84,12 +84,17 @@ def plain(value: Any) -> Any:
 
 def print_json(document: Mapping[str, Any]) -> None:
     """The one JSON document of a verb, to stdout."""
-    typer.echo(json.dumps(plain(document), indent=2, ensure_ascii=False, allow_nan=False))
+    say(printable(json.dumps(plain(document), indent=2, ensure_ascii=False, allow_nan=False), json_escape))
+
+
+def say(text: str, *, err: bool = False) -> None:
+    """A line for a person, in which nothing that came from a file reaches the terminal raw."""
+    typer.echo(printable(text), err=err)
 
 
 def print_error(error: MdnumError, *, as_json: bool) -> None:
     """An error as one line on stderr, and as the JSON document when one was asked for."""
-    typer.echo("mdnum: " + " ".join(str(error).split()), err=True)
+    say("mdnum: " + " ".join(str(error).split()), err=True)
     if as_json:
         print_json(
             {
@@ -119,13 +124,19 @@ def print_lines(lines: Iterable[str]) -> None:
 
 
 def console() -> Console:
-    """rich's console on stdout, made when first needed because importing rich is slow."""
+    """rich's console on stdout, made when first needed because importing rich is slow; prints nothing raw."""
     from rich.console import Console
+    from rich.segment import Segment
+
+    class Printable(Console):
+        def render(self, renderable: Any, options: Any = None) -> Iterable[Segment]:
+            for text, style, control in super().render(renderable, options):
+                yield Segment(text if control else printable(text), style, control)
 
     # no highlighting: a number is not more important for being a number; wide where nobody's window is
     # known, because a table folded to 80 columns is hard to read in a log and harder to grep
     width = None if sys.stdout.isatty() else _PIPE_WIDTH
-    return Console(highlight=False, width=width)
+    return Printable(highlight=False, width=width)
 
 
 def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:

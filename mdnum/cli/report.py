@@ -21,5 +21,5 @@ def report(
     if as_json:
         output.print_json({"folder": folder, "report": written})
     else:
-        typer.echo(f"wrote {written}")
+        output.say(f"wrote {written}")
     return output.EXIT_FINE

@@ -40,7 +40,7 @@ def show(
     if as_json:
         output.print_json(tomllib.loads(text))
     else:
-        typer.echo(text.rstrip())
+        output.say(text.rstrip())
     return output.EXIT_FINE
 
 
@@ -55,7 +55,7 @@ def check(
     if as_json:
         output.print_json(document)
     else:
-        typer.echo(f"{loaded.name}: fine, {_sized(document)}")
+        output.say(f"{loaded.name}: fine, {_sized(document)}")
     return output.EXIT_FINE
 
 
@@ -71,7 +71,7 @@ def copy(
     if as_json:
         output.print_json({"system": system, "path": copied})
     else:
-        typer.echo(f"wrote {copied}")
+        output.say(f"wrote {copied}")
     return output.EXIT_FINE
 
 

@@ -7,13 +7,13 @@ import os
 import platform
 import re
 import subprocess
-import sys
 import time
 from dataclasses import dataclass
 
 import numpy as np
 
 from mdnum.doctor.rows import Row
+from mdnum.safe_path import environment, python
 
 # what each release does wrong, for a message that can be looked up; the other tests compute
 KNOWN_BAD_JAX = {
@@ -142,7 +142,11 @@ class Child:
         """Start Python on code."""
         return cls(
             subprocess.Popen(
-                [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+                python("-c", code),
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+                env=environment(),
             )
         )
 

@@ -21,6 +21,7 @@ from mdnum.ball.problem import START, Problem
 from mdnum.errors import MdnumError
 from mdnum.forks.dials import dial
 from mdnum.forks.histories import history
+from mdnum.safe_path import environment, python
 from mdnum.systems.ball_system import BallSystem
 from mdnum.systems.build import build
 from mdnum.systems.build_ball import build_ball
@@ -71,12 +72,17 @@ def digests_elsewhere(
 def _answered(asked: dict[str, Any], values: Sequence[float], tell: Callable[[], None]) -> list[str]:
     """What one process says."""
     question = json.dumps({**asked, "values": [value.hex() for value in values]})
-    command = [sys.executable, "-m", "mdnum.forks.confirm"]
+    command = python("-m", "mdnum.forks.confirm")
     found: list[str] = []
     # what it says on stderr may be long, and nobody reads a pipe meanwhile
     with tempfile.TemporaryFile("w+") as errors:
         with subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, text=True
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=errors,
+            text=True,
+            env=environment(),
         ) as process:
             assert process.stdin is not None and process.stdout is not None
             try:

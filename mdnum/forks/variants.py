@@ -12,7 +12,6 @@ import hashlib
 import json
 import os
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
@@ -28,6 +27,7 @@ from mdnum.errors import InputError, MdnumError
 from mdnum.forks.choices.base import is_pairwise
 from mdnum.forks.programs import Program
 from mdnum.md.cell import Cell, displacement
+from mdnum.safe_path import environment, python
 from mdnum.systems.load import System
 
 _PROCESSES = 2
@@ -188,13 +188,13 @@ def _process(variant: Variant, folder: Path, k: int, steps: int) -> tuple[Ran, n
     # a program cached by another variant must not answer for this one; these flags are a CPU's
     told = {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "JAX_ENABLE_COMPILATION_CACHE": "false"}
     begin = time.perf_counter()
-    command = [sys.executable, "-m", "mdnum.forks.programs", json.dumps(task)]
+    command = python("-m", "mdnum.forks.programs", json.dumps(task))
     words = ""
     try:
         # nothing that a child says may reach the output of the parent
         done = subprocess.run(
             command,
-            env={**os.environ, **told},
+            env=environment(**told),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,

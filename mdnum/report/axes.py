@@ -95,7 +95,8 @@ class Engineering(FuncFormatter):
         super().set_locs(locs)
         largest = max((abs(loc) for loc in locs), default=0.0)
         exponent = int(np.floor(np.log10(largest))) if largest > 0 else 0
-        self.exponent = exponent if exponent < -2 or exponent > 4 else 0
+        # the power itself must be a float
+        self.exponent = max(exponent, -300) if exponent < -2 or exponent > 4 else 0
 
     def __call__(self, x: float, pos: int | None = None) -> str:
         scaled = round(x / 10.0**self.exponent, 6)

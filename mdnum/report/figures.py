@@ -11,6 +11,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from mdnum.report.axes import PAGE_WIDTH, POINTS, drawn, envelope, legend, line, log_ticks, y_label
 from mdnum.report.run import Run
+from mdnum.report.scales import clean
 from mdnum.report.svg import BAD, FIRST, MUTED, SECOND, THIRD
 from mdnum.report.words import power
 
@@ -123,7 +124,8 @@ def lists(run: Run, figure: Figure) -> None:
     """What each neighbor list used up of its skin, and how long it lived."""
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
     epochs, step = run.epochs, run.epochs["start"].astype(float)
-    skin, length = epochs["skin_consumed"], epochs["length"].astype(float)
+    # of no skin nothing can be used up
+    skin, length = clean(epochs["skin_consumed"]), epochs["length"].astype(float)
     bad = epochs["dangerous"].astype(bool) | (epochs["lost_pairs"] > 0)
     above.axhline(1, color=BAD, lw=0.9, ls=(0, (4, 3)), zorder=1.5, label="skin used up")
     for axes, values in ((above, skin), (below, length)):
@@ -139,7 +141,7 @@ def lists(run: Run, figure: Figure) -> None:
             axes.plot(
                 step[worst], values[worst], "o", color=BAD, ms=3.5, mew=0, label="dangerous, or pairs lost"
             )
-    above.set_ylim(0, max(1.18, 1.08 * float(np.max(skin, initial=0))))
+    above.set_ylim(0, max(1.18, 1.08 * float(np.nanmax(skin, initial=0))))
     below.set_ylim(0, 1.15 * float(np.max(length, initial=1)))
     below.yaxis.set_major_locator(MaxNLocator(4, integer=True))
     legend(above)

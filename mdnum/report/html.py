@@ -175,6 +175,7 @@ def _lists(run: Run) -> dict[str, Any] | None:
         "length_median": float(np.median(length)),
         "length_min": int(length.min()),
         "length_max": int(length.max()),
+        "skinned": bool(np.isfinite(skin).all()),
         "skin_median": float(np.median(skin)),
         "skin_max": float(skin.max()),
         "pairs_listed": float(np.mean(epochs["pairs_listed"])),

@@ -112,7 +112,13 @@ def _compose(plot: Plot, figure: Figure, x_range: tuple[float, float] | None) ->
         axes.axhline(float(y_scale.shown(np.array(value))), color=MUTED, lw=0.9, ls=(0, (4, 3)), zorder=1.6)
     if not axes.lines and plot.region is None:
         axes.text(0.5, 0.5, "no values", transform=axes.transAxes, color=MUTED, ha="center", va="center")
-    if x_range is not None and x_scale.kind == "linear" and not x_scale.shift and x_range[1] > x_range[0]:
+    if (
+        x_range is not None
+        and np.isfinite(x_range).all()
+        and x_scale.kind == "linear"
+        and not x_scale.shift
+        and x_range[1] > x_range[0]
+    ):
         room = 0.02 * (x_range[1] - x_range[0])
         axes.set_xlim(x_range[0] - room, x_range[1] + room)
     wide = figure.get_figwidth() >= PAGE_WIDTH

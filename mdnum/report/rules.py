@@ -10,6 +10,7 @@ from mdnum.report import analysis
 from mdnum.report.run import Run
 from mdnum.report.verdict import Finding
 from mdnum.report.words import count, many, number, percent
+from mdnum.rollout.summary import Line
 
 #: A flip taken back within so many steps is chatter.
 CHATTER_STEPS = 10
@@ -225,8 +226,13 @@ def _drift(run: Run) -> Iterator[Finding]:
         return
     # jumps do not count: what they add follows the number of pairs, up and down
     stated = run.summary.get("energy_drift_without_jumps")
-    fitted = float(np.polyfit(run.series["time"], run.budget["residual"], 1)[0]) / atoms
-    drift = fitted if stated is None else float(stated)
+    if stated is None:
+        fitted = Line()
+        fitted.add(run.series["time"], run.budget["residual"])
+        stated = None if fitted.slope is None else fitted.slope / atoms
+    if stated is None:
+        return
+    drift = float(stated)
     moved = abs(drift) * time
     if not thermal > 0 or moved < DRIFT_SHARE * thermal:
         return

@@ -143,7 +143,7 @@ class Scale:
             )
             largest = float(np.max(np.abs(locator.tick_values(low, high)), initial=0.0))
             exponent = int(np.floor(np.log10(largest))) if largest > 0 else 0
-            exponent = exponent if exponent < -2 or exponent > 4 else 0
+            exponent = max(exponent, -300) if exponent < -2 or exponent > 4 else 0
             axis.set_major_locator(locator)
             axis.set_major_formatter(
                 FuncFormatter(lambda value, _: f"{value / 10.0**exponent:,.6g}".replace("-", MINUS))

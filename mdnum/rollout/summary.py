@@ -42,10 +42,11 @@ class Line:
 
     @property
     def slope(self) -> float | None:
-        """dy/dx; None for fewer than three points."""
-        if self.count < 3:
+        """dy/dx; None for fewer than three points, or where their squares are out of a float's range."""
+        spread = self.count * self.xx - self.x * self.x
+        if self.count < 3 or not 1e-280 < spread < np.inf:
             return None
-        return (self.count * self.xy - self.x * self.y) / (self.count * self.xx - self.x**2)
+        return (self.count * self.xy - self.x * self.y) / spread
 
 
 @dataclass

@@ -306,9 +306,12 @@ class RunFolder:
         """Makes this the only process that writes a folder which is gone on with from answers.json.
 
         Raises:
-            FolderError: another process writes the folder.
+            FolderError: another process writes the folder, or answers.json is not as it was written.
         """
         self._take_lock()
+        self.check("answers.json")
+        self._owner = True
+        manifest.update(self.path, {}, ["log.txt", "summary.json"], finished=False)
 
     # -- reading ---------------------------------------------------------------------------------
 

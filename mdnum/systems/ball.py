@@ -67,7 +67,9 @@ Numbers = Annotated[float | tuple[float, ...], BeforeValidator(_numbers)]
 class Boundary(Table):
     """A batch at rest whose penetrations sum to stop.tol exactly: one an ulp short of it, and many small."""
 
-    terms: int = Field(default=8, ge=1, description="how many small penetrations make up the missing ulp")
+    terms: int = Field(
+        default=8, ge=1, le=1_000_000, description="how many small penetrations make up the missing ulp"
+    )
     format: Literal["float16", "bfloat16", "float32"] = Field(
         default="bfloat16", description="the format whose ulp is meant"
     )
@@ -78,7 +80,9 @@ class Start(Table):
 
     height: Numbers = Field(default=1.0, description="height above the floor (m), one or one per ball")
     velocity: Numbers = Field(default=0.0, description="velocity, up is positive (m/s), one or one per ball")
-    balls: int = Field(default=1, ge=1, description="how many balls; a list of heights says it, too")
+    balls: int = Field(
+        default=1, ge=1, le=10_000_000, description="how many balls; a list of heights says it, too"
+    )
     spread: NonNegative = Field(
         default=0.0, description="heights lie evenly over height ± spread (m); not with a list"
     )

@@ -39,12 +39,14 @@ class Remark:
         title: one line.
         text: what was seen.
         remedy: what to do.
+        severity: info where the run itself warns of what comes of it.
     """
 
     code: str
     title: str
     text: str
     remedy: str
+    severity: str = "warning"
 
 
 def check(spec: ball.BallSpec) -> None:
@@ -347,6 +349,8 @@ def _warnings(spec: ball.BallSpec) -> Iterator[Remark]:
                 f"stop.tol = {stop.tol:g}, but after a fall of {fall:.2g} m in a step a height is known to "
                 f"{unit:.2g} m in {spec.precision.state}: iterations past that resolve rounding errors.",
                 f"Raise stop.tol to {unit:.1g}, or make precision.state wider",
+                # a stop that rounding did decide is a warning of the run's own
+                severity="info",
             )
         product = contact.alpha * contact.k
         if product > 1:

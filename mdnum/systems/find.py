@@ -41,7 +41,7 @@ def world_of(name: str | Path) -> str:
     """
     try:
         return str(_world(find(name)[1]))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError):
+    except (ValueError, RecursionError):
         # whoever loads it says where the mistake is
         return "md"
 

@@ -5,7 +5,7 @@ Lengths and energies are in the units of the file: Å and eV, or σ and ε.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, model_validator
@@ -19,10 +19,38 @@ ONSET_FRACTION = 0.9
 """A switched cutoff without an onset starts to switch at this fraction of its radius."""
 
 
+#: Smallest size of a number but 0; what is computed with it squares it.
+_SMALLEST = 1e-150
+_LARGEST_INT = 2**62
+
+
+def _numbers_in(value: Any) -> Iterator[float]:
+    """The numbers of a value of a table, those in arrays and in free keys included."""
+    if isinstance(value, Mapping):
+        value = tuple(value.values())
+    for item in value if isinstance(value, tuple) else (value,):
+        if isinstance(item, int | float) and not isinstance(item, bool):
+            yield item
+
+
 class Table(BaseModel):
     """Base of every table: frozen, strict, no unknown keys, finite numbers only."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+    @model_validator(mode="after")
+    def _in_range(self) -> Any:
+        for name in type(self).model_fields:
+            for value in _numbers_in(getattr(self, name)):
+                if isinstance(value, int) and abs(value) > _LARGEST_INT:
+                    raise ValueError(f"{name} = {value}; expected a whole number of at most 2^62")
+                # a tolerance is compared and not squared, and what tolerances can be is checked with them
+                if value and name != "tol" and not _SMALLEST <= abs(value) <= 1 / _SMALLEST:
+                    raise ValueError(
+                        f"{name} = {value:g}; expected 0 or a size from {_SMALLEST:g} to {1 / _SMALLEST:g}, "
+                        "whose square is a number, too"
+                    )
+        return self
 
 
 # --- potential ----------------------------------------------------------------------------------------

@@ -26,6 +26,8 @@ _EXPECTED = {
     "tuple_type": "an array",
     "finite_number": "a finite number",
 }
+#: Nothing is like a longer word, and to find that out takes minutes.
+_LONGEST_WORD = 100
 _BOUNDS = {
     "greater_than": ("gt", "above"),
     "greater_than_equal": ("ge", "at least"),
@@ -36,6 +38,8 @@ _BOUNDS = {
 
 def nearest(word: str, known: Iterable[str]) -> str | None:
     """The known word most like this one, or None when none is like it."""
+    if len(word) > _LONGEST_WORD:
+        return None
     options = list(known)
     folded = {option.lower(): option for option in options}
     close = difflib.get_close_matches(word.lower(), list(folded), n=1, cutoff=0.6)

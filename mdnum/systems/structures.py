@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 
 from mdnum.errors import InputError
 from mdnum.systems import schema
@@ -20,6 +22,14 @@ _AXES = "xyz"
 
 _SMALLEST_DISTANCE = 0.3
 """Closer than this (Å) is a mistake in any structure of metal units without a pair sigma."""
+
+_MOST_ATOMS = 20_000_000
+"""Atoms of a crystal that is built; their positions alone take half a gigabyte."""
+
+_ATOMS_IN_CELL = {"fcc": 4, "bcc": 2, "sc": 1, "diamond": 8}
+
+_FARTHEST = 1e8
+"""Cutoff radii that a coordinate or a cell vector may be long: its ulp is then 2e-8 of the cutoff."""
 
 _SMALLEST_IN_SIGMA = 0.4
 """Lennard-Jones atoms closer than this many σ (240,000 ε) are a mistake and not a hot pair."""
@@ -65,7 +75,11 @@ def _read(path: Path, index: int) -> Atoms:
     if not path.is_file():
         raise InputError("no such structure file", where=str(path), remedy="Correct structure.file")
     try:
-        found = ase.io.read(path, index=index)
+        with warnings.catch_warnings():
+            # a reader's warning is about a line that it then refuses, or about nothing
+            warnings.simplefilter("ignore")
+            # whole: a name that begins like a database's address or has an @ in it is the name of a file
+            found = ase.io.read(path.resolve(), index=index, do_not_split_by_at_sign=True)
     except Exception as error:
         # ase's readers raise whatever their parsing meets; every one of them means the same to the reader
         detail = " ".join(str(error).split()) or "no more detail"
@@ -96,6 +110,13 @@ def _build(structure: schema.BuilderStructure) -> Atoms:
         raise InputError(
             f"structure.symbol = {structure.symbol!r} is no chemical symbol",
             remedy=f"Did you mean {near}?" if near else "Use one such as Ar",
+        )
+    cells = math.prod(structure.repeat)
+    if cells > _MOST_ATOMS // _ATOMS_IN_CELL[structure.builder]:
+        raise InputError(
+            f"structure.repeat = {list(structure.repeat)} makes "
+            f"{cells * _ATOMS_IN_CELL[structure.builder]:.3g} atoms; expected at most {_MOST_ATOMS:,}",
+            remedy="Repeat the cell less often",
         )
     atoms = bulk(structure.symbol, structure.builder, a=structure.lattice_constant, cubic=True)
     atoms = atoms.repeat(structure.repeat)
@@ -168,6 +189,7 @@ def check(atoms: Atoms, spec: schema.SystemSpec, r_cut: float, length: str) -> N
         InputError: non-finite numbers, a missing cell vector, a box too small for r_cut + skin, overlaps.
     """
     _check_finite(atoms)
+    _check_size(atoms, r_cut, length)
     _check_cell(atoms)
     _check_width(atoms, r_cut, spec.skin, length)
     _check_overlap(atoms, _smallest_distance(spec), length)
@@ -186,6 +208,28 @@ def _check_finite(atoms: Atoms) -> None:
                 + (f", and {count - 1} more atoms are like it" if count > 1 else ""),
                 remedy="Every coordinate must be a finite number; write the structure again",
             )
+
+
+def _check_size(atoms: Atoms, r_cut: float, length: str) -> None:
+    """Refuses coordinates whose own last digit is too coarse for distances to be told from them."""
+    farthest = _FARTHEST * r_cut
+    places = np.abs(atoms.positions).max(axis=1)
+    if (places > farthest).any():
+        worst = int(np.argmax(places))
+        raise InputError(
+            f"atom {worst} ({atoms.symbols[worst]}) has a coordinate of {places[worst]:g} {length}, where "
+            f"two neighboring numbers lie {np.spacing(places[worst]):.2g} {length} apart; expected at most "
+            f"{farthest:.3g} {length}, {_FARTHEST:g} cutoffs",
+            remedy="Correct the structure: its numbers, its unit, or its rattle",
+        )
+    sides = np.abs(np.asarray(atoms.cell)).max(axis=1)
+    if np.isfinite(sides).all() and (sides > farthest).any():
+        axis = int(np.argmax(sides))
+        raise InputError(
+            f"cell vector {'abc'[axis]} is {sides[axis]:g} {length} long; expected at most {farthest:.3g} "
+            f"{length}, {_FARTHEST:g} cutoffs",
+            remedy="Correct the structure's cell, or set structure.pbc to false along it",
+        )
 
 
 def _check_cell(atoms: Atoms) -> None:
@@ -236,24 +280,59 @@ def _smallest_distance(spec: schema.SystemSpec) -> float:
 
 
 def _check_overlap(atoms: Atoms, smallest: float, length: str) -> None:
-    from vesin import NeighborList
-
     if len(atoms) < 2:
         return
-    finder = NeighborList(cutoff=smallest, full_list=False)
-    i, j, distance = finder.compute(
-        points=atoms.positions, box=np.asarray(atoms.cell), periodic=atoms.pbc, quantities="ijd"
-    )
-    if len(distance) == 0:
+    distance, other, pairs = _nearest(atoms, smallest)
+    if not pairs:
         return
     worst = int(np.argmin(distance))
-    a, b = sorted((int(i[worst]), int(j[worst])))
-    more = f" ({len(distance)} such pairs)" if len(distance) > 1 else ""
+    a, b = sorted((worst, int(other[worst])))
+    more = f" ({pairs} such pairs)" if pairs > 1 else ""
     raise InputError(
         f"atoms {a} ({atoms.symbols[a]}) and {b} ({atoms.symbols[b]}) are {distance[worst]:.4g} {length} "
         f"apart, closer than {smallest:.4g} {length}{more}",
         remedy="They overlap: correct the positions, the cell or the units of the structure",
     )
+
+
+def _nearest(
+    atoms: Atoms, within: float
+) -> tuple[Float64[np.ndarray, " atoms"], Int64[np.ndarray, " atoms"], int]:
+    """Of each atom the nearest other one within a distance, over periodic faces, and how many such pairs.
+
+    A tree and not a grid of cells, which has more cells than memory where a box is large or flat.
+
+    Args:
+        within: length, less than half of any periodic width.
+
+    Returns:
+        distance (inf where there is none) and index of the nearest, and the number of pairs.
+    """
+    from ase.geometry import complete_cell
+    from scipy.spatial import KDTree
+
+    whole = complete_cell(np.asarray(atoms.cell))
+    at = atoms.positions @ np.linalg.inv(whole)
+    at = np.where(atoms.pbc, at - np.floor(at), at)
+    index = np.arange(len(atoms))
+    widths = perpendicular_widths(np.asarray(atoms.cell), atoms.pbc)
+    for axis in np.flatnonzero(atoms.pbc):
+        # what lies near one face is seen from beyond the other; twice what is needed, for the rounding
+        reach = 2 * within / widths[axis]
+        low, high = np.flatnonzero(at[:, axis] < reach), np.flatnonzero(at[:, axis] > 1 - reach)
+        images = at[np.concatenate([low, high])]
+        images[: len(low), axis] += 1.0
+        images[len(low) :, axis] -= 1.0
+        at, index = np.concatenate([at, images]), np.concatenate([index, index[low], index[high]])
+    places = at @ whole
+    count = len(atoms)
+    everything, own = KDTree(places, balanced_tree=False), KDTree(places[:count], balanced_tree=False)
+    found = everything.query(places[:count], k=2, distance_upper_bound=np.nextafter(within, np.inf))
+    near, who = (np.asarray(part) for part in found)
+    column = np.where(index[np.minimum(who[:, 0], len(index) - 1)] == np.arange(count), 1, 0)
+    rows = np.arange(count)
+    pairs = (int(own.count_neighbors(everything, within)) - count) // 2
+    return near[rows, column], index[np.minimum(who[rows, column], len(index) - 1)], pairs
 
 
 def to_extxyz(atoms: Atoms) -> str:

@@ -17,6 +17,10 @@ from mdnum.errors import InputError
 
 Key = tuple[str, ...]
 
+#: Depth of tables and arrays beyond which a file is refused.
+_DEEPEST = 20
+# what is valid in TOML and acted on by a terminal, or reorders what is read
+_UNPRINTED = re.compile("[\x7f-\x9f\u061c\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\U000e0000-\U000e007f]")
 _BARE = re.compile(r"^[A-Za-z0-9_-]+$")
 _PART = re.compile(r"""\s*(?:"((?:[^"\\]|\\.)*)"|'([^']*)'|([A-Za-z0-9_-]+))\s*""")
 
@@ -28,8 +32,17 @@ def parse(text: str, where: str | Path) -> dict[str, Any]:
         InputError: not TOML; names the line and shows it.
     """
     try:
-        return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+        tables = tomllib.loads(text)
+        if _is_deep(tables):
+            raise RecursionError
+        return tables
+    except RecursionError:
+        raise InputError(
+            f"tables or arrays are nested more than {_DEEPEST} deep",
+            where=str(where),
+            remedy="No table of a system file is deeper than three",
+        ) from None
+    except ValueError as error:
         seen = str(error)
         match = re.search(r"\(at line (\d+), column (\d+)\)", seen)
         lines = text.splitlines()
@@ -51,9 +64,24 @@ def scalar(text: str) -> Any:
     """
     try:
         parsed = tomllib.loads(f"value = {text}")
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):
         return text
-    return parsed["value"] if set(parsed) == {"value"} else text
+    return parsed["value"] if set(parsed) == {"value"} and not _is_deep(parsed) else text
+
+
+def _is_deep(value: Any) -> bool:
+    """Whether tables and arrays hold one another more often than anybody writes down."""
+    level = [value]
+    for _ in range(_DEEPEST):
+        level = [
+            item
+            for outer in level
+            for item in (outer.values() if isinstance(outer, dict) else outer)
+            if isinstance(item, dict | list)
+        ]
+        if not level:
+            return False
+    return True
 
 
 def dotted(text: str) -> Key:
@@ -129,7 +157,9 @@ def _key(key: str) -> str:
 
 
 def _string(text: str) -> str:
-    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007F")
+    # TOML knows the escapes of JSON, and \U for what JSON writes as two halves
+    escaped = json.dumps(text, ensure_ascii=False)
+    return _UNPRINTED.sub(lambda found: f"\\U{ord(found[0]):08X}", escaped)
 
 
 def _value(value: Any) -> str:

@@ -28,7 +28,7 @@ def summarize(simulation: BallSimulation, run: BallRun) -> dict[str, Any]:
     broken = _first_not_finite(run)
     flips, stops = int(ambiguous_flips(run).sum()), int(ambiguous_stops(run).sum())
     findings = [
-        {"code": one.code, "severity": "warning", "title": one.title, "text": one.text, "remedy": one.remedy}
+        {field: getattr(one, field) for field in ("code", "severity", "title", "text", "remedy")}
         for one in simulation.system.warnings
     ]
     return {

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mdnum.errors import FolderError, InputError
-from mdnum.store import RunFolder
-from mdnum.store.atomic import write_text
+from mdnum.store import RunFolder, manifest
+from mdnum.store.atomic import read_text, write_text
 from mdnum.store.naming import default_folder
 from mdnum.workflow.fork_question import Log, Progress, finish
 
@@ -175,7 +175,8 @@ def _kept(path: Path) -> dict[str, Any]:
             "holds no examination to go on with", where=str(path), remedy="Begin in a new folder"
         )
     try:
-        kept = json.loads(file.read_text(encoding="utf-8"))
+        folder.check("answers.json")
+        kept = json.loads(read_text(file))
         wanted = {"list", "tested", "options", "cases", "shrunk"} <= set(kept)
         wanted = wanted and {"cases", "seed", "large", "full", "limits"} <= set(kept["options"])
     except (ValueError, TypeError, OSError) as error:
@@ -193,7 +194,7 @@ def _again(path: str | Path) -> RunFolder:
     folder.world = "conform"
     folder.take()
     for name in ("areas", "failures"):
-        (folder.path / f"{name}.parquet").unlink(missing_ok=True)
+        manifest.remove(folder.path / f"{name}.parquet")
     return folder
 
 

@@ -109,6 +109,7 @@ def test_brute_force_over_all_floats_finds_the_same(key, at, width):
     assert set(met) <= set(truth) and (len(truth) > 1 or met == truth)
 
 
+@pytest.mark.usefixtures("strangers_folder")
 def test_both_sides_differ_in_a_fresh_process():
     system, steps = solid(), 30
     found = boundaries(system, "velocity.scale", 1.0, 1.01, steps, cells=4, most=2)

@@ -87,6 +87,7 @@ def test_a_program_ends_before_its_list_is_used_up():
     assert moved[-1] <= 0.1 < 0.11 and moved[-1] > 0.09
 
 
+@pytest.mark.usefixtures("strangers_folder")
 def test_in_processes_of_their_own_flags_order_and_faults_show(crystal: System):
     told: list[tuple[int, int]] = []
     known = {variant.name: variant for variant in VARIANTS}

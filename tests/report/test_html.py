@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from xml.etree import ElementTree
 
@@ -11,8 +12,9 @@ import numpy as np
 import pytest
 from report.synthetic import TOML, make_run
 
-from mdnum.report import html, svg, words
+from mdnum.report import figures, findings, html, svg, words
 from mdnum.report.run import TABLE_ROWS, load
+from mdnum.rollout.summary import Line
 from mdnum.store import RunFolder
 
 
@@ -166,3 +168,42 @@ def test_shares_never_claim_all_or_nothing():
         1.08: "108 %",
     }
     assert {share: words.percent(share) for share in shares} == shares
+
+
+def test_a_run_in_which_nothing_moves_has_a_page(folder):
+    """One atom, atoms at rest, pairs that never meet: the budget's residual does not move by a bit."""
+    run = load(folder)
+    still = {
+        name: np.zeros_like(run.series[name]) for name in ("energy_jump", "temperature", "entered", "left")
+    }
+    still |= {name: np.full_like(run.series[name], run.series[name][0]) for name in ("conserved", "pairs")}
+    none = {name: values[:0] for name, values in run.flips.items()}
+    quiet = replace(run, series={**run.series, **still}, flips=none, flips_total=0)
+    assert findings.sharpness(quiet) == (pytest.approx(1e-4, rel=10), 0.0)
+    text = html.render(quiet, findings.judge(quiet), dict.fromkeys(figures.FIGURES, ""))
+    assert "would be all that moves it" in text
+    for name in ("energy", "flips"):
+        assert figures.draw(name, quiet).axes
+
+
+def test_a_run_without_a_skin_has_a_page(folder):
+    run = load(folder)
+    bare = replace(run, epochs={**run.epochs, "skin_consumed": np.full(len(run.epochs["epoch"]), np.inf)})
+    assert "a list serves one step" in html.render(
+        bare, findings.judge(bare), dict.fromkeys(figures.FIGURES, "")
+    )
+    assert np.isfinite(figures.draw("lists", bare).axes[0].get_ylim()).all()
+
+
+@pytest.mark.parametrize("step", [1e-300, 1e-160, 0.0, 1e160])
+def test_a_time_that_has_no_slope(step):
+    line = Line()
+    line.add(step * np.arange(5), np.arange(5.0))
+    assert line.slope is None
+
+
+def test_a_killed_run_of_vanishing_steps_has_a_verdict(folder):
+    run = load(folder)
+    killed = {k: v for k, v in run.summary.items() if k != "energy_drift_without_jumps"}
+    short = replace(run, summary=killed, series={**run.series, "time": run.series["time"] * 1e-300})
+    assert findings.judge(short).headline

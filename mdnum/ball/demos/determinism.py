@@ -6,8 +6,6 @@ import hashlib
 import json
 import os
 import subprocess
-import sys
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -23,6 +21,7 @@ from mdnum.ball.rollout import BallRun, simulate
 from mdnum.ball.world import World
 from mdnum.errors import NumericalError
 from mdnum.precision import neighbor
+from mdnum.safe_path import environment, python
 
 G, H, RESTITUTION, STEPS = 9.81, 0.01, 0.8, 200
 #: Next to the boundary between a first contact in step 48 and one in step 49 (see the demonstration "fork").
@@ -221,18 +220,13 @@ def _gap(label: str, here: BallRun, y: np.ndarray, role: Any, dashed: bool = Fal
 
 
 def _start(flags: str) -> subprocess.Popen[str]:
-    environment = dict(os.environ)
-    if flags:
-        environment["XLA_FLAGS"] = f"{environment.get('XLA_FLAGS', '')} {flags}".strip()
-    # this package, wherever it is imported from here
-    package = str(Path(__file__).resolve().parents[3])
-    environment["PYTHONPATH"] = os.pathsep.join(filter(None, [package, environment.get("PYTHONPATH", "")]))
+    changed = {"XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {flags}".strip()} if flags else {}
     return subprocess.Popen(
-        [sys.executable, "-c", _CODE],
+        python("-c", _CODE),
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env=environment,
+        env=environment(**changed),
     )
 
 

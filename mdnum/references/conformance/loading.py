@@ -15,6 +15,7 @@ from typing import Any
 
 from mdnum.errors import InputError
 from mdnum.references.conformance.lists import KeptList, PairList, source_of
+from mdnum.safe_path import search_last
 
 #: What a function and the calls of a list that is kept are given, in order.
 _GIVEN = ("positions", "cell", "pbc", "r_cut")
@@ -166,9 +167,8 @@ def _module(place: str) -> ModuleType:
             sys.modules.setdefault(path.stem, module)
             spec.loader.exec_module(module)
             return module
-        if "" not in sys.path:
-            # as `python -m` does: what lies in the folder where one stands can be imported
-            sys.path.insert(0, "")
+        # what lies in the folder where one stands can be imported, too
+        search_last(".", place)
         return importlib.import_module(place)
     except InputError:
         raise

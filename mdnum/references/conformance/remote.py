@@ -17,6 +17,7 @@ from typing import Any, BinaryIO
 from mdnum.errors import MdnumError
 from mdnum.references.conformance.case import Case
 from mdnum.references.conformance.lists import Outcome, PairList, Session
+from mdnum.safe_path import environment, python
 
 #: Seconds that an answer may take, for so many atoms at most and for more; and those to import a library.
 #: They are its own processor time: by the clock nothing comes in time on a machine that has other work to do.
@@ -72,7 +73,8 @@ class RemoteSession:
     def _started(self) -> subprocess.Popen[bytes]:
         self._from = self._said.seek(0, os.SEEK_END)
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "mdnum.references.conformance.remote", self.tested.word],
+            python("-m", "mdnum.references.conformance.remote", self.tested.word),
+            env=environment(),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._said,

@@ -35,6 +35,7 @@ def first_contact(y: float) -> int:
     return -1
 
 
+@pytest.mark.usefixtures("strangers_folder")
 def test_the_demonstration():
     demo = run("determinism")
     assert [check.what for check in demo.checks if not check.ok] == []

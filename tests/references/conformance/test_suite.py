@@ -368,6 +368,7 @@ def test_a_process_that_crashes_or_hangs_is_a_failure(tmp_path: Path, monkeypatc
     assert time.perf_counter() - began < 50
 
 
+@pytest.mark.usefixtures("strangers_folder")
 def test_another_process_gives_the_same_answers():
     tested = load(f"{_PLANTED}:search")
     case = one("a gas", "few", gas(30, 4.0, 1), 4.0)
