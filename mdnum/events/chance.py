@@ -1,10 +1,10 @@
 """Whether a delay is more than chance: a sequential sign test on repeats of a pair of runs.
 
-A pair of runs is repeated from perturbed starts, each time free and under the first run's decisions. A single
-delay tells little: in a liquid any perturbation moves a split. But whether the flips were worth more than a
-given delay can be counted. If half of such pairs or fewer were delayed by more than that, k or more of n would
-be with the probability of k heads or more in n tosses at most, however the delays are distributed and however
-few they are: no scatter has to be estimated.
+A pair of runs is repeated from perturbed starts, each time free and under the first run's decisions. A
+single delay tells little: in a liquid any perturbation moves a split. But whether the flips were worth more
+than a given delay can be counted. Where half of such pairs or fewer are delayed by more than that, k or more
+of n are with the probability of k heads or more in n tosses at most, however the delays are distributed and
+however few they are: no scatter has to be estimated. docs/verdict-calibration.md has how often it is wrong.
 """
 
 from __future__ import annotations
@@ -93,6 +93,10 @@ def looks(pairs: int, error: float = ERROR) -> tuple[tuple[int, int], ...]:
     return tuple(found)
 
 
+#: Fewer repeats than this can never be clear.
+FEWEST = next(pairs for pairs in range(1, 2 + REPEATS) if looks(pairs)) - 1
+
+
 @dataclass(frozen=True)
 class Count:
     """How many pairs were delayed.
@@ -108,6 +112,11 @@ class Count:
     later: int
     not_later: int
     most: int
+
+    @property
+    def needed(self) -> tuple[int, int] | None:
+        """The look these pairs are at, or the next: pairs, and how many must agree; None for none."""
+        return next((look for look in looks(self.most) if look[0] >= self.pairs), None)
 
     @property
     def delayed(self) -> bool | None:

@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from mdnum.events.chance import REPEATS, Count, Delay, count, looks
+from mdnum.events.chance import FEWEST, REPEATS, Count, Delay, count
 
 Word = Literal["same", "no fork", "open", "cause", "accelerated", "bystander", "undecided"]
 
@@ -29,8 +29,6 @@ PATIENCE = 1.2
 _SAVED = 5.0
 #: A delay of less than one e-folding is no delay: the separation was never as much as e times smaller.
 NATS = 1.0
-#: Repeats that can tell at all.
-FEWEST = next(pairs for pairs in range(1, 2 + REPEATS) if looks(pairs)) - 1
 #: r² of a fit that counts as growth.
 FITS = 0.5
 #: E-foldings that the later half of a fit must grow by before it predicts anything. What the first steps do
@@ -239,8 +237,8 @@ def judge(
         return _kept(dates.split, handed, tolerance, (delay, *repeats), most, rate)
     gained = delay.handed - dates.split
     text = (
-        f"free, the runs split at step {dates.split}; under the first run's decisions at step {delay.handed}, "
-        f"{abs(gained)} steps {'later' if gained >= 0 else 'earlier'}"
+        f"free, the runs split at step {dates.split}; under the first run's decisions at step "
+        f"{delay.handed}, {abs(gained)} steps {'later' if gained >= 0 else 'earlier'}"
     )
     return _counted((delay, *repeats), most, rate, gained, (text,))
 
@@ -258,20 +256,19 @@ def _counted(
     later = "later" if rate is None else f"later by more than one e-folding ({threshold:.0f} steps)"
     unseen = found.pairs - found.later - found.not_later
     reasons += (
-        f"of the pair and {found.pairs - 1} repeats (all positions of B's start displaced at random by as much "
-        "as the choice separates the runs in their first 100 steps, an ulp at least) "
+        f"of the pair and {found.pairs - 1} repeats (all positions of B's start displaced at random by as "
+        "much as the choice separates the runs in their first 100 steps, an ulp at least) "
         f"{found.later} split {later} without the flips and {found.not_later} do not"
         + (f"; of {unseen} it was not seen" if unseen else ""),
     )
     made = found.delayed
     word: Word = "undecided" if made is None else "accelerated" if made else "bystander"
     if made is None:
-        plan = looks(found.most)
-        need = next((k for n, k in plan if n >= found.pairs), None)
+        need = found.needed
         reasons += (
             f"so few repeats cannot tell: at least {FEWEST} are needed"
-            if not plan
-            else f"that is not clear enough: {need} of {next(n for n, _ in plan if n >= found.pairs)} would be",
+            if need is None
+            else f"that is not clear: {need[1]} of {need[0]} would be",
         )
     return Verdict(word, pair.free, pair.handed, nats, reasons, threshold, found)
 

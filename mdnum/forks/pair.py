@@ -10,16 +10,16 @@ import numpy as np
 from jaxtyping import Shaped
 
 from mdnum.errors import InputError
-from mdnum.events.chance import REPEATS, Delay
+from mdnum.events.chance import Delay
 from mdnum.events.forks import PATIENCE, Dates, Growth, Verdict, growth, judge, split_of
 from mdnum.events.shares import Cell, Share, shares, table
 from mdnum.forks.repeats import perturbed, repeat
 from mdnum.forks.twin import Twin
+from mdnum.forks.words import repeats_asked
 from mdnum.md.cell import HostCell
 from mdnum.rollout.engine import Start, first_state
 from mdnum.rollout.flips import Ambiguous
 from mdnum.rollout.lockstep import CrossFlip, Stretch, lockstep
-from mdnum.systems.build import Simulation
 
 #: The split tolerance as a share of the longest cutoff. Flips that part a crystal do so slowly, and its atoms
 #: have no room to be much further apart; docs/verdict-calibration.md has the verdicts by tolerance.
@@ -70,8 +70,8 @@ class Fork:
         tolerance: of the split, length.
         dates: seed, fork and split.
         decision: at the fork; None without one.
-        series: arrays by step: "step"; separations from A "B", "B|A", "A|B from A", "B 1", ... (repeats, NaN
-            once all have split), from B "A|B" and "B|A from B" (length); "cross", pairs that differ; "overridden" and "furthest" of B|A;
+        series: arrays by step: "step"; separations from A "B", "B|A", "A|B from A", "B 1", ... (repeats,
+            NaN once all have split), from B "A|B" and "B|A from B" (length); "cross", pairs that differ; "overridden" and "furthest" of B|A;
             energies "energy A", "energy B", "energy B|A"; "nearest A", "nearest B", the distance of the pair
             next to its cutoff from it (length); "ambiguous A", "ambiguous B", ambiguous decisions.
         flips: cross-run flips, the first `FLIPS_KEPT`.
@@ -112,8 +112,8 @@ def fork(
     *,
     split: float | None = None,
     counterfactual: bool = True,
-    back: bool = True,
-    repeats: int = REPEATS,
+    back: bool | None = None,
+    repeats: int | None = None,
     seed: int = 0,
     progress: Callable[[int, int, dict[str, Any]], None] | None = None,
 ) -> Fork:
@@ -124,19 +124,20 @@ def fork(
         steps: last step; default the system's own. Followed to twice the split at most; a fifth further where
             the split comes too late to tell a cause from a delay.
         split: separation that counts as split, length; default 0.01 of the longest cutoff.
-        counterfactual: whether to run B under A's decisions.
+        counterfactual: whether to run B under A's decisions; many-body potentials cannot.
         back: whether to run A under B's decisions too, for the full table of two by two; it costs as much
-            as the run of B under A's.
+            as the run of B under A's. Default where that is run.
         repeats: runs of B at most of which all atoms are displaced at random by as much as the choice
-            separates the runs in their first 100 steps (an ulp at least), each free and under A's decisions.
-            They are run where the runs split either way, until the verdict is clear.
+            separates the runs in their first 100 steps (an ulp at least), each free and under A's decisions;
+            default 15. They are run where the runs split either way, until the verdict is clear.
         seed: of the perturbations.
         progress: called with the step reached, the last step, and figures.
 
     Raises:
-        InputError: steps below 1, or runs of different size.
+        InputError: steps below 1, runs of different size, or counterfactuals asked for that are not run.
     """
     a, b = twin.a, twin.b
+    counterfactual, back, most = counterfactuals(twin, counterfactual, back, repeats)
     if a.atoms != b.atoms:
         raise InputError(
             f"the runs have {a.atoms} and {b.atoms} atoms", remedy="Compare runs of one structure"
@@ -147,9 +148,6 @@ def fork(
     tolerance = SPLIT * a.r_cut if split is None else split
     if not tolerance > 0:
         raise InputError(f"split = {tolerance:g}; expected a length above 0")
-    if repeats < 0:
-        raise InputError(f"repeats = {repeats}; expected 0 or more")
-    counterfactual = counterfactual and a.pairwise and b.pairwise
     gathered: list[Stretch] = []
     flips: list[CrossFlip] = []
     doubts = {name: Ambiguous.joined([]) for name in ("A", "B")}
@@ -163,7 +161,7 @@ def fork(
         start_b=twin.start_b,
         frame=twin.frame,
         handed=counterfactual,
-        back=back and counterfactual,
+        back=back,
         guard=_GUARD * tolerance,
     ):
         apart = split_of(stretch.separation["B"], tolerance)
@@ -184,8 +182,33 @@ def fork(
             progress(min(reached, last), last, shown)
         if reached >= last:
             break
-    found = _judged(twin, asked, tolerance, gathered, tuple(flips), total, doubts, repeats)
-    return _repeated(found, repeats, seed, progress)
+    found = _judged(twin, asked, tolerance, gathered, tuple(flips), total, doubts, most)
+    return _repeated(found, most, seed, progress)
+
+
+def counterfactuals(
+    twin: Twin, counterfactual: bool, back: bool | None, repeats: int | None
+) -> tuple[bool, bool, int]:
+    """Whether to run B under A's decisions, A under B's, and how many repeats at most.
+
+    Args:
+        twin: the pair.
+        counterfactual: as asked.
+        back, repeats: as asked; None for what goes with it.
+
+    Raises:
+        InputError: asked for, and not run.
+    """
+    pairwise = twin.a.pairwise and twin.b.pairwise
+    runs = counterfactual and pairwise
+    why = "those are left out" if pairwise else "a many-body potential decides inside its energy function"
+    most = repeats_asked(repeats, runs, why)
+    if back and not runs:
+        raise InputError(
+            f"A under B's decisions was asked for, and B under A's is not run: {why}",
+            remedy="Leave out back",
+        )
+    return runs, runs if back is None else back, most
 
 
 def _beyond(step: int) -> int:
@@ -205,14 +228,14 @@ def _repeated(
         if progress is not None:
             progress(found.steps, found.steps, {"phase": f"repeats {done + 1} to {done + wanted} of {most}"})
         delays = []
-        runs = repeat(twin, starts[done : done + wanted], found.steps, found.tolerance, _GUARD * found.tolerance)
+        runs = repeat(
+            twin, starts[done : done + wanted], found.steps, found.tolerance, _GUARD * found.tolerance
+        )
         for number, (free, handed) in enumerate(runs, done + 1):
-            delays.append(Delay.of(free, handed, found.tolerance))
+            delays.append(Delay.of(free, handed, tolerance))
             series[f"B {number}"] = np.append(free, np.full(found.steps + 1 - len(free), np.nan))
         repeats = (*found.repeats, *delays)
-        verdict = judge(
-            found.dates, series["B"], series["B|A"], found.tolerance, repeats, most
-        )
+        verdict = judge(found.dates, series["B"], series["B|A"], found.tolerance, repeats, most)
         found = replace(found, series=series, repeats=repeats, verdict=verdict)
     return found
 
