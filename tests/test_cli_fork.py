@@ -30,7 +30,8 @@ SUMMARY: dict[str, Any] = {
         "protected": 0.5, "also": 2,
     },
     "growth_rate": 0.0121, "growth_rate_time": 3.03, "r_squared": 0.673, "predicted_split": None,
-    "splits": {"B": 1806, "B|A": None, "A|B": 2400}, "repeated": [{"free": 1475, "handed": 1480}], "cross_flips": 16114,
+    "splits": {"B": 1806, "B|A": None, "A|B": 2400}, "cross_flips": 16114,
+    "repeated": [{"free": 1475, "handed": 1480}],
     "table": [
         {"arithmetic": x, "decisions": y, "from": z, "same": x == y == z, "split": split, "until": 3839}
         for x, y, z, split in (

@@ -71,7 +71,8 @@ class Fork:
         dates: seed, fork and split.
         decision: at the fork; None without one.
         series: arrays by step: "step"; separations from A "B", "B|A", "A|B from A", "B 1", ... (repeats,
-            NaN once all have split), from B "A|B" and "B|A from B" (length); "cross", pairs that differ; "overridden" and "furthest" of B|A;
+            NaN once all have split), from B "A|B" and "B|A from B" (length);
+            "cross", pairs that differ; "overridden" and "furthest" of B|A;
             energies "energy A", "energy B", "energy B|A"; "nearest A", "nearest B", the distance of the pair
             next to its cutoff from it (length); "ambiguous A", "ambiguous B", ambiguous decisions.
         flips: cross-run flips, the first `FLIPS_KEPT`.
@@ -227,10 +228,8 @@ def _repeated(
         done = len(found.repeats)
         if progress is not None:
             progress(found.steps, found.steps, {"phase": f"repeats {done + 1} to {done + wanted} of {most}"})
-        delays = []
-        runs = repeat(
-            twin, starts[done : done + wanted], found.steps, found.tolerance, _GUARD * found.tolerance
-        )
+        delays, tolerance = [], found.tolerance
+        runs = repeat(twin, starts[done : done + wanted], found.steps, tolerance, _GUARD * tolerance)
         for number, (free, handed) in enumerate(runs, done + 1):
             delays.append(Delay.of(free, handed, tolerance))
             series[f"B {number}"] = np.append(free, np.full(found.steps + 1 - len(free), np.nan))

@@ -16,22 +16,22 @@ from mdnum.systems import load
 @pytest.fixture(scope="module")
 def hot():
     """The crystal of 108 atoms melting: the runs split whatever they decide."""
-    overrides = {"dynamics.temperature": 3.0, "neighbors.skin": 0.6}
+    overrides = {"dynamics.temperature": 3.0}
     return parse("precision").make(load("argon/crystal-108", overrides))
 
 
 def test_the_verdict_on_a_liquid_rests_on_repeats(hot):
-    found = fork(hot, 900, repeats=4, back=False)
+    found = fork(hot, 1100, repeats=4, back=False)
     count = found.verdict.count
     assert count is not None and (count.pairs, count.most) == (5, 5)
     assert found.verdict.word != "cause" and len(found.repeats) == 4
     assert {name for name in found.series if name.startswith("B ")} == {"B 1", "B 2", "B 3", "B 4"}
     # alone, from its start, the pair of runs is followed by another path through the code
     start = perturbed(hot, found.tolerance, 4, seed=0)[2]
-    alone = fork(replace(hot, start_b=start), 900, repeats=0, back=False)
+    alone = fork(replace(hot, start_b=start), 1100, repeats=0, back=False)
     assert (alone.splits["B"], alone.splits["B|A"]) == (found.repeats[2].free, found.repeats[2].handed)
     # and the first starts do not depend on how many there are
-    (one,) = repeat(hot, perturbed(hot, found.tolerance, 1, 0), 900, found.tolerance, 3 * found.tolerance)
+    (one,) = repeat(hot, perturbed(hot, found.tolerance, 1, 0), 1100, found.tolerance, 3 * found.tolerance)
     assert int((one[0] > found.tolerance).argmax()) == found.repeats[0].free
 
 
