@@ -10,7 +10,6 @@ from mdnum.cli import fork_options, output
 from mdnum.cli.fork_print import print_ranking, print_two_by_two
 from mdnum.cli.progress import watched
 from mdnum.errors import InputError
-from mdnum.workflow.fork_question import OF_A_BALL
 
 
 def is_ball(system: str) -> bool:
@@ -45,6 +44,8 @@ def fork(
     """
     for option, is_given in foreign.items():
         if is_given:
+            from mdnum.workflow.fork_question import OF_A_BALL
+
             raise InputError(
                 f"{option} is a question for molecular dynamics, and {system} is a ball",
                 remedy=OF_A_BALL.get(option, "Leave it out"),

@@ -89,7 +89,7 @@ def test_the_tables_hold_the_series(compared):
     table, series = folder.read("separation"), compared.fork.series
     assert table["step"].tolist() == list(range(STEPS + 1))
     np.testing.assert_allclose(table["time"], 0.004 * np.arange(STEPS + 1))
-    for column, name in (("free", "B"), ("handed", "B|A"), ("back", "A|B")
+    for column, name in (("free", "B"), ("handed", "B|A"), ("back", "A|B"),
                            ("energy_b", "energy B"), ("overridden", "overridden")):  # fmt: skip
         np.testing.assert_array_equal(table[column], series[name])
     for column, name in (("back_from_a", "A|B from A"), ("nearest_a", "nearest A"),
