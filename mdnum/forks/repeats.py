@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from mdnum.forks.twin import Twin
 from mdnum.rollout.compared import Apart
-from mdnum.rollout.engine import Start, first_state
+from mdnum.rollout.engine import Segment, Start, first_state
 from mdnum.rollout.frame import Frame
 from mdnum.rollout.handed import Handed
 from mdnum.rollout.lockstep import Counterfactual, apart, lockstep
@@ -58,9 +58,12 @@ def repeat(
     a, b = twin.a, twin.b
     frame = twin.frame or Frame.same(a.atoms)
     handed = [Counterfactual(Handed(b, a, start, frame), guard) for start in starts]
-    leader = Track(
-        a, last, twin.start_a, flips=False, listener=lambda segment: [run(segment) for run in handed]
-    )
+
+    def listen(segment: Segment) -> None:
+        for run in handed:
+            run(segment)
+
+    leader = Track(a, last, twin.start_a, flips=False, listener=listen)
     free = [Track(b, last, start, frame, flips=False) for start in starts]
     cell = Apart(a.cell)
     parts: list[tuple[list[np.ndarray], list[np.ndarray]]] = [([], []) for _ in starts]

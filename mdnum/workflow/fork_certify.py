@@ -18,7 +18,6 @@ from mdnum.workflow.fork_question import Log, Progress, basics, finish, is_ball,
 if TYPE_CHECKING:
     from mdnum.forks.bounce.certify import BallCertificate
     from mdnum.forks.exact import Certificate, CertifiedHorizon
-    from mdnum.precision import PrecisionPolicy
     from mdnum.systems.ball_system import BallSystem
     from mdnum.systems.build import Simulation
     from mdnum.systems.load import System
@@ -50,7 +49,7 @@ def fork_certify(
     system: System | BallSystem | str | Path,
     *,
     steps: int | None = None,
-    policies: Mapping[str, PrecisionPolicy] | Mapping[str, Mapping[str, str]] | None = None,
+    policies: Mapping[str, Any] | None = None,
     out: str | Path | None = None,
     overrides: Mapping[str, Any] | None = None,
     report: bool | None = None,
@@ -62,7 +61,7 @@ def fork_certify(
         system: a loaded system, a shipped name or the path of a system file: Lennard-Jones, NVE, at most 108
             atoms; or a ball whose steps are sums and products.
         steps: last step; default the system's own.
-        policies: to rank, by name; default `forks.exact.POLICIES`. Of a ball formats by role, such as
+        policies: `PrecisionPolicy` to rank, by name; default `forks.exact.POLICIES`. Of a ball formats by role, such as
             {"state": "float32"}; default `forks.bounce.certify.POLICIES`.
         out: the new fork folder; default runs/fork-<name>-<n>. That of a ball is printed, and leaves none.
         overrides: dotted keys to values.
@@ -128,7 +127,8 @@ def _of_a_ball(
     from mdnum.forks.bounce.certify import certify
     from mdnum.workflow.fork import loaded_of_any
 
-    found = certify(loaded_of_any(system, overrides), steps, policies, progress=progress)
+    ball: Any = loaded_of_any(system, overrides)
+    found = certify(ball, steps, policies, progress=progress)
     rows = [{"policy": row.name, **{name: getattr(row, name) for name in _BALL_ROW}} for row in found.ranking]
     summary = {"question": "certify", "steps": found.steps, "says": list(found.says), "ranking": rows}
     return CertifyResult(None, found, {}, summary)

@@ -56,9 +56,9 @@ def loaded(
     Raises:
         InputError: there is none, it is a ball, or it is loaded already and there are overrides.
     """
-    from mdnum.systems import System, load
+    from mdnum.systems import BallSystem, System, load
 
-    if is_ball(system):
+    if isinstance(system, BallSystem) or is_ball(system):
         name = system if isinstance(system, str | Path) else system.name
         raise InputError("this system is a ball", where=str(name), remedy=instead)
     if not isinstance(system, System):
