@@ -61,8 +61,8 @@ def fork_certify(
         system: a loaded system, a shipped name or the path of a system file: Lennard-Jones, NVE, at most 108
             atoms; or a ball whose steps are sums and products.
         steps: last step; default the system's own.
-        policies: `PrecisionPolicy` to rank, by name; default `forks.exact.POLICIES`. Of a ball formats by role, such as
-            {"state": "float32"}; default `forks.bounce.certify.POLICIES`.
+        policies: `PrecisionPolicy` to rank, by name; default `forks.exact.POLICIES`. Of a ball formats by
+            role, such as {"state": "float32"}; default `forks.bounce.certify.POLICIES`.
         out: the new fork folder; default runs/fork-<name>-<n>. That of a ball is printed, and leaves none.
         overrides: dotted keys to values.
         report: write report.html; default yes where there is a folder.
