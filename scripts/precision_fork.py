@@ -70,9 +70,7 @@ def main() -> None:
         "--roles", nargs="+", choices=ROLES, default=list(ROLES), metavar="ROLE",
         help="roles made float32 (default all of them, one at a time, and all but the state)",
     )  # fmt: skip
-    made.add_argument(
-        "--repeats", type=int, help="repeats at most that tell a delay (default 15)"
-    )
+    made.add_argument("--repeats", type=int, help="repeats at most that tell a delay (default 15)")
     chosen = made.parse_args()
     system = load(chosen.system, world="md")
     found = {}
