@@ -7,8 +7,9 @@ is the verdict:
 
     =  same        no bit differed            -  no fork    bits differed, no decision did
     ?  open        no split within the steps  b  bystander  the flips only came along
-    H  hurried     later without the flips    C  cause      no split without the flips
-    x  failed      the cell could not be run     empty      the choice does not apply
+    H  accelerated: later without the flips   C  cause      no split without the flips
+    u  undecided   the repeats do not tell    x  failed     the cell could not be run
+    an empty cell: the choice does not apply
 
 Finished cells stay in a CSV file beside the figure; started again, the script makes only those that are
 missing, and draws all of them. A cell that fails is noted, and tried again at the next start.
@@ -38,6 +39,7 @@ from cutoff_sensitivity import variant
 from matplotlib.colors import LogNorm
 
 from mdnum.errors import InputError, MdnumError
+from mdnum.events.chance import REPEATS
 from mdnum.forks import fork
 from mdnum.forks.choices import BY_NAME, Choice, parse
 from mdnum.forks.choices.base import varied
@@ -48,8 +50,8 @@ KINDS = ("hard", "shifted", "force-shifted", "switched")
 SYSTEMS = ("argon/crystal-108", "liquid:256", "argon/tilted-500")
 QUICK = ("precision", "reduction=exact", "order", "order@exact", "start")
 LETTERS = {
-    "same": "=", "no fork": "-", "open": "?", "bystander": "b", "hurried": "H", "cause": "C", "failed": "x",
-    "does not apply": "",
+    "same": "=", "no fork": "-", "open": "?", "bystander": "b", "accelerated": "H", "undecided": "u",
+    "cause": "C", "failed": "x", "does not apply": "",
 }  # fmt: skip
 
 
@@ -277,7 +279,7 @@ def main() -> None:
     )
     made.add_argument("--choices", nargs="+", metavar="CHOICE", help="default all that ship")
     made.add_argument("--steps", type=int, metavar="N", help="steps at most (default 4000)")
-    made.add_argument("--repeats", type=int, metavar="K", help="repeats that calibrate chance (default 2)")
+    made.add_argument("--repeats", type=int, metavar="K", help="repeats that tell a delay (default 15)")
     made.add_argument("--table", type=Path, metavar="FILE", help="finished cells (default beside the figure)")
     chosen = made.parse_args()
     quick = chosen.quick
@@ -285,7 +287,7 @@ def main() -> None:
     kinds = chosen.kinds or (("hard", "switched") if quick else KINDS)
     choices = [parse(word) for word in chosen.choices or (QUICK if quick else BY_NAME)]
     steps = chosen.steps or (300 if quick else 4000)
-    repeats = chosen.repeats if chosen.repeats is not None else (0 if quick else 2)
+    repeats = chosen.repeats if chosen.repeats is not None else (0 if quick else REPEATS)
     systems = {word: system_of(word) for word in words}
     book = Book(chosen.table or chosen.output.with_suffix(".csv"))
     cells = fill(book, systems, kinds, choices, steps, repeats)

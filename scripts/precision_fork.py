@@ -10,8 +10,8 @@ run's decisions; the table says:
     split    first step with an atom further apart than the tolerance
     told     the same for the run that is told the decisions
     growth   rate at which the separation grew, per step, before the split
-    verdict  whether the flips caused the split, hurried it, or came along (bystander); open: no
-             split within the steps
+    verdict  whether the flips caused the split, accelerated it, or came along (bystander); undecided:
+             the repeats do not tell; open: no split within the steps
 
 How to read it. All roles seed within a step or so, since one rounding is enough; they differ in the
 size of the error, and so in how soon a pair near its cutoff is decided otherwise. Where "told" is as
@@ -70,7 +70,7 @@ def main() -> None:
         "--roles", nargs="+", choices=ROLES, default=list(ROLES), metavar="ROLE",
         help="roles made float32 (default all of them, one at a time, and all but the state)",
     )  # fmt: skip
-    made.add_argument("--repeats", type=int, default=2, help="repeats that calibrate chance (default 2)")
+    made.add_argument("--repeats", type=int, help="repeats at most that tell a delay (default 15)")
     chosen = made.parse_args()
     system = load(chosen.system, world="md")
     found = {}

@@ -30,7 +30,8 @@ SUMMARY: dict[str, Any] = {
         "protected": 0.5, "also": 2,
     },
     "growth_rate": 0.0121, "growth_rate_time": 3.03, "r_squared": 0.673, "predicted_split": None,
-    "splits": {"B": 1806, "B|A": None, "A|B": 2400}, "repeats": [1475], "cross_flips": 16114,
+    "splits": {"B": 1806, "B|A": None, "A|B": 2400}, "cross_flips": 16114,
+    "repeated": [{"free": 1475, "handed": 1480}],
     "table": [
         {"arithmetic": x, "decisions": y, "from": z, "same": x == y == z, "split": split, "until": 3839}
         for x, y, z, split in (
@@ -122,7 +123,7 @@ def test_the_verdict_comes_first_then_dates_and_decision(compare: Recorder, caps
         "growth 0.0121 a step, 3.03 a unit of time, r² 0.673",
         "flips in one run only 16,114",
         "A its own is A 1,806", "B its own 1,806 is B", "B A's > 3,839 1,811", "A B's 1,790 2,400",
-        "B, start perturbed its own 1,475",
+        "B, start perturbed its own 1,475 to 1,475", "B, start perturbed A's 1,480 to 1,480",
         "decisions > 2,033 steps, > 24.6 nats 594 steps, 7.19 nats", "arithmetic -16 steps",
         "certified in A up to step 3,839: no decision is ambiguous",
         "certified in B not even at the start; 431 ambiguous decisions at 390 steps; "
@@ -143,7 +144,7 @@ def test_the_verdict_comes_first_then_dates_and_decision(compare: Recorder, caps
 
 def test_a_horizon_too_short_is_no_failure(compare: Recorder, capsys):
     compare.summary = SUMMARY | {
-        "split": None, "split_time": None, "predicted_split": 5200, "verdict": "open", "repeats": [],
+        "split": None, "split_time": None, "predicted_split": 5200, "verdict": "open", "repeated": [],
         "splits": {"B": None}, "table": SUMMARY["table"][:2], "shares": [],
         "lyapunov": None, "lyapunov_reason": "a many-body potential",
         "minimal": {"pairs": None, "tests": 0, "reason": "the runs did not split"},
@@ -161,7 +162,7 @@ def test_a_horizon_too_short_is_no_failure(compare: Recorder, capsys):
 
 def test_runs_that_do_not_fork_print_too(compare: Recorder, capsys):
     nothing = dict.fromkeys(("seed", "fork", "split", "decision", "growth_rate", "predicted_split"))
-    compare.summary = SUMMARY | nothing | {"verdict": "same", "splits": {"B": None}, "repeats": []}
+    compare.summary = SUMMARY | nothing | {"verdict": "same", "splits": {"B": None}, "repeated": []}
     assert call("fork", "argon/crystal-108", "--vary", "translate=lattice") == 0
     assert "seed none in 3,839 steps (first bit differs)" in printed(capsys)
 

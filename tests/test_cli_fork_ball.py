@@ -47,7 +47,7 @@ def test_an_unknown_choice_names_the_nearest_of_a_ball(capsys):
 
 def test_a_fork_of_a_ball_is_printed_and_told_as_json(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    asked = ("fork", "ball/stiff", "--vary", "contact=earlier", "--steps", "300", "--repeats", "1", "-o")
+    asked = ("fork", "ball/stiff", "--vary", "contact=earlier", "--steps", "300", "--repeats", "4", "-o")
     assert call(*asked, "here", "--no-report") == 0
     lines = printed(capsys)
     assert lines[0].startswith("The ")

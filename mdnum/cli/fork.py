@@ -12,9 +12,6 @@ from mdnum.cli.fork_print import print_rows
 from mdnum.cli.progress import watched
 from mdnum.errors import InputError
 
-#: Repeats where nothing was said.
-_REPEATS = 2
-
 
 def fork(
     system: str | None = typer.Argument(
@@ -31,14 +28,16 @@ def fork(
     ),
     steps: int | None = typer.Option(None, min=1, help="Steps to follow, instead of the system's own."),
     split: float | None = typer.Option(
-        None, metavar="LENGTH", help="The separation that counts as split; 0.04 of the cutoff by default."
+        None, metavar="LENGTH", help="The separation that counts as split; 0.01 of the cutoff by default."
     ),
     repeats: int | None = typer.Option(
-        None, min=0, metavar="K", help="Perturbed starts, to tell a delay from chance; 2 by default."
+        None, min=0, metavar="K", help="Perturbed starts at most, to tell a delay from chance; 15 by default."
     ),
     settings: list[str] | None = output.SET_OPTION,
     no_counterfactual: bool = typer.Option(
-        False, "--no-counterfactual", help="Do not run B under A's decisions: dates, but no cause."
+        False,
+        "--no-counterfactual",
+        help="Do not run B under A's decisions, nor repeats: dates, but no cause.",
     ),
     no_back: bool = typer.Option(
         False, "--no-back", help="Do not run A under B's decisions: half of the table of two by two."
@@ -115,7 +114,7 @@ def fork(
         }  # fmt: skip
         return fork_ball.fork(
             system, vary, foreign=foreign, given=given, certify=certify, steps=steps, split=split,
-            repeats=_REPEATS if repeats is None else repeats,
+            repeats=repeats,
             counterfactual=not no_counterfactual, out=out, overrides=overrides, report=not no_report,
             as_json=as_json,
         )  # fmt: skip
@@ -132,8 +131,9 @@ def fork(
         raise InputError("no system given", remedy="`mdnum systems list` names those that come with mdnum")
     fork_options.check(_question(asked, vary, benign, replay), given)
     pair = {
-        "steps": steps, "split": split, "repeats": _REPEATS if repeats is None else repeats,
-        "counterfactual": not no_counterfactual, "back": not no_back, "lyapunov": not no_lyapunov,
+        "steps": steps, "split": split, "repeats": repeats,
+        "counterfactual": not no_counterfactual, "back": False if no_back else None,
+        "lyapunov": False if no_lyapunov else None,
         "minimal": minimal, "pin": pin, "out": out, "report": not no_report,
     }  # fmt: skip
     if system is not None:

@@ -11,18 +11,6 @@ from mdnum.cli.fork_print import print_ranking, print_two_by_two
 from mdnum.cli.progress import watched
 from mdnum.errors import InputError
 
-#: What a ball offers in place of an option of molecular dynamics.
-_INSTEAD = {
-    "--processes": "whether a ball's bits depend on the program around it is shown by "
-    "`mdnum ball --demo determinism`",
-    "--forecast": "how far each contact is from another step is the margin that `mdnum ball` records",
-    "--benign": "a ball has no ensemble to be consistent with; --vary says how far the heights part",
-    "--minimal": "a ball's decisions are taken back one at a time: --vary contact=STEP:BALL",
-    "--pin": "a ball's decisions are taken back one at a time: --vary contact=STEP:BALL",
-    "--no-back": "a ball is run under either run's decisions always; --no-counterfactual leaves both out",
-    "--no-lyapunov": "a ball has no tangent run to leave out",
-}
-
 
 def is_ball(system: str) -> bool:
     """Whether a system's file is a ball's."""
@@ -40,7 +28,7 @@ def fork(
     certify: bool,
     steps: int | None,
     split: float | None,
-    repeats: int,
+    repeats: int | None,
     counterfactual: bool,
     out: Path | None,
     overrides: Mapping[str, str],
@@ -56,9 +44,11 @@ def fork(
     """
     for option, is_given in foreign.items():
         if is_given:
+            from mdnum.workflow.fork_question import OF_A_BALL
+
             raise InputError(
                 f"{option} is a question for molecular dynamics, and {system} is a ball",
-                remedy=_INSTEAD.get(option, "Leave it out"),
+                remedy=OF_A_BALL.get(option, "Leave it out"),
             )
     question = "--certify" if certify else "--vary all" if vary == "all" else "--vary"
     fork_options.check(f"{question} of a ball", given)
@@ -190,38 +180,24 @@ def _decided(made: Mapping[str, Any], counted: str) -> str:
 
 def _certify(system: str, steps: int | None, overrides: Mapping[str, str], *, as_json: bool) -> int:
     """When runs in each precision leave the history in exact arithmetic."""
-    from mdnum.forks.bounce.certify import certify
-    from mdnum.systems import load
+    from mdnum.workflow import fork_certify
 
     with watched() as progress:
-        found = certify(load(system, overrides, world="ball"), steps, progress=progress)
-    rows = [
-        {
-            "policy": row.name,
-            "horizon": row.horizon,
-            "channel": row.channel,
-            "ball": row.ball,
-            "height": row.height,
-            "separation_end": row.separation_end,
-            "why_not": row.why_not,
-        }
-        for row in found.ranking
-    ]
+        summary = fork_certify(system, steps=steps, overrides=overrides, progress=progress).summary
     if as_json:
-        document = {"question": "certify", "steps": found.steps, "says": found.says, "ranking": rows}
-        output.print_json(document)
+        output.print_json(summary)
         return output.EXIT_FINE
     out = output.console()
-    for sentence in found.says:
+    for sentence in summary["says"]:
         out.print(sentence, style="bold", markup=False)
     table = [
         (
             row["policy"],
-            "" if row["why_not"] else _horizon(row, found.steps),
+            "" if row["why_not"] else _horizon(row, summary["steps"]),
             row["separation_end"],
             row["why_not"] or "",
         )
-        for row in rows
+        for row in summary["ranking"]
     ]
     output.print_table("", ("precision", "leaves the exact history", "apart at the end, m", ""), table)
     return output.EXIT_FINE

@@ -95,6 +95,8 @@ def _certain(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
 
 def print_two_by_two(summary: Mapping[str, Any]) -> None:
     """Splits by arithmetic and decisions, from either run, and what each of the two contributed."""
+    from mdnum.report.fork.sections import repeated
+
     cells = summary.get("table") or ()
     runs = {(cell["arithmetic"], cell["decisions"]) for cell in cells}
     if len(runs) < 3 or all(cell["split"] is None for cell in cells):
@@ -110,9 +112,10 @@ def print_two_by_two(summary: Mapping[str, Any]) -> None:
         )
         for (arithmetic, decisions), texts in by_run.items()
     ]
-    lines += [("B, start perturbed", "its own", f"{split:,}", "") for split in summary.get("repeats") or ()]
-    more = (("B, start perturbed", "its own", f"> {summary['steps']:,}", ""),)
-    lines += more * (summary.get("repeats_censored") or 0)
+    lines += [
+        ("B, start perturbed", "its own" if decisions == "B" else f"{decisions}'s", text, "")
+        for decisions, text in repeated(summary)
+    ]
     output.print_table(
         "splits, either arithmetic under either decisions",
         ("arithmetic", "decisions", "from A", "from B"),

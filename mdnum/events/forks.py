@@ -1,7 +1,8 @@
 """Two runs that differ in one choice: their dates, how fast they part, and what a flip had to do with it.
 
-The verdict compares three separations from the first run: of the second run, and of the second run's
-arithmetic under the first run's decisions. Only the latter can tell whether the flips did it.
+The verdict compares two separations from the first run: of the second run, and of the second run's
+arithmetic under the first run's decisions. Only the latter can tell whether the flips did it. Where it splits
+as well, repeats of the pair tell whether the flips hastened it or only came along (mdnum.events.chance).
 """
 
 from __future__ import annotations
@@ -13,9 +14,9 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from mdnum.events.chance import Chance, scatter_of
+from mdnum.events.chance import FEWEST, REPEATS, Count, Delay, count
 
-Word = Literal["same", "no fork", "open", "cause", "hurried", "bystander"]
+Word = Literal["same", "no fork", "open", "cause", "accelerated", "bystander", "undecided"]
 
 #: A slope is fitted to separations between these, as shares of the split tolerance: above rounding's plateau
 #: at the start, below saturation at the end.
@@ -23,15 +24,15 @@ _FIT = (1e-12, 0.1)
 #: Fewer rows than this give no growth rate.
 _FIT_ROWS = 16
 #: A split must have been followed for so many times its steps before "did not split" means anything.
-_PATIENCE = 1.2
+PATIENCE = 1.2
 #: A counterfactual that grows and would split within so many times the free run's steps is late, not saved.
 _SAVED = 5.0
-#: A delay of less than one power of e is no delay: the separation was never as much as e times smaller.
+#: A delay of less than one e-folding is no delay: the separation was never as much as e times smaller.
 NATS = 1.0
 #: r² of a fit that counts as growth.
 FITS = 0.5
-#: Powers of e that the later half of a fit must grow by before it predicts anything. What the first steps do
-#: is a power law: its later half grows by 0.7 powers of e for every power of the time.
+#: E-foldings that the later half of a fit must grow by before it predicts anything. What the first steps do
+#: is a power law: its later half grows by 0.7 e-foldings for every e-folding of the time.
 _HALF = 3.0
 
 
@@ -118,8 +119,8 @@ def expected(
 ) -> float | None:
     """Steps after the last one at which runs that have not split are expected to; None where nothing tells.
 
-    Their own growth predicts only where it outlasts the first steps: its later half must be several powers
-    of e, at a rate within a factor of 2 of the whole.
+    Their own growth predicts only where it outlasts the first steps: its later half must be several
+    e-foldings, at a rate within a factor of 2 of the whole.
 
     Args:
         separation: of each step, length; NaN where a run had ended.
@@ -147,28 +148,36 @@ def expected(
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether the flips caused a split, hurried it, or only came along.
+    """Whether the flips caused a split, accelerated it, or only came along.
 
     Attributes:
         word: "same" (no bit differs), "no fork" (no decision differs), "open" (no split within the horizon,
-            or nothing tells a delay from chance), "cause" (without the flips no split), "hurried" (without
-            them later, beyond chance), "bystander" (the split came before any flip; or without them as
-            early, no later than by chance, or by less than one power of e).
+            or no counterfactual that was followed far enough), "cause" (without the flips no split),
+            "accelerated" (most pairs such as this split later without them, by more than one e-folding of the
+            separation), "bystander" (the split came before any flip, or most pairs do not split later by
+            that much), "undecided" (the repeats that were allowed do not tell the two apart).
         free: split of the free run, step.
         handed: split of the run under the other's decisions, step; None where there is none.
-        noise: by how many steps two splits differ by chance: twice the standard deviation of a difference; a
-            lower bound where a repeat did not split. 0 where nothing is known of it.
-        nats: growth rate times the steps gained: how many powers of e the flips were worth; infinite for a
-            cause.
+        nats: growth rate times the steps gained: how many e-foldings the flips of this pair were worth;
+            infinite for a cause.
+        threshold: delay that counts as later, steps: one e-folding, 0 where the separation grows otherwise;
+            None where no pairs were counted.
+        count: of the pair and its repeats, those that split later; None where none were counted.
         reasons: the criteria, in words with their numbers.
     """
 
     word: Word
     free: int | None
     handed: int | None
-    noise: float
     nats: float | None
     reasons: tuple[str, ...]
+    threshold: float | None = None
+    count: Count | None = None
+
+    @property
+    def wanted(self) -> int:
+        """Further repeats that would have to be run before the next look; 0 for none."""
+        return self.count.wanted if self.word == "undecided" and self.count is not None else 0
 
 
 def judge(
@@ -176,7 +185,8 @@ def judge(
     free: Float[np.ndarray, "steps"],
     handed: Float[np.ndarray, "steps"] | None,
     tolerance: float,
-    chance: Sequence[int | None] = (),
+    repeats: Sequence[Delay] = (),
+    most: int = REPEATS,
     *,
     ended: str | None = None,
 ) -> Verdict:
@@ -188,20 +198,20 @@ def judge(
         handed: separation of the counterfactual from the first run, length; NaN after it was ended. None
             where there is no counterfactual.
         tolerance: of the split, length.
-        chance: splits of repeats of the pair, the start perturbed by as much as the choice does, steps; None
-            for one that did not split.
+        repeats: of the pair, the start perturbed by as much as the choice does.
+        most: repeats that may be run in all.
         ended: where the fork is that one run ended and the other did not: which and how, in words.
     """
     last = len(free) - 1
     if ended is not None:
         before = f"no decision differs in the {last} steps before"
-        return Verdict("open", dates.split, None, 0.0, None, (f"{ended}: that is the fork; {before}",))
+        return Verdict("open", dates.split, None, None, (f"{ended}: that is the fork; {before}",))
     if dates.seed is None:
-        return Verdict("same", None, None, 0.0, None, (f"no bit differs in {last} steps",))
+        return Verdict("same", None, None, None, (f"no bit differs in {last} steps",))
     if dates.fork is None:
         text = f"no decision differs in {last} steps; the separation reaches {np.nanmax(free):.2g}"
         reasons = (text,) if dates.split is not None else (text, *_outlook(free, tolerance))
-        return Verdict("no fork", dates.split, None, 0.0, None, reasons)
+        return Verdict("no fork", dates.split, None, None, reasons)
     if dates.split is None:
         reasons = _outlook(free, tolerance)
         other = None if handed is None else split_of(handed, tolerance)
@@ -210,95 +220,96 @@ def judge(
                 f"under the first run's decisions the runs do split, at step {other}: the decisions that "
                 "differ keep them together",
             )
-        return Verdict("open", None, other, 0.0, None, reasons)
+        return Verdict("open", None, other, None, reasons)
     if dates.split < dates.fork:
         text = (
             f"the runs had split at step {dates.split}, before any decision differed (step {dates.fork}): no "
             "flip had a part in it"
         )
-        return Verdict("bystander", dates.split, None, 0.0, None, (text,))
+        return Verdict("bystander", dates.split, None, None, (text,))
     if handed is None:
         text = f"split at step {dates.split}; without a counterfactual nothing is said about the cause"
-        return Verdict("open", dates.split, None, 0.0, None, (text,))
-    scatter = scatter_of(dates.split, chance, last)
+        return Verdict("open", dates.split, None, None, (text,))
+    delay = Delay.of(free, handed, tolerance)
     fit = growth(free, tolerance)
     rate = fit.rate if fit.plain else None
-    other = split_of(handed, tolerance)
-    if other is None:
-        return _kept(dates.split, handed, tolerance, scatter, rate)
-    gained = other - dates.split
-    nats = None if rate is None else rate * gained
+    if delay.handed is None:
+        return _kept(dates.split, handed, tolerance, (delay, *repeats), most, rate)
+    gained = delay.handed - dates.split
     text = (
-        f"free, the runs split at step {dates.split}; under the first run's decisions at step {other}, "
-        f"{abs(gained)} steps {'later' if gained >= 0 else 'earlier'}"
+        f"free, the runs split at step {dates.split}; under the first run's decisions at step "
+        f"{delay.handed}, {abs(gained)} steps {'later' if gained >= 0 else 'earlier'}"
     )
-    worth = f"the flips were worth {nats:.2g} powers of e of separation" if nats is not None else ""
-    word, why = _delayed(gained, nats, scatter)
-    reasons = tuple(part for part in (text, scatter.text, worth, why) if part)
-    return Verdict(word, dates.split, other, scatter.noise, nats, reasons)
+    return _counted((delay, *repeats), most, rate, gained, (text,))
 
 
-def _delayed(gained: float, nats: float | None, scatter: Chance) -> tuple[Word, str]:
-    """The word for a split that comes so much later without the flips, and why."""
-    if gained <= 0:
-        return "bystander", "without the flips it comes no later"
-    if scatter.known and gained <= scatter.noise:
-        return "bystander", "no later than by chance"
-    if nats is not None and nats < NATS:
-        beyond = "beyond the scatter, but by" if scatter.known else "by"
-        return "bystander", (
-            f"later {beyond} less than one power of e of separation ({nats:.2g}), which counts as no "
-            "difference"
+def _counted(
+    delays: tuple[Delay, ...], most: int, rate: float | None, gained: float, reasons: tuple[str, ...]
+) -> Verdict:
+    """The verdict where the runs split either way: how many of the pair and its repeats split later."""
+    pair = delays[0]
+    threshold = 0.0 if rate is None else NATS / rate
+    nats = None if rate is None else rate * gained
+    if nats is not None:
+        reasons += (f"the flips were worth {nats:.2g} e-foldings of the separation",)
+    found = count(delays, threshold, 1 + most)
+    later = "later" if rate is None else f"later by more than one e-folding ({threshold:.0f} steps)"
+    unseen = found.pairs - found.later - found.not_later
+    reasons += (
+        f"of the pair and {found.pairs - 1} repeats (all positions of B's start displaced at random by as "
+        "much as the choice separates the runs in their first 100 steps, an ulp at least) "
+        f"{found.later} split {later} without the flips and {found.not_later} do not"
+        + (f"; of {unseen} it was not seen" if unseen else ""),
+    )
+    made = found.delayed
+    word: Word = "undecided" if made is None else "accelerated" if made else "bystander"
+    if made is None:
+        need = found.needed
+        reasons += (
+            f"so few repeats cannot tell: at least {FEWEST} are needed"
+            if need is None
+            else f"that is not clear: {need[1]} of {need[0]} would be",
         )
-    if not scatter.known:
-        return "open", f"no repeat tells whether {gained:.0f} steps later is chance"
-    if scatter.least:
-        return "open", f"{gained:.0f} steps later is more than that lower bound; it may still be chance"
-    return "hurried", "later, beyond chance"
+    return Verdict(word, pair.free, pair.handed, nats, reasons, threshold, found)
 
 
 def _kept(
-    free: int, handed: Float[np.ndarray, "steps"], tolerance: float, scatter: Chance, rate: float | None
+    free: int,
+    handed: Float[np.ndarray, "steps"],
+    tolerance: float,
+    delays: tuple[Delay, ...],
+    most: int,
+    rate: float | None,
 ) -> Verdict:
     """The verdict where the runs do not split under the first run's decisions."""
     some = np.isfinite(handed)
     seen = int(np.flatnonzero(some)[-1]) if some.any() else 0
     reach = float(np.nanmax(handed)) if some.any() else 0.0
     below = float(np.log(tolerance / reach)) if reach > 0 else float("inf")
-    how = f"{below:.2g} powers of e below the tolerance" if reach > 0 else "the same bits"
+    how = f"{below:.2g} e-foldings below the tolerance" if reach > 0 else "the same bits"
     text = (
         f"free, the runs split at step {free}; under the first run's decisions they do not up to step "
         f"{seen}: the separation is {reach:.2g} at most, {how}"
     )
-    noise = scatter.noise
-    if seen < _PATIENCE * free:
+    if seen < PATIENCE * free:
         more = (
             f"only {seen - free} steps follow the split; run longer to tell a cause from a delay"
             if seen > free
             else "where it was ended"
         )
-        return Verdict("open", free, None, noise, None, (text, scatter.text, more))
+        return Verdict("open", free, None, None, (text, more))
     late = _expected(handed, tolerance, seen)
     if late is not None and late < _SAVED * free:
-        gained = late - free
-        nats = None if rate is None else rate * gained
         more = f"it grows and is expected to split about step {late:.0f}: later, but not saved"
-        word, why = _delayed(gained, nats, scatter)
-        if word == "bystander":
-            # it has not split yet: the expectation may be off
-            word = "open"
-        return Verdict(word, free, None, noise, nats, (text, scatter.text, more, why))
+        return _counted(delays, most, rate, late - free, (text, more))
     if below < NATS:
-        more = "which is within one power of e of it: no cause without a longer run"
-        return Verdict("open", free, None, noise, None, (text, scatter.text, more))
+        more = "which is within one e-folding of it: no cause without a longer run"
+        return Verdict("open", free, None, None, (text, more))
     basis = (
         f"the word cause rests on that: no split within {seen / free:.2g} times the steps to the free one, "
         "and none on its way"
     )
-    if scatter.noise > seen - free:
-        # the free split may come that late by chance: then it is not the delay that tells
-        basis += "; the scatter is wider than the steps followed since, so it is the size that tells"
-    return Verdict("cause", free, None, noise, float("inf"), (text, scatter.text, basis))
+    return Verdict("cause", free, None, float("inf"), (text, basis))
 
 
 def _outlook(free: Float[np.ndarray, "steps"], tolerance: float) -> tuple[str, ...]:

@@ -6,28 +6,28 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Shaped
 
 from mdnum.errors import InputError
-from mdnum.events.forks import Dates, Growth, Verdict, growth, judge, split_of
+from mdnum.events.chance import Delay
+from mdnum.events.forks import PATIENCE, Dates, Growth, Verdict, growth, judge, split_of
 from mdnum.events.shares import Cell, Share, shares, table
+from mdnum.forks.repeats import perturbed, repeat
 from mdnum.forks.twin import Twin
+from mdnum.forks.words import repeats_asked
 from mdnum.md.cell import HostCell
 from mdnum.rollout.engine import Start, first_state
 from mdnum.rollout.flips import Ambiguous
 from mdnum.rollout.lockstep import CrossFlip, Stretch, lockstep
-from mdnum.systems.build import Simulation
 
-#: The split tolerance as a share of the longest cutoff: a tenth of σ at a cutoff of 2.5 σ.
-SPLIT = 0.04
+#: The split tolerance as a share of the longest cutoff. Flips that part a crystal do so slowly, and its atoms
+#: have no room to be much further apart; docs/verdict-calibration.md has the verdicts by tolerance.
+SPLIT = 0.01
 #: A run is followed for so many times the steps to its split, so that "did not split" means something.
 _BEYOND = 2.0
 #: A counterfactual ends when a decision it is told is so many tolerances from its cutoff.
 _GUARD = 3.0
-#: Repeats are perturbed by so many tolerances at most.
-_LARGEST_NUDGE = 1e-3
 #: Cross-run flips that are kept; the counts cover all of them.
 FLIPS_KEPT = 100_000
 
@@ -70,8 +70,9 @@ class Fork:
         tolerance: of the split, length.
         dates: seed, fork and split.
         decision: at the fork; None without one.
-        series: arrays by step: "step"; separations from A "B", "B|A", "A|B from A", "B 1", ..., from B "A|B"
-            and "B|A from B" (length); "cross", pairs that differ; "overridden" and "furthest" of B|A;
+        series: arrays by step: "step"; separations from A "B", "B|A", "A|B from A", "B 1", ... (repeats,
+            NaN once all have split), from B "A|B" and "B|A from B" (length);
+            "cross", pairs that differ; "overridden" and "furthest" of B|A;
             energies "energy A", "energy B", "energy B|A"; "nearest A", "nearest B", the distance of the pair
             next to its cutoff from it (length); "bound A", "bound B", how far rounding can move a distance
             that is compared (length); "ambiguous A", "ambiguous B", ambiguous decisions.
@@ -83,6 +84,7 @@ class Fork:
         table: splits of either arithmetic under either decisions.
         shares: what the decisions and what the arithmetic contributed to the split.
         verdict: on the flips.
+        repeats: when each repeat splits, free and under A's decisions.
         failed: runs that ended in "blow-up" or "runaway". Where a free run does, the comparison ends with it;
             where only one of them does, that is the fork at the latest.
     """
@@ -102,13 +104,8 @@ class Fork:
     table: tuple[Cell, ...]
     shares: tuple[Share, ...]
     verdict: Verdict
+    repeats: tuple[Delay, ...]
     failed: dict[str, str]
-
-    @property
-    def repeats(self) -> list[int]:
-        """Splits of the repeats, where they split."""
-        found = [split for name, split in self.splits.items() if name.startswith("B ")]
-        return [split for split in found if split is not None]
 
 
 def fork(
@@ -117,8 +114,8 @@ def fork(
     *,
     split: float | None = None,
     counterfactual: bool = True,
-    back: bool = True,
-    repeats: int = 2,
+    back: bool | None = None,
+    repeats: int | None = None,
     seed: int = 0,
     progress: Callable[[int, int, dict[str, Any]], None] | None = None,
 ) -> Fork:
@@ -126,20 +123,23 @@ def fork(
 
     Args:
         twin: the pair.
-        steps: last step; default the system's own. Followed to twice the split at most.
-        split: separation that counts as split, length; default 0.04 of the longest cutoff.
-        counterfactual: whether to run B under A's decisions.
+        steps: last step; default the system's own. Followed to twice the split at most; a fifth further where
+            the split comes too late to tell a cause from a delay.
+        split: separation that counts as split, length; default 0.01 of the longest cutoff.
+        counterfactual: whether to run B under A's decisions; many-body potentials cannot.
         back: whether to run A under B's decisions too, for the full table of two by two; it costs as much
-            as the run of B under A's.
-        repeats: runs of B of which all atoms are displaced at random by as much as the choice separates the
-            runs in their first 100 steps (an ulp at least), to tell a delay from chance.
+            as the run of B under A's. Default where that is run.
+        repeats: runs of B at most of which all atoms are displaced at random by as much as the choice
+            separates the runs in their first 100 steps (an ulp at least), each free and under A's decisions;
+            default 15. They are run where the runs split either way, until the verdict is clear.
         seed: of the perturbations.
         progress: called with the step reached, the last step, and figures.
 
     Raises:
-        InputError: steps below 1, or runs of different size.
+        InputError: steps below 1, runs of different size, or counterfactuals asked for that are not run.
     """
     a, b = twin.a, twin.b
+    counterfactual, back, most = counterfactuals(twin, counterfactual, back, repeats)
     if a.atoms != b.atoms:
         raise InputError(
             f"the runs have {a.atoms} and {b.atoms} atoms", remedy="Compare runs of one structure"
@@ -150,30 +150,28 @@ def fork(
     tolerance = SPLIT * a.r_cut if split is None else split
     if not tolerance > 0:
         raise InputError(f"split = {tolerance:g}; expected a length above 0")
-    counterfactual = counterfactual and a.pairwise and b.pairwise
-    start_b = twin.start_b or first_state(b)
-    starts = []
-    if counterfactual and repeats:
-        # a choice that changes everything at once (another noise) still leaves room to grow
-        size = min(seed_size(twin), _LARGEST_NUDGE * tolerance)
-        starts = nudged(b, start_b, size, repeats, seed)
     gathered: list[Stretch] = []
     flips: list[CrossFlip] = []
     doubts = {name: Ambiguous.joined([]) for name in ("A", "B")}
     total = 0
-    end = None
+    asked, end = last, None
     for stretch in lockstep(
         a,
         b,
-        last,
+        _beyond(last),
         start_a=twin.start_a,
-        start_b=start_b,
+        start_b=twin.start_b,
         frame=twin.frame,
         handed=counterfactual,
-        back=back and counterfactual,
-        repeats=starts,
+        back=back,
         guard=_GUARD * tolerance,
     ):
+        apart = split_of(stretch.separation["B"], tolerance)
+        if end is None and apart is not None and stretch.first + apart <= asked:
+            end = int(_BEYOND * (stretch.first + apart)) + 100
+            last = min(end, max(asked, _beyond(stretch.first + apart)))
+        # the stretches are the program's own: the last one may end beyond the last step
+        stretch = stretch.until(last)
         gathered.append(replace(stretch, flips=(), doubts={}))
         total += len(stretch.flips)
         flips += stretch.flips[: max(0, FLIPS_KEPT - len(flips))]
@@ -181,52 +179,65 @@ def fork(
             room = max(0, FLIPS_KEPT - len(doubts[name].step))
             doubts[name] = Ambiguous.joined([doubts[name], more.where(slice(room))])
         reached = stretch.first + stretch.rows - 1
-        apart = split_of(stretch.separation["B"], tolerance)
-        if end is None and apart is not None:
-            end = int(_BEYOND * (stretch.first + apart)) + 100
         if progress is not None:
             shown = {"phase": "run", "separation": float(np.nanmax(stretch.separation["B"], initial=0.0))}
-            progress(min(reached, last), min(last, end or last), shown)
-        if end is not None and reached >= end:
+            progress(min(reached, last), last, shown)
+        if reached >= last:
             break
-    return _judged(twin, last, tolerance, gathered, tuple(flips), total, doubts)
+    found = _judged(twin, asked, tolerance, gathered, tuple(flips), total, doubts, most)
+    return _repeated(found, most, seed, progress)
 
 
-def seed_size(twin: Twin, steps: int = 100) -> float:
-    """The largest separation of a pair within its first steps, length: how much the choice perturbs a run.
+def counterfactuals(
+    twin: Twin, counterfactual: bool, back: bool | None, repeats: int | None
+) -> tuple[bool, bool, int]:
+    """Whether to run B under A's decisions, A under B's, and how many repeats at most.
 
-    A smaller perturbation would leave the rounding errors of both runs the same, and their splits with them.
+    Args:
+        twin: the pair.
+        counterfactual: as asked.
+        back, repeats: as asked; None for what goes with it.
+
+    Raises:
+        InputError: asked for, and not run.
     """
-    largest = 0.0
-    for stretch in lockstep(
-        twin.a,
-        twin.b,
-        steps,
-        start_a=twin.start_a,
-        start_b=twin.start_b,
-        frame=twin.frame,
-        handed=False,
-    ):
-        largest = max(largest, float(np.nanmax(stretch.separation["B"], initial=0.0)))
-    return largest
+    pairwise = twin.a.pairwise and twin.b.pairwise
+    runs = counterfactual and pairwise
+    why = "those are left out" if pairwise else "a many-body potential decides inside its energy function"
+    most = repeats_asked(repeats, runs, why)
+    if back and not runs:
+        raise InputError(
+            f"A under B's decisions was asked for, and B under A's is not run: {why}",
+            remedy="Leave out back",
+        )
+    return runs, runs if back is None else back, most
 
 
-def nudged(simulation: Simulation, start: Start, size: float, count: int, seed: int) -> list[Start]:
-    """Starts whose atoms are displaced at random, the furthest by about a given length.
+def _beyond(step: int) -> int:
+    """The step up to which a split must be followed to mean something."""
+    return int(np.ceil(PATIENCE * step)) + 1
 
-    At least an ulp: a smaller displacement would be lost in the first addition.
-    """
-    rng = np.random.default_rng(seed)
-    x = np.asarray(start.state.x)
-    ulp = float(np.spacing(np.abs(x).max().astype(x.dtype)))
-    starts = []
-    for _ in range(count):
-        noise = rng.standard_normal(x.shape)
-        noise *= max(size, ulp) / np.sqrt((noise**2).sum(axis=0)).max()
-        moved = (x.astype(np.float64) + noise).astype(x.dtype)
-        state = start.state._replace(x=jnp.asarray(moved), x_before=jnp.asarray(moved))
-        starts.append(replace(start, state=state, reference=moved.T.astype(np.float64)))
-    return starts
+
+def _repeated(
+    found: Fork, most: int, seed: int, progress: Callable[[int, int, dict[str, Any]], None] | None
+) -> Fork:
+    """The same with as many repeats as its verdict wants."""
+    twin, series = found.twin, dict(found.series)
+    starts: list[Start] = []
+    while wanted := found.verdict.wanted:
+        starts = starts or perturbed(twin, found.tolerance, most, seed)
+        done = len(found.repeats)
+        if progress is not None:
+            progress(found.steps, found.steps, {"phase": f"repeats {done + 1} to {done + wanted} of {most}"})
+        delays, tolerance = [], found.tolerance
+        runs = repeat(twin, starts[done : done + wanted], found.steps, tolerance, _GUARD * tolerance)
+        for number, (free, handed) in enumerate(runs, done + 1):
+            delays.append(Delay.of(free, handed, tolerance))
+            series[f"B {number}"] = np.append(free, np.full(found.steps + 1 - len(free), np.nan))
+        repeats = (*found.repeats, *delays)
+        verdict = judge(found.dates, series["B"], series["B|A"], found.tolerance, repeats, most)
+        found = replace(found, series=series, repeats=repeats, verdict=verdict)
+    return found
 
 
 def _judged(
@@ -237,6 +248,7 @@ def _judged(
     flips: tuple[CrossFlip, ...],
     total: int,
     doubts: dict[str, Ambiguous],
+    most: int,
 ) -> Fork:
     series = _series(gathered)
     bits = np.concatenate([stretch.bits for stretch in gathered])
@@ -264,8 +276,7 @@ def _judged(
     dates = Dates(seed, first, splits["B"])
     handed = series.get("B|A")
     rates = {name: growth(series[name], tolerance) for name in ("B", "B|A") if name in series}
-    chance = [split for name, split in splits.items() if name.startswith("B ")]
-    verdict = judge(dates, free, handed, tolerance, chance, ended=told)
+    verdict = judge(dates, free, handed, tolerance, (), most, ended=told)
     cells = table(series, tolerance)
     return Fork(
         twin,
@@ -283,6 +294,7 @@ def _judged(
         cells,
         shares(cells, rates["B"].rate),
         verdict,
+        (),
         failed,
     )
 

@@ -8,7 +8,7 @@ how many pairs there are, and nothing of the past is kept but the pairs that dif
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -30,7 +30,7 @@ class Stretch:
     Attributes:
         first: step of the first row.
         separation: largest distance between an atom of A and the same atom of another run, length, by the
-            name ("B", "B|A", "B 1", ...), of "A|B" from B, and the other way around, "A|B from A" and
+            name ("B", "B|A"), of "A|B" from B, and the other way around, "A|B from A" and
             "B|A from B"; shape (rows,), NaN where a run has ended.
         bits: whether any bit of the state of A and B differs, shape (rows,).
         energy: total energy by run, shape (rows,).
@@ -64,6 +64,32 @@ class Stretch:
         """Number of steps."""
         return len(self.cross)
 
+    def until(self, last: int) -> Stretch:
+        """The rows up to a step, and what happened in them."""
+        rows = last - self.first + 1
+        if rows >= self.rows:
+            return self
+        cut = {
+            name: {run: values[:rows] for run, values in getattr(self, name).items()}
+            for name in ("separation", "energy", "overridden", "furthest", "nearest", "ambiguous")
+        }
+        doubts = {run: doubt.where(doubt.step <= last) for run, doubt in self.doubts.items()}
+        flips = [flip for flip in self.flips if flip.step <= last]
+        # a run that failed within these rows has no separation at the last of them; A has rows up to its end
+        failed = {
+            run: word if np.isnan(cut["separation"].get(run, np.zeros(rows))[-1]) else ""
+            for run, word in self.failed.items()
+        }
+        return replace(
+            self,
+            **cut,
+            bits=self.bits[:rows],
+            cross=self.cross[:rows],
+            flips=flips,
+            doubts=doubts,
+            failed=failed,
+        )
+
 
 def lockstep(
     a: Simulation,
@@ -75,7 +101,6 @@ def lockstep(
     frame: Frame | None = None,
     handed: bool = True,
     back: bool = False,
-    repeats: Sequence[Start] = (),
     guard: float | None = None,
 ) -> Iterator[Stretch]:
     """Advance both runs, and what is compared with them, a stretch of A's steps at a time.
@@ -87,7 +112,6 @@ def lockstep(
         frame: how B's atoms and axes are A's.
         handed: whether to run B's arithmetic under A's decisions, "B|A".
         back: whether to run A's arithmetic under B's decisions too, "A|B".
-        repeats: other starts of B; these runs are "B 1", "B 2", ...
         guard: length; a counterfactual ends when a decision it is told is further than this from its
             cutoff: it would no longer be a decision that rounding could have changed.
 
@@ -99,7 +123,6 @@ def lockstep(
     backward = Counterfactual(Handed(a, b, start_a, frame.inverse), guard) if back else None
     leader = Track(a, last, start_a, listener=forward)
     follower = Track(b, last, start_b, frame, listener=backward)
-    others = {f"B {k + 1}": Track(b, last, start, frame, flips=False) for k, start in enumerate(repeats)}
     cell_a = Apart(a.cell)
     crossing: Crossing | None = None
     while leader.segment() is not None:
@@ -142,9 +165,6 @@ def lockstep(
         ambiguous = {
             name: np.where(np.isnan(nearest[name]), np.nan, _per_row(doubts[name], rows_a)) for name in doubts
         }
-        for name, track in others.items():
-            rows, _ = track.until(end)
-            separation[name] = apart(cell_a, rows_a, rows)
         yield Stretch(
             rows_a.first,
             separation,

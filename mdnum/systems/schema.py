@@ -240,7 +240,7 @@ class Fork(Table):
     )
     steps: int | None = Field(default=None, ge=1, description="last step; default dynamics.steps")
     split: float | None = Field(
-        default=None, gt=0, description="separation that counts as split (Å or σ); default 0.04 of the cutoff"
+        default=None, gt=0, description="separation that counts as split (Å or σ); default 0.01 of the cutoff"
     )
 
 

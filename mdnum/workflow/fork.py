@@ -42,9 +42,9 @@ class ForkResult:
 
 @dataclass(frozen=True)
 class Asked:
-    """What is to be found out beside dates and verdict."""
+    """What is to be found out beside dates and verdict; the exponent unless it is left out."""
 
-    lyapunov: bool
+    lyapunov: bool | None
     minimal: bool
     pin: str | None
 
@@ -55,10 +55,10 @@ def fork(
     *,
     steps: int | None = None,
     split: float | None = None,
-    repeats: int = 2,
+    repeats: int | None = None,
     counterfactual: bool = True,
-    back: bool = True,
-    lyapunov: bool = True,
+    back: bool | None = None,
+    lyapunov: bool | None = None,
     minimal: bool = False,
     pin: str | None = None,
     out: str | Path | None = None,
@@ -70,15 +70,19 @@ def fork(
 
     Args:
         system: a loaded system, a shipped name or the path of a system file; of molecular dynamics or a
-            ball. A ball has choices of its own, and of the options those that are said to be of any system.
+            ball. A ball has choices of its own, and always both counterfactuals unless they are left out;
+            back, lyapunov, minimal and pin are not asked of it.
         vary: the choice, such as "precision" or "reduction=exact"; "all" screens every choice. Default what
             the [fork] table of the system file says, as for steps and split.
         steps: last step; default the system's own.
-        split: separation that counts as split, length; default 0.04 of the longest cutoff.
-        repeats: further runs with perturbed starts, to tell a delay from chance.
+        split: separation that counts as split, length; default 0.01 of the longest cutoff, of a ball 0.01 of
+            the largest start height.
+        repeats: further pairs of runs with perturbed starts at most, to tell a delay from chance; default 15.
+            They are run until the verdict is clear.
         counterfactual: whether to run B's arithmetic under A's decisions, which the verdict rests on.
-        back: whether to run A's arithmetic under B's decisions too, for the table of two by two.
-        lyapunov: whether to carry a tangent along A, for the largest Lyapunov exponent.
+        back: whether to run A's arithmetic under B's decisions too, for the table of two by two; default
+            with the counterfactual.
+        lyapunov: whether to carry a tangent along A, for the largest Lyapunov exponent; default yes.
         minimal: whether to look for the fewest decisions whose taking back keeps the runs together; it takes
             up to 80 runs.
         pin: a decision to take back in one more run of B: "fork", a pair "3-75", or a pair over a window
@@ -89,14 +93,23 @@ def fork(
         progress: called now and then with step, steps and a dictionary of figures.
 
     Raises:
-        InputError: the system cannot be run, or the choice is unknown or does not apply to it.
+        InputError: the system cannot be run, the choice is unknown or does not apply to it, or something was
+            asked for that would not be done.
         FolderError: the folder cannot be used.
     """
     from mdnum.systems import BallSystem
 
-    loaded = _loaded(system, overrides)
+    loaded = loaded_of_any(system, overrides)
+    _check(steps, split, repeats)
     if isinstance(loaded, BallSystem):
-        _check(steps, split, repeats)
+        given = {"minimal": minimal, "pin": pin is not None, "back": back is not None,
+                 "lyapunov": lyapunov is not None}  # fmt: skip
+        refuse(
+            given,
+            f"of molecular dynamics, and {loaded.name} is a ball",
+            "A ball is run under either run's decisions unless counterfactual=False, and has no tangent run; "
+            'a contact is taken back by vary="contact=STEP:BALL"',
+        )
         from mdnum.workflow.fork_ball import fork_ball
 
         return fork_ball(
@@ -104,6 +117,9 @@ def fork(
             report=report, progress=progress,
         )  # fmt: skip
     system = loaded
+    given = {"split": split is not None, "repeats": repeats is not None, "back": back is not None,
+             "counterfactual": not counterfactual, "lyapunov": lyapunov is not None, "minimal": minimal,
+             "pin": pin is not None}  # fmt: skip
     vary, steps, split = _as_in_file(system, vary, steps, split)
     _check(steps, split, repeats)
     if pin is not None:
@@ -111,10 +127,7 @@ def fork(
 
         parse_pin(pin, len(system.atoms))
     if vary == ALL:
-        if minimal or pin is not None:
-            raise InputError(
-                "decisions are taken back in one comparison, not in all", remedy="Give one choice to vary"
-            )
+        refuse(given, "of one comparison, and all choices were asked for", "Give one choice to vary")
         from mdnum.workflow.fork_screen import screen
 
         return screen(system, steps, out=out, report=report, progress=progress)
@@ -167,9 +180,12 @@ def follow_into_folder(
     """
     from mdnum.forks import fork as follow
     from mdnum.forks.neighborhood import neighborhood
+    from mdnum.forks.pair import counterfactuals
     from mdnum.workflow import fork_answers, fork_record
 
     began = time.perf_counter()
+    asked_of = {name: options[name] for name in ("counterfactual", "back", "repeats")}
+    counterfactuals(twin, **asked_of)
     folder = new_folder(twin.a.system, out)
     try:
         made = follow(twin, progress=_logged(folder, progress), **options)
@@ -177,7 +193,7 @@ def follow_into_folder(
         around = neighborhood(made)
         answers: dict[str, Any] = {"lyapunov": None, "lyapunov_reason": "not asked for", "minimal": None}
         taken = None
-        if asked.lyapunov:
+        if asked.lyapunov is not False:
             say(progress, made.steps, "the Lyapunov exponent")
             answers |= fork_answers.exponent(made)
         if asked.minimal:
@@ -230,7 +246,7 @@ def say(progress: Progress | None, step: int, phase: str) -> None:
         progress(step, 0, {"phase": phase})
 
 
-def _loaded(
+def loaded_of_any(
     system: System | BallSystem | str | Path, overrides: Mapping[str, Any] | None
 ) -> System | BallSystem:
     """A system of either world."""
@@ -266,14 +282,33 @@ def _as_in_file(
     return vary, steps, split
 
 
-def _check(steps: int | None, split: float | None, repeats: int) -> None:
+def refuse(given: Mapping[str, bool], whose: str, remedy: str) -> None:
+    """Refuses arguments that would change nothing.
+
+    Args:
+        given: argument to whether it was given.
+        whose: they are instead.
+        remedy: what to do.
+
+    Raises:
+        InputError: one was given.
+    """
+    names = [name for name, is_given in given.items() if is_given]
+    if names:
+        what = "an option" if len(names) == 1 else "options"
+        verb = "is" if len(names) == 1 else "are"
+        raise InputError(f"{' and '.join(names)} {verb} {what} {whose}", remedy=remedy)
+
+
+def _check(steps: int | None, split: float | None, repeats: int | None) -> None:
     """Refuses what cannot be, before a folder is made."""
+    from mdnum.forks.words import repeats_asked
+
     if steps is not None and steps < 1:
         raise InputError(f"steps = {steps}; expected at least 1")
     if split is not None and not 0 < split < float("inf"):
         raise InputError(f"split = {split:g}; expected a length above 0")
-    if repeats < 0:
-        raise InputError(f"repeats = {repeats}; expected 0 or more")
+    repeats_asked(repeats, True)
 
 
 def _logged(folder: RunFolder, progress: Progress | None) -> Progress:

@@ -10,7 +10,7 @@ import numpy as np
 
 from mdnum.errors import InputError
 from mdnum.workflow import fork_numbers as numbers
-from mdnum.workflow.fork import ALL, ForkResult, Progress, say
+from mdnum.workflow.fork import ALL, ForkResult, Progress, refuse, say
 from mdnum.workflow.fork_question import Log, finish, opened
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ def fork_ball(
     *,
     steps: int | None = None,
     split: float | None = None,
-    repeats: int = 2,
+    repeats: int | None = None,
     counterfactual: bool = True,
     out: str | Path | None = None,
     report: bool = True,
@@ -52,7 +52,7 @@ def fork_ball(
             the [fork] table of the system file says, as for steps and split.
         steps: to make; default the system's own.
         split: separation of heights that counts as split, m; default 1 % of the largest start height.
-        repeats: further runs with perturbed starts, to tell a delay from chance.
+        repeats: further pairs of runs with perturbed starts at most, to tell a delay from chance; default 15.
         counterfactual: whether to run either program under the other's decisions too.
         out: the new fork folder; default runs/fork-<name>-<n>.
         report: write report.html.
@@ -64,8 +64,9 @@ def fork_ball(
     """
     from mdnum.forks.bounce import fork as follow
     from mdnum.forks.bounce.choices import names, parse
+    from mdnum.forks.words import repeats_asked
 
-    table = system.spec.fork
+    asked_split, table = split is not None, system.spec.fork
     if table is not None:
         vary, steps, split = vary or table.vary, steps or table.steps, split or table.split
     if vary is None:
@@ -76,8 +77,11 @@ def fork_ball(
         )
     system = system if steps is None else system.for_steps(steps)
     if vary == ALL:
+        given = {"split": asked_split, "repeats": repeats is not None, "counterfactual": not counterfactual}
+        refuse(given, "of one comparison, and all choices were asked for", "Give one choice to vary")
         return _screen(system, out, report, progress)
     choice = parse(vary)
+    repeats_asked(repeats, counterfactual)
     began = time.perf_counter()
     say(progress, 0, "compile")
     twin = choice.make(system)
@@ -219,7 +223,7 @@ def summarize(system: BallSystem, fork: BallFork) -> dict[str, Any]:
         "splits": {name: fork.splits[name] for name in ("B", "B|A", "A|B") if name in fork.splits},
         "table": [numbers.cell(cell) for cell in fork.table],
         "shares": [numbers.share(share) for share in fork.shares],
-        **numbers.repeats(fork.splits),
+        **numbers.repeats(fork.repeats),
         "handed_until": numbers.until(fork.series, "B|A"),
         "handed_largest": numbers.largest(fork.series, "B|A"),
         "separation_end": numbers.plain(free[-1]),

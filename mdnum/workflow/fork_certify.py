@@ -12,14 +12,18 @@ import numpy as np
 
 from mdnum.errors import InputError
 from mdnum.store import RunFolder
-from mdnum.workflow.fork_question import Log, Progress, basics, finish, loaded, opened
+from mdnum.workflow.fork import refuse
+from mdnum.workflow.fork_question import Log, Progress, basics, finish, is_ball, loaded, opened
 
 if TYPE_CHECKING:
+    from mdnum.forks.bounce.certify import BallCertificate
     from mdnum.forks.exact import Certificate, CertifiedHorizon
-    from mdnum.precision import PrecisionPolicy
+    from mdnum.systems.ball_system import BallSystem
     from mdnum.systems.build import Simulation
     from mdnum.systems.load import System
 
+#: What is said of each precision of a ball.
+_BALL_ROW = ("horizon", "channel", "ball", "height", "separation_end", "why_not")
 _EXACT = {"phase": "in exact arithmetic", "unit": "steps"}
 
 
@@ -28,38 +32,40 @@ class CertifyResult:
     """A finished ranking of precision policies.
 
     Attributes:
-        folder: the fork folder.
+        folder: the fork folder; None of a ball, whose ranking leaves none.
         certificate: the exact history, and when each policy leaves it.
-        ambiguous: decisions of each policy's run that are within their rounding bound, by its name.
+        ambiguous: decisions of each policy's run that are within their rounding bound, by its name; empty of
+            a ball.
         summary: what summary.json says, findings included.
     """
 
-    folder: Path
-    certificate: Certificate
+    folder: Path | None
+    certificate: Certificate | BallCertificate
     ambiguous: Mapping[str, CertifiedHorizon]
     summary: dict[str, Any]
 
 
 def fork_certify(
-    system: System | str | Path,
+    system: System | BallSystem | str | Path,
     *,
     steps: int | None = None,
-    policies: Mapping[str, PrecisionPolicy] | None = None,
+    policies: Mapping[str, Any] | None = None,
     out: str | Path | None = None,
     overrides: Mapping[str, Any] | None = None,
-    report: bool = True,
+    report: bool | None = None,
     progress: Progress | None = None,
 ) -> CertifyResult:
     """When runs under each precision policy leave the history in exact arithmetic.
 
     Args:
         system: a loaded system, a shipped name or the path of a system file: Lennard-Jones, NVE, at most 108
-            atoms.
+            atoms; or a ball whose steps are sums and products.
         steps: last step; default the system's own.
-        policies: to rank, by name; default `forks.exact.POLICIES`.
-        out: the new fork folder; default runs/fork-<name>-<n>.
+        policies: `PrecisionPolicy` to rank, by name; default `forks.exact.POLICIES`. Of a ball formats by
+            role, such as {"state": "float32"}; default `forks.bounce.certify.POLICIES`.
+        out: the new fork folder; default runs/fork-<name>-<n>. That of a ball is printed, and leaves none.
         overrides: dotted keys to values.
-        report: write report.html.
+        report: write report.html; default yes where there is a folder.
         progress: called now and then with step, steps and a dictionary of figures.
 
     Raises:
@@ -69,6 +75,13 @@ def fork_certify(
     from mdnum.forks.exact import certify, why_not
     from mdnum.systems import build
 
+    if is_ball(system):
+        refuse(
+            {"out": out is not None, "report": bool(report)},
+            "of molecular dynamics: the ranking of a ball leaves no folder",
+            "Read it from the result",
+        )
+        return _of_a_ball(system, steps, policies, overrides, progress)
     began = time.perf_counter()
     system = loaded(system, overrides)
     simulation = build(system)
@@ -100,7 +113,25 @@ def fork_certify(
     except BaseException:
         folder.close()
         raise
-    return CertifyResult(folder.path, found, ambiguous, finish(folder, report, progress))
+    return CertifyResult(folder.path, found, ambiguous, finish(folder, report is not False, progress))
+
+
+def _of_a_ball(
+    system: Any,
+    steps: int | None,
+    policies: Any,
+    overrides: Mapping[str, Any] | None,
+    progress: Progress | None,
+) -> CertifyResult:
+    """The ranking of a ball."""
+    from mdnum.forks.bounce.certify import certify
+    from mdnum.workflow.fork import loaded_of_any
+
+    ball: Any = loaded_of_any(system, overrides)
+    found = certify(ball, steps, policies, progress=progress)
+    rows = [{"policy": row.name, **{name: getattr(row, name) for name in _BALL_ROW}} for row in found.ranking]
+    summary = {"question": "certify", "steps": found.steps, "says": list(found.says), "ranking": rows}
+    return CertifyResult(None, found, {}, summary)
 
 
 def _ambiguous(simulation: Simulation, found: Certificate, note: Log) -> dict[str, CertifiedHorizon]:

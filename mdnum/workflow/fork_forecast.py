@@ -12,7 +12,7 @@ import numpy as np
 
 from mdnum.errors import InputError
 from mdnum.store import RunFolder
-from mdnum.workflow.fork_question import Log, Progress, basics, finish, loaded, opened
+from mdnum.workflow.fork_question import OF_A_BALL, Log, Progress, basics, finish, loaded, opened
 
 if TYPE_CHECKING:
     from mdnum.forks.forecast import Forecast, Foretold, Range
@@ -68,7 +68,7 @@ def fork_forecast(
     if not 0 < size < float("inf"):
         raise InputError(f"a displacement of {size:g}; expected a length above 0")
     began = time.perf_counter()
-    system = loaded(system, overrides)
+    system = loaded(system, overrides, OF_A_BALL["--forecast"])
     simulation = build(system)
     if not simulation.pairwise:
         raise InputError(

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from mdnum.events.chance import Delay
 from mdnum.events.forks import Dates, Growth, Verdict, expected
 from mdnum.events.shares import Cell, Share
 
@@ -20,7 +21,10 @@ def dates(found: Dates, timestep: float) -> dict[str, Any]:
 
 def verdict(found: Verdict) -> dict[str, Any]:
     """The verdict in plain values."""
-    return {"verdict": found.word, "reasons": list(found.reasons), "nats": found.nats, "noise": found.noise}
+    count = None
+    if found.count is not None:
+        count = {**vars(found.count), "threshold": found.threshold, "needed": found.count.needed}
+    return {"verdict": found.word, "reasons": list(found.reasons), "nats": found.nats, "count": count}
 
 
 def rate(fit: Growth, timestep: float) -> dict[str, Any]:
@@ -75,14 +79,9 @@ def predicted(
     return {"predicted_split": None, "predicted_by": None}
 
 
-def repeats(splits: Mapping[str, int | None]) -> dict[str, Any]:
-    """Splits of the repeats, and how many did not split within the horizon."""
-    found = [split for name, split in splits.items() if name.startswith("B ")]
-    return {
-        "repeats": [split for split in found if split is not None],
-        "repeats_run": len(found),
-        "repeats_censored": sum(split is None for split in found),
-    }
+def repeats(delays: Sequence[Delay]) -> dict[str, Any]:
+    """When each repeat splits, free and under A's decisions; None for one that was not seen."""
+    return {"repeated": [{"free": one.free, "handed": one.handed} for one in delays]}
 
 
 def cell(found: Cell) -> dict[str, Any]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from mdnum.errors import InputError
 from mdnum.store import RunFolder
-from mdnum.workflow.fork_question import Log, Progress, basics, finish, loaded, opened, steps_of
+from mdnum.workflow.fork_question import OF_A_BALL, Log, Progress, basics, finish, loaded, opened, steps_of
 
 if TYPE_CHECKING:
     from mdnum.forks.variants import Ran, Variant, Variants
@@ -67,7 +67,7 @@ def fork_processes(
     from mdnum.forks.variants import VARIANTS, variants
 
     began = time.perf_counter()
-    system = loaded(system, overrides)
+    system = loaded(system, overrides, OF_A_BALL["--processes"])
     last = steps_of(system, min(STEPS, system.spec.dynamics.steps) if steps is None else steps)
     if not is_pairwise(system):
         raise InputError(

@@ -18,6 +18,17 @@ Progress = Callable[[int, int, dict[str, Any]], None]
 
 #: Steps of a question that makes hundreds of runs, or follows them by hand, unless more are asked for.
 FEW_STEPS = 500
+#: What a ball offers in place of a question about molecular dynamics.
+OF_A_BALL = {
+    "--processes": "whether a ball's bits depend on the program around it is shown by "
+    "`mdnum ball --demo determinism`",
+    "--forecast": "how far each contact is from another step is the margin that `mdnum ball` records",
+    "--benign": "a ball has no ensemble to be consistent with; --vary says how far the heights part",
+    "--minimal": "a ball's decisions are taken back one at a time: --vary contact=STEP:BALL",
+    "--pin": "a ball's decisions are taken back one at a time: --vary contact=STEP:BALL",
+    "--no-back": "a ball is run under either run's decisions always; --no-counterfactual leaves both out",
+    "--no-lyapunov": "a ball has no tangent run to leave out",
+}
 
 
 def is_ball(system: Any) -> bool:
@@ -30,16 +41,26 @@ def is_ball(system: Any) -> bool:
     return world_of(system) == "ball"
 
 
-def loaded(system: System | BallSystem | str | Path, overrides: Mapping[str, Any] | None) -> System:
+def loaded(
+    system: System | BallSystem | str | Path,
+    overrides: Mapping[str, Any] | None,
+    instead: str = "Use mdnum.bounce",
+) -> System:
     """The system of molecular dynamics that is meant.
+
+    Args:
+        system: a loaded system, a shipped name or the path of a system file.
+        overrides: dotted keys to values.
+        instead: what somebody with a ball can do.
 
     Raises:
         InputError: there is none, it is a ball, or it is loaded already and there are overrides.
     """
     from mdnum.systems import BallSystem, System, load
 
-    if isinstance(system, BallSystem):
-        raise InputError("this system is a ball", where=system.name, remedy="Use mdnum.bounce")
+    if isinstance(system, BallSystem) or is_ball(system):
+        name = system if isinstance(system, str | Path) else system.name
+        raise InputError("this system is a ball", where=str(name), remedy=instead)
     if not isinstance(system, System):
         return load(system, overrides, world="md")
     if overrides:

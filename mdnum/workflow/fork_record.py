@@ -88,7 +88,7 @@ def summarize(
         "growth": {name: numbers.fitted(fit, fork.series[name]) for name, fit in fork.growth.items()},
         **numbers.predicted(fork.dates, free, fork.tolerance, fork.steps, exponent),
         "splits": {name: fork.splits.get(name) for name in ("B", "B|A", "A|B") if name in fork.splits},
-        **numbers.repeats(fork.splits),
+        **numbers.repeats(fork.repeats),
         "handed_until": numbers.until(fork.series, "B|A"),
         "handed_largest": numbers.largest(fork.series, "B|A"),
         "separation_end": numbers.plain(free[np.isfinite(free)][-1]) if np.isfinite(free).any() else None,

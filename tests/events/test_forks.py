@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mdnum.events.chance import Delay
 from mdnum.events.forks import Dates, expected, growth, judge, split_of
 
 
@@ -53,7 +54,7 @@ def test_a_horizon_too_short_says_how_long_it_would_take(free):
 
 
 def test_a_cause_is_a_split_that_does_not_come(free):
-    verdict = judge(dates(free), free, np.full(3000, 1e-9), 0.1, chance=[1600, 1620])
+    verdict = judge(dates(free), free, np.full(3000, 1e-9), 0.1)
     assert verdict.word == "cause" and verdict.nats == float("inf")
 
 
@@ -62,54 +63,66 @@ def test_a_cause_needs_steps_after_the_split(free):
     assert judge(dates(free), free[:end], np.full(end, 1e-9), 0.1).word == "open"
 
 
-def test_hurried_is_later_beyond_chance(free):
-    handed = np.concatenate([np.full(300, 1e-15), free])[:3000]
+def later(free, *gains):
+    """Repeats whose flips are worth so many steps."""
     split = split_of(free, 0.1)
-    assert judge(dates(free), free, handed, 0.1, chance=[split + 10, split - 15]).word == "hurried"
-    assert judge(dates(free), free, handed, 0.1, chance=[split + 900, split - 700]).word == "bystander"
-    verdict = judge(dates(free), free, handed, 0.1, chance=[split + 10, split - 15])
+    return [Delay(split - 7, split - 7 + gain, 2999, 2999) for gain in gains]
+
+
+def test_two_repeats_tell_nothing(free):
+    """However little they scatter."""
+    handed = np.concatenate([np.full(300, 1e-15), free])[:3000]
+    verdict = judge(dates(free), free, handed, 0.1, later(free, 300, 301))
+    assert verdict.word == "undecided" and verdict.wanted == 3
+    assert judge(dates(free), free, handed, 0.1, later(free, 300, 301), most=2).wanted == 0
+
+
+def test_accelerated_is_later_in_most_repeats(free):
+    handed = np.concatenate([np.full(300, 1e-15), free])[:3000]
+    verdict = judge(dates(free), free, handed, 0.1, later(free, *5 * [60]))
+    assert verdict.word == "accelerated" and verdict.wanted == 0
     assert verdict.nats == pytest.approx(300 * 0.02, rel=1e-6)
+    assert verdict.threshold == pytest.approx(50)
+    # one of six not: it is looked at again after eleven, and after sixteen
+    gains = [60, 60, 60, 60, 40]
+    assert judge(dates(free), free, handed, 0.1, later(free, *gains)).wanted == 5
+    assert judge(dates(free), free, handed, 0.1, later(free, *gains, *5 * [60])).word == "accelerated"
+    verdict = judge(dates(free), free, handed, 0.1, later(free, *gains, 40, *4 * [60]))
+    assert verdict.word == "undecided" and verdict.wanted == 5
+    verdict = judge(dates(free), free, handed, 0.1, later(free, *gains, 40, *4 * [60], *5 * [40]))
+    assert verdict.word == "undecided" and verdict.wanted == 0
+    assert (verdict.count.later, verdict.count.not_later) == (9, 7)
 
 
-def test_a_bystander_splits_as_early_or_earlier(free):
-    split = split_of(free, 0.1)
-    assert judge(dates(free), free, free, 0.1, chance=[split + 5]).word == "bystander"
-    earlier = np.append(free[40:], np.full(40, 3.0))
-    assert judge(dates(free), free, earlier, 0.1, chance=[split + 5]).word == "bystander"
-
-
-def test_without_repeats_that_split_a_delay_is_open(free):
-    handed = np.concatenate([np.full(300, 1e-15), free])[:3000]
-    for chance in ((), (None, None)):
-        verdict = judge(dates(free), free, handed, 0.1, chance=chance)
-        assert verdict.word == "open"
-        assert "no repeat tells whether 300 steps later is chance" in verdict.reasons
-
-
-def test_a_repeat_that_does_not_split_bounds_the_scatter_from_below(free):
-    handed = np.concatenate([np.full(300, 1e-15), free])[:3000]
-    split = split_of(free, 0.1)
-    verdict = judge(dates(free), free, handed, 0.1, chance=[split, None])
-    assert verdict.word == "bystander" and verdict.noise == pytest.approx(2 * (2999 - split))
-    # eight of nine agree: later than the bound on their scatter proves nothing
-    late = np.concatenate([np.full(299, 1e-15), free])[: split + 301]
-    verdict = judge(dates(free), free[: split + 301], late, 0.1, chance=[*8 * [split], None])
-    assert verdict.word == "open" and verdict.noise == pytest.approx(2 * np.sqrt(2) * 300 / 3)
-    assert any(f"1 did not split within {split + 300} steps" in reason for reason in verdict.reasons)
-
-
-def test_less_than_a_power_of_e_counts_as_no_difference_and_says_so(free):
-    split = split_of(free, 0.1)
+def test_a_bystander_is_not_later_in_most_repeats(free):
+    for gain in (0, -40, 40):
+        assert judge(dates(free), free, free, 0.1, later(free, *5 * [gain])).word == "bystander"
+    # less than one e-folding, which is 50 steps here, beyond any scatter
     handed = np.concatenate([np.full(40, 1e-15), free])[:3000]
-    verdict = judge(dates(free), free, handed, 0.1, chance=[split + 2, split - 2])
-    assert verdict.word == "bystander" and verdict.noise < 40
-    assert any("less than one power of e of separation (0.8)" in reason for reason in verdict.reasons)
+    verdict = judge(dates(free), free, handed, 0.1, later(free, *5 * [40]))
+    assert verdict.word == "bystander" and verdict.nats == pytest.approx(0.8)
+
+
+def test_without_repeats_nothing_is_said_of_a_delay(free):
+    handed = np.concatenate([np.full(300, 1e-15), free])[:3000]
+    for run in (handed, free):
+        verdict = judge(dates(free), free, run, 0.1, most=0)
+        assert verdict.word == "undecided" and verdict.wanted == 0
+
+
+def test_what_was_not_seen_counts_for_neither(free):
+    handed = np.concatenate([np.full(300, 1e-15), free])[:3000]
+    unseen = [Delay(1600, None, 2999, 1640)] * 5
+    verdict = judge(dates(free), free, handed, 0.1, unseen)
+    assert verdict.word == "undecided" and (verdict.count.later, verdict.count.not_later) == (1, 0)
+    seen_to_be_later = [Delay(1600, None, 2999, 1700)] * 5
+    assert judge(dates(free), free, handed, 0.1, seen_to_be_later).word == "accelerated"
 
 
 def test_close_to_the_tolerance_is_no_cause(free):
-    verdict = judge(dates(free), free, np.full(3000, 0.05), 0.1, chance=[1600, 1620])
+    verdict = judge(dates(free), free, np.full(3000, 0.05), 0.1)
     assert verdict.word == "open"
-    assert any("within one power of e" in reason for reason in verdict.reasons)
+    assert any("within one e-folding" in reason for reason in verdict.reasons)
 
 
 def test_a_split_before_the_fork_is_no_flips_doing(free):

@@ -9,7 +9,7 @@ import pytest
 
 from mdnum.errors import InputError
 from mdnum.forks import Twin, fork
-from mdnum.forks.pair import nudged, seed_size
+from mdnum.forks.repeats import nudged, seed_size
 from mdnum.rollout.engine import first_state
 from mdnum.systems.build import Simulation, build
 

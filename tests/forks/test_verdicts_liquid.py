@@ -59,12 +59,13 @@ def forks() -> dict[str, list[Fork]]:
     """Float32 arithmetic beside float64, by cutoff and start."""
     choice = parse("precision")
     return {
-        cut: [fork(choice.make(argon(liquid(seed), cut)), 1000, repeats=3) for seed in STARTS] for cut in CUTS
+        cut: [fork(choice.make(argon(liquid(seed), cut)), 1000, back=False) for seed in STARTS]
+        for cut in CUTS
     }
 
 
 def worth(found: list[Fork]) -> float:
-    """What the flips were worth, powers of e, in the median over the starts."""
+    """What the flips were worth, e-foldings, in the median over the starts."""
     return float(np.median([one.verdict.nats for one in found]))
 
 
@@ -81,19 +82,15 @@ def test_the_starts_are_liquids():
         assert abs(wave.sum()) ** 2 / len(atoms) < 20
 
 
-def test_at_a_violent_cutoff_flips_hurry_the_split(forks):
-    """At thirteen starts: 1.5 to 21 powers of e, 4.4 in the median.
-
-    Eleven of them are "hurried". Two are not: their repeats scatter by more than the flips gained, because a
-    kick earlier or later is much.
-    """
-    assert words(forks["violent"]).count("hurried") >= 2
+def test_at_a_violent_cutoff_flips_accelerate_the_split(forks):
+    """At thirteen starts: 1.5 to 21 e-foldings, 4.4 in the median."""
+    assert words(forks["violent"]) == ["accelerated"] * len(STARTS)
     assert worth(forks["violent"]) > 2.5
     assert worth(forks["violent"]) > 2 * worth(forks["usual"])
 
 
 def test_switched_off_smoothly_they_only_come_along(forks):
-    """At eight starts: between -0.5 and 0.15 powers of e."""
+    """At eight starts: between -0.5 and 0.15 e-foldings."""
     assert words(forks["switched"]) == ["bystander"] * len(STARTS)
     for found in forks["switched"]:
         assert found.dates.fork < found.dates.split
@@ -101,10 +98,9 @@ def test_switched_off_smoothly_they_only_come_along(forks):
 
 
 def test_at_the_usual_cutoff_chaos_would_have_done(forks):
-    """At thirteen starts: 0.06 to 1.9 powers of e, 0.26 in the median.
+    """At thirteen starts: 0.06 to 1.9 e-foldings, 0.26 in the median. One is what "accelerated" asks for.
 
-    One is what "hurried" asks for, so four of the thirteen are that, and nine are "bystander". With 864 atoms
-    and a fifth of the time step it is 0.8.
+    With 864 atoms and a fifth of the time step it is 0.8.
     """
-    assert "bystander" in words(forks["usual"])
+    assert set(words(forks["usual"])) <= {"bystander", "undecided"}
     assert worth(forks["usual"]) < 1.5

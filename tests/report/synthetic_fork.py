@@ -133,7 +133,7 @@ def make_fork(
             "growth_rate": RATE if forks else None, "growth_rate_time": RATE / 0.01 if forks else None,
             "r_squared": 0.99 if forks else None, "growth": {"B": fit if forks else dict.fromkeys(fit)},
             "predicted_split": None, "splits": {"B": split, "B|A": None} if handed else {"B": split},
-            "nats": None, "noise": 12.0, "repeats": [1316, 1326] if forks else [], "repeats_run": 2,
+            "nats": None, "count": None, "repeated": [],
             "handed_until": STEPS if handed else None, "handed_largest": SIZE,
             "separation_end": float(free[-1]),
             "separation_largest": float(free.max()), "overridden": 6, "cross_flips": 7_000 if forks else 0,

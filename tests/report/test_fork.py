@@ -73,9 +73,9 @@ def test_the_page_states_what_the_folder_holds(page, folder):
         "in neither run could rounding alone have decided otherwise", "the margin no longer protected it",
         "precision.reduction", "sequential in A, exact in B", "0123456789abcdef",
         "The first 5,000 of 7,000 flips", "all of them are in cross_flips.parquet",
-        "2 repeats; two splits differ by 12.0 steps by chance", "doubles in 34.7 steps",
+        "doubles in 34.7 steps",
         f"arithmetic decisions from A from B A its own is A {split:,} B its own {split:,} is B",
-        f"B A’s &gt; 1,500 {split - 1:,}", "B, start perturbed its own 1,316",
+        f"B A’s &gt; 1,500 {split - 1:,}",
         "decisions &gt; 179 steps &gt; 3.58 nats –", "arithmetic – −1 step −0.0200 nats",
         "up to step 1,500: no decision is ambiguous",
         "up to step 70; after it 2,860 ambiguous decisions at 1,430 steps, first pair 5–8: "
@@ -160,12 +160,18 @@ def test_ticks_stand_where_only_one_run_flips(folder):
     [
         ({}, "info", "The flip at step 400 is the cause"),
         (
-            {"verdict": "hurried", "splits": {"B": 1300, "B|A": 1400}, "split": 1300},
+            {"verdict": "accelerated", "splits": {"B": 1300, "B|A": 1400}, "split": 1300},
             "info",
             "100 steps later",
         ),
-        ({"verdict": "hurried", "splits": {"B": 1300, "B|A": None}}, "info", "later than they were followed"),
+        # as an older version wrote it
+        (
+            {"verdict": "hurried", "splits": {"B": 1300, "B|A": None}},
+            "info",
+            "The flips accelerated the split",
+        ),
         ({"verdict": "bystander"}, "info", "The flip at step 400 is a bystander"),
+        ({"verdict": "undecided"}, "info", "What the flips did to the split is undecided"),
         ({"verdict": "open", "split": None, "predicted_split": 9000}, "info", "at about step 9,000"),
         ({"verdict": "open"}, "info", "what the flips did to it is open"),
         (
@@ -199,42 +205,45 @@ def test_every_verdict_has_its_words(tmp_path, entries, tone, words):
     assert not verdict.headline.endswith("..")
 
 
+COUNT = {"pairs": 16, "later": 9, "not_later": 7, "most": 16, "threshold": 43.2, "needed": [16, 12]}
+
+
 @pytest.mark.parametrize(
-    ("handed", "noise", "nats", "words"),
+    ("handed", "words"),
     [
-        (1290, 0.0, -0.2, "under A’s decisions 31 steps earlier."),
-        (1350, 80.0, 0.5, "29 steps later, no later than by chance (repeats scatter by 80)."),
-        (1350, 12.0, 0.5, "beyond the scatter of repeats (12), but by less than one power of e (0.50)"),
-        (
-            1350,
-            0.0,
-            0.5,
-            "29 steps later: by less than one power of e (0.50), which counts as no difference.",
-        ),
-        (None, 0.0, None, "the runs had split at step 300, before any decision differed."),
+        (1290, "under A’s decisions 31 steps earlier; 9 of 16 such pairs split more than one e-folding"),
+        (1321, "under A’s decisions at the same step; 9 of 16"),
+        (1350, "29 steps later; 9 of 16 such pairs split more than one e-folding (43 steps) later"),
+        (None, "the runs had split at step 300, before any decision differed."),
     ],
 )
-def test_a_bystander_is_told_by_its_criterion(tmp_path, handed, noise, nats, words):
+def test_a_bystander_is_told_by_its_criterion(tmp_path, handed, words):
     split = 1321 if handed is not None else 300
     splits = {"B": split, "B|A": handed}
-    found = judged(tmp_path, verdict="bystander", split=split, splits=splits, noise=noise, nats=nats)
+    found = judged(tmp_path, verdict="bystander", split=split, splits=splits, count=COUNT)
     assert words in found.headline
 
 
-def test_repeats_that_did_not_split_are_in_the_page(tmp_path):
-    ran = {"repeats": [1300], "repeats_run": 2, "repeats_censored": 1, "noise": 60.0}
-    run = load(make_fork(tmp_path / "one", summary=ran))
-    assert [row["A"] for row in sections.runs(run)][-2:] == ["1,300", "> 1,500"]
-    assert str(findings.chance(run)).endswith("at least: 1 did not split")
-    none = load(make_fork(tmp_path / "none", summary=ran | {"repeats": [], "repeats_censored": 2}))
-    assert "none of which split in 1,500 steps" in str(findings.chance(none))
+def test_repeats_are_in_the_page_as_ranges(tmp_path):
+    repeated = [{"free": 1300, "handed": 1410}, {"free": 1280, "handed": None}]
+    run = load(make_fork(tmp_path / "one", summary={"repeated": repeated, "count": COUNT}))
+    assert [row["A"] for row in sections.runs(run)][-2:] == [
+        "1,280 to 1,300",
+        "1,410 to 1,410; 1 of 2 not seen to",
+    ]
+    assert "15 repeats" in str(findings.chance(run))
+    assert findings.chance(load(make_fork(tmp_path / "none"))) is None
 
 
-def test_a_delay_without_repeats_is_open(tmp_path):
-    entries = {"splits": {"B": 1321, "B|A": 1700}, "repeats_run": 0, "verdict": "open"}
-    found = judged(tmp_path, **entries)
-    assert found.headline.endswith("378 steps later; whether that is chance is open, as no repeats were run.")
-    assert [finding.code for finding in found.findings] == ["NO_REPEATS"]
+def test_what_repeats_leave_open_is_said_with_what_would_do(tmp_path):
+    def told(name, **count):
+        entries = {"splits": {"B": 1321, "B|A": 1700}, "verdict": "undecided", "count": COUNT | count}
+        ((finding),) = findings.judge(load(make_fork(tmp_path / name, summary=entries))).findings
+        return finding
+
+    assert told("all").code == "UNDECIDED" and "--repeats 30" in told("again").remedy
+    none = told("none", pairs=1, later=1, not_later=0, most=1, needed=None)
+    assert none.title == "no repeats were run" and "--repeats 15" in none.remedy
 
 
 def test_findings_are_those_that_apply(tmp_path):
@@ -248,7 +257,7 @@ def test_findings_are_those_that_apply(tmp_path):
     assert codes("short", split=None, verdict="open") == {"HORIZON_SHORT": "info"}
     assert codes("guard", handed_until=900) == {"GUARD": "info"}
     assert codes("told", handed_until=900, failed_told={"B|A": "runaway"}) == {"GUARD": "info"}
-    assert codes("alone", verdict="hurried", repeats_run=0) == {"NO_REPEATS": "info"}
+    assert codes("alone", verdict="undecided", count=COUNT) == {"UNDECIDED": "info"}
     assert codes("held", must_hold=True) == {"MUST_HOLD_FORKED": "error"}
     kept = {"code": "OF_OTHERS", "severity": "warning", "title": "look", "text": "there"}
     stale = {"code": "GUARD", "severity": "info", "title": "no longer", "text": "so"}

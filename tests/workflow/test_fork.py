@@ -48,9 +48,7 @@ def use(monkeypatch, choice):
 def compared(tmp_path_factory) -> ForkResult:
     """float32 against float64 on the crystal, up to a little after the fork."""
     out = tmp_path_factory.mktemp("forks") / "crystal"
-    return mdnum.fork(
-        "argon/crystal-108", "precision", steps=STEPS, out=out, repeats=1, minimal=True, pin="fork"
-    )
+    return mdnum.fork("argon/crystal-108", "precision", steps=STEPS, out=out, minimal=True, pin="fork")
 
 
 def test_the_summary_says_what_was_followed(compared):
@@ -65,7 +63,7 @@ def test_the_summary_says_what_was_followed(compared):
     assert summary["growth_rate_time"] == pytest.approx(summary["growth_rate"] / 0.004)
     assert summary["changes"]["precision.force"] == ["float64", "float32"]
     assert summary["cross_flips"] == made.flips_total > 0
-    assert set(summary["splits"]) == {"B", "B|A", "A|B"} and summary["repeats_run"] == 1
+    assert set(summary["splits"]) == {"B", "B|A", "A|B"} and summary["repeated"] == []
     assert [(cell["arithmetic"], cell["decisions"], cell["from"]) for cell in summary["table"]] == [
         ("A", "A", "A"), ("B", "B", "A"), ("B", "A", "A"), ("A", "B", "A"),
         ("A", "A", "B"), ("B", "B", "B"), ("B", "A", "B"), ("A", "B", "B"),
@@ -91,8 +89,8 @@ def test_the_tables_hold_the_series(compared):
     table, series = folder.read("separation"), compared.fork.series
     assert table["step"].tolist() == list(range(STEPS + 1))
     np.testing.assert_allclose(table["time"], 0.004 * np.arange(STEPS + 1))
-    for column, name in (("free", "B"), ("handed", "B|A"), ("back", "A|B"), ("repeat_1", "B 1"),
-                         ("energy_b", "energy B"), ("overridden", "overridden")):  # fmt: skip
+    for column, name in (("free", "B"), ("handed", "B|A"), ("back", "A|B"),
+                           ("energy_b", "energy B"), ("overridden", "overridden")):  # fmt: skip
         np.testing.assert_array_equal(table[column], series[name])
     for column, name in (("back_from_a", "A|B from A"), ("nearest_a", "nearest A"),
                          ("ambiguous_b", "ambiguous B")):  # fmt: skip
@@ -239,7 +237,18 @@ def test_screening_ranks_what_was_screened(tmp_path, monkeypatch):
         ("argon/crystal-108", "precision", {"repeats": -1}, "repeats = -1"),
         ("argon/crystal-108", "precision", {"overrides": {"cutoff.knd": 1}}, "knd"),
         ("argon/crystal-108", "precision", {"pin": "3-108"}, "no pair 3-108"),
-        ("argon/crystal-108", "all", {"minimal": True}, "in one comparison"),
+        ("argon/crystal-108", "precision", {"repeats": 2}, "repeats = 2; expected 0, or 4 and more"),
+        # what would be left undone, and was without a word
+        ("argon/crystal-108", "precision", {"repeats": 4, "counterfactual": False}, "repeats = 4"),
+        ("argon/crystal-108", "precision", {"back": True, "counterfactual": False}, "A under B's decisions"),
+        ("silicon/tersoff-512", "precision", {"repeats": 4}, "many-body"),
+        ("ball/drop", "start", {"repeats": 4, "counterfactual": False}, "repeats = 4"),
+        ("ball/drop", "start", {"minimal": True}, "minimal is an option of molecular dynamics"),
+        ("ball/drop", "start", {"pin": "fork", "back": False}, "pin and back are options of molecular"),
+        ("ball/drop", "start", {"lyapunov": True}, "lyapunov is an option of molecular dynamics"),
+        ("ball/drop", "all", {"split": 0.1, "repeats": 4}, "split and repeats are options of one comparison"),
+        ("argon/crystal-108", "all", {"minimal": True}, "minimal is an option of one comparison"),
+        ("argon/crystal-108", "all", {"split": 0.1, "lyapunov": False}, "split and lyapunov are options"),
     ],
 )
 def test_what_is_refused_leaves_no_folder(tmp_path, system, vary, options, words):

@@ -50,7 +50,7 @@ def file(tmp_path_factory):
 @pytest.fixture(scope="module")
 def compared(file, tmp_path_factory) -> ForkResult:
     """What the system file asks for itself: its first contact a step earlier."""
-    return mdnum.fork(file, out=tmp_path_factory.mktemp("forks") / "three", repeats=1)
+    return mdnum.fork(file, out=tmp_path_factory.mktemp("forks") / "three")
 
 
 def test_the_summary_says_what_was_followed(compared):
@@ -69,7 +69,7 @@ def test_the_summary_says_what_was_followed(compared):
     assert decision["margins"]["A"] == decision["margins"]["B"] < 0
     assert not decision["ambiguous"] and decision["bounds"]["A"] > 0
     assert summary["splits"] == {"B": made.dates.split, "B|A": None, "A|B": None}
-    assert summary["handed_largest"] == 0.0 and len(summary["table"]) == 8 and summary["repeats_run"] == 1
+    assert summary["handed_largest"] == 0.0 and len(summary["table"]) == 8 and summary["repeated"] == []
     assert summary["cross_flips"] == summary["cross_contacts"] + summary["cross_stops"] > 0
     ball = decision["ball"]
     assert summary["headline"].startswith(
@@ -81,7 +81,7 @@ def test_the_summary_says_what_was_followed(compared):
         "difference",
         "reasons",
         "nats",
-        "noise",
+        "count",
         "growth",
         "shares",
         "predicted_split",
@@ -93,7 +93,7 @@ def test_the_tables_hold_series_and_decisions(compared):
     folder, made = RunFolder.open(compared.folder), compared.fork
     table = folder.read("separation")
     assert table["step"].tolist() == list(range(STEPS + 1))
-    for column, name in (("free", "B"), ("handed", "B|A"), ("back", "A|B"), ("repeat_1", "B 1"),
+    for column, name in (("free", "B"), ("handed", "B|A"), ("back", "A|B"),
                          ("cross", "cross"), ("energy_b", "energy B")):  # fmt: skip
         np.testing.assert_array_equal(table[column], made.series[name])
     rows = folder.read("cross_flips")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from mdnum.events.chance import Delay
 from mdnum.events.forks import Dates
 from mdnum.workflow import fork_numbers as numbers
 
@@ -26,6 +27,6 @@ def test_a_prediction_says_what_it_comes_from():
     assert numbers.predicted(Dates(0, 5, 9), steady, 0.1, 899)["predicted_split"] is None
 
 
-def test_repeats_that_did_not_split_are_counted():
-    splits = {"B": 10, "B 1": 12, "B 2": None, "B|A": None}
-    assert numbers.repeats(splits) == {"repeats": [12], "repeats_run": 2, "repeats_censored": 1}
+def test_repeats_that_did_not_split_are_kept():
+    delays = [Delay(12, 40, 99, 99), Delay(None, 30, 99, 99)]
+    assert numbers.repeats(delays) == {"repeated": [{"free": 12, "handed": 40}, {"free": None, "handed": 30}]}

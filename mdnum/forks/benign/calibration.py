@@ -19,7 +19,6 @@ from mdnum.forks.benign import rule
 from mdnum.forks.benign.ensemble import ensemble, parting, starts
 from mdnum.forks.benign.features import Ruler
 from mdnum.forks.benign.planted import Change, planted
-from mdnum.forks.pair import SPLIT
 from mdnum.rollout.engine import Start, first_state
 from mdnum.systems.build import Simulation
 
@@ -27,6 +26,8 @@ from mdnum.systems.build import Simulation
 _SHARES = (0.07, 0.15, 0.25, 0.4, 0.55, 0.7, 0.85)
 #: Where members do not split: windows up to this step.
 _UNSPLIT = 1000
+#: Runs further apart than so many cutoffs have parted.
+_PARTED = 0.04
 #: A window is good where every planted change is so many limits away, and the latest good one is taken:
 #: a change that acts rarely has then had time to act.
 _CLEAR = 3.0
@@ -230,7 +231,7 @@ def choose(windows: Sequence[Window], name: str) -> Window:
 
 
 def _windows(simulation: Simulation, start: Start | None, seed: int) -> list[int]:
-    split = parting(simulation, start, SPLIT * simulation.r_cut, seed) or _UNSPLIT
+    split = parting(simulation, start, _PARTED * simulation.r_cut, seed) or _UNSPLIT
     return [max(1, round(share * split)) for share in _SHARES]
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mdnum.forks.benign.features import Ruler, measure
-from mdnum.forks.pair import nudged
+from mdnum.forks.repeats import nudged
 from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, first_state, resume_point
 from mdnum.systems.build import Simulation
 

@@ -21,10 +21,12 @@ from mdnum.ball.rollout import BallRun, simulate
 from mdnum.ball.state import BallState, Decisions
 from mdnum.ball.world import World
 from mdnum.errors import InputError
+from mdnum.events.chance import Delay
 from mdnum.events.forks import Dates, Growth, Verdict, growth, judge, split_of
 from mdnum.events.shares import Cell, Share, shares, table
 from mdnum.forks.bounce.cross import Differing, differing, overridden
 from mdnum.forks.bounce.twin import BallTwin, as_in_a, in_order, told
+from mdnum.forks.words import repeats_asked
 
 #: The split tolerance as a share of the largest start height (or of the largest one, from the floor).
 SPLIT = 0.01
@@ -94,6 +96,7 @@ class BallFork:
         table: splits of either arithmetic under either decisions.
         shares: what the decisions and what the arithmetic contributed to the split.
         verdict: on the decisions that differ.
+        repeats: when each repeat splits, free and under A's decisions.
         failed: runs that ended in a "blow-up", with which the comparison ends; where only one of them does,
             that is the fork at the latest.
         runs: A, B and the counterfactuals by name, with every state.
@@ -112,13 +115,9 @@ class BallFork:
     table: tuple[Cell, ...]
     shares: tuple[Share, ...]
     verdict: Verdict
+    repeats: tuple[Delay, ...]
     failed: dict[str, str]
     runs: dict[str, BallRun]
-
-    @property
-    def repeats(self) -> list[int]:
-        """Split steps of the repeats that did split."""
-        return [split for name, split in self.splits.items() if name.startswith("B ") and split is not None]
 
 
 def fork(
@@ -126,7 +125,7 @@ def fork(
     steps: int | None = None,
     *,
     split: float | None = None,
-    repeats: int = 4,
+    repeats: int | None = None,
     counterfactual: bool = True,
     seed: int = 0,
     progress: Callable[[int, int, dict[str, Any]], None] | None = None,
@@ -137,7 +136,9 @@ def fork(
         twin: the programs.
         steps: steps to make; default those of A.
         split: separation that counts as split, m; default 1 % of the largest start height.
-        repeats: runs of B whose start is perturbed by as much as the two runs differ at first.
+        repeats: runs of B at most whose start is perturbed by as much as the two runs differ at first, each
+            free and under A's decisions; default 15. They are made where the runs split either way, until the
+            verdict is clear.
         counterfactual: run B under A's decisions, and A under B's.
         seed: of the perturbations.
         progress: called with runs done times steps, of how many, and a dictionary with the phase.
@@ -150,9 +151,8 @@ def fork(
     steps = a.steps if steps is None else steps
     if steps < 1:
         raise InputError(f"steps = {steps}; expected at least 1")
-    if repeats < 0:
-        raise InputError(f"repeats = {repeats}; expected 0 or more")
-    count = 2 + 2 * counterfactual + repeats
+    most = repeats_asked(repeats, counterfactual)
+    count = 2 + 2 * counterfactual
     done = 0
 
     def run(problem: Problem, given: Decisions | None = None, start: BallState | None = None) -> BallRun:
@@ -203,15 +203,25 @@ def fork(
     for name in ("A", "B", "B|A"):
         if name in runs:
             series[f"energy {name}"] = runs[name].energy[: last + 1].mean(axis=1)
-    if dates.fork is not None:
-        begins = dates.fork if begun is None else begun
-        size = _seed_size(series["B"], begins, dates.fork, tolerance)
-        for number, start in enumerate(_nudged(b, size, repeats, seed), 1):
+    verdict = judge(dates, series["B"], handed, tolerance, (), most, ended=ended)
+    delays: list[Delay] = []
+    starts: list[BallState] = []
+    while wanted := verdict.wanted:
+        if not starts:
+            assert dates.fork is not None
+            begins = dates.fork if begun is None else begun
+            starts = _nudged(b, _seed_size(series["B"], begins, dates.fork, tolerance), most, seed)
+        count += 2 * wanted
+        for start in starts[len(delays) : len(delays) + wanted]:
             again = as_in_a(run(b, pins, start), twin.order)
-            series[f"B {number}"] = _apart(run_a, again, last)
-    names = [name for name in series if name in ("B", "B|A", "A|B") or name.startswith("B ")]
+            under = as_in_a(run(b, in_order(run_a.told(), twin.order), start), twin.order)
+            kept = _apart(run_a, under, last)
+            _guard(kept, overridden(under, last)[1], tolerance)
+            series[f"B {len(delays) + 1}"] = free = _apart(run_a, again, last)
+            delays.append(Delay.of(free, kept, tolerance))
+        verdict = judge(dates, series["B"], handed, tolerance, delays, most)
+    names = [name for name in series if name in ("B", "B|A", "A|B")]
     splits = {name: split_of(series[name], tolerance) for name in names}
-    chance = [at for name, at in splits.items() if name.startswith("B ")]
     rates = {name: growth(series[name], tolerance) for name in ("B", "B|A") if name in series}
     apart = {name: values for name, values in series.items() if name[0] in "AB"}
     cells = table(apart, tolerance)
@@ -228,7 +238,8 @@ def fork(
         splits=splits,
         table=cells,
         shares=shares(cells, rates["B"].rate),
-        verdict=judge(dates, series["B"], handed, tolerance, chance, ended=ended),
+        verdict=verdict,
+        repeats=tuple(delays),
         failed=failed,
         runs=runs,
     )

@@ -13,7 +13,7 @@ from mdnum.report.words import count, listed, many, number, plain, typeset
 
 #: Codes that are decided anew each time.
 CODES = frozenset({
-    "MUST_HOLD_FORKED", "RUN_FAILED", "AMBIGUOUS_FORK", "HORIZON_SHORT", "GUARD", "NO_REPEATS",
+    "MUST_HOLD_FORKED", "RUN_FAILED", "AMBIGUOUS_FORK", "HORIZON_SHORT", "GUARD", "UNDECIDED",
 })  # fmt: skip
 _ORDER = ("error", "warning", "info")
 
@@ -57,16 +57,14 @@ def headline(run: ForkFolder) -> str:
             f"The {what} at step {at} is the cause: free, the runs split at step {split}; "
             f"under A’s decisions they stay together{findings.followed(run)}."
         )
-    if run.word == "hurried":
-        other = (summary.get("splits") or {}).get("B|A")
-        later = (
-            many(other - dates["split"], "step") + " later" if other is not None else "later than followed"
-        )
-        return f"The decisions hurried the split: free, it is at step {split}; under A’s decisions {later}."
+    if run.word == "accelerated":
+        return f"The decisions accelerated the split: {findings.compared(run)}."
+    if run.word == "undecided":
+        return f"What the decisions did to the split is undecided: {findings.compared(run)}."
     if run.word == "bystander":
         return f"The {what} at step {at} is a bystander: {findings.bystander(run)}."
     if "split" in dates:
-        return f"The runs fork at step {at} and split at step {split}{findings.undecided(run, 'decisions')}."
+        return f"The runs fork at step {at} and split at step {split}; what the decisions did to it is open."
     return f"The runs fork at step {at} and have not split after {steps}."
 
 
@@ -166,14 +164,7 @@ def _findings(run: ForkFolder) -> Iterator[Finding]:
             "A contact that it was told was no longer near the floor in its own heights: nothing that "
             "rounding could have changed.",
         )
-    if findings.uncalibrated(run):
-        yield Finding(
-            "NO_REPEATS",
-            "info",
-            "no repeats were run",
-            "Without them a delay cannot be told from chance.",
-            "Add --repeats 4.",
-        )
+    yield from findings.unclear(run)
 
 
 # --- tables -------------------------------------------------------------------------------------------

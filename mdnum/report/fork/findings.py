@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from mdnum.events.chance import REPEATS
 from mdnum.report.fork.run import ForkFolder, load
 from mdnum.report.verdict import Finding, restore
 from mdnum.report.words import count, listed, many, number, typeset
@@ -14,7 +15,7 @@ from mdnum.store import RunFolder
 
 #: Codes that are decided anew each time.
 CODES = frozenset({
-    "MUST_HOLD_FORKED", "RUN_FAILED", "AMBIGUOUS_FORK", "HORIZON_SHORT", "GUARD", "NO_REPEATS",
+    "MUST_HOLD_FORKED", "RUN_FAILED", "AMBIGUOUS_FORK", "HORIZON_SHORT", "GUARD", "UNDECIDED",
 })  # fmt: skip
 #: r² from which a separation counts as one exponential.
 FITS = 0.8
@@ -88,20 +89,14 @@ def _headline(run: ForkFolder) -> str:
             f"The flip at step {fork} is the cause: free, the runs split at step {split}; "
             f"under A’s decisions they stay together{followed(run)}."
         )
-    if run.word == "hurried":
-        other = (summary.get("splits") or {}).get("B|A")
-        later = (
-            f"{many(other - dates['split'], 'step')} later"
-            if other is not None
-            else "later than they were followed"
-        )
-        return (
-            f"The flips hurried the split: free, the runs split at step {split}; under A’s decisions {later}."
-        )
+    if run.word == "accelerated":
+        return f"The flips accelerated the split: {compared(run)}."
+    if run.word == "undecided":
+        return f"What the flips did to the split is undecided: {compared(run)}."
     if run.word == "bystander":
         return f"The flip at step {fork} is a bystander: {bystander(run)}."
     if "split" in dates:
-        return f"The runs fork at step {fork} and split at step {split}{undecided(run)}."
+        return f"The runs fork at step {fork} and split at step {split}; what the flips did to it is open."
     guess = summary.get("predicted_split")
     what = "the Lyapunov exponent" if summary.get("predicted_by") == "exponent" else "the growth so far"
     tail = f"; {what} puts it at about step {count(guess)}" if guess is not None else ""
@@ -114,38 +109,37 @@ def followed(run: ForkFolder) -> str:
     return "" if until is None else f" up to step {count(until)}"
 
 
-def undecided(run: ForkFolder, what: str = "flips") -> str:
-    """Why it is open what flips did to a split."""
-    other = (run.summary.get("splits") or {}).get("B|A")
-    later = None if other is None else other - run.dates["split"]
-    if later is None or later <= 0:
-        return f"; what the {what} did to it is open"
-    return f", under A’s decisions {many(later, 'step')} later; whether that is chance is open, as " + (
-        "a repeat did not split" if run.summary.get("repeats_run") else "no repeats were run"
+def compared(run: ForkFolder) -> str:
+    """When the runs split, free and under A's decisions, and in how many repeats that is later."""
+    summary, split = run.summary, run.dates["split"]
+    other = (summary.get("splits") or {}).get("B|A")
+    text = f"free, the runs split at step {count(split)}, and under A’s decisions "
+    if other is None:
+        text += "later than they were followed"
+    elif other == split:
+        text += "at the same step"
+    else:
+        text += f"{many(abs(other - split), 'step')} {'later' if other > split else 'earlier'}"
+    return f"{text}; {agreeing(run)}" if summary.get("count") else text
+
+
+def agreeing(run: ForkFolder) -> str:
+    """How many of the pair and its repeats split later without the flips."""
+    found = run.summary["count"]
+    later = (
+        "later"
+        if not found["threshold"]
+        else f"more than one e-folding ({number(found['threshold'], 2)} steps) later"
     )
+    return f"{count(found['later'])} of {many(found['pairs'], 'such pair')} split {later} without the flips"
 
 
 def bystander(run: ForkFolder) -> str:
     """By which criterion flips had no part in a split."""
-    summary, dates = run.summary, run.dates
-    split = dates["split"]
-    other = (summary.get("splits") or {}).get("B|A")
-    if split < dates.get("fork", 0):
+    split = run.dates["split"]
+    if split < run.dates.get("fork", 0):
         return f"the runs had split at step {count(split)}, before any decision differed"
-    if other is None:
-        return f"free, the runs split at step {count(split)}"
-    gained, noise = other - split, summary.get("noise") or 0.0
-    if gained <= 0:
-        when = "at the same step" if gained == 0 else f"{many(-gained, 'step')} earlier"
-        return f"free, the runs split at step {count(split)}, and under A’s decisions {when}"
-    later = (
-        f"free, the runs split at step {count(split)}, and under A’s decisions {many(gained, 'step')} later"
-    )
-    if gained <= noise:
-        return f"{later}, no later than by chance (repeats scatter by {noise:,.0f})"
-    beyond = f"beyond the scatter of repeats ({noise:,.0f}), but by" if noise else "by"
-    nats = number(summary.get("nats"), 2)
-    return f"{later}: {beyond} less than one power of e ({nats}), which counts as no difference"
+    return compared(run)
 
 
 def _ended(run: ForkFolder) -> str:
@@ -255,35 +249,34 @@ def _findings(run: ForkFolder) -> Iterator[Finding]:
             else "A decision that it was told was no longer near its threshold in its own positions: "
             "nothing that rounding could have changed.",
         )
-    if uncalibrated(run):
-        yield Finding(
-            "NO_REPEATS",
-            "info",
-            "no repeats were run",
-            "Without them a delay cannot be told from chance.",
-            "Add --repeats 4.",
-        )
+    yield from unclear(run)
+
+
+def unclear(run: ForkFolder) -> Iterator[Finding]:
+    """A verdict that the repeats leave open."""
+    found = run.summary.get("count")
+    if run.word != "undecided" or not found:
+        return
+    need = found["needed"]
+    clear = "no number of them could be" if need is None else f"{count(need[1])} of {count(need[0])} would be"
+    more = max(REPEATS, 2 * (found["most"] - 1))
+    yield Finding(
+        "UNDECIDED",
+        "info",
+        "the repeats do not tell what the flips did" if found["pairs"] > 1 else "no repeats were run",
+        f"{agreeing(run)}, which is not clear: {clear}.",
+        f"Allow more: --repeats {more}." if more > found["most"] - 1 else "",
+    )
 
 
 def chance(run: ForkFolder) -> str | None:
-    """How far splits scatter by chance; None where no repeats were run."""
-    ran, late = run.summary.get("repeats_run"), run.summary.get("repeats_censored")
-    if not ran:
+    """What repeats were compared; None where none were."""
+    found = run.summary.get("count")
+    if not found or found["pairs"] < 2:
         return None
-    if late == ran:
-        return f"{many(ran, 'repeat')}, none of which split in {many(run.steps, 'step')}: it is not known"
-    text = (
-        f"{many(ran, 'repeat')}; two splits differ by {number(run.summary.get('noise'), 3)} steps by chance "
-        "(2 σ)"
+    return (
+        f"{many(found['pairs'] - 1, 'repeat')}, free and under A’s decisions; with the pair {agreeing(run)}"
     )
-    return text + (f" at least: {count(late)} did not split" if late else "")
-
-
-def uncalibrated(run: ForkFolder) -> bool:
-    """Whether a split under A's decisions was compared with no repeats."""
-    told = (run.summary.get("splits") or {}).get("B|A") is not None
-    judged = run.word in ("hurried", "bystander") or (run.word == "open" and told)
-    return judged and "fork" in run.dates and not run.summary.get("repeats_run")
 
 
 def _broken(one: Mapping[str, Any], remedy: str) -> Finding:

@@ -67,7 +67,9 @@ class ForkFolder:
     @property
     def word(self) -> str:
         """The verdict."""
-        return str(self.summary.get("verdict") or "")
+        word = str(self.summary.get("verdict") or "")
+        # as folders of older versions have it
+        return "accelerated" if word == "hurried" else word
 
     @property
     def decision(self) -> Mapping[str, Any] | None:

@@ -76,15 +76,22 @@ def runs(run: ForkFolder) -> Iterator[dict[str, str]]:
     for (arithmetic, decisions), texts in rows.items():
         whose = "its own" if arithmetic == decisions else f"{decisions}’s"
         yield {"arithmetic": arithmetic, "decisions": whose, **{name: texts.get(name, "") for name in "AB"}}
-    for at in run.summary.get("repeats") or ():
-        yield {"arithmetic": "B, start perturbed", "decisions": "its own", "A": count(at), "B": ""}
-    for _ in range(run.summary.get("repeats_censored") or 0):
-        yield {
-            "arithmetic": "B, start perturbed",
-            "decisions": "its own",
-            "A": f"> {count(run.steps)}",
-            "B": "",
-        }
+    for decisions, text in repeated(run.summary):
+        whose = "its own" if decisions == "B" else "A’s"
+        yield {"arithmetic": "B, start perturbed", "decisions": whose, "A": text, "B": ""}
+
+
+def repeated(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """Between which steps repeats split under B's decisions, which are their own, and under A's."""
+    found = summary.get("repeated") or ()
+    for decisions, name in (("B", "free"), ("A", "handed")):
+        seen = [one[name] for one in found if one[name] is not None]
+        late = len(found) - len(seen)
+        text = f"{count(min(seen))} to {count(max(seen))}" if seen else ""
+        if late:
+            text += f"{'; ' if seen else ''}{late} of {len(found)} not seen to"
+        if found:
+            yield decisions, text
 
 
 def _cell(cell: Mapping[str, Any]) -> str:

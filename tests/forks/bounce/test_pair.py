@@ -102,7 +102,7 @@ def test_bits_that_differ_without_a_decision_that_does():
     found = fork(between(world, world, world.start(1.0), world.start(1.0 + 1e-12), 800))
     assert found.verdict.word == "no fork"
     np.testing.assert_array_equal(found.series["B"], found.series["B|A"])
-    assert found.splits["B"] is None and found.repeats == []
+    assert found.splits["B"] is None and found.repeats == ()
 
 
 def test_another_gravity_needs_no_decision_to_split():
@@ -111,9 +111,11 @@ def test_another_gravity_needs_no_decision_to_split():
         ball.World.create(ball.Penalty(1e4), ball.SemiImplicitEuler(1e-3), gravity)
         for gravity in (9.81, 9.75)
     )
-    found = fork(between(light, heavy, light.start(1.0), steps=2000), repeats=2)
+    found = fork(between(light, heavy, light.start(1.0), steps=2000))
     assert found.dates.fork is not None and found.dates.split is not None
     assert found.verdict.word == "bystander", found.verdict
+    # six of six are not later without them
+    assert len(found.repeats) == 5 and found.verdict.count.not_later == 6
 
 
 def test_programs_that_decide_different_things_are_refused():

@@ -1,0 +1,311 @@
+"""How often is a verdict of `mdnum fork` wrong? Two liquids and a crystal, float32 beside float64.
+
+A false verdict needs a truth that is known apart from the verdict:
+
+    switched   a liquid whose cutoff switches off smoothly: a pair that crosses it adds nothing to the
+               forces, so flips can neither cause nor accelerate anything. Right: bystander.
+    placebo    the hard cutoff, but in place of the run under the other's decisions stands a further free
+               run from a perturbed start: the two differ in nothing. Right: not accelerated.
+    hard       a hard cutoff at 2 sigma (1.8 in the mixture). The truth is what most of 16 further repeats
+               do, none of which the verdict saw: split more than one e-folding later without the flips, or
+               not.
+    violent    the same with a cutoff at 1.5 sigma (1.4 in the mixture), inside the well.
+    crystal    argon/crystal-108, whose second shell lies at a hard cutoff. The truth: repeats under the
+               other's decisions do not split at all.
+
+Every start is kept in a file of its own as soon as it is done (--store), as separations and steps of splits,
+not as a verdict: the study goes on where it was stopped, and its tables are judged from the files by the
+rule that mdnum has now.
+
+    nice python scripts/verdict_calibration.py --seeds 100 --only switched hard
+    nice python scripts/verdict_calibration.py --seeds 30
+    python scripts/verdict_calibration.py --seeds 100 --tables docs/verdict-calibration.md
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from _output import say, start
+from ase import Atoms
+from ase.build import bulk
+
+from mdnum.events.chance import Delay, count
+from mdnum.events.forks import Dates, Verdict, growth, judge
+from mdnum.forks import fork
+from mdnum.forks.choices import parse
+from mdnum.forks.pair import SPLIT
+from mdnum.forks.repeats import perturbed, repeat
+from mdnum.rollout.engine import Engine
+from mdnum.systems import System, SystemSpec, build, load
+
+STEPS = 4000
+#: Repeats that no verdict sees, where it was clear: the truth.
+UNSEEN = 16
+#: Of the crystal, where a repeat takes 4,000 steps.
+UNSEEN_CRYSTAL = 2
+SHARES = (0.002 / 1.5874, SPLIT, 0.02, 0.04, 0.1 / 1.5874)
+POTENTIAL = {"kind": "lennard-jones", "sigma": 1.0, "epsilon": 1.0}
+MIXTURE = {
+    "kind": "lennard-jones",
+    "pairs": {
+        "Ni-Ni": {"sigma": 1.0, "epsilon": 1.0},
+        "Ni-P": {"sigma": 0.8, "epsilon": 1.5},
+        "P-P": {"sigma": 0.88, "epsilon": 0.5},
+    },
+}
+#: By liquid: density, temperature, time step, skin, potential, cutoffs in sigma of each pair. The skins are
+#: as wide as 108 atoms allow: most of the time goes to lists.
+LIQUIDS = {
+    "Lennard-Jones": (0.8442, 0.72, 0.005, 0.5, POTENTIAL, {"hard": 2.0, "switched": 2.0, "violent": 1.5}),
+    "Kob-Andersen": (1.2, 1.0, 0.003, 0.42, MIXTURE, {"hard": 1.8, "switched": 1.8, "violent": 1.4}),
+}
+
+
+# --- systems ------------------------------------------------------------------------------------------
+
+
+def system(name: str, atoms: Atoms, cutoff: str, seed: int, thermostat: float | None = None) -> System:
+    """A liquid with one of its cutoffs; with a Langevin thermostat where a temperature is given."""
+    _, temperature, timestep, skin, potential, radii = LIQUIDS[name]
+    dynamics = {"kind": "nve", "timestep": timestep, "temperature": temperature, "seed": seed}
+    if thermostat is not None:
+        dynamics |= {"kind": "langevin", "friction": 2.0, "temperature": thermostat}
+    kind = cutoff if cutoff == "switched" else "hard"
+    data = {
+        "units": "lj",
+        "structure": {"file": "made in memory"},
+        "potential": potential,
+        "cutoff": {"kind": kind, "in_sigma": radii[cutoff]},
+        "neighbors": {"skin": skin},
+        "dynamics": dynamics,
+    }
+    return System(f"{name} {cutoff}", SystemSpec.model_validate(data), None, atoms)
+
+
+def liquid(name: str, seed: int) -> Atoms:
+    """108 atoms, melted at 3 times the temperature and cooled to it, 2,000 steps each."""
+    density, temperature, *_ = LIQUIDS[name]
+    atoms = bulk("Ni", "fcc", a=(4 / density) ** (1 / 3), cubic=True).repeat(3)
+    if name == "Kob-Andersen":
+        atoms.symbols[::5] = "P"
+    atoms.set_array("masses", np.ones(len(atoms)))
+    for kelvin in (3 * temperature, temperature):
+        simulation = build(system(name, atoms, "switched", seed, kelvin))
+        *_, last = Engine(simulation, 2000, record=False).segments()
+        atoms = atoms.copy()
+        atoms.positions = np.asarray(last.state.x, np.float64).T
+        atoms.set_velocities(np.asarray(last.state.v, np.float64).T)
+    return atoms
+
+
+# --- what is run --------------------------------------------------------------------------------------
+
+
+def gather(made: System, share: float, unseen: int, *, always: bool = False) -> dict[str, np.ndarray]:
+    """What a verdict needs, and the truth, of one start.
+
+    Args:
+        made: the system.
+        share: the split tolerance over the cutoff.
+        unseen: repeats for the truth.
+        always: whether to run those where the verdict is not clear or asked for none, too.
+    """
+    twin = parse("precision").make(made)
+    found = fork(twin, STEPS, split=share * twin.a.r_cut, back=False)
+    truth: list[Delay] = []
+    clear = found.verdict.word in ("accelerated", "bystander")
+    if unseen and found.dates.split is not None and (clear or always):
+        starts = perturbed(found.twin, found.tolerance, unseen, seed=1)
+        runs = repeat(found.twin, starts, found.steps, found.tolerance, 3 * found.tolerance)
+        truth = [Delay.of(*run, found.tolerance) for run in runs]
+    # the separations are stored in full: a verdict must be the same from the file
+    kept = {name: found.series[name] for name in ("B", "B|A")}
+    delays = {"seen": _rows(found.repeats), "unseen": _rows(truth)}
+    dates = [-1 if at is None else at for at in vars(found.dates).values()]
+    return {**kept, **delays, "dates": np.array(dates), "tolerance": np.array(found.tolerance)}
+
+
+def _rows(delays: Sequence[Delay]) -> np.ndarray:
+    """Repeats as rows of free, handed, free_until, handed_until; -1 for no split."""
+    rows = [[-1 if at is None else at for at in vars(one).values()] for one in delays]
+    return np.array(rows, int).reshape(-1, 4)
+
+
+def tasks() -> Iterator[tuple[str, Callable[[int], dict[str, np.ndarray]]]]:
+    """(name, what gathers a seed) of everything that is run."""
+    for name, (*_, radii) in LIQUIDS.items():
+        for cutoff in radii:
+            unseen = 0 if cutoff == "switched" else UNSEEN
+            yield f"{name} {cutoff}", partial(_of_liquid, name, cutoff, unseen)
+    for share in SHARES:
+        # only the pair is run at other tolerances than the default one
+        yield f"crystal {share * 1.5874:.4f}", partial(_of_crystal, share, UNSEEN_CRYSTAL * (share == SPLIT))
+
+
+def _of_liquid(name: str, cutoff: str, unseen: int, seed: int) -> dict[str, np.ndarray]:
+    return gather(system(name, liquid(name, seed), cutoff, seed), SPLIT, unseen)
+
+
+def _of_crystal(share: float, unseen: int, seed: int) -> dict[str, np.ndarray]:
+    made = load("argon/crystal-108", {"dynamics.seed": seed}, world="md")
+    return gather(made, share, unseen, always=True)
+
+
+def fill(store: Path, seeds: int, only: Sequence[str]) -> None:
+    """Run what is not stored yet, every system's first seed before its second."""
+    store.mkdir(parents=True, exist_ok=True)
+    for seed in range(1, seeds + 1):
+        for name, made in tasks():
+            path = store / f"{name}-{seed}.npz".replace(" ", "-")
+            if path.exists() or not any(word in name for word in only):
+                continue
+            part = path.with_suffix(".part")
+            with part.open("wb") as file:
+                np.savez_compressed(file, **made(seed))
+            part.replace(path)
+        say(f"seed {seed} of {seeds}")
+
+
+# --- what is judged -----------------------------------------------------------------------------------
+
+
+def stored(store: Path, name: str, seeds: int) -> list[dict[str, np.ndarray]]:
+    """What is stored of a system, by seed."""
+    paths = [store / f"{name}-{seed}.npz".replace(" ", "-") for seed in range(1, seeds + 1)]
+    return [dict(np.load(path)) for path in paths if path.exists()]
+
+
+def delays(rows: np.ndarray) -> list[Delay]:
+    """Rows as they were stored."""
+    return [
+        Delay(*(None if at < 0 else int(at) for at in row[:2]), *(int(at) for at in row[2:])) for row in rows
+    ]
+
+
+def verdict(one: dict[str, np.ndarray], repeats: list[Delay], handed: np.ndarray | None = None) -> Verdict:
+    """The verdict of a start, with as many repeats as it wants."""
+    dates = Dates(*(None if at < 0 else int(at) for at in one["dates"]))
+    told = one["B|A"] if handed is None else handed
+    tolerance, used = float(one["tolerance"]), 0
+    while True:
+        found = judge(dates, one["B"], told, tolerance, repeats[:used])
+        wanted = min(found.wanted, len(repeats) - used)
+        if not wanted:
+            return found
+        used += wanted
+
+
+def threshold(one: dict[str, np.ndarray]) -> float:
+    """One e-folding, steps."""
+    fit = growth(one["B"], float(one["tolerance"]))
+    return 1.0 / fit.rate if fit.plain else 0.0
+
+
+def placebo(one: dict[str, np.ndarray]) -> str:
+    """The verdict where every run under the other's decisions is a free run instead."""
+    free = delays(one["seen"])
+    pairs = [
+        Delay(a.free, b.free, a.free_until, b.free_until) for a, b in zip(free[::2], free[1::2], strict=False)
+    ]
+    used = 1
+    while True:
+        found = count(tuple(pairs[:used]), threshold(one), len(pairs))
+        if not found.wanted:
+            return "undecided" if found.delayed is None else "accelerated" if found.delayed else "bystander"
+        used += found.wanted
+
+
+def truth(one: dict[str, np.ndarray]) -> tuple[int, int]:
+    """Of the repeats that no verdict saw: how many split later without the flips, and how many do not."""
+    found = count(tuple(delays(one["unseen"])), threshold(one), 1)
+    return found.later, found.not_later
+
+
+WORDS = ("bystander", "undecided", "accelerated", "cause", "open", "no fork")
+
+
+def table(columns: tuple[str, ...], rows: list[tuple[object, ...]]) -> str:
+    """A Markdown table."""
+    lines = [columns, ("---",) * len(columns), *rows]
+    return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in lines)
+
+
+def tables(store: Path, seeds: int) -> str:
+    """Every table of the study."""
+    rows, repeats, wrong = [], [], []
+    for name, _ in tasks():
+        every = stored(store, name, seeds)
+        if not every:
+            continue
+        found = [verdict(one, delays(one["seen"])) for one in every]
+        words = Counter(one.word for one in found)
+        rows.append((name, len(every), *(words[word] for word in WORDS)))
+        made = [one.count.pairs - 1 for one in found if one.count is not None]
+        if made:
+            repeats.append((name, f"{np.median(made):.0f}", f"{np.mean(made):.1f}"))
+        if name.endswith("switched"):
+            wrong.append((name, "cause", words["cause"], len(every)))
+            wrong.append((name, "accelerated", words["accelerated"], len(every)))
+        elif name.startswith("crystal"):
+            if name == f"crystal {SPLIT * 1.5874:.4f}":
+                wrong.append((name, "bystander", words["bystander"], len(every)))
+        else:
+            told = [truth(one) for one in every]
+            pairs = list(zip(found, told, strict=True))
+            fast = sum(v.word == "accelerated" and later <= no for v, (later, no) in pairs)
+            slow = sum(v.word == "bystander" and later > no for v, (later, no) in pairs)
+            wrong.append((name, "cause", words["cause"], len(every)))
+            wrong.append((name, "accelerated", fast, len(every)))
+            wrong.append((name, "bystander", slow, len(every)))
+            # of five repeats there are two pairs, and two can never be clear
+            kept = [one for one in every if len(one["seen"]) > 9]
+            empty = Counter(placebo(one) for one in kept)
+            rows.append((f"{name}, placebo", len(kept), *(empty[word] for word in WORDS)))
+            wrong.append((f"{name}, placebo", "accelerated", empty["accelerated"], len(kept)))
+    parts = [
+        table(("system", "starts", *WORDS), rows),
+        table(
+            ("system", "false", "starts", "share"),
+            [(name, f"{word}: {no}", of, f"{100 * no / of:.1f} %") for name, word, no, of in wrong],
+        ),
+        table(("system", "repeats, median", "mean"), repeats),
+    ]
+    return "\n\n".join(parts)
+
+
+MARK = "<!-- written by scripts/verdict_calibration.py -->"
+
+
+def main() -> None:
+    """Parse, run what is missing, judge, print."""
+    made = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    made.add_argument("--seeds", type=int, default=100, metavar="N", help="starts of each (default 100)")
+    made.add_argument(
+        "--only", nargs="+", default=[""], metavar="WORD", help="systems whose name has one of these in it"
+    )
+    made.add_argument(
+        "--store", type=Path, default=Path("verdict-calibration"), metavar="DIR",
+        help="where every start is kept (default verdict-calibration)",
+    )  # fmt: skip
+    made.add_argument(
+        "--tables", type=Path, metavar="PAGE",
+        help="run nothing: judge what is stored, and put the tables between the marks of this page",
+    )  # fmt: skip
+    chosen = made.parse_args()
+    if chosen.tables is None:
+        fill(chosen.store, chosen.seeds, chosen.only)
+        print(tables(chosen.store, chosen.seeds))
+        return
+    before, _, after = chosen.tables.read_text(encoding="utf-8").split(MARK)
+    text = tables(chosen.store, chosen.seeds)
+    chosen.tables.write_text(f"{before}{MARK}\n\n{text}\n\n{MARK}{after}", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    start(main)
