@@ -50,8 +50,8 @@ def audit(
 ) -> int:
     """Ask any ASE calculator: is it smooth, invariant, conservative, forgetful, and does it keep energy?
 
-    Runs the Python that makes the calculator, with --resume what the folder names. No other verb but `conform`
-    runs Python that it is given.
+    Runs the Python that makes the calculator, with --resume what the folder names. No other verb but
+    `conform` runs Python that it is given.
     """
     from mdnum.workflow.audit import AuditStopped
     from mdnum.workflow.audit import audit as ask

@@ -54,8 +54,8 @@ def conform(
 ) -> int:
     """Put a neighbor list through a conformance suite: pairs, shifts, distances, and lists that go stale.
 
-    Runs the Python of the list, with --resume of the list that the folder names. No other verb but `audit` runs
-    Python that it is given.
+    Runs the Python of the list, with --resume of the list that the folder names. No other verb but `audit`
+    runs Python that it is given.
     """
     if pairs is None and resume is None:
         return _names(as_json)
