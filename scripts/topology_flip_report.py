@@ -31,6 +31,7 @@ from mdnum.errors import InputError
 from mdnum.report import analysis
 from mdnum.report.html import write_report
 from mdnum.report.run import Run, load
+from mdnum.store import RunFolder
 
 CHATTER = 5
 
@@ -48,7 +49,7 @@ def found_or_made(subject: str, out: Path | None, steps: int | None) -> Path:
 
 def facts(run: Run) -> list[tuple[str, str]]:
     """The ledger in numbers."""
-    flips, total, steps = run.flips, run.flips_total, max(run.steps, 1)
+    total, steps = run.flips_total, max(run.steps, 1)
     atoms, summary = run.summary["atoms"], run.summary
     rows = [
         ("flips", f"{total:,}: {summary['flips_entered']:,} entered, {summary['flips_left']:,} left"),
@@ -68,7 +69,7 @@ def facts(run: Run) -> list[tuple[str, str]]:
             ("smallest margin", f"{margins.min():.3g} rounding bounds"),
             (
                 "ambiguous flips",
-                f"{int(flips['ambiguous'].sum()):,}; {analysis.expected_ambiguous(margins):.2g} expected",
+                f"{int((margins <= 1).sum()):,}; {analysis.expected_ambiguous(margins):.2g} expected",
             ),
         ]
     closes = "closes" if summary["energy_budget_closes"] else "does not close"
@@ -79,8 +80,9 @@ def facts(run: Run) -> list[tuple[str, str]]:
     return rows
 
 
-def _median(lengths: np.ndarray) -> str:
-    return f"{np.median(lengths):.0f}" if len(lengths) else "no"
+def _median(counts: np.ndarray) -> str:
+    found = analysis.median(counts)
+    return "no" if found is None else f"{found:.0f}"
 
 
 def draw(run: Run, path: Path) -> None:
@@ -106,10 +108,10 @@ def draw(run: Run, path: Path) -> None:
         per_pair.set_ylim(bottom=0.5)
         per_pair.xaxis.set_major_locator(MaxNLocator(integer=True))
         lengths = run.stays
-        longest = max(lengths.all.max(initial=10), 10)
+        longest = int(np.flatnonzero(lengths.inside + lengths.outside).max(initial=10))
         edges = np.unique(np.round(np.geomspace(1, longest + 1, 30)))
-        for values, label in ((lengths.inside, "inside"), (lengths.outside, "outside")):
-            density = np.histogram(values, edges)[0] / np.diff(edges)
+        for counts, label in ((lengths.inside, "inside"), (lengths.outside, "outside")):
+            density = np.histogram(np.arange(len(counts)), edges, weights=counts)[0] / np.diff(edges)
             stayed.stairs(density, edges, label=label, baseline=None)
         stayed.legend()
         stayed.set_xscale("log")
@@ -147,20 +149,24 @@ def main() -> None:
         words=2,
     )
     if run.flips_total:
+        flips = RunFolder.open(folder).read("flips", ("i", "j", "distance", "radial_speed"))
         busiest = zip(run.busiest.i, run.busiest.j, run.busiest.flips, strict=True)
         table(
             "\npairs that flip most",
             ("pair", "flips", f"mean distance ({run.units.length})", "fastest radial speed"),
-            ((f"{i}-{j}", count, *_where(run, i, j)) for i, j, count in islice(busiest, chosen.busiest)),
+            (
+                (f"{i}-{j}", count, *_where(run, flips, i, j))
+                for i, j, count in islice(busiest, chosen.busiest)
+            ),
         )
     draw(run, chosen.output)
     print(f"\n{run.summary['verdict']}\n\n{folder / 'report.html'}")
 
 
-def _where(run: Run, i: int, j: int) -> tuple[str, str]:
-    mine = (run.flips["i"] == i) & (run.flips["j"] == j)
-    speed = np.abs(run.flips["radial_speed"][mine]).max()
-    return f"{run.flips['distance'][mine].mean():.5f}", f"{speed:.3g} {run.units.length}/{run.units.time}"
+def _where(run: Run, flips: dict[str, np.ndarray], i: int, j: int) -> tuple[str, str]:
+    mine = (flips["i"] == i) & (flips["j"] == j)
+    speed = np.abs(flips["radial_speed"][mine]).max()
+    return f"{flips['distance'][mine].mean():.5f}", f"{speed:.3g} {run.units.length}/{run.units.time}"
 
 
 if __name__ == "__main__":

@@ -29,6 +29,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from _output import say, start
@@ -167,7 +168,8 @@ def fill(store: Path, seeds: int, only: Sequence[str]) -> None:
                 continue
             part = path.with_suffix(".part")
             with part.open("wb") as file:
-                np.savez_compressed(file, **made(seed))
+                arrays: dict[str, Any] = made(seed)
+                np.savez_compressed(file, **arrays)
             part.replace(path)
         say(f"seed {seed} of {seeds}")
 
@@ -184,7 +186,8 @@ def stored(store: Path, name: str, seeds: int) -> list[dict[str, np.ndarray]]:
 def delays(rows: np.ndarray) -> list[Delay]:
     """Rows as they were stored."""
     return [
-        Delay(*(None if at < 0 else int(at) for at in row[:2]), *(int(at) for at in row[2:])) for row in rows
+        Delay(None if free < 0 else int(free), None if handed < 0 else int(handed), int(until), int(there))
+        for free, handed, until, there in rows
     ]
 
 

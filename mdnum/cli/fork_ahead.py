@@ -27,6 +27,7 @@ def certify(
         result = fork_certify(
             system, steps=steps, out=out, overrides=overrides, report=report, progress=progress
         )
+    assert result.folder is not None, "of molecular dynamics"
     return output.answer(result.folder, result.summary, _print_certified, as_json=as_json)
 
 
