@@ -71,7 +71,7 @@ class Stretch:
             return self
         cut = {
             name: {run: values[:rows] for run, values in getattr(self, name).items()}
-            for name in ("separation", "energy", "overridden", "furthest", "nearest", "ambiguous")
+            for name in ("separation", "energy", "overridden", "furthest", "nearest", "bound", "ambiguous")
         }
         doubts = {run: doubt.where(doubt.step <= last) for run, doubt in self.doubts.items()}
         flips = [flip for flip in self.flips if flip.step <= last]

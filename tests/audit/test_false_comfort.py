@@ -211,7 +211,7 @@ def test_two_energies_are_both_read(make, severity: str, belong: str):
 
 def test_an_energy_that_alone_is_cut_is_seen():
     asked = subject(planted.CutEnergy)
-    assert not codes(Smoothness(seconds=0.2, neighbors=8)(asked))
+    assert not codes(Smoothness(neighbors=8, routes=1)(asked))
     part = Forces()(asked)
     assert codes(part) == {"TWO_ENERGIES": "error"}
     assert "between Ar-Ar at 3.4 Å, by 0.01 eV" in text(part, "TWO_ENERGIES")

@@ -170,5 +170,9 @@ def test_findings_of_others_are_kept_and_own_ones_are_decided_anew(tmp_path):
 def test_a_folder_without_a_step_is_refused(tmp_path):
     folder = make_ball(tmp_path / "run")
     (folder.path / "steps.parquet").unlink()
+    with pytest.raises(FolderError, match=r"steps\.parquet: is missing"):
+        load(folder.path)
+    # where nothing says that there were steps
+    (folder.path / "manifest.json").unlink()
     with pytest.raises(FolderError, match="holds no step"):
         load(folder.path)

@@ -11,7 +11,7 @@ import pytest
 from report.synthetic import make_run
 
 from mdnum.report import html
-from mdnum.report.run import load
+from mdnum.report.run import TABLE_ROWS, load
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 
@@ -67,7 +67,7 @@ def test_sort_search_and_pages(tmp_path):
     seen = json.loads(found[1].replace("&gt;", ">").replace("&lt;", "<").replace("&amp;", "&"))
 
     total = run.flips_total
-    assert 25 < total < html.TABLE_ROWS
+    assert 25 < total < TABLE_ROWS
     assert seen["start"] == [str(step) for step in run.flips.nearest["step"][:25]]
     assert seen["sorted"] == "ascending"
     assert seen["ratio"] != seen["ratio_down"]

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from report.synthetic import TOML, make_run
 
-from mdnum.report import figures, findings, html, svg, words
+from mdnum.report import analysis, figures, findings, html, svg, words
 from mdnum.report.run import TABLE_ROWS, load
 from mdnum.rollout.summary import Line
 from mdnum.store import RunFolder
@@ -177,8 +177,9 @@ def test_a_run_in_which_nothing_moves_has_a_page(folder):
         name: np.zeros_like(run.series[name]) for name in ("energy_jump", "temperature", "entered", "left")
     }
     still |= {name: np.full_like(run.series[name], run.series[name][0]) for name in ("conserved", "pairs")}
-    none = {name: values[:0] for name, values in run.flips.items()}
-    quiet = replace(run, series={**run.series, **still}, flips=none, flips_total=0)
+    none = {name: values[:0] for name, values in RunFolder.open(folder).read("flips").items()}
+    none = analysis.scan(none, len(run.series["step"]))
+    quiet = replace(run, series={**run.series, **still}, flips=none)
     assert findings.sharpness(quiet) == (pytest.approx(1e-4, rel=10), 0.0)
     text = html.render(quiet, findings.judge(quiet), dict.fromkeys(figures.FIGURES, ""))
     assert "would be all that moves it" in text

@@ -71,6 +71,7 @@ def judge(run: Question) -> Verdict:
         [typeset(sentence) for sentence in summary["evidence"]],
         [_typeset(restore(one)) for one in summary["findings"]],
         plain_tone="good",
+        judged=True,
     )
 
 

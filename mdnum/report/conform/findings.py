@@ -93,7 +93,7 @@ def judge(run: Question) -> Verdict:
     if left:
         asked = int(summary["questions"]) - left
         headline = f"As far as asked ({count(asked)} of {many(summary['questions'], 'case')}), {headline}"
-    return verdict(headline, _evidence(run), findings, plain_tone="good")
+    return verdict(headline, _evidence(run), findings, plain_tone="good", judged=True)
 
 
 def silent(row: Mapping[str, Any]) -> int:

@@ -80,18 +80,24 @@ def load(folder: RunFolder | str | Path, question: str, verb: str = "fork") -> t
 
 
 def verdict(
-    headline: str, evidence: Iterable[str], found: Iterable[Finding], *, plain_tone: str = "info"
+    headline: str,
+    evidence: Iterable[str],
+    found: Iterable[Finding],
+    *,
+    plain_tone: str = "info",
+    judged: bool = False,
 ) -> Verdict:
     """A verdict whose tone is that of its worst finding, which its headline names.
 
     Args:
         plain_tone: where there is nothing worse than information.
+        judged: whether the headline follows from the findings already.
     """
     findings = sorted(found, key=lambda finding: _ORDER.index(finding.severity))
     worst = findings[0].severity if findings else "info"
     tone: Any = plain_tone if worst == "info" else worst
     title = findings[0].title if findings else ""
-    if title.lower() in headline.lower():
+    if judged or title.lower() in headline.lower():
         pass
     elif worst == "error":
         headline = f"{title[:1].upper()}{title[1:]}. {headline}"
