@@ -177,7 +177,7 @@ def test_a_run_in_which_nothing_moves_has_a_page(folder):
         name: np.zeros_like(run.series[name]) for name in ("energy_jump", "temperature", "entered", "left")
     }
     still |= {name: np.full_like(run.series[name], run.series[name][0]) for name in ("conserved", "pairs")}
-    none = {name: values[:0] for name, values in RunFolder.open(folder).read("flips").items()}
+    none = {name: values[:0] for name, values in folder.read("flips").items()}
     none = analysis.scan(none, len(run.series["step"]))
     quiet = replace(run, series={**run.series, **still}, flips=none)
     assert findings.sharpness(quiet) == (pytest.approx(1e-4, rel=10), 0.0)
