@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 from test_store import frame, series_rows, state_at, write_run
 
-from mdnum.errors import FolderError
+from mdnum.errors import FolderError, InputError
 from mdnum.report import page
 from mdnum.store import RunFolder, atomic, checkpoint, manifest
 
@@ -244,9 +244,7 @@ def test_what_came_to_nothing_is_begun_again_and_what_did_not_is_kept(tmp_path, 
     started.write_provenance({})
     started.log("compile")
     started.close()
-    with pytest.raises(
-        FolderError, match="Nothing was computed in it yet: give the `mdnum run` command again"
-    ):
+    with pytest.raises(FolderError, match="Nothing of it was kept: give the `mdnum run` command again"):
         RunFolder.open(started.path).resume()
     (started.path / "mine.md").write_text("mine")
     with pytest.raises(FolderError, match="already holds a run"):
@@ -285,12 +283,195 @@ def test_a_full_disk_gives_advice_that_can_be_followed(tmp_path, monkeypatch):
 
 def test_answers_are_listed_as_soon_as_they_are_written(tmp_path):
     folder = RunFolder.create(tmp_path / "run", world="audit")
-    for text in ("{}", '{"a": 1}', '{"a": 1, "b": 2}'):
-        atomic.write_text(folder.path / "answers.json", text)
-        folder.check("answers.json")
-    (folder.path / "answers.json").write_text('{"a": 1, "b": 3}')
-    with pytest.raises(FolderError, match=r"answers\.json: is damaged"):
-        folder.check("answers.json")
+    atomic.subfolder(folder.path, "structures")
+    for name in ("answers.json", "summary.json", "structures/failed-1.extxyz", "reproduce-1-missing.py"):
+        for text in ("{}", '{"a": 1}', '{"a": 1, "b": 2}'):
+            atomic.write_text(folder.path / name, text)
+            folder.check(name)
+        (folder.path / name).write_text('{"a": 1, "b": 3}')
+        with pytest.raises(FolderError, match=rf"{name}: is damaged"):
+            folder.check(name)
+
+
+def _listed_anew(path: Path, name: str) -> None:
+    """Lists a file as it is: what the digests do not see."""
+    made = manifest.load(path)
+    assert made is not None
+    made.files[name] = [manifest.digest(path / name)]
+    manifest.save(path, made)
+
+
+def _put(told, where: str, value) -> None:
+    *way, last = where.split("/")
+    for key in way:
+        told = told[int(key) if isinstance(told, list) else key]
+    told[last] = value
+
+
+_OPTIONS = {
+    "cases": 3,
+    "seed": 0,
+    "large": False,
+    "full": None,
+    "precision": None,
+    "superset": None,
+    "limits": [],
+}
+_CASE = {
+    "case": "x", "failures": [["MISSING", "a", 1, 0]], "refused": None, "ties": [0, 0], "aliased": False,
+    "single": False, "seconds": 0.1,
+}  # fmt: skip
+_STILL = {"positions": [[0.0, 0, 0]], "cell": np.eye(3).tolist(), "fresh": False, "skin": None}
+_SMALL = {"name": "x", "area": "few", "pbc": [True] * 3, "r_cut": 1.0, "skin": 0.0, "stills": [_STILL]}
+_ANSWERS = {
+    "list": "ase", "tested": ["ase", None], "options": _OPTIONS, "seconds": 1.0, "cases": {"0": _CASE},
+    "shrunk": {"k": {"case": _SMALL, "failures": [["MISSING", "a", 1, 0]], "alone": True}},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("where", "value"),
+    [
+        ("tested", None), ("list", 5), ("options/cases", "x"), ("options/cases", 10**9), ("options/limits", 5),
+        ("options/full", "maybe"), ("options", {}), ("seconds", "x"), ("cases/0", [1]), ("cases/0", "x"),
+        ("cases/0/failures", [[1, 2]]), ("cases/0/failures", "abc"), ("cases/0/ties", [1]), ("cases", []),
+        ("shrunk/k", {}), ("shrunk/k/case/stills", [{}]), ("shrunk/k/case/pbc", [1]),
+        ("shrunk/k/failures", [["MISSING", "a", 1, 7]]), ("shrunk/k/case/stills/0/positions", [[1e999, 0, 0]]),
+        ("shrunk/k/case/stills/0/cell", [[1.0, 0, 0]]), ("", "[" * 100_000),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("listed", [True, False])
+def test_answers_of_another_shape_are_told_in_a_line(tmp_path, where, value, listed):
+    from mdnum.workflow.conform import conform
+
+    folder = RunFolder.create(tmp_path / "run", world="conform")
+    folder.close()
+    told = json.loads(json.dumps(_ANSWERS))
+    if where:
+        _put(told, where, value)
+    file = folder.path / "answers.json"
+    file.write_text(json.dumps(told) if where else value)
+    if listed:
+        _listed_anew(folder.path, "answers.json")
+    else:
+        (folder.path / "manifest.json").unlink()
+    with pytest.raises(FolderError, match=r"answers\.json: ") as seen:
+        conform(resume=folder.path, report=False)
+    assert "\n" not in str(seen.value)
+
+
+def test_more_questions_than_anybody_waits_for_are_refused(tmp_path):
+    from mdnum.workflow.conform import conform
+
+    with pytest.raises(InputError, match="1,000,000,000 random cases"):
+        conform("ase", cases=10**9, out=tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+_PART = {
+    "name": "forces", "title": "Forces", "says": "x", "findings": [], "tables": {}, "numbers": {},
+    "curves": [{"title": "", "x_label": "", "y_label": "", "x": [0.0], "lines": {"a": [1.0]}, "marks": {},
+                "log_y": False}],
+    "skipped": [["a", "b"]], "seconds": 1.0, "asked": 1, "possible": 1,
+}  # fmt: skip
+_THRESHOLD = {
+    "radius": 1.0, "species": ["A", "A"], "order": 0, "jumps": [0.0] * 3, "doubt": [0.0] * 3, "inside": 1.0,
+    "outside": 1.0, "dies": False, "located": 0.0,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("where", "value"),
+    [
+        ("", 0), ("atoms", "x"), ("atoms", '{"__ase_objtype__": "nosuch"}'), ("audit", 5), ("question", {}),
+        ("question/checks", ["nosuch"]), ("question/checks", 5), ("question/temperature", "x"), ("parts", [{}]),
+        ("parts", "x"), ("parts", None), ("parts/0/says", 5), ("parts/0/tables", [5]), ("parts/0/skipped", [1]),
+        ("parts/0/findings", [{"code": 1}]), ("parts/0/curves", [{"x": "q"}]), ("cut", {}), ("files", 5),
+        ("pairs", [1]), ("thresholds", [{}]), ("thresholds/0/species", 5), ("seconds", "x"),
+    ],
+)  # fmt: skip
+def test_a_checkpoint_of_an_audit_of_another_shape_is_told_in_a_line(tmp_path, where, value):
+    from ase.build import bulk
+
+    from mdnum.workflow import audit_record
+
+    folder = RunFolder.create(tmp_path / "run", world="audit")
+    question = {"checks": ["forces", "curl"], "temperature": None, "timestep": None, "steps": None}
+    state = json.loads(json.dumps({
+        "audit": "nosuch:X", "atoms": audit_record._told(bulk("Cu")), "question": question, "parts": [_PART],
+        "pairs": [], "cut": None, "files": [], "thresholds": [_THRESHOLD], "seconds": 1.0,
+    }))  # fmt: skip
+    if where:
+        _put(state, where, value)
+    folder.checkpoint(state, force=True)
+    folder.close()
+
+    class Loaded(Exception):
+        pass
+
+    def load(words):
+        raise Loaded
+
+    with pytest.raises(FolderError if where else Loaded, match=r"checkpoint\.npz: " if where else ""):
+        audit_record.open_again(folder.path, None, load)
+
+
+def test_tables_that_are_written_anew_leave_no_rows_of_an_end_that_was_killed(tmp_path):
+    folder = RunFolder.create(tmp_path / "run", world="conform")
+    atomic.write_text(folder.path / "answers.json", "{}")
+    rows = {"area": ["few"], "asked": [1], "passed": [1], "failed": [0], "refused": [0], "skipped": [0]}
+    folder.append("areas", rows)
+    folder._stream("areas").flush()
+    folder.close()
+    (folder.path / "reproduce-1-mine.py").write_text("mine")
+    again = RunFolder.open(folder.path)
+    again.take()
+    with pytest.raises(FolderError, match="another process"):
+        RunFolder.open(folder.path).take()
+    again.write_anew(("areas", "failures"))
+    again.append("areas", rows)
+    again.finalize()
+    assert len(RunFolder.open(folder.path).read("areas")["area"]) == 1
+    assert RunFolder.open(folder.path).damaged() == {}
+    # what is there to go on from is never taken for nothing
+    with pytest.raises(FolderError, match="already holds a run"):
+        RunFolder.create(folder.path)
+
+
+def test_scripts_of_a_person_stay(tmp_path):
+    from types import SimpleNamespace
+
+    from mdnum.workflow.conform import _write_scripts
+
+    folder = RunFolder.create(tmp_path / "run", world="conform")
+    stale = folder.path / "reproduce-3-missing.py"
+    atomic.write_text(stale, "of mdnum")
+    names = ("reproduce-mine.py", "reproduce-1-mine.py", "reproduce-1-extra.py")
+    for name in names:
+        (folder.path / name).write_text("mine")
+    assert _write_scripts(folder, SimpleNamespace(failed=[])) == []  # pyright: ignore[reportArgumentType]
+    assert not stale.exists() and all((folder.path / name).read_text() == "mine" for name in names)
+    assert folder.damaged() == {}
+
+
+@pytest.mark.parametrize(
+    ("world", "state", "advice"),
+    [
+        ("fork", None, "Nothing of it was kept: give the `mdnum fork` command again"),
+        ("audit", "checkpoint.npz", "Continue it with `mdnum audit --resume"),
+        ("conform", "answers.json", "Continue it with `mdnum conform --resume"),
+    ],
+)
+def test_advice_on_a_folder_of_another_verb_can_be_followed(tmp_path, world, state, advice):
+    from mdnum.workflow import run
+
+    folder = RunFolder.create(tmp_path / "killed", world=world)
+    folder.write_provenance({})
+    folder.close()
+    if state is not None:
+        (folder.path / state).write_text("{}")
+    with pytest.raises(InputError, match=f"is the folder of `mdnum {world}`, and no run. {advice}"):
+        run(resume=folder.path)
 
 
 def test_no_damage_of_a_campaign_is_a_traceback_or_goes_unsaid(tmp_path, monkeypatch):

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from mdnum.audit.base import Meter
 from mdnum.audit.ledger import Ledger
 from mdnum.errors import MdnumError
+from mdnum.store.atomic import write_text
 from mdnum.units import METAL, Units
 
 #: A calculator that fails is asked hundreds of times; this many structures are kept.
@@ -281,7 +282,7 @@ class CalculatorSubject:
         self._saved += 1
         while (path := self.folder / f"failed-{self._saved}.extxyz").exists():
             self._saved += 1
-        path.write_text(exact_extxyz(atoms), encoding="utf-8")
+        write_text(path, exact_extxyz(atoms))
         return path
 
 

@@ -62,7 +62,7 @@ def run(
 
         if resumable(folder):
             return f"Continue with `mdnum run --resume {folder}`"
-        return "Nothing was computed yet: give the command again"
+        return "Nothing of it was kept: give the command again"
 
     notes: list[str] = []
     if resume is not None and resume.is_dir():

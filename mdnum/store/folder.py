@@ -290,10 +290,8 @@ class RunFolder:
                 if name not in ("log.txt", "summary.json"):
                     self.check(name)
             self._owner = True
-            manifest.update(self.path, {}, ["trajectory.traj", "log.txt", "summary.json"], finished=False)
-            for pattern in (".*.part", "parts/.*.part"):
-                for file in self.path.glob(pattern):
-                    file.unlink()
+            manifest.update(self.path, {}, ["trajectory.traj", "log.txt"], finished=False)
+            self._sweep()
             for name, rows in store["rows"].items():
                 self._stream(name).truncate(rows)
             self._frames.truncate(store["frames"])
@@ -310,8 +308,23 @@ class RunFolder:
         """
         self._take_lock()
         self.check("answers.json")
-        self._owner = True
-        manifest.update(self.path, {}, ["log.txt", "summary.json"], finished=False)
+
+    def write_anew(self, tables: Sequence[str]) -> None:
+        """Makes a folder that was taken an unfinished one, without the tables that are written at its end.
+
+        Args:
+            tables: names; their part files go too, which a kill during `finalize` leaves behind.
+        """
+        with disk_errors(self.path):
+            refuse_link(self.path / "log.txt", in_place=True)
+            refuse_link(self.path / "parts" / "any")
+            self._owner = True
+            manifest.update(self.path, {}, ["log.txt"], finished=False)
+            self._sweep()
+            for name in tables:
+                parts = (self.path / "parts").glob(f"{name}-*.parquet")
+                for file in (self.path / f"{name}.parquet", *parts):
+                    manifest.remove(file)
 
     # -- reading ---------------------------------------------------------------------------------
 
@@ -477,6 +490,12 @@ class RunFolder:
             self.check(merged)
         return TableStream(self.path, name, self.world, lambda path: self.check(manifest.place(path)[1]))
 
+    def _sweep(self) -> None:
+        """Removes what a kill left of files that were being replaced."""
+        for pattern in (".*.part", "parts/.*.part"):
+            for file in self.path.glob(pattern):
+                file.unlink()
+
     def _listed(self) -> dict[str, list[str]]:
         path = self.path / manifest.NAME
         try:
@@ -608,14 +627,54 @@ class RunFolder:
         return held
 
 
+@contextmanager
+def restoring(path: Path) -> Iterator[None]:
+    """Whatever goes wrong in here because a file holds what mdnum would not write there is told in one line.
+
+    Args:
+        path: of the file.
+
+    Raises:
+        FolderError: it does.
+    """
+    try:
+        yield
+    except (
+        ArithmeticError,
+        AssertionError,
+        AttributeError,
+        LookupError,
+        RecursionError,
+        TypeError,
+        ValueError,
+    ) as error:
+        seen = " ".join(str(error).split())[:200]
+        raise FolderError(
+            f"holds what mdnum does not write there ({type(error).__name__} {seen})",
+            remedy="Restore it from a copy, or begin in a new folder",
+            where=str(path),
+        ) from error
+
+
+def expect(right: object, seen: str) -> None:
+    """Refuses what is restored where it is not right; inside of `restoring`.
+
+    Raises:
+        ValueError: it is not.
+    """
+    if not right:
+        raise ValueError(seen)
+
+
 def _came_to_nothing(path: Path, present: Sequence[str]) -> bool:
     """Whether a folder holds what a start left behind that was stopped before anything was computed."""
     made = manifest.load(path)
     if made is None or made.finished or (path / "parts").is_symlink():
         return False
     known = {*_NOTHING_YET, *made.files}
+    something = {"checkpoint.npz", "answers.json", "summary.json"}
     return all(name in known or re.fullmatch(r"\.[0-9a-f]{16}\.part", name) for name in present) and not (
-        "checkpoint.npz" in present or any((path / "parts").glob("*.parquet"))
+        something & set(present) or any((path / "parts").glob("*.parquet"))
     )
 
 
@@ -636,13 +695,12 @@ def _refuse_to_overwrite(path: Path, present: Sequence[str]) -> None:
 def _again(path: Path) -> str:
     """What can be done about a folder that was not finished."""
     made = manifest.load(path)
-    verb = f"mdnum {VERBS.get(made.world, 'run')}" if made is not None else "mdnum run"
+    world = made.world if made is not None else "conform" if (path / "answers.json").exists() else "md"
+    verb = f"mdnum {VERBS.get(world, 'run')}"
     if manifest.resumable(path):
-        return f"Continue it with `mdnum run --resume {path}`, or choose another folder"
-    if (path / "answers.json").exists():
         return f"Continue it with `{verb} --resume {path}`, or choose another folder"
     if _came_to_nothing(path, [entry.name for entry in path.iterdir()]):
-        return f"Nothing was computed in it yet: give the `{verb}` command again"
+        return f"Nothing of it was kept: give the `{verb}` command again"
     return f"It cannot be continued: give the `{verb}` command again for another folder, or remove this one"
 
 

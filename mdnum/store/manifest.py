@@ -24,8 +24,10 @@ NAME = "manifest.json"
 #: May be missing.
 ABSENT = ""
 _CHUNK = 1 << 20
-# replaced again and again by whoever may go on from it
-_FROM_THE_FIRST = ("answers.json",)
+# listed from their first write on; scripts and structures among them, which a page or a person goes by
+_FROM_THE_FIRST = re.compile(r"answers\.json|summary\.json|reproduce[\w.-]*\.py|structures/[^/]+\.extxyz")
+# what a command goes on from, by the world of the folder
+_STATE = {"md": "checkpoint.npz", "audit": "checkpoint.npz", "conform": "answers.json"}
 _INSIDE = re.compile(rf"(({'|'.join(SUBFOLDERS)})/)?(?!\.{{1,2}}$)[^/\0]+")
 
 
@@ -132,7 +134,7 @@ def foretell(path: Path, new: str) -> None:
     if name == NAME or not (root / NAME).exists():
         return
     made = load(root)
-    if made is None or (name not in made.files and name not in _FROM_THE_FIRST):
+    if made is None or (name not in made.files and not _FROM_THE_FIRST.fullmatch(name)):
         return
     known = made.files.get(name, [ABSENT])
     now = digest(path)
@@ -150,12 +152,12 @@ def remove(path: Path) -> None:
 
 
 def resumable(root: Path) -> bool:
-    """Whether `mdnum run --resume` would find something in a folder."""
-    if not (root / "checkpoint.npz").exists():
-        return False
+    """Whether the verb that made a folder would find something there to go on from."""
     with suppress(FolderError, OSError):
         made = load(root)
-        return made is None or made.world == "md"
+        if made is None:
+            return any((root / name).exists() for name in _STATE.values())
+        return made.world in _STATE and (root / _STATE[made.world]).exists()
     return False
 
 

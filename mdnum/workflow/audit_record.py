@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,7 +14,7 @@ import numpy as np
 from mdnum.audit.causes import grouped
 from mdnum.errors import FolderError, InputError
 from mdnum.references.findings import plain
-from mdnum.store import RunFolder, manifest
+from mdnum.store import RunFolder, expect, manifest, restoring
 from mdnum.store.atomic import subfolder, write_text
 from mdnum.units import METAL
 
@@ -195,16 +196,12 @@ def open_again(path: str | Path, calculator: Any, load: Callable[[Any], Loaded])
         FolderError: it holds no audit, or another process writes it.
         InputError: the calculator was no words and is not given, or is another.
     """
-    from ase import Atoms
-    from ase.io.jsonio import decode
-
-    from mdnum.audit.threshold import Threshold
-
     folder = RunFolder.open(path)
     folder.world = "audit"
     state = folder.load_checkpoint()
     if "audit" not in state:
         raise FolderError("holds no audit", remedy="Resume it with the verb that made it", where=str(path))
+    _told_by(folder, state)
     words = state["audit"]
     if calculator is None and words is None:
         raise InputError("the calculator of this audit has no name", remedy="Give it again", where=str(path))
@@ -215,28 +212,52 @@ def open_again(path: str | Path, calculator: Any, load: Callable[[Any], Loaded])
     loaded = load(words if calculator is None else calculator)
     state = folder.resume()
     try:
+        told = _told_by(folder, state)
         for file in (folder.path / STRUCTURES).glob("failed-*.extxyz"):
-            if file.name not in state["files"]:
+            if re.fullmatch(r"failed-\d+\.extxyz", file.name) and file.name not in state["files"]:
                 manifest.remove(file)
-        atoms = decode(state["atoms"])
-        if not isinstance(atoms, Atoms):
-            raise FolderError("has no structure in its checkpoint", where=str(path))
-        found = state["thresholds"]
-        return AuditRecord(
-            folder,
-            loaded,
-            words is not None,
-            atoms,
-            state["question"],
-            [_restored(one) for one in state["parts"]],
-            state["pairs"],
-            None if state["cut"] is None else _restored(state["cut"]),
-            None if found is None else [Threshold(**{k: _tuple(v) for k, v in one.items()}) for one in found],
-            state["seconds"],
-        )
+        return AuditRecord(folder, loaded, words is not None, **told)
     except BaseException:
         folder.close()
         raise
+
+
+def _told_by(folder: RunFolder, state: Mapping[str, Any]) -> dict[str, Any]:
+    """The attributes of a record that a checkpoint keeps, each of the kind that it was.
+
+    Raises:
+        FolderError: the checkpoint holds something else.
+    """
+    from ase import Atoms
+    from ase.io.jsonio import decode
+
+    from mdnum.workflow.audit import CHECKS
+
+    with restoring(folder.path / "checkpoint.npz"):
+        expect(isinstance(state["audit"], str | None), "no name of a calculator")
+        atoms = decode(state["atoms"])
+        expect(isinstance(atoms, Atoms) and len(atoms), "no structure")
+        expect(np.isfinite(atoms.positions).all() and np.isfinite(atoms.cell[:]).all(), "no coordinates")
+        question = {name: state["question"][name] for name in ("checks", "temperature", "timestep", "steps")}
+        expect(isinstance(question["checks"], list) and question["checks"], "no checks")
+        expect(set(question["checks"]) <= set(CHECKS), "a check that there is not")
+        for name in ("temperature", "timestep", "steps"):
+            expect(question[name] is None or _number(question[name]), f"{name} is no number")
+        expect(type(question["steps"]) in (int, type(None)), "steps are no whole number")
+        expect(_number(state["seconds"]) and isinstance(state["parts"], list), "no parts")
+        for name in ("pairs", "files"):
+            expect(isinstance(state[name], list), f"no {name}")
+            expect(all(isinstance(one, str) and "/" not in one for one in state[name]), f"no {name}")
+        cut, found = state["cut"], state["thresholds"]
+        return {
+            "atoms": atoms,
+            "question": question,
+            "parts": [_restored(one, question["checks"]) for one in state["parts"]],
+            "pairs": list(state["pairs"]),
+            "cut": None if cut is None else _restored(cut, question["checks"]),
+            "found": None if found is None else [_threshold(one) for one in found],
+            "seconds": state["seconds"],
+        }
 
 
 def _told(atoms: Atoms) -> str:
@@ -249,25 +270,51 @@ def _told(atoms: Atoms) -> str:
     return encode(copy)
 
 
-def _tuple(value: Any) -> Any:
-    return tuple(value) if isinstance(value, list) else value
+def _number(value: object) -> bool:
+    return type(value) in (int, float) and bool(np.isfinite(value))  # pyright: ignore[reportCallIssue, reportArgumentType]
 
 
-def _restored(told: Mapping[str, Any]) -> Part:
+def _threshold(told: Mapping[str, Any]) -> Threshold:
+    """A threshold that `plain` made plain."""
+    from mdnum.audit.threshold import Threshold
+
+    found = Threshold(**{name: tuple(one) if isinstance(one, list) else one for name, one in told.items()})
+    expect(len(found.species) == 2 and all(isinstance(one, str) for one in found.species), "no species")
+    expect(type(found.order) is int and type(found.dies) is bool, "no order")
+    numbers = (*found.jumps, *found.doubt, found.radius, found.inside, found.outside, found.located)
+    expect(len(numbers) == 10 and all(type(one) in (int, float) for one in (*numbers, found.third)), "jumps")
+    return found
+
+
+def _restored(told: Mapping[str, Any], wanted: Sequence[str]) -> Part:
     """A part that `plain` made plain."""
     from mdnum.audit.base import Curve, Part
 
-    curves = [
-        Curve(
+    curves = []
+    for one in told["curves"]:
+        curve = Curve(
             **{
                 **one,
                 "x": np.array(one["x"], np.float64),
                 "lines": {name: np.array(line, np.float64) for name, line in one["lines"].items()},
             }
         )
-        for one in told["curves"]
-    ]
-    return Part(**{**told, "curves": curves, "skipped": [(what, why) for what, why in told["skipped"]]})
+        expect(curve.x.ndim == 1 and all(y.shape == curve.x.shape for y in curve.lines.values()), "no curve")
+        texts = (curve.title, curve.x_label, curve.y_label, *curve.marks)
+        expect(all(isinstance(text, str) for text in texts) and type(curve.log_y) is bool, "no curve")
+        expect(all(type(mark) in (int, float) for mark in curve.marks.values()), "no marks")
+        curves.append(curve)
+    part = Part(**{**told, "curves": curves, "skipped": [(what, why) for what, why in told["skipped"]]})
+    texts = (part.title, part.says, *(word for both in part.skipped for word in both))
+    expect(part.name in wanted and all(isinstance(text, str) for text in texts), "no part of this audit")
+    for one in part.findings:
+        expect({"code", "severity", "title", "text", "remedy"} <= set(one), "no finding")
+        expect(one["severity"] in ("info", "warning", "error"), "no finding")
+        expect(all(isinstance(word, str) for word in one.values()), "no finding")
+    rows = [row for table in part.tables.values() for row in table]
+    expect(isinstance(part.numbers, Mapping) and all(isinstance(row, Mapping) for row in rows), "no tables")
+    expect(_number(part.seconds) and type(part.asked) is int and type(part.possible) is int, "no counts")
+    return part
 
 
 def write_parts(folder: RunFolder, parts: Sequence[Part]) -> None:

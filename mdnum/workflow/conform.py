@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,12 +13,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mdnum.errors import FolderError, InputError
-from mdnum.store import RunFolder, manifest
+from mdnum.store import RunFolder, expect, manifest, restoring
 from mdnum.store.atomic import read_text, write_text
 from mdnum.store.naming import default_folder
 from mdnum.workflow.fork_question import Log, Progress, finish
 
 if TYPE_CHECKING:
+    from mdnum.references.conformance.answers import Answers
     from mdnum.references.conformance.lists import PairList
     from mdnum.references.conformance.suite import Report
 
@@ -37,6 +39,8 @@ LIMITS = {
     "lower-triangular": "lower",
     "whole-cell": "whole_cell",
 }
+#: Random cases that can be asked for: they are drawn before the first is asked, some 300 a second.
+MOST_CASES = 100_000
 #: What a function, and a list that is kept, are to do.
 _RETURNS = "(i, j), (i, j, shift), (i, j, shift, distance) or a mapping with i and j: an entry for each pair"
 _CONTRACT = {
@@ -86,7 +90,7 @@ def conform(
             distance) or a mapping; or a class with `allocate` and `update`. What has a name is called in a
             process of its own, so that a crash is a finding. With `resume`, the list that was examined, where
             it had no name; else none.
-        cases: random cases beside those with a name; 500 by default.
+        cases: random cases beside those with a name, `MOST_CASES` at most; 500 by default.
         seed: of the random ones.
         large: ask about 5,000 and 100,000 atoms, too.
         full: every pair is listed from both of its atoms (True) or once (False); found out by default.
@@ -109,39 +113,42 @@ def conform(
     from mdnum.references.conformance.suite import CASES, Examiner, examine
 
     deadline = Deadline(time)
-    kept = None if resume is None else _kept(Path(resume))
-    if kept is None:
-        options = {"cases": CASES if cases is None else cases, "seed": seed, "large": large, "full": full,
-                   "precision": precision, "superset": superset, "limits": list(limits)}  # fmt: skip
-    else:
-        options = dict(kept["options"])
-        pairs = pairs or kept["list"]
-    if not pairs:
-        raise InputError("no list is given", remedy="Give a name, package.module:function or a function")
-    tested = _declared(
-        _loaded(pairs), options["full"], options["precision"], options["superset"], tuple(options["limits"])
-    )
-    if kept is not None and [tested.name, tested.version] != kept["tested"]:
-        was, now = (
-            " ".join(filter(None, words)) for words in (kept["tested"], (tested.name, tested.version))
-        )
-        raise InputError(
-            f"was begun with {was}, not {now}", where=str(resume), remedy="Begin in a new folder"
-        )
-    examiner = Examiner(tested, reuse=True, apart=True)
+    # what it holds is read by the one process that goes on from it
+    folder = None if resume is None else _taken(Path(resume))
+    examiner = None
     try:
+        kept = None if folder is None else _kept(folder.path)
+        if kept is None:
+            options = {"cases": CASES if cases is None else cases, "seed": seed, "large": large, "full": full,
+                       "precision": precision, "superset": superset, "limits": list(limits)}  # fmt: skip
+            _refuse_many(options["cases"])
+        else:
+            options = kept.options
+            pairs = pairs or kept.words
+        if not pairs:
+            raise InputError("no list is given", remedy="Give a name, package.module:function or a function")
+        tested = _declared(
+            _loaded(pairs),
+            options["full"],
+            options["precision"],
+            options["superset"],
+            tuple(options["limits"]),
+        )
+        if kept is not None and [tested.name, tested.version] != kept.tested:
+            was, now = (
+                " ".join(filter(None, words)) for words in (kept.tested, (tested.name, tested.version))
+            )
+            raise InputError(
+                f"was begun with {was}, not {now}", where=str(resume), remedy="Begin in a new folder"
+            )
+        examiner = Examiner(tested, reuse=True, apart=True)
         if (why := examiner.unusable()) is not None:
             raise InputError(why, where=tested.name, remedy=_CONTRACT[tested.kept])
-        if resume is not None:
-            folder = _again(resume)
+        if folder is not None:
+            folder.write_anew(("areas", "failures"))
         else:
             path = default_folder(f"conform-{_slug(tested.name)}") if out is None else out
             folder = RunFolder.create(path, world="conform")
-    except BaseException:
-        examiner.session.close()
-        raise
-    try:
-        if kept is None:
             folder.write_provenance(surroundings() | {"list": tested.name, "list_version": tested.version})
         keeper = _Keeper(folder, examiner.report, tested, options, kept)
         found = examine(
@@ -157,45 +164,86 @@ def conform(
         )
         keeper.write(ended=True)
     except BaseException:
-        examiner.session.close()
-        folder.close()
+        if examiner is not None:
+            examiner.session.close()
+        if folder is not None:
+            folder.close()
         raise
     return ConformResult(folder.path, found, finish(folder, report, progress))
 
 
-def _kept(path: Path) -> dict[str, Any]:
+@dataclass(frozen=True)
+class _Kept:
     """What a folder holds to go on from.
 
-    Raises:
-        FolderError: nothing that can be gone on from.
+    Attributes:
+        words: that name the list; None where it had none.
+        tested: name and version of the list.
+        options: that it was begun with.
+        seconds: that were spent.
+        answers: that it gave.
     """
-    folder, file = RunFolder.open(path), path / "answers.json"
-    if not file.is_file() or folder.summary.get("question", "conform") != "conform":
+
+    words: str | None
+    tested: list[str | None]
+    options: dict[str, Any]
+    seconds: float
+    answers: Answers
+
+
+def _taken(path: Path) -> RunFolder:
+    """A folder that only this process goes on with.
+
+    Raises:
+        FolderError: nothing that can be gone on from, or another process writes it.
+    """
+    folder = RunFolder.open(path)
+    if not (path / "answers.json").is_file():
         raise FolderError(
             "holds no examination to go on with", where=str(path), remedy="Begin in a new folder"
         )
-    try:
-        folder.check("answers.json")
-        kept = json.loads(read_text(file))
-        wanted = {"list", "tested", "options", "cases", "shrunk"} <= set(kept)
-        wanted = wanted and {"cases", "seed", "large", "full", "limits"} <= set(kept["options"])
-    except (ValueError, TypeError, OSError) as error:
-        raise FolderError(
-            f"cannot be read ({error})", where=str(file), remedy="Begin in a new folder"
-        ) from error
-    if not wanted:
-        raise FolderError("holds no answers", where=str(file), remedy="Begin in a new folder")
-    return kept
-
-
-def _again(path: str | Path) -> RunFolder:
-    """A folder that is gone on with, without the tables that are written at the end."""
-    folder = RunFolder.open(path)
     folder.world = "conform"
     folder.take()
-    for name in ("areas", "failures"):
-        manifest.remove(folder.path / f"{name}.parquet")
     return folder
+
+
+def _kept(path: Path) -> _Kept:
+    """What a folder holds to go on from, each of its values of the kind that it was.
+
+    Raises:
+        FolderError: it holds something else.
+    """
+    from mdnum.references.conformance.answers import Answers
+
+    file = path / "answers.json"
+    text = read_text(file)
+    with restoring(file):
+        told = json.loads(text)
+        expect(isinstance(told, dict), "no answers")
+        words, tested, options, seconds = (told[name] for name in ("list", "tested", "options", "seconds"))
+        expect(words is None or (isinstance(words, str) and words), "no name of a list")
+        expect(isinstance(tested, list) and len(tested) == 2, "no name and version of a list")
+        expect(isinstance(tested[0], str) and isinstance(tested[1], str | None), "no name and version")
+        expect(type(seconds) in (int, float) and 0 <= seconds < np.inf, "no seconds")
+        names = ("cases", "seed", "large", "full", "precision", "superset", "limits")
+        options = {name: options[name] for name in names}
+        for name in ("cases", "seed"):
+            expect(type(options[name]) is int, f"options.{name} is {options[name]!r}")
+        for name, kind in (("large", bool), ("full", bool | None), ("superset", bool | None)):
+            expect(isinstance(options[name], kind), f"options.{name} is {options[name]!r}")
+        expect(options["precision"] in (None, *PRECISIONS), f"precision is {options['precision']!r}")
+        expect(isinstance(options["limits"], list) and set(options["limits"]) <= set(LIMITS), "limits")
+        answers = Answers(told, str(file))
+    try:
+        _refuse_many(options["cases"])
+    except InputError as error:
+        raise FolderError(error.message, where=str(file), remedy="Begin in a new folder") from error
+    return _Kept(words, tested, options, float(seconds), answers)
+
+
+def _refuse_many(cases: int) -> None:
+    if not 0 <= cases <= MOST_CASES:
+        raise InputError(f"{cases:,} random cases", remedy=f"Ask for 0 to {MOST_CASES:,}")
 
 
 class _Keeper:
@@ -205,9 +253,7 @@ class _Keeper:
         kept: what the folder held, of one that is gone on with.
     """
 
-    def __init__(
-        self, folder: RunFolder, found: Report, tested: PairList, options: Any, kept: Mapping[str, Any] | None
-    ):
+    def __init__(self, folder: RunFolder, found: Report, tested: PairList, options: Any, kept: _Kept | None):
         from mdnum.references.conformance.answers import Answers
 
         self._folder, self._found, self._seed = folder, found, options["seed"]
@@ -216,9 +262,10 @@ class _Keeper:
             "tested": [tested.name, tested.version],
             "options": options,
         }
-        self._before = 0.0 if kept is None else float(kept.get("seconds", 0.0))
+        self._before = 0.0 if kept is None else kept.seconds
         self._began, self._due, self._due_in_words = monotonic(), 0.0, 0.0
-        self.answers = Answers(kept, self._put)
+        self.answers = Answers() if kept is None else kept.answers
+        self.answers.saved = self._put
         self._write_answers()
 
     def _put(self, urgent: bool) -> None:
@@ -280,20 +327,30 @@ def _slug(name: str) -> str:
     return name.replace(":", "-")
 
 
+def _script(code: str) -> str:
+    """The end of the name of a failure's script."""
+    return f"{code.lower().replace('_', '-')}.py"
+
+
 def _write_scripts(folder: RunFolder, found: Report) -> list[str]:
-    """Writes a script for each failure, and removes those that stand for none; their names."""
+    """Writes a script for each failure, and removes those of mdnum that stand for none; their names."""
+    from mdnum.references.conformance.judge import CODES
     from mdnum.references.conformance.reproduction import script
 
     scripts = []
     for number, failed in enumerate(found.failed, 1):
-        scripts.append(f"reproduce-{number}-{failed.code.lower().replace('_', '-')}.py")
+        scripts.append(f"reproduce-{number}-{_script(failed.code)}")
         lines = script(found.tested, failed, found.how, found.superset, found.reach(failed.case))
         path = folder.path / scripts[-1]
-        if not path.is_file() or path.read_text(encoding="utf-8") != lines:
+        # what a link leads to is not looked at: the link is replaced
+        same = path.is_file() and not path.is_symlink()
+        if not (same and manifest.digest(path) == manifest.digest_of(lines.encode())):
             write_text(path, lines)
-    for path in folder.path.glob("reproduce-*.py"):
-        if path.name not in scripts:
-            path.unlink()
+    made = manifest.load(folder.path)
+    mine = re.compile(rf"reproduce-\d+-({'|'.join(re.escape(_script(code)) for code in CODES)})")
+    for name in made.files if made is not None else ():
+        if mine.fullmatch(name) and name not in scripts:
+            manifest.remove(folder.path / name)
     return scripts
 
 

@@ -61,7 +61,9 @@ def run(
             where=str(resume),
             remedy=f"Run it again with `mdnum ball {resume}`"
             if ball
-            else f"`mdnum report {resume}` shows it",
+            else f"`mdnum report {resume}` shows it"
+            if folder.summary
+            else folder.again,
         )
     try:
         result = roll_out(

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from mdnum.errors import InputError
-from mdnum.references.conformance.case import Case, Still
-from mdnum.references.conformance.judge import Failure
-from mdnum.references.conformance.results import Failed
+import numpy as np
 
-#: Keys of `Answers.plain`, so that a file of another kind is not taken for one.
-_KEYS = {"cases", "shrunk"}
+from mdnum.errors import InputError
+from mdnum.references.conformance.case import AREAS, Case, Still
+from mdnum.references.conformance.judge import CODES, Failure
+from mdnum.references.conformance.results import Failed
+from mdnum.store import expect
 
 
 class Answers:
@@ -20,19 +21,34 @@ class Answers:
     Questions are drawn anew when an examination goes on, the same for the same seed; so none is kept.
 
     Args:
-        kept: `plain` of an earlier one.
+        kept: `plain` of an earlier one, as JSON gives it back.
+        where: the file that it is from.
+
+    Attributes:
         saved: called after each that is put in, with whether it should not be lost.
 
     Raises:
-        InputError: what is kept is of another kind.
+        KeyError, TypeError, ValueError or the like: what is kept is of another kind.
     """
 
-    def __init__(self, kept: Mapping[str, Any] | None = None, saved: Callable[[bool], None] | None = None):
+    def __init__(self, kept: Mapping[str, Any] | None = None, where: str | None = None):
         kept = {"cases": {}, "shrunk": {}} if kept is None else kept
-        if not (set(kept) >= _KEYS and all(isinstance(kept[key], Mapping) for key in _KEYS)):
-            raise InputError("these are no answers of an examination", remedy="Begin again in a new folder")
         self._cases, self._shrunk = dict(kept["cases"]), dict(kept["shrunk"])
-        self._saved = saved or (lambda urgent: None)
+        for number, one in self._cases.items():
+            expect(number.isdecimal() and isinstance(one["case"], str), f"question {number!r}")
+            _expect_rows(one["failures"])
+            expect(type(one["aliased"]) is bool and type(one["single"]) is bool, "no yes or no")
+            expect(len(one["ties"]) == 2 and all(map(_count, one["ties"])), "no two counts")
+            expect(_size(one["seconds"]), "no seconds")
+            if one["refused"] is not None:
+                step, words = one["refused"]
+                expect(_count(step) and isinstance(words, str), "no step and words of a refusal")
+        for one in self._shrunk.values():
+            case = _case(one["case"])
+            _expect_rows(one["failures"], case.steps)
+            expect(one["failures"] and type(one["alone"]) is bool, "no failure")
+        self._where = where
+        self.saved: Callable[[bool], None] = lambda urgent: None
 
     def plain(self) -> dict[str, Any]:
         """For JSON."""
@@ -49,13 +65,22 @@ class Answers:
             raise InputError(
                 f"its question {number} was {kept.get('case')!r} and is {case.name!r} now",
                 remedy="Begin again in a new folder: the questions are another version's",
+                where=self._where,
+            )
+        steps = [] if kept is None else [row[3] for row in kept["failures"]]
+        steps += [kept["refused"][0]] if kept is not None and kept["refused"] is not None else []
+        if any(step >= case.steps for step in steps):
+            raise InputError(
+                f"its question {number} has an answer at a step that it does not have",
+                remedy="Begin again in a new folder",
+                where=self._where,
             )
         return kept
 
     def put(self, number: int, kept: Mapping[str, Any]) -> None:
         """Keeps what became of a question."""
         self._cases[str(number)] = dict(kept)
-        self._saved(bool(kept["failures"]))
+        self.saved(bool(kept["failures"]))
 
     def shrunk(self, failed: Failed) -> Failed | None:
         """A failure as it was shrunk before; None where it was not."""
@@ -72,7 +97,7 @@ class Answers:
             self._shrunk[_name(failed)] = {
                 "case": _plain(small.case), "failures": failures, "alone": small.alone,
             }  # fmt: skip
-            self._saved(True)
+            self.saved(True)
 
 
 def as_row(failure: Failure) -> list[Any]:
@@ -96,8 +121,31 @@ def _plain(case: Case) -> dict[str, Any]:
 
 
 def _case(kept: Mapping[str, Any]) -> Case:
-    stills = tuple(
-        Still(one["positions"], one["cell"], bool(one["fresh"]), one["skin"]) for one in kept["stills"]
-    )
-    x, y, z = (bool(axis) for axis in kept["pbc"])
-    return Case(kept["name"], kept["area"], stills, (x, y, z), kept["r_cut"], kept["skin"])
+    stills = []
+    for one in kept["stills"]:
+        still = Still(one["positions"], one["cell"], one["fresh"], one["skin"])
+        expect(np.isfinite(still.positions).all() and np.isfinite(still.cell).all(), "no coordinates")
+        expect(still.cell.shape == (3, 3) and type(still.fresh) is bool, "no cell")
+        expect(still.skin is None or _size(still.skin), "no skin")
+        stills.append(still)
+    x, y, z = kept["pbc"]
+    expect(stills and all(type(axis) is bool for axis in (x, y, z)), "no axes")
+    expect(isinstance(kept["name"], str) and kept["area"] in AREAS, "no question")
+    expect(_size(kept["r_cut"]) and kept["r_cut"] > 0 and _size(kept["skin"]), "no cutoff")
+    return Case(kept["name"], kept["area"], tuple(stills), (x, y, z), kept["r_cut"], kept["skin"])
+
+
+def _count(value: object) -> bool:
+    return type(value) is int and value >= 0
+
+
+def _size(value: object) -> bool:
+    return isinstance(value, int | float) and type(value) is not bool and 0 <= value < math.inf
+
+
+def _expect_rows(rows: Any, steps: int | None = None) -> None:
+    """Rows are arguments of failures."""
+    expect(isinstance(rows, list), "no failures")
+    for code, text, count, step in rows:
+        expect(code in CODES and isinstance(text, str), "no failure")
+        expect(_count(count) and _count(step) and (steps is None or step < steps), "no count and step")
