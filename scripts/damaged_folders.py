@@ -102,6 +102,35 @@ def _conform(path: Path) -> None:
     mdnum.conform("ase", cases=3, large=False, out=path, report=False)
 
 
+def _killed_audit(path: Path) -> None:
+    """An audit that is stopped before its second check."""
+    from ase.build import bulk
+
+    def watch(done: int, total: int, info: dict) -> None:
+        if info["phase"] == "curl":
+            raise _Stopped
+
+    with contextlib.suppress(_Stopped):
+        mdnum.audit_calculator(
+            "ase.calculators.emt:EMT", bulk("Cu", cubic=True), checks="forces,curl", out=path,
+            report=False, progress=watch,
+        )  # fmt: skip
+
+
+def _killed_conform(path: Path) -> None:
+    """An examination that is stopped at half of its questions."""
+
+    def watch(done: int, total: int, info: dict) -> None:
+        if 2 * done > total:
+            raise _Stopped
+
+    with contextlib.suppress(_Stopped):
+        mdnum.conform(
+            "ase", cases=3, large=False, limits=("minimum-image", "orthorhombic", "all-axes"), out=path,
+            report=False, progress=watch,
+        )  # fmt: skip
+
+
 #: What makes a folder, by kind.
 KINDS: dict[str, Callable[[Path], None]] = {
     "finished": _run,
@@ -112,6 +141,8 @@ KINDS: dict[str, Callable[[Path], None]] = {
     "flips": _flips,
     "audit": _audit,
     "conform": _conform,
+    "killed audit": _killed_audit,
+    "killed conform": _killed_conform,
 }
 
 
@@ -128,6 +159,9 @@ def readers(kind: str) -> tuple[tuple[str, ...], ...]:
             report, resume, fork,
         ),
         "ball": (report, fork),
+        # resumed twice as often as read
+        "killed audit": (report, *2 * (("audit", "--resume", "folder", "--no-report"),)),
+        "killed conform": (report, *2 * (("conform", "--resume", "folder", "--no-report"),)),
     }.get(kind, (report,))  # fmt: skip
 
 
@@ -285,7 +319,9 @@ def result(folder: Path, words: tuple[str, ...], out: str) -> dict[str, object]:
     elif "--json" in words:
         made["out"] = out
     else:
-        where = folder if words[0] == "run" else folder.parent / "new"
+        where = folder if "--resume" in words else folder.parent / "new"
+        if words[0] in ("audit", "conform"):
+            made["summary"] = _TIMES.sub("", (folder / "summary.json").read_text())
         for path in sorted(where.glob("*.parquet")):
             held = pq.read_table(path)
             kept = [name for name in held.column_names if name != "build_ms"]

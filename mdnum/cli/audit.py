@@ -63,6 +63,7 @@ def audit(
         begun = folder is not None and (folder / "checkpoint.npz").exists()
         return f"Continue with `mdnum audit --resume {folder}`" if begun else None
 
+    notes = output.noted(resume)
     with watched(go_on) as progress:
         try:
             result = ask(
@@ -80,6 +81,7 @@ def audit(
             )
         except AuditStopped as stop:
             result, stopped = stop.result, True
+    output.print_lines(notes)
     summary = result.summary if as_json else by_cause(result.summary)
     code = output.answer(result.folder, summary, print_rows, as_json=as_json)
     if result.summary["status"] != "complete" and not as_json:

@@ -69,6 +69,7 @@ def conform(
     from mdnum.workflow.conform import conform as examine
 
     words = tuple(word.strip() for one in limits or () for word in one.split(",") if word.strip())
+    notes = output.noted(resume)
     with watched(lambda: _to_go_on(resume or out)) as progress:
         result = examine(
             pairs,
@@ -85,6 +86,7 @@ def conform(
             report=not no_report,
             progress=progress,
         )
+    output.print_lines(notes)
     return output.answer(result.folder, result.summary, _print, as_json=as_json)
 
 

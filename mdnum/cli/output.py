@@ -117,6 +117,16 @@ def print_notes(*folders: str | Path) -> None:
         print_lines(RunFolder.open(folder).noted())
 
 
+def noted(folder: Path | None) -> list[str]:
+    """What is not as it was written in a folder that is gone on with: said when nothing worse was found.
+
+    It is looked at before the folder goes on and is listed anew.
+    """
+    from mdnum.store import RunFolder
+
+    return RunFolder.open(folder).noted() if folder is not None and folder.is_dir() else []
+
+
 def print_lines(lines: Iterable[str]) -> None:
     """Lines on stderr that say who speaks."""
     for line in lines:

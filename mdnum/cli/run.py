@@ -64,12 +64,7 @@ def run(
             return f"Continue with `mdnum run --resume {folder}`"
         return "Nothing of it was kept: give the command again"
 
-    notes: list[str] = []
-    if resume is not None and resume.is_dir():
-        from mdnum.store import RunFolder
-
-        # before it goes on and is listed anew; told when nothing worse was found
-        notes = RunFolder.open(resume).noted()
+    notes = output.noted(resume)
     with watched(go_on) as progress:
         result = run_system(
             system,

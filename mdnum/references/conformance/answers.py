@@ -33,6 +33,7 @@ class Answers:
 
     def __init__(self, kept: Mapping[str, Any] | None = None, where: str | None = None):
         kept = {"cases": {}, "shrunk": {}} if kept is None else kept
+        expect(isinstance(kept["cases"], dict) and isinstance(kept["shrunk"], dict), "no answers")
         self._cases, self._shrunk = dict(kept["cases"]), dict(kept["shrunk"])
         for number, one in self._cases.items():
             expect(number.isdecimal() and isinstance(one["case"], str), f"question {number!r}")
