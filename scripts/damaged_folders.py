@@ -76,7 +76,7 @@ def _run(path: Path, seed: int = 1, stop: bool = False) -> None:
 
 
 def _fork(path: Path) -> None:
-    mdnum.fork(SYSTEM, vary="reduction", steps=20, repeats=2, out=path, report=False)
+    mdnum.fork(SYSTEM, vary="reduction", steps=20, repeats=4, out=path, report=False)
 
 
 def _grad(path: Path) -> None:

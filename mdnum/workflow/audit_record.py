@@ -235,9 +235,9 @@ def _told_by(folder: RunFolder, state: Mapping[str, Any]) -> dict[str, Any]:
 
     with restoring(folder.path / "checkpoint.npz"):
         expect(isinstance(state["audit"], str | None), "no name of a calculator")
-        atoms = decode(state["atoms"])
+        atoms: Any = decode(state["atoms"])
         expect(isinstance(atoms, Atoms) and len(atoms), "no structure")
-        expect(np.isfinite(atoms.positions).all() and np.isfinite(atoms.cell[:]).all(), "no coordinates")
+        expect(np.isfinite(atoms.positions).all() and np.isfinite(atoms.cell.array).all(), "no coordinates")
         question = {name: state["question"][name] for name in ("checks", "temperature", "timestep", "steps")}
         expect(isinstance(question["checks"], list) and question["checks"], "no checks")
         expect(set(question["checks"]) <= set(CHECKS), "a check that there is not")
@@ -278,7 +278,8 @@ def _threshold(told: Mapping[str, Any]) -> Threshold:
     """A threshold that `plain` made plain."""
     from mdnum.audit.threshold import Threshold
 
-    found = Threshold(**{name: tuple(one) if isinstance(one, list) else one for name, one in told.items()})
+    values: dict[str, Any] = {k: tuple(one) if isinstance(one, list) else one for k, one in told.items()}
+    found = Threshold(**values)
     expect(len(found.species) == 2 and all(isinstance(one, str) for one in found.species), "no species")
     expect(type(found.order) is int and type(found.dies) is bool, "no order")
     numbers = (*found.jumps, *found.doubt, found.radius, found.inside, found.outside, found.located)
