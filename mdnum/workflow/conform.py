@@ -342,7 +342,7 @@ def _write_scripts(folder: RunFolder, found: Report) -> list[str]:
         scripts.append(f"reproduce-{number}-{_script(failed.code)}")
         lines = script(found.tested, failed, found.how, found.superset, found.reach(failed.case))
         path = folder.path / scripts[-1]
-        # what a link leads to is not looked at: the link is replaced
+        # what a link leads to is not looked at
         same = path.is_file() and not path.is_symlink()
         if not (same and manifest.digest(path) == manifest.digest_of(lines.encode())):
             write_text(path, lines)
