@@ -304,10 +304,12 @@ class RunFolder:
         """Makes this the only process that writes a folder which is gone on with from answers.json.
 
         Raises:
-            FolderError: another process writes the folder, or answers.json is not as it was written.
+            FolderError: another process writes the folder, or what it goes on from is not as it was written.
         """
         self._take_lock()
-        self.check("answers.json")
+        # what its end would refuse is refused before anything is asked
+        for name in ("answers.json", "provenance.json"):
+            self.check(name)
 
     def write_anew(self, tables: Sequence[str]) -> None:
         """Makes a folder that was taken an unfinished one, without the tables that are written at its end.
