@@ -255,7 +255,7 @@ def summed_up(rows: list[tuple[Any, ...]], wrong: list[tuple[str, str, int, int]
     def named(kept: list[tuple[str, str, int, int]], bounds: bool) -> str:
         words: dict[str, list[str]] = {}
         for name, word, no, of in kept:
-            bound = f" ({no} of {of}, below {100 * below(no, of):.1f} %)" * bounds
+            bound = f" ({no} of {of}, below {100 * below(no, of):.2f} %)" * bounds
             words.setdefault(name, []).append(f"{word}{bound}")
         return "; ".join(f"{name}: {', '.join(told)}" for name, told in words.items())
 
