@@ -271,13 +271,13 @@ def summed_up(rows: list[tuple[Any, ...]], wrong: list[tuple[str, str, int, int]
     target = f"{100 * TARGET:.0f} %"
     sentences = (
         f"The target is that each kind of false verdict is the word of fewer than {target} of all starts.",
-        f"It is shown, with 95 % confidence, for {named(shown, False)}.",
-        f"It is not shown for {named(short, True)}." if short else "It is shown for every row.",
-        f"There are {most} starts of some rows and {fewer} of others (hard cutoffs take longest, and a placebo "
-        "can be made of those starts alone that needed more than five repeats), so that bounds of these are "
+        f"It is shown, with 95 % confidence, for {'' if short else 'every row: '}{named(shown, False)}.",
+        *([f"It is not shown for {named(short, True)}."] if short else []),
+        f"There are {most} starts of some rows and {fewer} of others (hard cutoffs take longest, and a "
+        "placebo can be made of those starts alone that needed more than five repeats), so that bounds of these are "
         f"wider. How often the word is undecided: {open_ or 'never'}; of the others, never.",
     )
-    return "\n\n".join(fill_text(one, 118) for one in sentences)
+    return "\n\n".join(fill_text(one, 118, break_on_hyphens=False) for one in sentences)
 
 
 def tables(store: Path, seeds: int) -> tuple[str, str]:
@@ -343,7 +343,7 @@ def main() -> None:
     )  # fmt: skip
     made.add_argument(
         "--tables", type=Path, metavar="PAGE",
-        help="run nothing: judge what is stored, and put what it says and the tables between the marks of this page",
+        help="run nothing: judge what is stored, and put what it says between the marks of this page",
     )  # fmt: skip
     chosen = made.parse_args()
     if chosen.tables is None:

@@ -259,7 +259,8 @@ def _accelerated(before: Any, after: Any) -> str:
         return ""
     ratio = after["rate"] / before["rate"]
     if ratio > _ALIKE:
-        return f", {number(ratio, 2)} times as fast: as it would if the flip accelerated it, and as it may by chance"
+        fast = f"{number(ratio, 2)} times as fast"
+        return f", {fast}: as it would if the flip accelerated it, and as it may by chance"
     if ratio < 1 / _ALIKE:
         return ", slower than before: nothing here says that a flip accelerated it"
     return ", as before: nothing here says that a flip accelerated it"
