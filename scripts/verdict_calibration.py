@@ -274,8 +274,8 @@ def summed_up(rows: list[tuple[Any, ...]], wrong: list[tuple[str, str, int, int]
         f"It is shown, with 95 % confidence, for {'' if short else 'every row: '}{named(shown, False)}.",
         *([f"It is not shown for {named(short, True)}."] if short else []),
         f"There are {most} starts of some rows and {fewer} of others (hard cutoffs take longest, and a "
-        "placebo can be made of those starts alone that needed more than five repeats), so that bounds of these are "
-        f"wider. How often the word is undecided: {open_ or 'never'}; of the others, never.",
+        "placebo can be made of those starts alone that needed more than five repeats), so that their bounds "
+        f"are wider. How often the word is undecided: {open_ or 'never'}; of the others, never.",
     )
     return "\n\n".join(fill_text(one, 118, break_on_hyphens=False) for one in sentences)
 
