@@ -191,6 +191,29 @@ class CalculatorSubject:
         self.ledger.forces(asked, forces, *self._asked_as())
         return forces
 
+    def again(
+        self, atoms: Atoms, energy: float | None = None, forces: Float[np.ndarray, "atoms 3"] | None = None
+    ) -> bool:
+        """Asks this object a question that it has answered, of which the ledger takes note.
+
+        Args:
+            atoms: as they were asked about.
+            energy: that was answered, eV; at least one of both.
+            forces: that were answered, eV/Å.
+
+        Returns:
+            Whether the answer is another one by more than rounding.
+
+        Raises:
+            CalculatorError: as for `energy`.
+        """
+        if not self.ledger.asks_again:
+            return False
+        self.forget()
+        now = self.energy(atoms)
+        both = None if forces is None else (forces, self.forces(atoms))
+        return self.ledger.again((now if energy is None else energy, now), both, self.kT)
+
     def writes(self, atoms: Atoms) -> list[str]:
         """Which of positions, numbers, cell and periods differ in the atoms after the calculator had them.
 
