@@ -106,7 +106,9 @@ class Forces:
         unclear = [
             found[place]
             for place in sorted(found)
-            if found[place].agrees and _tells(found[place]) > _DROWNED * scale * np.linalg.norm(wanted[place][1])
+            # as much as a force of the drowned size does along a direction in which more atoms move
+            if found[place].agrees
+            and _tells(found[place]) > _DROWNED * scale * float(np.linalg.norm(wanted[place][1]))
         ]
         first = min(found)
         told = [
@@ -123,7 +125,7 @@ class Forces:
                 found[first].error,
             ),
         ]
-        if unclear and not any(one["severity"] in ("error", "warning") for one in told):
+        if unclear and not told:  # otherwise that is why
             told.append(_untold(unclear, len(slopes), scale))
         worst = max(slopes, key=lambda one: abs(one.difference - one.force) / one.error)
         return Part(

@@ -23,6 +23,8 @@ _MOST_AGAIN = 100
 
 #: (which object, its how manieth question).
 Question = tuple[int, int]
+#: Energy, eV, and forces, eV/Å; None where they were not asked for.
+Told = tuple[float, Float[np.ndarray, "atoms 3"] | None]
 
 
 @dataclass
@@ -107,30 +109,14 @@ class Ledger:
         """Whether one more answer that sticks out is to be asked for again: few are, and one is enough."""
         return self.chance.times < _MOST_AGAIN and not self.chance.differ
 
-    def again(
-        self,
-        energies: tuple[float, float],
-        forces: tuple[Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"]] | None,
-        kT: float,
-    ) -> bool:
-        """Takes note of two answers of one object to one question; whether they are two.
-
-        Args:
-            energies: before and now, eV.
-            forces: before and now, eV/Å; None where they were not asked for.
-            kT: energy that a difference is compared with, eV.
-        """
-        change = abs(energies[1] - energies[0])
-        force = 0.0 if forces is None else float(np.max(np.abs(forces[1] - forces[0]), initial=0.0))
-        found = no_rounding(change, energies[0], force, None if forces is None else forces[0], kT)
-        self.chance.times += 1
-        if forces is not None:
-            self.chance.typical = _typical(forces[0])
-        if found:
-            self.chance.differ += 1
-            self.chance.energy = max(self.chance.energy, change)
-            self.chance.force = max(self.chance.force, force)
-        return found
+    def note(self, before: Told, now: Told) -> None:
+        """Takes note of two answers of one object to one question, where the one before stood alone."""
+        chance = self.chance
+        chance.differ += 1
+        chance.energy = max(chance.energy, abs(now[0] - before[0]))
+        if before[1] is not None and now[1] is not None:
+            chance.force = max(chance.force, float(np.max(np.abs(now[1] - before[1]), initial=0.0)))
+            chance.typical = _typical(now[1])
 
     def findings(self, kT: float) -> list[dict[str, str]]:
         """That one question has two answers, where that has come up and is no rounding.
@@ -177,6 +163,20 @@ class Ledger:
                 self.new.energy = max(self.new.energy, size)
             else:
                 self.new.force = max(self.new.force, size)
+
+
+def differ(before: Told, now: Told, kT: float) -> bool:
+    """Whether two answers to one question differ by more than any rounding.
+
+    Args:
+        before: energy and forces.
+        now: the same of another answer.
+        kT: energy that a difference is compared with, eV.
+    """
+    force = 0.0
+    if before[1] is not None and now[1] is not None:
+        force = float(np.max(np.abs(now[1] - before[1]), initial=0.0))
+    return no_rounding(abs(now[0] - before[0]), before[0], force, before[1], kT)
 
 
 def no_rounding(

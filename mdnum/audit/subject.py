@@ -14,7 +14,7 @@ from ase import Atoms
 from jaxtyping import Float
 
 from mdnum.audit.base import Meter
-from mdnum.audit.ledger import Ledger
+from mdnum.audit.ledger import Ledger, differ
 from mdnum.errors import MdnumError
 from mdnum.units import METAL, Units
 
@@ -196,6 +196,9 @@ class CalculatorSubject:
     ) -> bool:
         """Asks this object a question that it has answered, of which the ledger takes note.
 
+        Only an answer that stands alone is one of chance: where the object that is asked again answers
+        otherwise than a new one does, what it has seen since may be why.
+
         Args:
             atoms: as they were asked about.
             energy: that was answered, eV; at least one of both.
@@ -210,9 +213,16 @@ class CalculatorSubject:
         if not self.ledger.asks_again:
             return False
         self.forget()
-        now = self.energy(atoms)
-        both = None if forces is None else (forces, self.forces(atoms))
-        return self.ledger.again((now if energy is None else energy, now), both, self.kT)
+        told = self.energy(atoms), None if forces is None else self.forces(atoms)
+        before = told[0] if energy is None else energy, forces
+        self.ledger.chance.times += 1
+        if not differ(before, told, self.kT):
+            return False
+        new = self.fresh()
+        if differ(told, (new.energy(atoms), None if forces is None else new.forces(atoms)), self.kT):
+            return False
+        self.ledger.note(before, told)
+        return True
 
     def writes(self, atoms: Atoms) -> list[str]:
         """Which of positions, numbers, cell and periods differ in the atoms after the calculator had them.
