@@ -195,7 +195,7 @@ def slope(
     error = spread + rounding + 1e-15 * np.abs(better[1:])
     force = -float(np.sum(forces * line))
     best, doubt = _best(better[1:] - force, error, rounding)
-    # what differs from the slope along so short a line goes with the third power of the step, a 64th each time
+    # what a smooth energy has beside its slope goes with the third power of the step, a 64th each time
     off = np.abs(2 * _LADDER * (central - better[best + 1]))
     odd = np.append(False, off[1:] > 0.25 * off[:-1])
     rung = int(np.argmax(np.where(odd, off, 0.0)))

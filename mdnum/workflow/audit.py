@@ -136,7 +136,9 @@ def audit(
         for check in _checks(record, subject):
             told(0, 0, {"phase": check.name})
             try:
-                part = _in_units(_repeatable(_ask(check, subject, told), subject, record.parts), subject.units)
+                part = _in_units(
+                    _repeatable(_ask(check, subject, told), subject, record.parts), subject.units
+                )
             except KeyboardInterrupt:
                 if not record.parts:
                     raise

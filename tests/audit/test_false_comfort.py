@@ -127,7 +127,9 @@ def test_what_is_asked_again_is_little_and_has_one_answer(make):
     for check in (Invariance(), Forces()):
         check(asked)
     assert not asked.ledger.chance.differ and not asked.ledger.findings(asked.kT)
-    assert asked.ledger.chance.times <= (0 if make in (planted.Good, planted.Single) else 0.1 * asked.meter.calls)
+    assert asked.ledger.chance.times <= (
+        0 if make in (planted.Good, planted.Single) else 0.1 * asked.meter.calls
+    )
 
 
 def test_a_direction_that_cannot_tell_is_no_comfort():
