@@ -88,7 +88,10 @@ def _largely_unasked(part: Part) -> bool:
 
 def _headline(name: str, answers: Mapping[str, Answer], parts: Sequence[Part], left: Sequence[str]) -> str:
     head = _said(name, answers["run"], answers["differentiate"])
-    if parts and not head and any(set(left).intersection(needed) for needed in _NEEDED.values()):
+    wanted = {part.name for part in parts}.union(left)
+    # of checks that do not make up an answer, none is to come
+    to_come = any(wanted.issuperset(needed) and set(left).intersection(needed) for needed in _NEEDED.values())
+    if parts and not head and to_come:
         return _nothing_yet(name, parts, left)
     unasked = [
         f"{part.asked:,} of {part.possible:,} ways of {part.name}" for part in parts if _largely_unasked(part)
