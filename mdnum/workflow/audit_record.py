@@ -201,10 +201,13 @@ def open_again(path: str | Path, calculator: Any, load: Callable[[Any], Loaded])
     from mdnum.audit.threshold import Threshold
 
     folder = RunFolder.open(path)
-    folder.world = "audit"
-    state = folder.load_checkpoint()
+    state = folder.load_checkpoint() if folder.world == "audit" or manifest.resumable(folder.path) else {}
     if "audit" not in state:
-        raise FolderError("holds no audit", remedy="Resume it with the verb that made it", where=str(path))
+        # a run, and an examination of lists, are resumed by the verb that made them; the rest is done anew
+        goes_on = manifest.resumable(folder.path) or (folder.path / "answers.json").exists()
+        remedy = f"Resume it with `mdnum {folder.verb} --resume {path}`" if goes_on else "Begin a new audit"
+        raise FolderError("holds no audit", remedy=remedy, where=str(path))
+    folder.world = "audit"
     words = state["audit"]
     if calculator is None and words is None:
         raise InputError("the calculator of this audit has no name", remedy="Give it again", where=str(path))
