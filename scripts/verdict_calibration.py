@@ -29,12 +29,14 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
+from textwrap import fill as fill_text
 from typing import Any
 
 import numpy as np
 from _output import say, start
 from ase import Atoms
 from ase.build import bulk
+from scipy.stats import beta
 
 from mdnum.events.chance import Delay, count
 from mdnum.events.forks import Dates, Verdict, growth, judge
@@ -50,6 +52,8 @@ STEPS = 4000
 UNSEEN = 16
 #: Of the crystal, where a repeat takes 4,000 steps.
 UNSEEN_CRYSTAL = 2
+#: Share of false verdicts that is aimed at: below it.
+TARGET = 0.05
 SHARES = (0.002 / 1.5874, SPLIT, 0.02, 0.04, 0.1 / 1.5874)
 POTENTIAL = {"kind": "lennard-jones", "sigma": 1.0, "epsilon": 1.0}
 MIXTURE = {
@@ -239,8 +243,45 @@ def table(columns: tuple[str, ...], rows: list[tuple[object, ...]]) -> str:
     return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in lines)
 
 
-def tables(store: Path, seeds: int) -> str:
-    """Every table of the study."""
+def below(false: int, of: int) -> float:
+    """The share that the true one is below with 95 % confidence: exact, one-sided (Clopper and Pearson,
+    Biometrika 26, 404, 1934)."""
+    return 1.0 if false == of else float(beta.ppf(0.95, false + 1, of - false))
+
+
+def summed_up(rows: list[tuple[Any, ...]], wrong: list[tuple[str, str, int, int]]) -> str:
+    """What was aimed at, for which rows it is shown, and how often the word is undecided."""
+
+    def named(kept: list[tuple[str, str, int, int]], bounds: bool) -> str:
+        words: dict[str, list[str]] = {}
+        for name, word, no, of in kept:
+            bound = f" ({no} of {of}, below {100 * below(no, of):.2f} %)" * bounds
+            words.setdefault(name, []).append(f"{word}{bound}")
+        return "; ".join(f"{name}: {', '.join(told)}" for name, told in words.items())
+
+    shown = [one for one in wrong if below(*one[2:]) < TARGET]
+    short = [one for one in wrong if one not in shown]
+    fewer = min(of for *_, of in wrong)
+    most = max(of for *_, of in wrong)
+    open_ = "; ".join(
+        f"{name}: {row[WORDS.index('undecided')]} of {of}"
+        for name, of, *row in rows
+        if row[WORDS.index("undecided")]
+    )
+    target = f"{100 * TARGET:.0f} %"
+    sentences = (
+        f"The target is that each kind of false verdict is the word of fewer than {target} of all starts.",
+        f"It is shown, with 95 % confidence, for {'' if short else 'every row: '}{named(shown, False)}.",
+        *([f"It is not shown for {named(short, True)}."] if short else []),
+        f"There are {most} starts of some rows and {fewer} of others (hard cutoffs take longest, and a "
+        "placebo can be made of those starts alone that needed more than five repeats), so that their bounds "
+        f"are wider. How often the word is undecided: {open_ or 'never'}; of the others, never.",
+    )
+    return "\n\n".join(fill_text(one, 118, break_on_hyphens=False) for one in sentences)
+
+
+def tables(store: Path, seeds: int) -> tuple[str, str]:
+    """What the study says, and every table of it."""
     rows, repeats, wrong = [], [], []
     for name, _ in tasks():
         every = stored(store, name, seeds)
@@ -274,12 +315,16 @@ def tables(store: Path, seeds: int) -> str:
     parts = [
         table(("system", "starts", *WORDS), rows),
         table(
-            ("system", "false", "starts", "share"),
-            [(name, f"{word}: {no}", of, f"{100 * no / of:.1f} %") for name, word, no, of in wrong],
+            ("system", "false", "starts", "share", "below (95 %)"),
+            [
+                (name, f"{word}: {no}", of, f"{100 * no / of:.1f} %", f"{100 * below(no, of):.1f} %")
+                for name, word, no, of in wrong
+                if of
+            ],
         ),
         table(("system", "repeats, median", "mean"), repeats),
     ]
-    return "\n\n".join(parts)
+    return summed_up(rows, [one for one in wrong if one[-1]]), "\n\n".join(parts)
 
 
 MARK = "<!-- written by scripts/verdict_calibration.py -->"
@@ -298,16 +343,16 @@ def main() -> None:
     )  # fmt: skip
     made.add_argument(
         "--tables", type=Path, metavar="PAGE",
-        help="run nothing: judge what is stored, and put the tables between the marks of this page",
+        help="run nothing: judge what is stored, and put what it says between the marks of this page",
     )  # fmt: skip
     chosen = made.parse_args()
     if chosen.tables is None:
         fill(chosen.store, chosen.seeds, chosen.only)
-        print(tables(chosen.store, chosen.seeds))
+        print(*tables(chosen.store, chosen.seeds), sep="\n\n")
         return
-    before, _, after = chosen.tables.read_text(encoding="utf-8").split(MARK)
-    text = tables(chosen.store, chosen.seeds)
-    chosen.tables.write_text(f"{before}{MARK}\n\n{text}\n\n{MARK}{after}", encoding="utf-8")
+    parts = chosen.tables.read_text(encoding="utf-8").split(MARK)
+    parts[1], parts[3] = (f"\n\n{text}\n\n" for text in tables(chosen.store, chosen.seeds))
+    chosen.tables.write_text(MARK.join(parts), encoding="utf-8")
 
 
 if __name__ == "__main__":

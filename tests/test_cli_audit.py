@@ -10,6 +10,10 @@ from ase.build import bulk
 from ase.io import write
 from command_line import call, printed
 
+from mdnum.cli.audit_print import print_rows
+from mdnum.store import RunFolder
+from mdnum.store.atomic import write_text
+
 EMT = "ase.calculators.emt:EMT"
 
 
@@ -69,6 +73,29 @@ def test_a_calculator_that_is_not(copper, capsys):
     assert told["folder"] == "out" and not (copper / "out/report.html").exists()
     assert call("audit", "mine.py", "-s", "cu.extxyz", "--checks", "forces", "-o", "out") == 2
     assert "already holds a run" in capsys.readouterr().err
+
+
+def test_what_is_no_audit_is_told_which_verb_goes_on_with_it(copper, capsys):
+    for world, kept in (("conform", "answers.json"), ("md", "checkpoint.npz"), ("grad", "gradients.npz")):
+        folder = RunFolder.create(copper / world, world=world)
+        folder.checkpoint({"step": 1}, force=True) if world == "md" else write_text(folder.path / kept, "{}")
+        folder.close()
+    for name, told in (
+        ("conform", "Resume it with `mdnum conform --resume conform`"),
+        ("md", "Resume it with `mdnum run --resume md`"),
+        ("grad", "Begin a new audit"),
+    ):
+        assert call("audit", "--resume", name) == 2
+        assert capsys.readouterr().err.strip() == f"mdnum: {name}: holds no audit. {told}."
+
+
+def test_a_table_of_nothing_is_not_printed(capsys):
+    shown = {"calculator": "x", "formula": "Ar3", "atoms": 3, "parts": [], "left_out": []}
+    print_rows(shown)
+    assert printed(capsys) == ["x, Ar3, 3 atoms"]
+    one = {"title": "Forces", "asked": 2, "possible": 15, "says": "Said."}
+    print_rows({**shown, "parts": [one]})
+    assert [line.split() for line in printed(capsys)][1:] == [["asked"], ["Forces", "2", "of", "15", "Said."]]
 
 
 def test_control_c_keeps_what_was_found(copper, capsys, monkeypatch):

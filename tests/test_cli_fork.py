@@ -124,7 +124,7 @@ def test_the_verdict_comes_first_then_dates_and_decision(compare: Recorder, caps
         "flips in one run only 16,114",
         "A its own is A 1,806", "B its own 1,806 is B", "B A's > 3,839 1,811", "A B's 1,790 2,400",
         "B, start perturbed its own 1,475 to 1,475", "B, start perturbed A's 1,480 to 1,480",
-        "decisions > 2,033 steps, > 24.6 nats 594 steps, 7.19 nats", "arithmetic -16 steps",
+        "decisions > 2,033 steps, > 24.6 e-foldings 594 steps, 7.19 e-foldings", "arithmetic -16 steps",
         "certified in A up to step 3,839: no decision is ambiguous",
         "certified in B not even at the start; 431 ambiguous decisions at 390 steps; "
         "of listed pairs only, a rule of rebuilds that is not safe may miss some",

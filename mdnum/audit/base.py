@@ -72,6 +72,17 @@ def meter_of(subject: Subject) -> Meter:
     return getattr(subject, "meter", None) or Meter()
 
 
+def again(
+    subject: Subject,
+    atoms: Atoms,
+    energy: float | None = None,
+    forces: Float[np.ndarray, "atoms 3"] | None = None,
+) -> bool:
+    """Whether a subject that is asked again gives another answer; one that cannot tell gives the same."""
+    ask = getattr(subject, "again", None)
+    return ask is not None and ask(atoms, energy, forces)
+
+
 class Subject(Protocol):
     """The calculator under audit, and the structure it is asked about.
 

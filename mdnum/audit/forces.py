@@ -11,8 +11,9 @@ import numpy as np
 from ase import Atoms
 from jaxtyping import Float
 
-from mdnum.audit.base import TIME_UP, Curve, Part, Progress, Subject, TimeUp, meter_of
+from mdnum.audit.base import TIME_UP, Curve, Part, Progress, Subject, TimeUp, again, meter_of
 from mdnum.audit.digits import precision
+from mdnum.audit.ledger import no_rounding
 from mdnum.audit.noise import FEW, Noise, Steps, direction, displaced, of_all_kinds, settled, steps
 from mdnum.audit.two_energies import two_energies
 from mdnum.references.findings import finding
@@ -98,7 +99,17 @@ class Forces:
             raise TimeUp
         slopes = [found[place] for place in sorted(found)]
         sums = list(_sums(atoms, forces, noise))
+        if not all(one.agrees for one in slopes) or any(_judged_sums(sums, scale)):
+            # the forces at the structure itself, which all directions are held against
+            again(worker, atoms, forces=forces)
         drowned = _drowned(slopes, noise, scale, steps(worker, atoms))
+        unclear = [
+            found[place]
+            for place in sorted(found)
+            # as much as a force of the drowned size does along a direction in which more atoms move
+            if found[place].agrees
+            and _tells(found[place]) > _DROWNED * scale * float(np.linalg.norm(wanted[place][1]))
+        ]
         first = min(found)
         told = [
             *drowned,
@@ -114,11 +125,13 @@ class Forces:
                 found[first].error,
             ),
         ]
+        if unclear and not told:  # otherwise that is why
+            told.append(_untold(unclear, len(slopes), scale))
         worst = max(slopes, key=lambda one: abs(one.difference - one.force) / one.error)
         return Part(
             name=self.name,
             title="Forces",
-            says=_says(slopes, worst, scale, _known(slopes) > _DROWNED * scale),
+            says=_says(slopes, unclear, scale, _known(slopes) > _DROWNED * scale),
             findings=told,
             tables={
                 "Derivative of the energy along a direction": [_row(one) for one in slopes],
@@ -128,6 +141,7 @@ class Forces:
             numbers={
                 "directions": len(slopes),
                 "disagree": sum(not one.agrees for one in slopes),
+                "could_not_tell": len(unclear),
                 "largest_difference": max(abs(one.difference - one.force) for one in slopes),
                 "largest_error": max(one.error for one in slopes),
                 "rms_force": scale,
@@ -181,6 +195,13 @@ def slope(
     error = spread + rounding + 1e-15 * np.abs(better[1:])
     force = -float(np.sum(forces * line))
     best, doubt = _best(better[1:] - force, error, rounding)
+    # what a smooth energy has beside its slope goes with the third power of the step, a 64th each time
+    off = np.abs(2 * _LADDER * (central - better[best + 1]))
+    odd = np.append(False, off[1:] > 0.25 * off[:-1])
+    rung = int(np.argmax(np.where(odd, off, 0.0)))
+    if odd[rung] and no_rounding(off[rung], plus[rung], 0.0, None, subject.kT):
+        for sign, energies in ((1, plus), (-1, minus)):
+            again(subject, displaced(atoms, sign * _LADDER[rung] * line), float(energies[rung]))
     return Slope(
         what,
         float(better[best + 1]),
@@ -284,6 +305,25 @@ def _drowned(slopes: list[Slope], noise: Noise, scale: float, stairs: Steps) -> 
     ]
 
 
+def _tells(one: Slope) -> float:
+    """To within what a direction tells that force and difference agree, eV/Å."""
+    return max(one.error, abs(one.difference - one.force))
+
+
+def _untold(unclear: list[Slope], directions: int, scale: float) -> dict[str, str]:
+    """A finding where nothing else says why a direction could not tell."""
+    return finding(
+        "NOISE_FLOOR",
+        "warning",
+        "differences of the energy cannot tell some of the forces",
+        f"{len(unclear)} of {directions} directions could not tell: moving {unclear[0].what}, differences of "
+        f"the energy tell the slope to within {max(map(_tells, unclear)):.2g} eV/Å, at a root mean square "
+        f"force of {scale:.2g} eV/Å. A wrong force there, no check here has seen.",
+        "Look for steps of the energy that come and go, and whether the same question has the same answer "
+        "twice.",
+    )
+
+
 def _judged(slopes: list[Slope], scale: float) -> Iterator[dict[str, str]]:
     steps = [one for one in slopes if one.jump]
     if steps:
@@ -343,7 +383,7 @@ def _row(one: Slope) -> dict[str, Any]:
     }
 
 
-def _says(slopes: list[Slope], worst: Slope, scale: float, drowned: bool) -> str:
+def _says(slopes: list[Slope], unclear: list[Slope], scale: float, drowned: bool) -> str:
     wrong = sum(not one.agrees for one in slopes)
     if wrong:
         return (
@@ -352,16 +392,18 @@ def _says(slopes: list[Slope], worst: Slope, scale: float, drowned: bool) -> str
             f"{max(abs(one.difference - one.force) for one in slopes):.2g} eV/Å apart, at a root mean square "
             f"force of {scale:.3g} eV/Å."
         )
-    if drowned:
+    clear = [one for one in slopes if not any(one is other for other in unclear)]
+    if drowned or not clear:
         return (
             f"Along {len(slopes)} directions noise hides whether the forces are the derivative of the "
             f"energy: the differences can tell to within {max(one.error for one in slopes):.1g} eV/Å, at a "
             f"root mean square force of {scale:.3g} eV/Å."
         )
+    tail = f" {len(unclear)} of {len(slopes)} directions could not tell." if unclear else ""
     return (
-        f"Along {len(slopes)} directions the forces are the derivative of the energy to within "
-        f"{max(abs(one.difference - one.force) for one in slopes):.1g} eV/Å, which is what the differences "
-        f"can tell (their largest error is {max(one.error for one in slopes):.1g} eV/Å)."
+        f"Along {len(clear)} directions the forces are the derivative of the energy to within "
+        f"{max(abs(one.difference - one.force) for one in clear):.1g} eV/Å, which is what the differences "
+        f"can tell (their largest error is {max(one.error for one in clear):.1g} eV/Å).{tail}"
     )
 
 

@@ -12,7 +12,7 @@ from ase import Atoms
 
 from mdnum.audit import transformations
 from mdnum.audit.answer import Refusal, ask
-from mdnum.audit.base import TIME_UP, Part, Progress, Subject, TimeUp, meter_of
+from mdnum.audit.base import TIME_UP, Part, Progress, Subject, TimeUp, again, meter_of
 from mdnum.audit.noise import Noise, along_a_line, louder, settled, under_jitter
 from mdnum.audit.subject import CalculatorError
 from mdnum.audit.transformations import Same
@@ -275,6 +275,7 @@ class _Judge:
         self._rng = rng
         self._known: dict[tuple[int, int], tuple[float, Any, Noise]] = {}
         self._bases: list[Atoms] = [atoms]
+        self._answer: tuple[float, Any] = (0.0, None)
 
     def before(self, same: Same) -> Atoms:
         return self.atoms if same.before is None else same.before
@@ -285,7 +286,13 @@ class _Judge:
         found = self._compared(self.worker, same, energy, forces, allowed)
         if not found.agrees:
             # another object, which has seen nothing else: what it remembers is another question
-            found = self._compared(self.subject.fresh(), same, energy, forces, allowed)
+            other = self.subject.fresh()
+            first, found = self._answer, self._compared(other, same, energy, forces, allowed)
+            # who stands alone may have answered so by chance, and is asked again
+            if found.agrees:
+                again(self.worker, same.atoms, *first)
+            else:
+                again(self.worker if base is self.atoms else self.subject.fresh(), base, energy, forces)
         return found
 
     def narrow_refused(self, same: Same, error: CalculatorError) -> None:
@@ -305,10 +312,10 @@ class _Judge:
     def _compared(
         self, worker: Subject, same: Same, energy: float, forces: Any, allowed: Noise
     ) -> _Difference:
-        there = worker.energy(same.atoms) / same.copies
+        self._answer = worker.energy(same.atoms), worker.forces(same.atoms)
         expected = forces[same.order] @ same.turn.T
-        force = float(np.max(np.abs(worker.forces(same.atoms) - expected), initial=0.0))
-        change = abs(there - energy)
+        force = float(np.max(np.abs(self._answer[1] - expected), initial=0.0))
+        change = abs(self._answer[0] / same.copies - energy)
         return _Difference(
             same,
             change,

@@ -16,7 +16,7 @@ from mdnum.audit.answer import Answer, Refusal, ask
 from mdnum.audit.approaches import Asked, approaches
 from mdnum.audit.base import TIME_UP, Part, Progress, Subject, TimeUp, meter_of
 from mdnum.audit.digits import digits
-from mdnum.audit.ledger import Again
+from mdnum.audit.ledger import Again, not_repeatable
 from mdnum.audit.noise import FEW, Noise, displaced, settled
 from mdnum.audit.subject import CalculatorError, CalculatorSubject, only_trying
 from mdnum.audit.threshold import Threshold
@@ -29,9 +29,6 @@ _ALLOWED = 40.0
 #: How often one structure is asked about again: by one object at once, by it with another structure between,
 #: and by new objects.
 _AT_ONCE, _BETWEEN, _NEW = 4, 2, 3
-#: Of the root mean square force, and of kT: answers to one question that differ by more are no rounding.
-_LARGE = 1e-4
-_LARGE_ENERGY = 1e-3
 #: Å by which an atom is moved a little further each time.
 _TINY = 10.0 ** np.arange(-9, -1)
 #: An answer that should have changed by so many of its last digits, and has not at all, was kept.
@@ -456,25 +453,7 @@ def _unsteady(repeats: Mapping[str, Any], kT: float) -> Iterator[dict[str, str]]
         )
         said += f"{force:.2g} eV/Å from those of new ones to the same structures, and do not when the same "
         said += f"questions are asked again; a typical force is {repeats['typical force']:.2g} eV/Å."
-    large = force > _LARGE * repeats["typical force"] or energy > _LARGE_ENERGY * kT
-    yield finding(
-        "NOT_REPEATABLE",
-        "error" if large else "warning",
-        "the same question has another answer each time"
-        if large
-        else "the same question has not the same answer to the last bit",
-        said
-        + (
-            " That is no rounding: no other number here is worth more than this."
-            if large
-            else " Two runs of one input will part, as all that differ in a last bit do."
-        ),
-        "Look for memory that is read before it is written, for what is drawn at random, and for threads "
-        "that write to one place."
-        if large
-        else "Look for sums in the order of threads or of atomic additions, and for a list kept from the "
-        "call before.",
-    )
+    yield not_repeatable(said, energy, force, repeats["typical force"], kT)
 
 
 def _tolerance(subject: Subject, atoms: Atoms) -> float:

@@ -14,7 +14,7 @@ from ase import Atoms
 from jaxtyping import Float
 
 from mdnum.audit.base import Meter
-from mdnum.audit.ledger import Ledger
+from mdnum.audit.ledger import Ledger, differ
 from mdnum.errors import MdnumError
 from mdnum.store.atomic import write_text
 from mdnum.units import METAL, Units
@@ -191,6 +191,39 @@ class CalculatorSubject:
             )
         self.ledger.forces(asked, forces, *self._asked_as())
         return forces
+
+    def again(
+        self, atoms: Atoms, energy: float | None = None, forces: Float[np.ndarray, "atoms 3"] | None = None
+    ) -> bool:
+        """Asks this object a question that it has answered, of which the ledger takes note.
+
+        Only an answer that stands alone is one of chance: where the object that is asked again answers
+        otherwise than a new one does, what it has seen since may be why.
+
+        Args:
+            atoms: as they were asked about.
+            energy: that was answered, eV; at least one of both.
+            forces: that were answered, eV/Å.
+
+        Returns:
+            Whether the answer is another one by more than rounding.
+
+        Raises:
+            CalculatorError: as for `energy`.
+        """
+        if not self.ledger.asks_again:
+            return False
+        self.forget()
+        told = self.energy(atoms), None if forces is None else self.forces(atoms)
+        before = told[0] if energy is None else energy, forces
+        self.ledger.chance.times += 1
+        if not differ(before, told, self.kT):
+            return False
+        new = self.fresh()
+        if differ(told, (new.energy(atoms), None if forces is None else new.forces(atoms)), self.kT):
+            return False
+        self.ledger.note(before, told)
+        return True
 
     def writes(self, atoms: Atoms) -> list[str]:
         """Which of positions, numbers, cell and periods differ in the atoms after the calculator had them.

@@ -76,10 +76,10 @@ def _answer(question: str, parts: Sequence[Part], wanted: Sequence[str]) -> Answ
     if not set(wanted).issuperset(_NEEDED[question]):
         return "not asked"
     begun = {part.name for part in parts}
+    if not begun.issuperset(_NEEDED[question]):
+        return "not asked"
     asked = {part.name for part in parts if not _largely_unasked(part)}
-    if asked.issuperset(_NEEDED[question]):
-        return "yes"
-    return "as far as asked" if begun.intersection(_NEEDED[question]) else "not asked"
+    return "yes" if asked.issuperset(_NEEDED[question]) else "as far as asked"
 
 
 def _largely_unasked(part: Part) -> bool:
@@ -88,6 +88,11 @@ def _largely_unasked(part: Part) -> bool:
 
 def _headline(name: str, answers: Mapping[str, Answer], parts: Sequence[Part], left: Sequence[str]) -> str:
     head = _said(name, answers["run"], answers["differentiate"])
+    wanted = {part.name for part in parts}.union(left)
+    # of checks that do not make up an answer, none is to come
+    to_come = any(wanted.issuperset(needed) and set(left).intersection(needed) for needed in _NEEDED.values())
+    if parts and not head and to_come:
+        return _nothing_yet(name, parts, left)
     unasked = [
         f"{part.asked:,} of {part.possible:,} ways of {part.name}" for part in parts if _largely_unasked(part)
     ]
@@ -116,6 +121,12 @@ def _headline(name: str, answers: Mapping[str, Answer], parts: Sequence[Part], l
     if len(shown) > 3:
         shown[2:] = [f"and {len(shown) - 2} more findings"]
     return f"{head}: {'; '.join(shown)}."
+
+
+def _nothing_yet(name: str, parts: Sequence[Part], left: Sequence[str]) -> str:
+    """What is said where a check that both answers need has not begun, and nothing was found so far."""
+    ways = [f"{part.asked:,} of {part.possible:,} ways of {part.name}" for part in parts]
+    return f"{name}: nothing can be said yet ({', '.join(ways)} asked; {', '.join(left)} not asked)."
 
 
 def _said(name: str, run: Answer, differentiate: Answer) -> str:

@@ -26,7 +26,8 @@ def print_rows(summary: Mapping[str, Any]) -> None:
     out = output.console()
     out.print(f"  {summary['calculator']}, {summary['formula']}, {summary['atoms']:,} atoms", markup=False)
     rows = [(part["title"], _ways(part), part["says"]) for part in summary["parts"]]
-    output.print_table("", ("", "asked", ""), rows)
+    if rows:
+        output.print_table("", ("", "asked", ""), rows)
     left = [one for one in summary["left_out"] if one["why"]]
     if left:
         rows = [(one["what"], one["why"]) for one in left]

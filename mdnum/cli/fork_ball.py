@@ -47,7 +47,7 @@ def fork(
             from mdnum.workflow.fork_question import OF_A_BALL
 
             raise InputError(
-                f"{option} is a question for molecular dynamics, and {system} is a ball",
+                f"{option} is an option for molecular dynamics, and {system} is a ball",
                 remedy=OF_A_BALL.get(option, "Leave it out"),
             )
     question = "--certify" if certify else "--vary all" if vary == "all" else "--vary"

@@ -139,10 +139,10 @@ def _cell(cell: Mapping[str, Any]) -> str:
 
 
 def share_words(share: Mapping[str, Any]) -> str:
-    """Steps and nats of a share; a lower bound has its sign."""
+    """Steps and e-foldings of a share; a lower bound has its sign."""
     more = "> " if share["at_least"] else ""
     text = f"{more}{share['steps']:,} steps"
-    return text if share["nats"] is None else f"{text}, {more}{share['nats']:.3g} nats"
+    return text if share["nats"] is None else f"{text}, {more}{share['nats']:.3g} e-foldings"
 
 
 def _pinned(found: Mapping[str, Any] | None) -> Iterator[tuple[str, str]]:

@@ -7,6 +7,9 @@ from typing import Any
 
 from mdnum.cli import output
 
+#: Digits of a derivative, where none is known not to hold.
+_MOST = 8
+
 
 def print_rows(summary: Mapping[str, Any]) -> None:
     """What a gradient folder says below its headline."""
@@ -28,18 +31,19 @@ def print_rows(summary: Mapping[str, Any]) -> None:
     left = [one for one in summary["left_out"] if one["how"]]
     if left:
         rows = [(one["what"], one["why"], one["how"]) for one in left]
-        output.print_table("left out (--methods all asks for all methods)", ("", "", "ask with"), rows)
+        output.print_table("left out (--methods all asks for all methods)", ("", "", "to have it"), rows)
     if never := [one["what"] for one in summary["left_out"] if not one["how"]]:
         out.print(f"  do not apply (why is in the report): {', '.join(never)}", markup=False)
 
 
 def _print_methods(summary: Mapping[str, Any]) -> None:
     """Derivatives by method, each with how far it is from the reference."""
+    from mdnum.report.grad.words import digits_note, held
+
     names = [one["name"] for one in summary["parameters"]]
     apart = {(row["method"], row["name"]): row for row in summary["comparisons"]}
     reference = summary["reference"]
-    trust = summary.get("trust") or {}
-    half, digits = trust.get("half"), trust.get("digits") or {}
+    half = (summary.get("trust") or {}).get("half")
     table = []
     if exact := summary.get("exact"):
         table.append(
@@ -48,11 +52,17 @@ def _print_methods(summary: Mapping[str, Any]) -> None:
     for one in sorted(summary["methods"], key=lambda one: one["method"] != reference):
         cells = []
         for name in names:
-            cells += [_slope(one, name, digits.get(name)), _apart(apart.get((one["method"], name)))]
+            note = digits_note(summary, name) if one["method"] == reference else ""
+            cells += [
+                _slope(one, name, held(summary, name, _MOST)) + (f" ({note})" if note else ""),
+                _apart(apart.get((one["method"], name))),
+            ]
         table.append((one["method"], *cells))
         if half and one["method"] == reference:
             shorter = {"gradient": half, "error": {}}
-            cells = [cell for name in names for cell in (_slope(shorter, name, digits.get(name)), "")]
+            cells = [
+                cell for name in names for cell in (_slope(shorter, name, held(summary, name, _MOST)), "")
+            ]
             table.append(("  at half the time step", *cells))
     heads = [_head(one) for one in summary["parameters"]]
     columns = [part for head in heads for part in (head, f"from {reference}")]
@@ -72,10 +82,10 @@ def _head(parameter: Mapping[str, Any]) -> str:
     return f"d/d {parameter['name']}" + (f" ({', '.join(entries)})" if entries else "")
 
 
-def _slope(found: Mapping[str, Any], name: str, digits: int | None = None) -> str:
-    """A derivative, with the digits that half the time step leaves (one at least) where that is known."""
+def _slope(found: Mapping[str, Any], name: str, digits: int | None) -> str:
+    """A derivative, with so many digits where they are limited."""
     value = found["gradient"].get(name)
-    kept = 8 if digits is None else min(max(digits, 1), 8)
+    kept = _MOST if digits is None else digits
     if isinstance(value, Mapping):
         return f"norm {value['norm']:.{kept}g}"
     if isinstance(value, list):

@@ -8,7 +8,8 @@ how many pairs there are, and nothing of the past is kept but the pairs that dif
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -69,10 +70,8 @@ class Stretch:
         rows = last - self.first + 1
         if rows >= self.rows:
             return self
-        cut = {
-            name: {run: values[:rows] for run, values in getattr(self, name).items()}
-            for name in ("separation", "energy", "overridden", "furthest", "nearest", "bound", "ambiguous")
-        }
+        # whatever has a value for each row, in an array or in a dictionary of arrays, and nothing else
+        cut = {one.name: _first_rows(getattr(self, one.name), rows) for one in fields(self)}
         doubts = {run: doubt.where(doubt.step <= last) for run, doubt in self.doubts.items()}
         flips = [flip for flip in self.flips if flip.step <= last]
         # a run that failed within these rows has no separation at the last of them; A has rows up to its end
@@ -80,15 +79,16 @@ class Stretch:
             run: word if np.isnan(cut["separation"].get(run, np.zeros(rows))[-1]) else ""
             for run, word in self.failed.items()
         }
-        return replace(
-            self,
-            **cut,
-            bits=self.bits[:rows],
-            cross=self.cross[:rows],
-            flips=flips,
-            doubts=doubts,
-            failed=failed,
-        )
+        return Stretch(**{**cut, "flips": flips, "doubts": doubts, "failed": failed})
+
+
+def _first_rows(value: Any, rows: int) -> Any:
+    """The first rows of an array, or of each array of a dictionary; anything else as it is."""
+    if isinstance(value, np.ndarray):
+        return value[:rows]
+    if isinstance(value, dict):
+        return {name: _first_rows(one, rows) for name, one in value.items()}
+    return value
 
 
 def lockstep(

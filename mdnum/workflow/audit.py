@@ -136,7 +136,9 @@ def audit(
         for check in _checks(record, subject):
             told(0, 0, {"phase": check.name})
             try:
-                part = _in_units(_ask(check, subject, told), subject.units)
+                part = _in_units(
+                    _repeatable(_ask(check, subject, told), subject, record.parts), subject.units
+                )
             except KeyboardInterrupt:
                 if not record.parts:
                     raise
@@ -288,6 +290,14 @@ def _internal(timestep: float | None, units: Units) -> float | None:
     if not timestep > 0:
         raise InputError(f"a time step of {timestep:g}; expected one above 0", remedy="Correct --timestep")
     return timestep * units.time_factor / (1000.0 if units.time == "ps" else 1.0)
+
+
+def _repeatable(part: Part, subject: CalculatorSubject, before: Sequence[Part]) -> Part:
+    """A part with the finding that one question has had two answers, where no part has it yet."""
+    told = {one["code"] for each in (*before, part) for one in each.findings}
+    if "NOT_REPEATABLE" in told:
+        return part
+    return replace(part, findings=[*subject.ledger.findings(subject.kT), *part.findings])
 
 
 def _ask(check: Check, subject: CalculatorSubject, told: Log) -> Part:

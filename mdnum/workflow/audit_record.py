@@ -197,10 +197,13 @@ def open_again(path: str | Path, calculator: Any, load: Callable[[Any], Loaded])
         InputError: the calculator was no words and is not given, or is another.
     """
     folder = RunFolder.open(path)
-    folder.world = "audit"
-    state = folder.load_checkpoint()
+    state = folder.load_checkpoint() if folder.world == "audit" or folder.has_checkpoint() else {}
     if "audit" not in state:
-        raise FolderError("holds no audit", remedy="Resume it with the verb that made it", where=str(path))
+        # a run, and an examination of lists, are resumed by the verb that made them; the rest is done anew
+        goes_on = manifest.resumable(folder.path)
+        remedy = f"Resume it with `mdnum {folder.verb} --resume {path}`" if goes_on else "Begin a new audit"
+        raise FolderError("holds no audit", remedy=remedy, where=str(path))
+    folder.world = "audit"
     _told_by(folder, state)
     words = state["audit"]
     if calculator is None and words is None:

@@ -20,14 +20,14 @@ Progress = Callable[[int, int, dict[str, Any]], None]
 FEW_STEPS = 500
 #: What a ball offers in place of a question about molecular dynamics.
 OF_A_BALL = {
-    "--processes": "whether a ball's bits depend on the program around it is shown by "
+    "--processes": "Whether a ball's bits depend on the program around it is shown by "
     "`mdnum ball --demo determinism`",
-    "--forecast": "how far each contact is from another step is the margin that `mdnum ball` records",
-    "--benign": "a ball has no ensemble to be consistent with; --vary says how far the heights part",
-    "--minimal": "a ball's decisions are taken back one at a time: --vary contact=STEP:BALL",
-    "--pin": "a ball's decisions are taken back one at a time: --vary contact=STEP:BALL",
-    "--no-back": "a ball is run under either run's decisions always; --no-counterfactual leaves both out",
-    "--no-lyapunov": "a ball has no tangent run to leave out",
+    "--forecast": "How far each contact is from another step is the margin that `mdnum ball` records",
+    "--benign": "A ball has no ensemble to be consistent with; --vary says how far the heights part",
+    "--minimal": "A ball's decisions are taken back one at a time: --vary contact=STEP:BALL",
+    "--pin": "A ball's decisions are taken back one at a time: --vary contact=STEP:BALL",
+    "--no-back": "A ball is run under either run's decisions always; --no-counterfactual leaves both out",
+    "--no-lyapunov": "A ball has no tangent run to leave out",
 }
 
 

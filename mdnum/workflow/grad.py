@@ -27,7 +27,7 @@ _STARTS = {
 _HALF = {
     "what": "half the time step",
     "why": "the gradient over the same time in twice as many steps: the digits that hold",
-    "how": "no --no-half-step",
+    "how": "leave out --no-half-step",
 }
 
 
@@ -133,10 +133,12 @@ class Asked:
 def _molecules(
     system: System, asked: Asked, out: str | Path | None, report: bool, progress: Progress | None
 ) -> GradResult:
+    from mdnum.gradients.diagnose.trust import no_half_step
     from mdnum.workflow import grad_methods, grad_record
 
     began = time.perf_counter()
     word, problem, names = _problem(system, asked)
+    impossible = no_half_step(problem.simulation)
     plan = grad_methods.plan(problem, names, asked.methods, asked.replicas)
     also = grad_methods.further(asked.also)
     folder = opened(system, "grad", out, "grad")
@@ -151,7 +153,7 @@ def _molecules(
                 "left_out": [
                     *_shorter(system, asked.steps, problem.steps),
                     *([] if asked.replicas or found.trust is None else [_STARTS]),
-                    *([] if asked.half_step or found.trust is None else [_HALF]),
+                    *([] if asked.half_step or found.trust is None or impossible else [_HALF]),
                     *grad_methods.not_asked(also, found),
                     *plan.left_out,
                 ],

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from ase import Atoms
@@ -11,6 +13,7 @@ from audit.planted import crystal, subject
 from audit.test_invariance import codes
 from audit.test_state import at_cutoff
 
+import mdnum
 from mdnum.audit.crowd_words import reach, units_of
 from mdnum.audit.forces import Forces
 from mdnum.audit.invariance import Invariance
@@ -85,8 +88,8 @@ def test_an_energy_in_single_precision_is_told_and_one_that_loses_kT_is_warned_o
     assert set(found.values()) == {"warning"} and not {"FORCES_NOT_GRADIENT", "ENERGY_STEP"} & set(found)
 
 
-def seeded(kind: type[planted.Drops], share: float) -> type[planted.Drops]:
-    return type("Drops", (kind,), {"share": share, "rng": np.random.default_rng(7)})
+def seeded(kind: type[planted.Good], share: float, seed: int = 7) -> type[Any]:
+    return type(kind.__name__, (kind,), {"share": share, "rng": np.random.default_rng(seed)})
 
 
 def test_a_pair_that_is_left_out_now_and_then_is_the_first_thing_said():
@@ -101,10 +104,47 @@ def test_a_pair_that_is_left_out_now_and_then_is_the_first_thing_said():
 
 @pytest.mark.parametrize("seed", range(3))
 def test_one_call_in_fifty_is_chance_and_no_memory(seed: int):
-    make = seeded(planted.Drops, 0.02)
-    make.rng = np.random.default_rng(seed)
-    found = codes(State(at_cutoff)(subject(make)))
+    found = codes(State(at_cutoff)(subject(seeded(planted.Drops, 0.02, seed))))
     assert found["NOT_REPEATABLE"] == "error" and "STALE_STATE" not in found
+
+
+@pytest.mark.parametrize("kind", [planted.Drops, planted.Hits])
+@pytest.mark.parametrize("check", ["forces", "invariance"])
+@pytest.mark.parametrize("seed", range(2))
+def test_one_call_in_fifty_is_found_by_whatever_asks(kind, check: str, seed: int, tmp_path):
+    make = seeded(kind, 0.02, seed)
+    asked = mdnum.audit_calculator(make, crystal(), checks=check, out=tmp_path / "out", report=False)
+    found = {one["code"]: one["severity"] for one in asked.findings}
+    assert found["NOT_REPEATABLE"] == "error"
+    assert asked.summary["headline"].endswith("as it is: the same question has another answer each time.")
+    if kind is planted.Hits:
+        assert make.hits > 1
+
+
+@pytest.mark.parametrize("make", [planted.Good, planted.HardEdge, planted.Single, planted.OldPairs])
+def test_what_is_asked_again_is_little_and_has_one_answer(make):
+    asked = subject(make)
+    for check in (Invariance(), Forces()):
+        check(asked)
+    assert not asked.ledger.chance.differ and not asked.ledger.findings(asked.kT)
+    assert asked.ledger.chance.times <= (
+        0 if make in (planted.Good, planted.Single) else 0.1 * asked.meter.calls
+    )
+
+
+def test_a_direction_that_cannot_tell_is_no_comfort():
+    """A rough energy, always the same for the same positions, beside forces that are smooth."""
+
+    class Rough(planted.Good):
+        def extra(self, atoms, energy, forces):
+            return energy + 1e-3 * np.sin(1e9 * float(atoms.positions[3, 0])), forces
+
+    part = Forces()(subject(Rough))
+    # atom 3 is moved along x, and with all others in three ways; chance may let one of them tell
+    assert codes(part) == {"NOISE_FLOOR": "warning"}
+    assert part.numbers["could_not_tell"] > 1
+    assert f"{part.numbers['could_not_tell']} of 15 directions could not tell" in part.says
+    assert float(part.says.partition("to within ")[2].split()[0]) < 0.1 * part.numbers["rms_force"]
 
 
 def test_parameters_by_order_of_appearance_are_no_molecules():

@@ -45,6 +45,13 @@ def test_the_same_program_is_the_same():
     assert found.verdict.word == "same"
 
 
+def test_every_series_ends_at_the_last_step_wherever_the_stretches_end():
+    """A's stretches are as long as its program makes them: no 37 steps."""
+    a = build("argon/crystal-108")
+    found = fork(Twin(a, moved(a, 1e-6), "start"), 37, back=True, repeats=0)
+    assert {name: len(values) for name, values in found.series.items()} == dict.fromkeys(found.series, 38)
+
+
 def test_a_horizon_too_short_is_open():
     a = build("argon/crystal-108")
     found = fork(Twin(a, moved(a, 1e-6), "start"), 120, split=0.03, repeats=0)

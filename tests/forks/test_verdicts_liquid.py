@@ -102,5 +102,7 @@ def test_at_the_usual_cutoff_chaos_would_have_done(forks):
 
     With 864 atoms and a fifth of the time step it is 0.8.
     """
-    assert set(words(forks["usual"])) <= {"bystander", "undecided"}
+    found = words(forks["usual"])
+    # bystander at two of the three starts, where no pair of 6 is delayed; at the third 6 of 16 are
+    assert set(found) <= {"bystander", "undecided"} and found.count("bystander") >= 1
     assert worth(forks["usual"]) < 1.5

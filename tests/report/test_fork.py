@@ -66,7 +66,7 @@ def test_the_page_states_what_the_folder_holds(page, folder):
     split = folder.summary["split"]
     for words in (
         "argon/synthetic: reduction=exact", "The flip at step 400 is the cause", f"split at step {split:,}",
-        "under A’s decisions not, and so on.", "The flips were worth &gt; 3.58 nats: growth rate",
+        "under A’s decisions not, and so on.", "The flips were worth &gt; 3.58 e-foldings: growth rate",
         "Nothing but exponentials.",
         "108 atoms, 1,500 steps of 0.01 τ",
         "Pair 3–4 enters its cutoff in run B alone at step 400, 1.0 × 10⁻¹⁰ σ from it",
@@ -76,7 +76,7 @@ def test_the_page_states_what_the_folder_holds(page, folder):
         "doubles in 34.7 steps",
         f"arithmetic decisions from A from B A its own is A {split:,} B its own {split:,} is B",
         f"B A’s &gt; 1,500 {split - 1:,}",
-        "decisions &gt; 179 steps &gt; 3.58 nats –", "arithmetic – −1 step −0.0200 nats",
+        "decisions &gt; 179 steps &gt; 3.58 e-foldings –", "arithmetic – −1 step −0.0200 e-foldings",
         "up to step 1,500: no decision is ambiguous",
         "up to step 70; after it 2,860 ambiguous decisions at 1,430 steps, first pair 5–8: "
         "margin +1.5 × 10⁻⁷, bound 6.0 × 10⁻⁶", "all of them are in ambiguous_pairs.parquet",

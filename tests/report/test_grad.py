@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,8 +11,9 @@ from report.synthetic_grad import NAMES, RATE, STEPS, WEIGHTS, summary, write
 from report.test_html import Tags
 
 from mdnum import report
+from mdnum.cli.grad_print import print_rows
 from mdnum.report.fork.question import load
-from mdnum.report.grad import figures, findings
+from mdnum.report.grad import figures, findings, sections
 from mdnum.report.grad.words import apart, resolved
 from mdnum.store import RunFolder
 
@@ -154,6 +156,63 @@ def test_the_half_time_step_stands_beside_and_near_misses_below(tmp_path):
     assert "3–5 77 3.0 × 10⁻⁵ 8.0 × 10⁻⁵ 0.10 1.9" in text.replace("\N{NO-BREAK SPACE}", " ")
     assert resolved(43517.0, 2) == "4.4 × 10⁴".replace(" ", "\N{NO-BREAK SPACE}")
     assert resolved(0.0444, 1) == "0.04" and resolved(-4.898, 0) == "−5" and resolved(22.06, 2) == "22"
+
+
+def open_trust(*unseen: str, unknown: tuple[str, ...] = ()) -> dict[str, Any]:
+    """Trust that is undecided: half the time step was not made, and these limits were not looked at."""
+    limits = [{"what": what, "horizon": None, "reached": False, "says": "Not looked at."} for what in unseen]
+    more = {"half": {}, "digits": {}, "near": None, "says": "Undecided."}
+    unknown = unknown or unseen
+    return {**TRUST, "verdict": "undecided", "limited_by": "", "limits": limits, "unknown": unknown, **more}
+
+
+def test_two_digits_are_told_where_nobody_knows_how_many_hold(tmp_path, capsys):
+    methods = [
+        {**one, "gradient": {**one["gradient"], NAMES[0]: -0.0086653366}} for one in summary()["methods"]
+    ]
+    trust = open_trust("time step", "near miss")
+    folder = write(tmp_path / "run", trust=trust, methods=methods)
+    _, run = load(folder, "grad", "grad")
+    assert "epsilon = −0.0087 σ²/ε (digits not known)" in findings.judge(run).headline
+    print_rows(folder.summary)
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "-0.0087 (digits not known)" in printed and "-0.00866" not in printed
+    report.write(folder.path)
+    page = (folder.path / "report.html").read_text(encoding="utf-8")
+    assert "digits not known" in page and "0.00866" not in page
+    # of a question that is none about trust they are told in full
+    plain = write(tmp_path / "plain", methods=methods)
+    print_rows(plain.summary)
+    assert "-0.0086653366" in capsys.readouterr().out
+
+
+def test_what_is_undecided_says_what_to_do(tmp_path):
+    def remedy(name, trust, *left):
+        ways = {"left_out": [{"what": what, "why": "", "how": "x"} for what in left]}
+        return judged(tmp_path / name, trust=trust, **ways)["UNDECIDED"].remedy
+
+    both = ("time step", "near miss")
+    assert remedy("a", open_trust(*both), "half the time step") == "Leave out --no-half-step."
+    noisy = remedy("b", open_trust(*both, "standard error", unknown=both))
+    assert "--set dynamics.kind=nve, or" in noisy and "--replicas 8" in noisy
+    starts = remedy("c", open_trust("standard error", unknown=("whether other starts agree",)))
+    assert starts == "Look at other starts with --replicas 8."
+    assert "fewer parameters" in remedy("d", open_trust("near miss"))
+    alone = {"reference": "symmetric", "methods": summary()["methods"][:1], "comparisons": []}
+    found = judged(tmp_path / "e", trust=open_trust("near miss"), left_out=[], **alone)
+    assert "add event-aware" in found["UNDECIDED"].remedy.lower()
+
+
+def test_no_share_is_told_of_a_derivative_without_a_digit(tmp_path):
+    folder = write(tmp_path / "run", trust={**TRUST, "digits": {NAMES[0]: 2, NAMES[1]: 0}})
+    _, run = load(folder, "grad", "grad")
+    told = findings.judge(run)
+    few = next(one for one in told.findings if one.code == "FEW_FLIPS")
+    assert "25 %" not in few.text and "No digit of it holds" in few.text and "0–1 at step 1" in few.text
+    assert not any("100 %" in line for line in told.evidence)
+    assert any("10 % of that by potential.epsilon" in line for line in told.evidence)
+    rows = {row["name"]: row["parts"] for row in sections.shares(run)}
+    assert rows[NAMES[1]] == ["–"] * 3 and rows[NAMES[0]][0] == "+90.0 %"
 
 
 def test_a_ball_far_from_its_closed_form_is_told(tmp_path):

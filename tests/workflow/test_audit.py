@@ -216,15 +216,19 @@ def test_what_is_largely_unasked_is_not_safe():
     # nearly all of its ways is enough, nothing at all is not
     nearly = replace(parts[1], asked=50, possible=52)
     assert judge("x", [parts[0], nearly, *parts[2:]]).run == "yes"
-    judged = judge("x", parts[:3], ["smoothness", *REST])
-    assert (judged.run, judged.differentiate) == ("as far as asked", "as far as asked")
     nothing = judge("x", [], ["smoothness", *REST])
     assert nothing.run == nothing.differentiate == "not asked" and "safe" not in nothing.headline
     assert judge("x", parts[1:2], ["smoothness", *REST]).differentiate == "not asked"
+    # nothing is safe as long as a check that it needs has not begun
+    judged = judge("x", [few, *parts[:1]], ["smoothness", *REST])
+    assert (judged.run, judged.differentiate) == ("not asked", "not asked")
     assert judged.headline == (
-        "x is safe as far as asked (curl not asked, state not asked, dynamics not asked): "
-        "3 checks found nothing."
+        "x: nothing can be said yet (11 of 52 ways of invariance, 1 of 1 ways of smoothness asked; "
+        "forces, curl, state, dynamics not asked)."
     )
+    judged = judge("x", [few, *parts[:1], *parts[2:4]], ["smoothness", *REST])
+    assert (judged.run, judged.differentiate) == ("not asked", "yes")
+    assert "safe to differentiate" in judged.headline and "run" not in judged.headline
     # what was found stands, and so does what it does not rest on
     judged = judge("x", [part("curl", ("CURL", "warning")), few])
     assert judged.run == "with care" and "11 of 52" in judged.headline

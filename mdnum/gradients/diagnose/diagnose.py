@@ -12,7 +12,7 @@ from mdnum.gradients.base import Gradient, Method, Problem, Progress, independen
 from mdnum.gradients.diagnose.agreement import agreement
 from mdnum.gradients.diagnose.detective import detective
 from mdnum.gradients.diagnose.edges import edges
-from mdnum.gradients.diagnose.flips import flips
+from mdnum.gradients.diagnose.flips import flips, sentence
 from mdnum.gradients.diagnose.growth import GrowthWatch, gain
 from mdnum.gradients.diagnose.near import Near
 from mdnum.gradients.diagnose.passes import Passed, passed
@@ -144,6 +144,8 @@ def diagnose(
             progress=progress,
         ),
     )
+    if "flips" in found and "trust" in found:
+        found["flips"] = replace(found["flips"], says=sentence(found["flips"], found["trust"].digits))
     attempt(
         "spectrum", lambda: spectrum(problem, tape=None if made is None else made.tape, progress=progress)
     )

@@ -9,7 +9,8 @@ other.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -93,7 +94,7 @@ def flips(
     }  # a scalar has the empty index
     subject = np.concatenate([one.subject for one in ledgers]) if ledgers else np.zeros((0, 2), np.int64)
     margin, bound = column([one.margin for one in ledgers]), column([one.bound for one in ledgers])
-    return Flips(
+    result = Flips(
         column([one.step for one in ledgers], np.int64)[order],
         subject[order, 0],
         subject[order, 1],
@@ -109,8 +110,9 @@ def flips(
         whole,
         {word: _shares(float(smooth[k]), each[:, k], entered, whole[word]) for k, word in enumerate(words)},
         skipped,
-        _sentence(words, each, smooth, grazing),
+        "",
     )
+    return replace(result, says=sentence(result))
 
 
 def _shares(smooth: float, each: np.ndarray, entered: np.ndarray, total: float) -> dict[str, float]:
@@ -118,19 +120,29 @@ def _shares(smooth: float, each: np.ndarray, entered: np.ndarray, total: float) 
     return {word: part / total if total != 0 else float("nan") for word, part in parts.items()}
 
 
-def _sentence(words: Sequence[str], each: np.ndarray, smooth: np.ndarray, grazing: np.ndarray) -> str:
-    if not len(each):
+def sentence(found: Flips, digits: Mapping[str, int] | None = None) -> str:
+    """What stands out, in a sentence; no share is told of a derivative of which no digit holds.
+
+    Args:
+        found: the contributions.
+        digits: digits that hold, by parameter, where they are known.
+    """
+    if not len(found):
         return "No pair crossed its cutoff."
     told = []
-    for k, word in enumerate(words):
-        parts = np.sort(np.abs(each[:, k]))[::-1]
+    for word, each in found.contribution.items():
+        if (digits or {}).get(word.partition("[")[0]) == 0:
+            told.append(f"what they make of the derivative by {word} is not told, since no digit of it holds")
+            continue
+        parts = np.sort(np.abs(each))[::-1]
         if not parts.any():
             told.append(f"flips add nothing to the derivative by {word}")
             continue
         half = int(np.searchsorted(np.cumsum(parts), 0.5 * parts.sum())) + 1
-        added, total = float(each[:, k].sum()), float(smooth[k] + each[:, k].sum())
+        added = float(each.sum())
+        total = found.smooth[word] + added
         share = f"{100 * added / total:.3g} % of" if total != 0 else f"{added:.3g} to"
         told.append(f"flips make {share} the derivative by {word}, half of that in weight {half} of them")
-    left = f" {int(grazing.sum())} grazed and were left out." if grazing.any() else ""
-    text = "; ".join(told)
-    return f"Of {len(each)} flips: {text}.{left}"
+    grazed = int(found.grazing.sum())
+    left = f" {grazed} grazed and were left out." if grazed else ""
+    return f"Of {len(found)} flips: {'; '.join(told)}.{left}"

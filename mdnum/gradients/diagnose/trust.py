@@ -156,8 +156,9 @@ def trust(
         )  # fmt: skip
         growth = grows.result(made.gradient)
     columns = sum(int(np.size(parameters.value(simulation, name))) for name in kept)
-    if near is not None and 48 * near.rows * simulation.atoms * columns > _MEMORY:
-        near = None
+    unseen = "" if near is not None else "they were not collected with the reverse pass"
+    if near is not None and (needed := 48 * near.rows * simulation.atoms * columns) > _MEMORY:
+        near, unseen = None, f"tangents by {columns} numbers would take {needed / 2**30:.3g} GiB at a time"
 
     def follow(one: Problem, word: str, at=at, each=None, watch=None) -> Horizons:
         def told(done: int, steps: int, phase: str) -> None:
@@ -176,17 +177,16 @@ def trust(
     shadow = shadow_of(simulation)
     other = follow(replace(problem, simulation=shadow.simulation), "its shadow", each=beside(1))
     apart = relative(own, other)
-    shorter, why = None, "not asked for"
-    if half_step and isinstance(simulation.integrator, Langevin):
-        why = "the noise of a thermostat is another at half the step, so that one run has no counterpart"
-    elif half_step:
+    shorter, why = None, no_half_step(simulation) or "not asked for"
+    if half_step and not no_half_step(simulation):
         shorter = _per_step(follow(halved(problem), "half the time step", 2 * at, beside(2)))
     steps = {} if shorter is None else relative(own, shorter)
     turns = None if near is None or shorter is None else near.turns(columns)
+    unseen = unseen or ("how far they may reach takes half the time step" if shorter is None else "")
     limits = [
         _rounding(at, apart, tolerance, shadow, first_difference(own, other)),
         _time_step(at, own, shorter, steps, tolerance, why),
-        _missed(problem, own, turns, made, tolerance, saltation),
+        _missed(problem, own, turns, unseen, made, tolerance, saltation),
         ambiguity(problem),
     ]
     scatter: dict[str, np.ndarray] = {}
@@ -206,6 +206,13 @@ def trust(
         verdict, horizon, limited, tuple(limits), unknown, tolerance, shadow.words, at, apart, steps, scatter,
         half, digits, turns, tuple(map(str, own.columns)), says,
     )  # fmt: skip
+
+
+def no_half_step(simulation: Simulation) -> str:
+    """Why a run cannot be compared with one at half the time step; "" where it can."""
+    if isinstance(simulation.integrator, Langevin):
+        return "the noise of a thermostat is another at half the step, so that one run has no counterpart"
+    return ""
 
 
 def verdict_of(
@@ -279,9 +286,16 @@ def _time_step(at, own: Horizons, shorter: Horizons | None, steps, tolerance: fl
 
 
 def _missed(
-    problem: Problem, own: Horizons, turns: Turns | None, made: Passed, tolerance: float, saltation: bool
+    problem: Problem,
+    own: Horizons,
+    turns: Turns | None,
+    unseen: str,
+    made: Passed,
+    tolerance: float,
+    saltation: bool,
 ) -> Limit:
-    """Where a turning point within reach of the cutoff has a term that weighs."""
+    """Where a turning point within reach of the cutoff has a term that weighs; `unseen` says why it was not
+    looked at."""
     if not np.any(np.asarray(problem.simulation.jumps())):
         return Limit(
             NEAR,
@@ -303,7 +317,7 @@ def _missed(
     if left is not None:
         return left
     if turns is None:
-        return Limit(NEAR, None, False, "How far pairs that turn around may reach takes half the time step.")
+        return Limit(NEAR, None, False, f"Pairs that turn around near it were not looked at: {unseen}.")
     kept = turns.within
     size = np.concatenate(
         [np.full(part.shape[1], np.linalg.norm(part[-1])) for part in own.by_name().values()]
@@ -318,8 +332,7 @@ def _missed(
         return Limit(NEAR, problem.steps, False, f"No pair turned around within reach of its cutoff: {near}.")
     heavy, column = np.unravel_index(int(np.argmax(share)), share.shape)
     gap, held, count = turns.gap[heavy], size[column], int(kept.sum())
-    unseen = "unseen between two steps, " if turns.unseen[heavy] else ""
-    side = "short of" if gap > 0 else f"{unseen}beyond"
+    side = "short of" if gap > 0 else f"{'unseen between two steps, ' * bool(turns.unseen[heavy])}beyond"
     part = f"{100 * share[heavy, column]:.3g} % of" if held else f"{turns.term[heavy, column]:.3g} to"
     told = (
         f"{count} pair{'' if count == 1 else 's'} turned around within reach of the cutoff; the heaviest, "

@@ -150,7 +150,7 @@ def _sets(run: Question) -> Iterator[str]:
     if before is not None and before["r2"] >= _FITS and before["rate"] > 0:
         yield f"Before the sets differ the separation grows {_rate(run, before)}."
     if after is not None and after["r2"] >= _FITS and after["rate"] > 0:
-        yield f"From then on it grows {_rate(run, after)}{_hurried(before, after)}."
+        yield f"From then on it grows {_rate(run, after)}{_accelerated(before, after)}."
 
 
 def _positions(run: Question) -> Iterator[str]:
@@ -254,17 +254,16 @@ def _rate(run: Question, found: Any) -> str:
     return f"by a factor e in {told} ({count(found['frames'])} frames)"
 
 
-def _hurried(before: Any, after: Any) -> str:
+def _accelerated(before: Any, after: Any) -> str:
     if before is None or before["r2"] < _FITS or before["rate"] <= 0:
         return ""
     ratio = after["rate"] / before["rate"]
     if ratio > _ALIKE:
-        return (
-            f", {number(ratio, 2)} times as fast: as it would if the flip hurried it, and as it may by chance"
-        )
+        fast = f"{number(ratio, 2)} times as fast"
+        return f", {fast}: as it would if the flip accelerated it, and as it may by chance"
     if ratio < 1 / _ALIKE:
-        return ", slower than before: nothing here says that a flip hurried it"
-    return ", as before: nothing here says that a flip hurried it"
+        return ", slower than before: nothing here says that a flip accelerated it"
+    return ", as before: nothing here says that a flip accelerated it"
 
 
 def cannot(run: Question) -> Iterator[str]:

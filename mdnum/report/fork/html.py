@@ -111,8 +111,8 @@ def _key_figures(run: ForkFolder) -> Iterator[tuple[str, str, str]]:
 
 
 def _worth(run: ForkFolder) -> tuple[str, str]:
-    """How much later the runs would have split without the flips, in nats; and what that is."""
-    what = "nats: growth rate × steps gained"
+    """How much later the runs would have split without the flips, in e-foldings; and what that is."""
+    what = "e-foldings: growth rate × steps gained"
     nats = run.summary.get("nats")
     if nats is None and run.word == "cause":
         # no split in sight: the share is at least what was followed

@@ -107,7 +107,7 @@ def shares(run: ForkFolder) -> list[dict[str, Any]]:
         more = "> " if share["at_least"] else ""
         lines = [f"{more}{count(share['steps'])} {'step' if abs(share['steps']) == 1 else 'steps'}"]
         if share["nats"] is not None:
-            lines.append(f"{more}{number(share['nats'], 3)} nats")
+            lines.append(f"{more}{number(share['nats'], 3)} e-foldings")
         rows.setdefault(share["what"], {})[share["reference"]] = lines
     return [{"what": what, **{name: texts.get(name, ["–"]) for name in "AB"}} for what, texts in rows.items()]
 

@@ -10,9 +10,9 @@ import numpy as np
 
 from mdnum.report.fork.findings import Verdict
 from mdnum.report.fork.question import Question, verdict
-from mdnum.report.grad.words import apart, by, digits_of, size, slope, slope_unit
+from mdnum.report.grad.words import apart, by, digits_note, digits_of, size, slope, slope_unit
 from mdnum.report.verdict import Finding
-from mdnum.report.words import count, listed, many, number, percent
+from mdnum.report.words import count, heading, listed, many, number, percent
 
 #: Share of a derivative above which single flips decide it, and how many of them count as single.
 _HEAVY, _SINGLE = 0.2, 3
@@ -55,8 +55,8 @@ def _headline(run: Question) -> str:
     for one in summary["parameters"][:3]:
         short = one["name"].rpartition(".")[2]
         value = f"{slope(summary, reference, one['name'], 4)} {slope_unit(summary, one)}".rstrip()
-        none = " (no digit holds)" if digits_of(summary, one["name"]) == 0 else ""
-        parts.append(f"d {summary['loss']['word']} / d {short} = {value}{none}")
+        note = digits_note(summary, one["name"])
+        parts.append(f"d {summary['loss']['word']} / d {short} = {value}{f' ({note})' if note else ''}")
     trust = summary.get("trust")
     end = {
         "trusted": "; trusted",
@@ -85,7 +85,7 @@ def _evidence(run: Question) -> Iterator[str]:
     told = [
         f"{percent(round(abs(parts['pair enters'] + parts['pair leaves']), 6))} of that by {name}"
         for name, parts in added.items()
-        if None not in parts.values()
+        if None not in parts.values() and digits_of(summary, name.partition("[")[0]) != 0
     ]
     if told:
         yield f"Flips on the way make {listed(told)}."
@@ -170,17 +170,35 @@ def _short(run: Question) -> Iterator[Finding]:
             f"Ask for a shorter horizon, {_FURTHER[trust['limited_by']]}.",
         )
     elif trust and judged == "undecided":
-        unknown = trust.get("unknown") or ["what half the time step gives"]
-        starts = any("other starts" in one for one in unknown)
         yield Finding(
             "UNDECIDED",
             "warning",
             "whether to trust it is undecided",
             trust["says"],
-            "Average over starts with --replicas."
-            if starts
-            else "Look at what is not known, or ask without it.",
+            _remedy(run, trust),
         )
+
+
+def _remedy(run: Question, trust: Mapping[str, Any]) -> str:
+    """What to do about each thing that was not looked at."""
+    if "limits" not in trust or "verdict" not in trust:
+        return "Ask again: this folder is from before half the time step was looked at."
+    unseen = {one["what"] for one in trust["limits"] if one["horizon"] is None}
+    steps = []
+    if any(one["what"] == "half the time step" for one in run.summary["left_out"]):
+        steps.append("leave out --no-half-step")
+    elif "time step" in unseen:
+        nve = "take the thermostat off with --set dynamics.kind=nve"
+        steps.append(nve + ", or average over starts with --replicas 8" * (not _replicas(run)))
+    if "near miss" in unseen and by(run, "event-aware") is None:
+        steps.append("add event-aware to --methods")
+    elif "near miss" in unseen and "time step" not in unseen:
+        steps.append("ask by fewer parameters in --wrt")
+    if any("other starts" in one for one in trust["unknown"]) and not any("--replicas" in s for s in steps):
+        steps.append("look at other starts with --replicas 8")
+    if any("too many entries" in one for one in trust["unknown"]):
+        steps.append("name parameters of few entries alone in --wrt")
+    return f"{heading('; '.join(steps))}." if steps else ""
 
 
 def _few_flips(run: Question) -> Iterator[Finding]:
@@ -195,17 +213,24 @@ def _few_flips(run: Question) -> Iterator[Finding]:
         if not len(heavy):
             continue
         first = heavy[0]
+        none = digits_of(run.summary, name.partition("[")[0]) == 0
         pair = f"{table['i'][first]}–{table['j'][first]} at step {count(int(table['step'][first]))}"
         speed = number(abs(float(table["radial_speed"][first])), 2)
+        crosses = f"the pair {pair}, which crosses with a radial speed of {speed}"
         how = (
             f"{many(len(heavy), 'flip')} add{'s' * (len(heavy) == 1)} more than {percent(_HEAVY)} of it each"
         )
+        share = percent(abs(float(added[first]) / total))
         yield Finding(
             "FEW_FLIPS",
             "info",
             f"few flips decide the derivative by {name}",
-            f"{how}: first the pair {pair}, which crosses with a radial speed of {speed} and adds "
-            f"{percent(abs(float(added[first]) / total))}. One run then says little of another.",
+            (
+                f"No digit of it holds; the heaviest is {crosses}."
+                if none
+                else f"{how}: first {crosses} and adds {share}."
+            )
+            + " One run then says little of another.",
             "" if _replicas(run) else "Average over starts with --replicas.",
         )
 

@@ -10,7 +10,16 @@ from mdnum.report.fork.findings import Verdict
 from mdnum.report.fork.question import Question, declared, load, size_of, took, write_page
 from mdnum.report.grad import figures as drawn
 from mdnum.report.grad import findings, sections
-from mdnum.report.grad.words import EXACT, by, difference, half, slope, slope_unit, value_text
+from mdnum.report.grad.words import (
+    EXACT,
+    by,
+    difference,
+    digits_note,
+    half,
+    slope,
+    slope_unit,
+    value_text,
+)
 from mdnum.report.words import count, heading, number
 from mdnum.store import RunFolder
 
@@ -67,7 +76,12 @@ def _key_figures(run: Question) -> Iterator[tuple[str, str, str]]:
     )
     reference = by(run, summary["reference"])
     for one in summary["parameters"][:4]:
-        yield f"by {one['name']}", slope(summary, reference, one["name"], 4), slope_unit(summary, one)
+        small = [slope_unit(summary, one), digits_note(summary, one["name"])]
+        yield (
+            f"by {one['name']}",
+            slope(summary, reference, one["name"], 4),
+            ", ".join(part for part in small if part),
+        )
     details = {} if reference is None else reference["details"]
     if "crossings" in details:
         yield "Flips on the way", count(details["crossings"]), f"{count(details['grazing'])} of them grazing"
@@ -88,13 +102,19 @@ def _methods(run: Question) -> Iterator[dict[str, Any]]:
         cells = [(number(summary["exact"].get(one["name"]), 6), ("", "")) for one in summary["parameters"]]
         yield {"method": "closed form", "says": EXACT, "cells": cells}
     for one in rows:
+        first = one["method"] == summary["reference"]
         cells = [
-            (slope(summary, one, each["name"]), difference(run, one["method"], each["name"])[:2])
+            (
+                slope(summary, one, each["name"]),
+                (digits_note(summary, each["name"]),)
+                if first
+                else difference(run, one["method"], each["name"])[:2],
+            )
             for each in summary["parameters"]
         ]
         yield {"method": one["method"], "says": one["says"], "cells": cells}
         shorter = half(summary)
-        if shorter is not None and one["method"] == summary["reference"]:
+        if shorter is not None and first:
             cells = [(slope(summary, shorter, each["name"]), ("", "")) for each in summary["parameters"]]
             yield {"method": shorter["method"], "says": shorter["says"], "cells": cells}
 

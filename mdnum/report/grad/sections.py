@@ -9,7 +9,7 @@ import numpy as np
 
 from mdnum.report.browse import Browse, Column, plain_rows
 from mdnum.report.fork.question import Question
-from mdnum.report.grad.words import apart, digits_of, resolved, slope_unit
+from mdnum.report.grad.words import apart, digits_of, one_slope, slope_unit
 from mdnum.report.words import count, number, typeset
 
 #: Rows of the table of flips that the page carries.
@@ -35,27 +35,23 @@ def shares(run: Question) -> list[dict[str, object]]:
     found = run.summary.get("flips") or {}
     rows = []
     for name, parts in found.get("share", {}).items():
+        parameter = name.partition("[")[0]
         unit = next(
-            (
-                slope_unit(run.summary, one)
-                for one in run.summary["parameters"]
-                if one["name"] == name.partition("[")[0]
-            ),
+            (slope_unit(run.summary, one) for one in run.summary["parameters"] if one["name"] == parameter),
             "",
         )
         rows.append(
             {
                 "name": name,
-                "parts": [_percent(parts[key]) for key in ("smooth", "pair enters", "pair leaves")],
-                "total": f"{_total(run, name, found['total'][name])} {unit}".rstrip(),
+                "parts": [
+                    # of a derivative without a digit a share is none
+                    _percent(None if digits_of(run.summary, parameter) == 0 else parts[key])
+                    for key in ("smooth", "pair enters", "pair leaves")
+                ],
+                "total": f"{one_slope(run.summary, parameter, found['total'][name], 4)} {unit}".rstrip(),
             }
         )
     return rows
-
-
-def _total(run: Question, name: str, value: float) -> str:
-    held = digits_of(run.summary, name.partition("[")[0])
-    return number(value, 4) if held is None else resolved(value, min(held, 4))
 
 
 def _percent(share: float | None) -> str:
@@ -79,7 +75,7 @@ def edges(run: Question) -> Iterator[dict[str, Any]]:
                 "beyond": repr(side["beyond"]),
                 "decision": f"pair {side['i']}–{side['j']} at step {count(side['step'])}",
                 "gradients": [
-                    number(side[where].get("event-aware"), 6)
+                    one_slope(run.summary, one["name"], side[where].get("event-aware"), 6)
                     for where in ("gradient_inside", "gradient_beyond")
                 ],
             }

@@ -11,6 +11,8 @@ from mdnum.report.words import MINUS, number, percent, power
 
 #: Which derivative a closed form gives.
 EXACT = "the derivative of the exact motion"
+#: Digits that are told where nobody knows how many hold.
+_UNKNOWN = 2
 
 
 def by(run: Question, method: str) -> Mapping[str, Any] | None:
@@ -32,6 +34,26 @@ def size(value: Any) -> float | None:
 def digits_of(summary: Mapping[str, Any], name: str) -> int | None:
     """Digits of a derivative that half the time step leaves; None where that was not looked at."""
     return ((summary.get("trust") or {}).get("digits") or {}).get(name)
+
+
+def unknown_digits(summary: Mapping[str, Any], name: str) -> bool:
+    """Whether a derivative belongs to a question about trust, and nobody knows how many digits of it hold."""
+    return bool(summary.get("trust")) and digits_of(summary, name) is None
+
+
+def held(summary: Mapping[str, Any], name: str, most: int) -> int | None:
+    """Digits that a derivative is told with, `most` at most; None where no question was about its trust."""
+    if unknown_digits(summary, name):
+        return min(_UNKNOWN, most)
+    known = digits_of(summary, name)
+    return None if known is None else max(min(known, most), 1)
+
+
+def digits_note(summary: Mapping[str, Any], name: str) -> str:
+    """What must be known beside the digits of a derivative; "" where they hold, or nobody asked."""
+    if unknown_digits(summary, name):
+        return "digits not known"
+    return "no digit holds" if digits_of(summary, name) == 0 else ""
 
 
 def half(summary: Mapping[str, Any]) -> Mapping[str, Any] | None:
@@ -56,14 +78,20 @@ def resolved(value: float | None, digits: int) -> str:
     )
 
 
+def one_slope(summary: Mapping[str, Any], name: str, value: float | None, digits: int) -> str:
+    """One number of a derivative by a parameter as text, `digits` at most."""
+    kept = held(summary, name, digits)
+    return number(value, digits) if kept is None else resolved(value, kept)
+
+
 def slope(summary: Mapping[str, Any], found: Mapping[str, Any] | None, name: str, digits: int = 6) -> str:
-    """A derivative as text, with the digits that half the time step leaves where that is known."""
+    """A derivative as text, with the digits that half the time step leaves."""
     if found is None or name not in found["gradient"]:
         return "–"
-    value, held = found["gradient"][name], digits_of(summary, name)
+    value = found["gradient"][name]
 
     def told(entry: float | None) -> str:
-        return number(entry, digits) if held is None else resolved(entry, min(held, digits))
+        return one_slope(summary, name, entry, digits)
 
     if isinstance(value, Mapping):
         return f"norm {told(value['norm'])}"

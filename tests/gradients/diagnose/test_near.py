@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 import numpy as np
@@ -132,7 +133,7 @@ def test_a_pair_that_is_inside_between_two_steps_alone_is_seen():
     assert turns.bend[0] == pytest.approx(speed**2 / closest, rel=0.01)
 
 
-def test_nothing_is_trusted_that_was_not_looked_at():
+def test_nothing_is_trusted_that_was_not_looked_at(monkeypatch):
     wide = problem(0.01, 0.01)
     found = trust(wide, NAMES, tolerance=0.03)
     assert found.verdict == "trusted" and found.says.startswith("Trusted over all 60 steps")
@@ -140,6 +141,10 @@ def test_nothing_is_trusted_that_was_not_looked_at():
     blind = trust(wide, NAMES, tolerance=0.03, half_step=False)
     assert blind.verdict == "undecided" and "rusted" not in blind.says and not blind.digits
     assert limit(blind, "time step").horizon is None and limit(blind, "near miss").horizon is None
+    # what was made is not what is missing
+    monkeypatch.setattr(sys.modules["mdnum.gradients.diagnose.trust"], "_MEMORY", 0)
+    large = limit(trust(wide, NAMES, tolerance=0.03), "near miss")
+    assert large.horizon is None and "half the time step" not in large.says and "GiB" in large.says
     # the third atom is inside for a while
     crossing = trust(problem(-0.02, 0.01), NAMES, tolerance=0.03, saltation=False)
     assert crossing.verdict == "limited" and crossing.limited_by == "flips left out"

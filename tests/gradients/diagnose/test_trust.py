@@ -13,12 +13,15 @@ from small_systems import LENNARD_JONES, crystal, make
 
 from mdnum.errors import InputError
 from mdnum.gradients import Problem
+from mdnum.gradients.diagnose.flips import sentence
 from mdnum.gradients.diagnose.horizons import Horizons, first_difference, horizons, spread
+from mdnum.gradients.diagnose.places import Flips
 from mdnum.gradients.diagnose.results import Limit
 from mdnum.gradients.diagnose.trust import (
     ambiguity,
     last_agreeing,
     last_below,
+    no_half_step,
     shadow_of,
     standard_error,
     trust,
@@ -90,6 +93,25 @@ def test_a_gradient_that_grew_is_not_trusted_before_other_starts_were_looked_at(
     assert verdict_of(several, 2000, True, 2880.0, ())[:3] == ("trusted", 2000, "")
     scattered = [*fine, Limit("standard error", 350, True, "passes the mean")]
     assert verdict_of(scattered, 2000, True, 2880.0, ())[:3] == ("limited", 350, "standard error")
+
+
+def test_flips_have_no_share_of_a_derivative_without_a_digit():
+    one = np.array([0.3, -1.3])
+    whole = np.zeros(2, np.int64)
+    sure = np.zeros(2, bool)
+    columns = (whole, whole, whole + 1, sure, one, one, sure, one, one, sure)
+    found = Flips(*columns, {"q": one, "p[0]": one}, {"q": 0.5, "p[0]": 0.5}, {}, {}, {}, "")
+    assert "200 % of the derivative by q" in sentence(found) and sentence(found).count("%") == 2
+    told = sentence(found, {"q": 0, "p": 3})
+    assert told.count("%") == 1 and "200 % of the derivative by p[0]" in told and "no digit" in told
+    assert sentence(found, {"q": 0, "p": 0}).count("%") == 0
+
+
+def test_half_the_time_step_of_a_thermostat_is_another_noise(problem):
+    assert not no_half_step(problem.simulation)
+    dynamics = {"kind": "langevin", "friction": 1.0, "timestep": 0.004, "temperature": 1.0, "seed": 3}
+    noisy = build(make(crystal(), LENNARD_JONES, QUINTIC, dynamics=dynamics))
+    assert "noise of a thermostat" in no_half_step(noisy)
 
 
 def test_the_standard_error_is_that_of_the_mean():
