@@ -54,6 +54,11 @@ class Boxes:
         """What somebody who relies on the boxes should know, in sentences."""
         return (_ONCE,) if self._models is not None and self._models.once else ()
 
+    @property
+    def own(self) -> bool:
+        """Whether boxes are read from the file itself, and may be others than MDAnalysis's."""
+        return self._matrix is not None or self._models is not None
+
     def box(self, ts: Any, number: int) -> Box:
         """The box of a timestep that is this frame of the file."""
         dimensions = ts.dimensions

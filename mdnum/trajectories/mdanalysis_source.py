@@ -300,6 +300,8 @@ def _has_no_times(trajectory: Any, said: list[str]) -> bool:
 
 def differing_box(trajectory: Any, boxes: Boxes) -> Iterator[str]:
     """A sentence on where MDAnalysis takes a box for another one than the file has, from two frames."""
+    if not boxes.own:
+        return
     worst, said = -1, ""
     for number in (0, trajectory.n_frames - 1):
         try:
@@ -323,6 +325,10 @@ def differing_box(trajectory: Any, boxes: Boxes) -> Iterator[str]:
                 f"frame {number} MDAnalysis puts {counts[0]:,} pairs of atoms closer than {_CLOSE:g} Å, "
                 f"the file's {counts[1]:,}."
             )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        # selections by place are made at the frame where the reader stands
+        trajectory[0]
     if said:
         yield said
 

@@ -526,7 +526,10 @@ def test_atoms_that_change_their_order_or_element_in_mid_file_end_it(tmp_path, k
 
 
 def test_where_a_box_is_another_than_that_of_mdanalysis_it_is_said_with_the_pairs_that_tell():
-    notes = open_trajectory(datafiles.DCD_TRICLINIC, datafiles.PSF_TRICLINIC).notes
+    opened = open_trajectory(datafiles.DCD_TRICLINIC, datafiles.PSF_TRICLINIC)
+    # the reader was left where it was: "around 5 protein" means the first frame
+    assert opened.universe.trajectory.frame == 0
+    notes = opened.notes
     (said,) = [note for note in notes if "box" in note]
     universe = MDAnalysis.Universe(datafiles.PSF_TRICLINIC, datafiles.DCD_TRICLINIC)
     universe.trajectory[-1]
