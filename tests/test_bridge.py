@@ -10,10 +10,10 @@ from ase import Atoms
 from small_systems import make
 
 from mdnum import ball
-from mdnum.events import Hysteresis, Ledger, Threshold, broken_alternations
-from mdnum.events.saltation import carry
 from mdnum.md.stepper import MdState, PairDynamics
-from mdnum.precision.reductions import BY_NAME
+from mdnum.numerics import Hysteresis, Ledger, Threshold, broken_alternations
+from mdnum.numerics.reductions import BY_NAME
+from mdnum.numerics.saltation import carry
 from mdnum.rollout.engine import first_state
 from mdnum.rollout.health import rebuild_ledger
 from mdnum.rollout.run import run

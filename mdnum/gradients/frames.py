@@ -21,7 +21,6 @@ from mdnum.gradients import parameters
 from mdnum.gradients.pairs import MODEL, SCALE, pull_back
 from mdnum.gradients.parameters import Cotangents
 from mdnum.gradients.tape import Tape, frame_of, rows_of
-from mdnum.md.cutoffs import Hard
 from mdnum.md.pairforce import PairForce
 from mdnum.systems.build import Simulation
 
@@ -72,7 +71,7 @@ def energy_of_forces(simulation: Simulation) -> Simulation:
     A hard cutoff has the forces of the shifted one, and no force at the sphere where its energy jumps: a run
     samples the ensemble of the shifted energy, whatever energy it reports.
     """
-    return simulation.with_cutoff("shifted") if isinstance(simulation.cutoff, Hard) else simulation
+    return simulation.continuous
 
 
 def frames(tape: Tape, names: Sequence[str], progress: Callable[[int, int], None] | None = None) -> Frames:

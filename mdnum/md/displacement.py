@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-import mdnum.precision  # noqa: F401  (switches float64 on before the first array exists)
+import mdnum.numerics  # noqa: F401  (switches float64 on before the first array exists)
 from mdnum.errors import InputError
 from mdnum.md.cell import complete
 

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-import mdnum.precision  # noqa: F401  (switches float64 on before the first array exists)
+import mdnum.numerics  # noqa: F401  (switches float64 on before the first array exists)
 from mdnum.errors import CapacityError, InputError, NumericalError
 from mdnum.md.displacement import Displacement, complete, displacement, widths
 

@@ -20,10 +20,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mdnum.errors import InputError
-from mdnum.events import Threshold
 from mdnum.md.cell import Cell
 from mdnum.md.decide import PairDecider
 from mdnum.md.potentials import CutPotential
+from mdnum.numerics import Threshold
 
 #: Listed distances are below 2^30 spacings: three of their squares fit a 64-bit integer.
 REACH_BITS = 30

@@ -24,8 +24,8 @@ from mdnum.md.decide import Decisions, SlotJudge, Tables, displacements, halves_
 from mdnum.md.lattice import REACH_BITS, Lattice, LatticeDecider
 from mdnum.md.pairforce import Forces, PairForce, other_than
 from mdnum.md.potentials import CutPotential, of_type
-from mdnum.precision.exact import fence, zero_bits
-from mdnum.precision.reproducible import reproducible
+from mdnum.numerics.exact import fence, zero_bits
+from mdnum.numerics.reproducible import reproducible
 
 # added to a double below 2^51 it leaves the nearest integer in the low bits
 _ROUND = 1.5 * 2**52

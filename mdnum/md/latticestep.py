@@ -23,8 +23,8 @@ from jaxtyping import Array, Float, Int
 from mdnum.errors import InputError
 from mdnum.md.integrators import Integrator, Langevin, VelocityVerlet
 from mdnum.md.lattice import Lattice
-from mdnum.precision.elementary import normal_quantile
-from mdnum.precision.exact import squared_norm, zero_bits
+from mdnum.numerics.exact import squared_norm, zero_bits
+from mdnum.numerics.reproducible import normal_quantile
 
 # a velocity in float64 tells its integer momentum back up to here
 _LARGEST = 2.0**50

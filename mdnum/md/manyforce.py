@@ -18,8 +18,8 @@ from jaxtyping import Array, Float, Int, UInt8
 from mdnum.md.cell import Cell
 from mdnum.md.decide import Decisions, PairDecider, Tables, decide_table
 from mdnum.md.pairforce import Forces
-from mdnum.precision import PrecisionPolicy
-from mdnum.precision.exact import zero_bits
+from mdnum.numerics import PrecisionPolicy
+from mdnum.numerics.exact import zero_bits
 
 
 class ManyBodyForce(eqx.Module):

@@ -30,9 +30,9 @@ from mdnum.md.decide import (
     unpacked,
 )
 from mdnum.md.potentials import CutPotential
-from mdnum.precision import PrecisionPolicy
-from mdnum.precision.exact import fence, rounded, zero_bits
-from mdnum.precision.reductions import Reduction, Sequential
+from mdnum.numerics import PrecisionPolicy
+from mdnum.numerics.exact import fence, rounded, zero_bits
+from mdnum.numerics.reductions import Reduction, Sequential
 
 
 class Forces(NamedTuple):

@@ -11,7 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Integer, Num
 
+import mdnum.numerics  # noqa: F401 (float64 must be on before the first array exists)
 from mdnum.md.cutoffs import AtCutoff, Cutoff
+from mdnum.registry import Registry
 
 
 def of_type(leaf: Num[Array, "types"], types: Integer[Array, "..."] | None) -> Num[Array, "..."]:
@@ -94,6 +96,13 @@ class SoftSphere(PairPotential):
         )
 
 
+#: Every pair potential by its name; a package adds one by an entry point of this group. Its fields are the
+#: constants of a pair, as system files give them.
+POTENTIALS: Registry[PairPotential] = Registry("potential", "mdnum.potentials", kind=PairPotential)
+for _potential in (LennardJones, Morse, SoftSphere):
+    POTENTIALS.add(_potential.name, _potential)
+
+
 class CutPotential(eqx.Module):
     """A pair potential with its cutoff: what the force loop evaluates.
 
@@ -105,7 +114,7 @@ class CutPotential(eqx.Module):
     """
 
     potential: PairPotential
-    cutoff: Cutoff
+    cutoff: Cutoff = eqx.field(static=True)
     r_cut: Float[Array, "types"]
     r_onset: Float[Array, "types"]
 

@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from mdnum.errors import CapacityError, InputError
-from mdnum.events import set_bits
 from mdnum.md.cell import Cell, displacement, strain_loss
 from mdnum.md.cells import neighbor_table
+from mdnum.numerics import set_bits
 
 # decisions leave the force loop eight to a byte, so lists have a multiple of eight slots
 SLOTS = 8

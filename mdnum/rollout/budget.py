@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float
 
-from mdnum.precision import unit_roundoff
+from mdnum.numerics import unit_roundoff
 from mdnum.systems.build import Simulation
 
 # a missed flip shows as one jump; rounding of the sums must stay far below it
@@ -45,9 +45,7 @@ class EnergyBudget:
     @cached_property
     def _reference(self) -> Simulation:
         jumps = bool(np.any(self.simulation.jumps()[0] != 0))
-        return (
-            self.simulation.with_cutoff("shifted") if jumps and self.simulation.pairwise else self.simulation
-        )
+        return self.simulation.continuous if jumps else self.simulation
 
     def check(self, step: int, positions: Float[np.ndarray, "atoms 3"], potential: float) -> float:
         """Close the budget at one step; returns the deviation there.

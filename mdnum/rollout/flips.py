@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from mdnum.errors import MdnumError
-from mdnum.events import Ledger, changes_in_time, count_set, sort_rows
 from mdnum.md.cell import HostCell, displacement
 from mdnum.md.verlet import PairTable
+from mdnum.numerics import Ledger, changes_in_time, count_set, sort_rows
 from mdnum.rollout.engine import Segment
 from mdnum.systems.build import Simulation
 

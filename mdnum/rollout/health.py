@@ -6,10 +6,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from mdnum.events import Ledger
 from mdnum.md.cell import Cell
-from mdnum.precision import distance_bound
-from mdnum.precision.policy import carrier
+from mdnum.numerics import Ledger, distance_bound
+from mdnum.numerics.roles import carrier
 from mdnum.rollout.engine import Segment
 from mdnum.rollout.flips import decided_pairs, true_pairs
 from mdnum.store import RunFolder

@@ -13,7 +13,7 @@ from ase import Atoms
 
 from mdnum import provenance
 from mdnum.errors import FolderError, InputError, NumericalError
-from mdnum.events import Ledger
+from mdnum.numerics import Ledger
 from mdnum.rollout.budget import EnergyBudget
 from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, resume_point
 from mdnum.rollout.flips import PairRecorder, flip_columns

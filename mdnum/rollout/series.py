@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mdnum.events import Ledger
+from mdnum.numerics import Ledger
 from mdnum.rollout.engine import Segment
 from mdnum.systems import schema
 from mdnum.systems.build import Simulation

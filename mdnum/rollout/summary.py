@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mdnum.events import Ledger
 from mdnum.md.cell import displacement, wrap_positions
+from mdnum.numerics import Ledger
 from mdnum.rollout.engine import Segment
 from mdnum.rollout.series import degrees_of_freedom
 from mdnum.systems.build import Simulation

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from mdnum.events import Ledger
+from mdnum.numerics import Ledger
 from mdnum.rollout.compared import in_user_order
 from mdnum.rollout.crossing import Flips
 from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, first_state

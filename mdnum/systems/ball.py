@@ -39,7 +39,7 @@ NUMBERED = ("permuted", "blocked", "fixed-point")
 
 
 def _reduction(value: Any) -> Any:
-    """A reduction in the words of mdnum.precision.reductions.parse, told without importing it (and jax)."""
+    """A reduction in the words of mdnum.numerics.reductions.parse, told without importing it (and jax)."""
     if isinstance(value, str):
         name, colon, number = value.partition(":")
         if name in REDUCTIONS and (not colon or (name in NUMBERED and number.isdecimal())):

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +14,7 @@ from jaxtyping import Float, Int
 
 from mdnum.errors import InputError
 from mdnum.md.cell import Cell, displacement
-from mdnum.md.cutoffs import BY_NAME as CUTOFFS
+from mdnum.md.cutoffs import CUTOFFS, Cutoff
 from mdnum.md.decide import PairDecider, Tables
 from mdnum.md.integrators import Integrator, Langevin, VelocityVerlet
 from mdnum.md.lattice import Lattice, LatticeDecider
@@ -25,9 +24,9 @@ from mdnum.md.manyforce import ManyBodyForce
 from mdnum.md.pairforce import PairForce
 from mdnum.md.potentials import CutPotential, LennardJones, Morse, PairPotential, SoftSphere, pair_type
 from mdnum.md.verlet import BUILDERS, SLOTS, PairTable, RebuildRule, VerletList, check_radius
-from mdnum.precision import PrecisionPolicy, unit_roundoff
-from mdnum.precision.policy import LATTICE
-from mdnum.precision.reductions import BY_NAME as REDUCTIONS
+from mdnum.numerics import PrecisionPolicy, unit_roundoff
+from mdnum.numerics.reductions import REDUCTIONS
+from mdnum.numerics.roles import LATTICE
 from mdnum.systems import pairs, schema
 from mdnum.systems.load import System, load
 from mdnum.units import Units
@@ -203,9 +202,17 @@ class Simulation:
             types = jnp.asarray(kinds.astype(np.uint8).reshape(shape))
         return Tables(jnp.asarray(table.index.reshape(shape)), types, jnp.asarray(table.order))
 
-    def with_cutoff(self, kind: str) -> Simulation:
+    def with_cutoff(self, cutoff: str | Cutoff) -> Simulation:
         """The same system with another treatment of its cutoff (its radius and pairs stay the same)."""
-        return replace(self, model=eqx.tree_at(lambda m: m.cutoff, self.model, CUTOFFS[kind]))
+        made = CUTOFFS.parse(cutoff) if isinstance(cutoff, str) else cutoff
+        return replace(self, model=replace(self.model, cutoff=made))
+
+    @property
+    def continuous(self) -> Simulation:
+        """The same forces from an energy that does not jump at the cutoff."""
+        if not self.pairwise or self.cutoff.continuous is self.cutoff:
+            return self
+        return self.with_cutoff(self.cutoff.continuous)
 
     def with_cell(self, cell: Cell) -> Simulation:
         """The same system in another box."""
@@ -253,7 +260,7 @@ def _pair_model(system: System) -> CutPotential:
     r_cut = jnp.asarray(_per_type(radius))
     return CutPotential(
         _POTENTIALS[spec.potential.kind](**constants),
-        CUTOFFS[spec.cutoff.kind],
+        CUTOFFS.parse(spec.cutoff.kind),
         r_cut,
         r_cut if onset is None else jnp.asarray(_per_type(onset)),
     )
@@ -345,7 +352,7 @@ def build(system: System | str, overrides: Mapping[str, Any] | None = None) -> S
         # a search on the host wins on a CPU; on an accelerator the positions would have to travel
         ("host" if jax.default_backend() == "cpu" else "jax-md") if builder == "auto" else builder,
         policy,
-        REDUCTIONS[precision.reduction],
+        REDUCTIONS.parse(precision.reduction),
         integrator,
     )
     return _in_whole_numbers(simulation) if precision.state == LATTICE else simulation

@@ -15,8 +15,8 @@ from mdnum.ball.losses import FinalHeight, Loss, MeanHeight, ResidualPenetration
 from mdnum.ball.problem import Problem
 from mdnum.ball.world import World
 from mdnum.errors import InputError
-from mdnum.precision import neighbor, reductions
-from mdnum.precision.policy import RolePrecision
+from mdnum.numerics import neighbor, reductions
+from mdnum.numerics.roles import RolePrecision
 from mdnum.systems import ball, ball_checks
 from mdnum.systems.ball_system import BallSystem
 from mdnum.systems.load import load

@@ -8,16 +8,16 @@ import mpmath
 import numpy as np
 import pytest
 
-from mdnum.md.cutoffs import BY_NAME, AtCutoff
+from mdnum.md.cutoffs import CUTOFFS, AtCutoff
 from mdnum.md.potentials import CutPotential, LennardJones
 
 SIGMA, EPSILON, R_CUT, R_ONSET = 1.1, 0.7, 2.6, 2.2
-KINDS = sorted(BY_NAME)
+KINDS = sorted(CUTOFFS)
 
 
 def model(kind):
     one = [jnp.asarray([value]) for value in (SIGMA, EPSILON, R_CUT, R_ONSET)]
-    return CutPotential(LennardJones(*one[:2]), BY_NAME[kind], *one[2:])
+    return CutPotential(LennardJones(*one[:2]), CUTOFFS.parse(kind), *one[2:])
 
 
 def evaluate(kind, r2):
@@ -84,11 +84,11 @@ def test_jumps_are_the_limits_from_inside(kind):
     assert energy_jump.shape == force_jump.shape == (1,)
     assert energy_jump[0] == pytest.approx(float(energy[0]), abs=1e-13)
     assert force_jump[0] == pytest.approx(float(-2 * R_CUT * slope[0]), abs=1e-12)
-    if BY_NAME[kind].smoothness >= 0:
+    if CUTOFFS.parse(kind).smoothness >= 0:
         assert energy_jump[0] == 0
     else:
         assert energy_jump[0] == pytest.approx(float(bare(R_CUT)), rel=1e-14)
-    if BY_NAME[kind].smoothness >= 1:
+    if CUTOFFS.parse(kind).smoothness >= 1:
         assert force_jump[0] == 0
     else:
         # attractive at the cutoff: a pair that enters brings a pull
@@ -112,7 +112,7 @@ def one_sided(kind, order, at, side):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_smoothness_claimed_is_the_one_there_is(kind):
-    cutoff = BY_NAME[kind]
+    cutoff = CUTOFFS.parse(kind)
     places = [R_CUT] + ([R_ONSET] if cutoff.switches else [])
     orders = []
     for place in places:
@@ -128,7 +128,7 @@ def test_the_smoothness_claimed_is_the_one_there_is(kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_below_the_onset_a_switched_potential_is_untouched(kind):
-    cutoff = BY_NAME[kind]
+    cutoff = CUTOFFS.parse(kind)
     r2 = np.linspace(0.9, R_ONSET, 50) ** 2 * (1 - 1e-15)
     energy, slope = evaluate(kind, r2)
     plain, plain_slope = evaluate("hard", r2)
@@ -178,7 +178,7 @@ def test_the_switch_is_that_of_ase():
 def test_constants_of_several_pair_types_do_not_mix(kind):
     sigma, epsilon = jnp.asarray([1.0, 0.8, 0.88]), jnp.asarray([1.0, 1.5, 0.5])
     r_cut = 2.5 * sigma
-    cut = CutPotential(LennardJones(sigma, epsilon), BY_NAME[kind], r_cut, 0.9 * r_cut)
+    cut = CutPotential(LennardJones(sigma, epsilon), CUTOFFS.parse(kind), r_cut, 0.9 * r_cut)
     types = jnp.asarray([2, 0, 1, 1, 2])
     r2 = jnp.asarray([1.2, 1.4, 1.1, 3.6, 4.3])
     energy, slope = cut.evaluate(r2, types, cut.at_cutoff())

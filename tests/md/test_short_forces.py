@@ -11,8 +11,8 @@ import pytest
 import small_systems
 
 from mdnum.md.cell import HostCell, wrap_positions
-from mdnum.precision import PrecisionPolicy
-from mdnum.precision.exact import rounded, zero_bits
+from mdnum.numerics import PrecisionPolicy
+from mdnum.numerics.exact import rounded, zero_bits
 from mdnum.systems.build import Simulation, build
 
 SHORT = {"bfloat16": np.dtype(ml_dtypes.bfloat16), "float16": np.dtype(np.float16)}

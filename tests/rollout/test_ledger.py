@@ -19,8 +19,8 @@ from rollout.harness import (
     write_system,
 )
 
-from mdnum.events import Ledger, broken_alternations
 from mdnum.md.verlet import VerletList
+from mdnum.numerics import Ledger, broken_alternations
 from mdnum.rollout.budget import EnergyBudget
 from mdnum.systems import load
 

@@ -14,7 +14,7 @@ import pytest
 from mdnum import systems
 from mdnum.ball.limits import smallest
 from mdnum.errors import InputError
-from mdnum.precision import reductions
+from mdnum.numerics import reductions
 from mdnum.systems import BallSystem, System, ball, load
 from mdnum.systems.ball_system import BALL_SCHEMA
 

@@ -14,7 +14,7 @@ from mdnum.ball.rollout import BallRun, simulate
 from mdnum.ball.stopping import GlobalSum, Hysteresis
 from mdnum.ball.world import World
 from mdnum.precision import RolePrecision
-from mdnum.precision.reductions import Reduction, make
+from mdnum.precision.reductions import Reduction, parse
 
 #: A ball that rests on a soft spring and is shaken: it wavers about the floor.
 BALLS, STEPS, H, STIFFNESS, DAMPING, SHAKE = 16, 2000, 5e-3, 1000.0, 5.0, 9.0
@@ -67,7 +67,7 @@ def run() -> Demo:
     """Flips of both channels with one threshold and with two."""
     contact: dict[float, BallRun] = {0.0: shaken(None)} | {lift: shaken(lift) for lift in LIFTS}
     rows = {lift: len(one.contacts) for lift, one in contact.items()}
-    stop = {gap: [pressed(make(order), gap) for order in ORDERS] for gap in (None, *GAPS)}
+    stop = {gap: [pressed(parse(order), gap) for order in ORDERS] for gap in (None, *GAPS)}
     starts = {gap: flips(runs[0].iterations > 0) for gap, runs in stop.items()}
     apart = {gap: int(np.sum(runs[0].iterations != runs[1].iterations)) for gap, runs in stop.items()}
     left = {gap: float(np.mean(runs[0].residual.astype(np.float64))) for gap, runs in stop.items()}

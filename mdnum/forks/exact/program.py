@@ -20,7 +20,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mdnum.errors import InputError
-from mdnum.forks.exact.laws import Undecided, pull_of
+from mdnum.forks.exact.laws import pull_of
+from mdnum.md.cutoffs import Undecided
 from mdnum.forks.exact.tape import Tape
 from mdnum.md.cell import complete
 from mdnum.md.integrators import VelocityVerlet

@@ -11,7 +11,7 @@ from oracles import exact_r2
 
 from mdnum.md.cell import Cell, displacement, wrap_positions
 from mdnum.md.decide import PairDecider
-from mdnum.precision import distance_bound, gamma, squared_distance_bound
+from mdnum.numerics import distance_bound, gamma, squared_distance_bound
 
 BOXES = {
     "cube": np.diag([17.3, 17.3, 17.3]),

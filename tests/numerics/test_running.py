@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from mdnum.errors import InputError
-from mdnum.precision.reductions import BY_NAME, Blocked, FixedPoint, Kahan, Pairwise, Sequential, Widened
-from mdnum.precision.running import running_sum_table
+from mdnum.numerics.reductions import BY_NAME, Blocked, FixedPoint, Kahan, Pairwise, Sequential, Widened
+from mdnum.numerics.running import running_sum_table
 
 DTYPES = [np.float64, np.float32, np.float16, ml_dtypes.bfloat16]
 SUMS = {**BY_NAME, "tree of three": Blocked(3), "fixed-point": FixedPoint(12)}

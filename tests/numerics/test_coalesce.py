@@ -11,8 +11,12 @@ import numpy as np
 import pytest
 
 from mdnum.errors import InputError
-from mdnum.precision.coalesce import Coordinates, distinct_bits, orders, scatter_add, segment_sum
-from mdnum.precision.reductions import BY_NAME, Exact, FixedPoint, Sequential
+from mdnum.numerics.reductions import (
+    BY_NAME,
+    Exact,
+    scatter_add,
+    segment_sum,
+)
 
 
 def entries(count=200, segments=9, dtype=np.float64, seed=1):
@@ -51,38 +55,6 @@ def test_the_derivative_of_a_segment_sum_gathers():
     assert np.array_equal(np.asarray(slope), np.arange(1.0, 5.0)[index])
 
 
-def sparse(seed=0):
-    rng = np.random.default_rng(seed)
-    count = 60
-    row, column = rng.integers(0, 3, count), rng.integers(0, 2, count)
-    return Coordinates(row, column, rng.normal(size=count).astype(np.float32), (3, 2))
-
-
-def test_coalescing_adds_duplicates():
-    matrix = sparse()
-    small = matrix.coalesced()
-    assert len(small.values) == 6 == len(set(zip(small.row.tolist(), small.column.tolist(), strict=True)))
-    assert np.array_equal(small.dense(), matrix.dense())
-    for r, c, value in zip(small.row, small.column, small.values, strict=True):
-        own = matrix.values[(matrix.row == r) & (matrix.column == c)]
-        assert value == pytest.approx(math.fsum(own.astype(float)), abs=1e-5)
-
-
-def test_storage_order_decides_the_bits_unless_the_sum_does_not_care():
-    matrix = sparse()
-    stored = [matrix.stored(order) for order in orders(60, 30)]
-
-    def count(**how):
-        return distinct_bits(lambda m: (m.coalesced(**how).values,), stored)
-
-    assert count(reduction=Sequential()) > 5
-    assert count(reduction=Sequential(), by_value=True) == 1
-    assert count(reduction=Exact()) == 1
-    assert count(reduction=FixedPoint(30)) == 1
-
-
 def test_entries_outside_are_refused():
     with pytest.raises(InputError, match=r"outside 0 ... 2"):
         segment_sum(jnp.ones(2), np.array([0, 3]), 3)
-    with pytest.raises(InputError, match=r"row outside 0 ... 2"):
-        Coordinates(np.array([3]), np.array([0]), np.ones(1), (3, 2))

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mdnum.precision.exact import fence, squared_norm, zero_bits
+from mdnum.numerics.exact import fence, squared_norm, zero_bits
 
 
 def triples(dtype, count=100_000):

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mdnum.errors import InputError
-from mdnum.precision.ranges import COLUMNS, check_ranges, measure
+from mdnum.numerics.formats import RangeReport, measure
 
 VALUES = np.array([[1.0, -2.0], [2.0**-20, 0.0], [1e5, -3.0], [np.inf, np.nan], [np.nan, np.nan]])
 
@@ -22,7 +21,6 @@ def test_a_range_by_step():
     # 65504 is almost 2^16; two is 15 doublings below, 1e5 is above
     assert seen.headroom[0] == pytest.approx(15, abs=1e-3)
     assert seen.headroom[2] == pytest.approx(np.log2(65504 / 1e5))
-    assert seen.footroom[1] == -6
     assert [seen.first(what) for what in ("not finite", "subnormal", "out of range")] == [3, 1, 2]
 
 
@@ -33,7 +31,9 @@ def test_the_same_numbers_fit_a_wider_format():
 
 
 def test_what_is_wrong_is_said_with_its_step():
-    said = check_ranges({"y": VALUES, "distance": VALUES[:3]}, "float16", ("distance",)).findings()
+    said = RangeReport(
+        {"y": measure("y", VALUES, "float16"), "distance": measure("distance", VALUES[:3], "float16", True)}
+    ).findings()
     assert said[0] == "y in float16 is not finite at step 3"
     assert said[1] == "y in float16 reaches 1e+05 at step 2, above 6.55e+04"
     assert said[2].startswith("y in float16 is 9.54e-07 at step 1, below 6.1e-05")
@@ -44,12 +44,3 @@ def test_what_is_wrong_is_said_with_its_step():
 def test_a_denominator_may_be_small_but_not_too_small():
     near = measure("r", np.array([[1e-4], [1e-5]]), "float16", denominator=True)
     assert list(near.reciprocal_overflows) == [False, True]
-
-
-def test_a_report_has_a_row_for_each_quantity():
-    report = check_ranges({"y": VALUES[:3], "v": np.ones((4, 1))}, "float32")
-    rows = report.table()
-    assert len(COLUMNS) == len(rows[0])
-    assert rows[1] == ("v", 1.0, 1.0, 1.0, pytest.approx(128, abs=1e-6), 0, 0)
-    with pytest.raises(InputError, match="unknown format"):
-        check_ranges({"y": VALUES}, "half")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from jax import lax
 
-from mdnum.precision.exact import fence, zero_bits
+from mdnum.numerics.exact import fence, zero_bits
 
 DTYPES = [np.float16, ml_dtypes.bfloat16, np.float32, np.float64]
 each = pytest.mark.parametrize("dtype", DTYPES)

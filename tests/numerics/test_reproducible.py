@@ -8,9 +8,9 @@ import mpmath
 import numpy as np
 import pytest
 
-from mdnum.precision import elementary
-from mdnum.precision.exact import zero_bits
-from mdnum.precision.reproducible import reproducible
+from mdnum.numerics import reproducible as elementary
+from mdnum.numerics.exact import zero_bits
+from mdnum.numerics.reproducible import reproducible
 
 ZERO = zero_bits(np.float64)
 

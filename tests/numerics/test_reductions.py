@@ -12,19 +12,19 @@ import pytest
 from jax import lax
 
 from mdnum.errors import InputError
-from mdnum.precision.exact import zero_bits
-from mdnum.precision.orders import Halves, Twice
-from mdnum.precision.reductions import (
+from mdnum.numerics.exact import zero_bits
+from mdnum.numerics.reductions import (
     BY_NAME,
     Blocked,
+    FixedPoint,
     Pairwise,
     Permuted,
     Sequential,
     Sorted,
     Widened,
-    make,
     parse,
 )
+from mdnum.numerics.sums import Halves, Twice
 
 DTYPES = [np.float64, np.float32, np.float16, ml_dtypes.bfloat16]
 
@@ -83,8 +83,8 @@ WRITTEN_OUT = [
     (Pairwise(), lambda t: tree(list(t))),
     (Blocked(3), lambda t: tree(list(t), 3)),
     (Blocked(20), lambda t: tree(list(t), 20)),
-    (make("kahan"), kahan),
-    (make("neumaier"), neumaier),
+    (parse("kahan"), kahan),
+    (parse("neumaier"), neumaier),
     (Sorted(), by_magnitude),
     (Sorted("descending"), lambda t: by_magnitude(t, descending=True)),
 ]
@@ -236,22 +236,28 @@ def test_a_sum_of_nothing_is_zero_and_of_one_term_that_term():
         assert float(single) == 1.5
 
 
-def test_reductions_have_names_and_options():
-    assert make("blocked", width=8) == Blocked(8)
-    assert make("reversed") == Sequential("reversed")
+def test_reductions_have_names_and_numbers():
+    assert parse("blocked:8") == Blocked(8)
+    assert parse("reversed") == Sequential("reversed")
     assert parse("permuted:3") == Permuted(3)
-    assert parse("exact") == make("exact")
-    assert parse("fixed-point:30") == make("fixed-point", bits=30)
-    with pytest.raises(InputError, match=r"no reduction called 'kahn'.*Did you mean kahan"):
-        make("kahn")
-    with pytest.raises(InputError, match=r"pairwise has no option 'width'"):
-        make("pairwise", width=3)
-    with pytest.raises(InputError, match="exact takes no number"):
-        parse("exact:3")
-    with pytest.raises(InputError, match="'x' in 'permuted:x' is not a whole number"):
-        parse("permuted:x")
-    with pytest.raises(InputError, match="width 1 adds nothing"):
-        parse("blocked:1")
+    assert parse("fixed-point:30") == FixedPoint(30)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("kahn", "no reduction 'kahn'.*Did you mean kahan"),
+        ("exact:3", "'exact' takes no argument"),
+        ("permuted:x", "'x' is not a whole number"),
+        ("blocked:1", "width 1 adds nothing"),
+    ],
+)
+def test_a_reduction_that_is_none(text, message):
+    with pytest.raises(InputError, match=message):
+        parse(text)
+
+
+def test_a_wider_dtype_is_one_of_the_known():
     with pytest.raises(InputError, match="unknown dtype 'half'"):
         Widened(Sequential(), "half")
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mdnum.events.chance import ERROR, FEWEST, REPEATS, Delay, count, looks
+from mdnum.numerics.verdicts import ERROR, FEWEST, REPEATS, Delay, count, looks
 
 
 def words(coins: np.ndarray, most: int) -> list[bool | None]:

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mdnum.errors import InputError
-from mdnum.precision.reductions import BY_NAME, Exact, FixedPoint
+from mdnum.numerics.reductions import BY_NAME, Exact, FixedPoint
 
 DTYPES = [np.float64, np.float32, np.float16, ml_dtypes.bfloat16]
 EXACT = jax.jit(Exact())

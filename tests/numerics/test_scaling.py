@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mdnum.errors import InputError, NumericalError
-from mdnum.precision.scaling import DynamicScale, StaticScale
+from mdnum.numerics.scaling import DynamicScale, StaticScale
 
 X = np.array([0.9, 1.1, 2.3])
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mdnum.errors import InputError
-from mdnum.events import Threshold
+from mdnum.numerics import Threshold
 
 POSITIVE = st.floats(1e-290, 1e290)
 ANY = st.floats(allow_nan=False, allow_infinity=False)

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from mdnum.events import Ledger, broken_alternations, sort_rows
+from mdnum.numerics import Ledger, broken_alternations, sort_rows
 
 # decisions of up to six subjects over up to twelve steps
 HISTORIES = st.tuples(st.integers(2, 12), st.integers(1, 6)).flatmap(lambda s: arrays(np.bool_, s))

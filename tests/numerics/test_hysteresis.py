@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mdnum.errors import InputError
-from mdnum.events import Hysteresis, Threshold
+from mdnum.numerics import Hysteresis, Threshold
 
 TRIGGER = Hysteresis(Threshold(0.0, "<", "height"), Threshold(1.0, "<=", "height"))
 

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mdnum.events.chance import Delay
-from mdnum.events.forks import Dates, expected, growth, judge, split_of
+from mdnum.numerics.verdicts import Dates, Delay, expected, growth, judge, split_of
 
 
 def grown(rate: float, steps: int, start: float = 1e-15, top: float = 3.0) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mdnum.events.shares import Share, shares, table
+from mdnum.numerics.verdicts import Share, shares, table
 
 RATE, TOLERANCE, STEPS = 0.02, 0.1, 3000
 

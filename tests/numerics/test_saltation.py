@@ -11,7 +11,7 @@ import pytest
 
 from mdnum.ball.exact import ExactImpact
 from mdnum.errors import NumericalError
-from mdnum.events.saltation import GRAZING, carry, grazing, saltation, saltation_flagged, time_shift
+from mdnum.numerics.saltation import GRAZING, carry, grazing, saltation, saltation_flagged, time_shift
 
 EPS = 2.0**-52
 

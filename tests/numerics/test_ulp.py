@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mdnum.precision.ulp import neighbor, ordinal, ulp_distance, unit_roundoff
+from mdnum.numerics.rounding import neighbor, ordinal, ulp_distance, unit_roundoff
 
 WIDTHS: dict[type, Any] = {np.float64: 64, np.float32: 32, np.float16: 16, ml_dtypes.bfloat16: 32}
 

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from mdnum.events import changed_bits, count_set, set_bits
+from mdnum.numerics import changed_bits, count_set, set_bits
 
 SHAPES = st.tuples(st.integers(1, 5), st.integers(1, 9))
 

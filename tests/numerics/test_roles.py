@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mdnum.errors import InputError
-from mdnum.precision import PrecisionPolicy, RolePrecision
+from mdnum.numerics import PrecisionPolicy, RolePrecision
 
 
 def test_every_role_can_have_its_own_dtype():
