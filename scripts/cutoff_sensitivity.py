@@ -29,7 +29,7 @@ from _record import record
 from mdnum.errors import InputError
 from mdnum.md.cutoffs import CUTOFFS
 from mdnum.systems import System, build, load
-from mdnum.systems.schema import ONSET_FRACTION, SwitchingCutoff
+from mdnum.systems.schema import ONSET_FRACTION
 
 KINDS = tuple(CUTOFFS)
 
@@ -61,7 +61,7 @@ def variant(system: System, kind: str, scale: float) -> dict[str, object]:
         if (value := getattr(cutoff, key)) is not None:
             values[f"cutoff.{key}"] = scale * value
             if CUTOFFS.parse(kind).switches:
-                own = cutoff.onset if isinstance(cutoff, SwitchingCutoff) else None
+                own = cutoff.onset
                 values["cutoff.onset"] = scale * (own or ONSET_FRACTION * value)
     for pair, value in (cutoff.pairs or {}).items():
         values[f"cutoff.pairs.{pair}"] = scale * value

@@ -5,7 +5,7 @@ one, for pairs inside. What a pair outside contributes (nothing) is decided else
 
 One class is all that a cutoff needs: its formula `cut`, its name and how smooth it is. System files, the
 command line, jumps, comparisons with other codes and certificates take it from `CUTOFFS`. Where a formula is
-written a second time (`reference`) or with error bounds (`enclose`), that is used; else both follow from `cut`.
+written a second time (`reference`) or in ball arithmetic (`enclose`), that is used; else both follow.
 
 Works on numpy and jax arrays alike, and imports neither jax nor a file of it.
 """
@@ -125,6 +125,9 @@ class Cutoff(ABC):
 
         cut = enclosed(lambda r2, u, w, *at: self.cut(r2, u, w, AtCutoff(*at))[1], 7)
         return lambda r2: 2 * cut(r2, energy(r2), pull(r2) / 2, *at)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}()"
 
     def __eq__(self, other: object) -> bool:
         return type(self) is type(other) and vars(self) == vars(other)
@@ -363,7 +366,11 @@ class Level(Cutoff):
 
     def __init__(self, inner: Cutoff):
         self.inner = inner
-        self.switches = inner.switches
+
+    @property
+    def switches(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """As the other."""
+        return self.inner.switches
 
     def cut(self, r2, u, w, at):
         energy, slope = self.inner.cut(r2, u, w, at)

@@ -30,6 +30,20 @@ class PairPotential(eqx.Module):
     def evaluate(self, r2: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """Energy u and du/d(r²) at squared distances, parameters broadcast against r2."""
 
+    @classmethod
+    def reference(
+        cls, r: Float[np.ndarray, "pairs"], **constants: float
+    ) -> tuple[Float[np.ndarray, "pairs"], Float[np.ndarray, "pairs"]]:
+        """u(r) and u'(r) on the host: the judge of `evaluate`, its slope the derivative of its energy.
+
+        Args:
+            r: distances, length.
+            constants: of the pair.
+        """
+        made = cls(**{name: jnp.asarray(value) for name, value in constants.items()})
+        energy, slope = jax.jvp(lambda r: made.evaluate(r * r)[0], (jnp.asarray(r),), (jnp.ones(len(r)),))
+        return np.asarray(energy), np.asarray(slope)
+
     def of(self, types: Integer[Array, "..."] | None) -> PairPotential:
         """The parameters of given pair types; types None means that there is only one."""
         return jax.tree.map(lambda leaf: of_type(leaf, types), self)

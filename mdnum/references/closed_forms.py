@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from mdnum.md.cutoffs import CUTOFFS, AtCutoff
+from mdnum.md.potentials import POTENTIALS
 from mdnum.systems import pairs
 from mdnum.systems.schema import SystemSpec
 
@@ -50,7 +51,9 @@ class PairForm:
 
     def bare(self, r: Float[ndarray, "pairs"]) -> tuple[Float[ndarray, "pairs"], Float[ndarray, "pairs"]]:
         """u(r) and u'(r) without any cutoff."""
-        return _BARE[self.kind](r, **self.constants)
+        if self.kind in _BARE:
+            return _BARE[self.kind](r, **self.constants)
+        return POTENTIALS[self.kind].reference(r, **self.constants)
 
     def __call__(self, r: Float[ndarray, "pairs"]) -> tuple[Float[ndarray, "pairs"], Float[ndarray, "pairs"]]:
         """Energy and its derivative with respect to r, cut off, for pairs that are inside."""

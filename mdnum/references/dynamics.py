@@ -135,10 +135,10 @@ def check_dynamics(system: System, steps: int = 100, *, judge: Reference | None 
 
 def _without_bath(system: System) -> System:
     dynamics = system.spec.dynamics
-    if isinstance(dynamics, schema.NVE):
+    if isinstance(dynamics, schema.NVETable):
         return system
     shared = dynamics.model_dump(exclude={"kind", "friction"})
-    return replace(system, spec=system.spec.model_copy(update={"dynamics": schema.NVE(kind="nve", **shared)}))
+    return replace(system, spec=system.spec.model_copy(update={"dynamics": schema.NVETable(kind="nve", **shared)}))
 
 
 def _forces(system: System) -> Reference:

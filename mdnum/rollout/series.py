@@ -13,7 +13,7 @@ from mdnum.systems.build import Simulation
 def degrees_of_freedom(simulation: Simulation) -> int:
     """3 N, less the three of a center of mass that nothing moves."""
     conserved = simulation.system.spec.dynamics.remove_drift and not isinstance(
-        simulation.system.spec.dynamics, schema.Langevin
+        simulation.system.spec.dynamics, schema.LangevinTable
     )
     return max(3 * simulation.atoms - (3 if conserved and simulation.atoms > 1 else 0), 1)
 

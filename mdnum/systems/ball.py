@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Discriminator, Field, WithJsonSchema
+from pydantic import BeforeValidator, Discriminator, Field
 from pydantic_core import PydanticKnownError
 
-from mdnum.systems.interactions import NonNegative, Table
+from mdnum.systems.grammar import Named, NonNegative, Table
 
 Positive = Annotated[float, Field(gt=0)]
 FloatName = Literal["float16", "bfloat16", "float32", "float64"]
@@ -30,34 +30,11 @@ def _numbers(value: Any) -> Any:
     return tuple(float(item) for item in value) if isinstance(value, list | tuple) else value
 
 
-REDUCTIONS = (
-    "sequential", "reversed", "permuted", "pairwise", "blocked", "kahan", "neumaier", "sorted", "exact",
-    "fixed-point",
-)  # fmt: skip
-NUMBERED = ("permuted", "blocked", "fixed-point")
-"""Reductions that a number may follow, after a colon: the seed, the width of a block, the bits."""
-
-
-def _reduction(value: Any) -> Any:
-    """A reduction in the words of mdnum.numerics.reductions.parse, told without importing it (and jax)."""
-    if isinstance(value, str):
-        name, colon, number = value.partition(":")
-        if name in REDUCTIONS and (not colon or (name in NUMBERED and number.isdecimal())):
-            return value
-        shown = ", ".join(f'"{one}:n"' if one in NUMBERED else f'"{one}"' for one in REDUCTIONS)
-        raise PydanticKnownError("literal_error", {"expected": f"one of {shown}"})
-    return value
-
-
 def _tuple(value: Any) -> Any:
     # TOML has arrays only; strict pydantic would refuse a list where a tuple is declared
     return tuple(value) if isinstance(value, list) else value
 
 
-_PATTERN = "|".join(rf"{name}(:\d+)?" if name in NUMBERED else name for name in REDUCTIONS)
-Reduction = Annotated[
-    str, BeforeValidator(_reduction), WithJsonSchema({"type": "string", "pattern": f"^({_PATTERN})$"})
-]
 Numbers = Annotated[float | tuple[float, ...], BeforeValidator(_numbers)]
 
 
@@ -255,7 +232,7 @@ class BallPrecision(Table):
     decision: FloatName = Field(default="float64", description="a residual and the tolerance, where compared")
     accumulate: FloatName = Field(default="float64", description="the sum of the residuals")
     loss: FloatName = Field(default="float64", description="the loss")
-    reduction: Reduction = Field(
+    reduction: Annotated[str, Named("mdnum.numerics.reductions:REDUCTIONS")] = Field(
         default="sequential",
         description="how the residuals are summed; a number may follow permuted (its seed), blocked (terms "
         'per block) and fixed-point (bits): "permuted:3"',

@@ -22,7 +22,7 @@ from mdnum.md.latticeforce import LatticeForce
 from mdnum.md.latticestep import LatticeStep, on_lattice
 from mdnum.md.manyforce import ManyBodyForce
 from mdnum.md.pairforce import PairForce
-from mdnum.md.potentials import CutPotential, LennardJones, Morse, PairPotential, SoftSphere, pair_type
+from mdnum.md.potentials import POTENTIALS, CutPotential, pair_type
 from mdnum.md.verlet import BUILDERS, SLOTS, PairTable, RebuildRule, VerletList, check_radius
 from mdnum.numerics import PrecisionPolicy, unit_roundoff
 from mdnum.numerics.reductions import REDUCTIONS
@@ -34,11 +34,8 @@ from mdnum.units import Units
 if TYPE_CHECKING:
     from mdnum.systems.evaluate import Evaluation
 
-_POTENTIALS: Mapping[str, type[PairPotential]] = {
-    "lennard-jones": LennardJones,
-    "morse": Morse,
-    "soft-sphere": SoftSphere,
-}
+if TYPE_CHECKING:
+    from mdnum.systems.evaluate import Evaluation
 
 
 @dataclass(frozen=True)
@@ -259,7 +256,7 @@ def _pair_model(system: System) -> CutPotential:
     radius, onset = pairs.cutoff_radii(spec, species)
     r_cut = jnp.asarray(_per_type(radius))
     return CutPotential(
-        _POTENTIALS[spec.potential.kind](**constants),
+        POTENTIALS[spec.potential.kind](**constants),
         CUTOFFS.parse(spec.cutoff.kind),
         r_cut,
         r_cut if onset is None else jnp.asarray(_per_type(onset)),
@@ -272,13 +269,13 @@ def _many_body_model(system: System):
     potential = system.spec.potential
     a, b, c = (bool(flag) for flag in system.atoms.pbc)
     pbc = (a, b, c)
-    if isinstance(potential, schema.EmbeddedAtom):
+    if isinstance(potential, schema.EmbeddedAtomTable):
         return manybody.embedded_atom(
             system.folder / potential.file, system.atoms.get_chemical_symbols(), pbc
         )
-    if isinstance(potential, schema.Tersoff):
+    if isinstance(potential, schema.TersoffTable):
         return manybody.tersoff(potential.parameters, pbc)
-    assert isinstance(potential, schema.StillingerWeber)
+    assert isinstance(potential, schema.StillingerWeberTable)
     return manybody.stillinger_weber(potential.parameters, pbc)
 
 
@@ -330,7 +327,7 @@ def build(system: System | str, overrides: Mapping[str, Any] | None = None) -> S
     rebuild = spec.neighbors.rebuild
     builder = spec.neighbors.builder
     timestep = jnp.asarray(spec.dynamics.timestep * units.time_factor, jnp.float64)
-    if isinstance(spec.dynamics, schema.Langevin):
+    if isinstance(spec.dynamics, schema.LangevinTable):
         integrator: Integrator = Langevin(
             timestep,
             jnp.asarray(spec.dynamics.friction / units.time_factor, jnp.float64),

@@ -14,7 +14,6 @@ import pytest
 from mdnum import systems
 from mdnum.ball.limits import smallest
 from mdnum.errors import InputError
-from mdnum.numerics import reductions
 from mdnum.systems import BallSystem, System, ball, load
 from mdnum.systems.ball_system import BALL_SCHEMA
 
@@ -197,7 +196,7 @@ def test_a_mistake_in_the_file(penalty: Path, old: str, new: str, line: int, wor
         ("loss.kind", "residual-penetration", ["--set loss.kind: ", "the contact is a penalty"]),
         ("contact.hysteresis", "0", ["contact.hysteresis = 0", "above 0"]),
         ("precision.state", "float8", ["--set precision.state: ", '"bfloat16"']),
-        ("precision.reduction", "backwards", ["--set precision.reduction: ", '"blocked:n"', '"neumaier"']),
+        ("precision.reduction", "backwards", ["--set precision.reduction: ", "neumaier"]),
         ("precision.reduction", "sequential:3", ["--set precision.reduction: "]),
         ("precision.rounding", "up", ['"nearest" or "stochastic"']),
         ("precision.arithmetic", "float16", ["contact.k = 10000", ""]),
@@ -426,13 +425,6 @@ def test_a_batch_on_the_boundary_needs_a_tolerance_of_its_format():
         )  # fmt: skip
     with pytest.raises(InputError, match="needs a tolerance to be on the boundary of"):
         load(name, {"stop.rule": "fixed", "stop.count": "2"})
-
-
-def test_reductions_are_those_of_the_library():
-    assert set(ball.REDUCTIONS) == set(reductions.BY_NAME)
-    for name in ball.REDUCTIONS:
-        text = f"{name}:16" if name in ball.NUMBERED else name
-        assert type(reductions.parse(text)) is type(reductions.BY_NAME[name])
 
 
 def test_methods_are_those_of_the_library():

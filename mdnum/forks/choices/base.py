@@ -14,7 +14,7 @@ from mdnum.precision import reductions
 from mdnum.systems import overrides, structures, toml
 from mdnum.systems.build import Simulation, build
 from mdnum.systems.load import GRAMMAR, System
-from mdnum.systems.schema import Langevin, SystemSpec
+from mdnum.systems.schema import LangevinTable, SystemSpec
 
 #: Reductions whose result does not depend on the order of their terms.
 ORDERLESS = ("exact", "fixed-point")
@@ -113,7 +113,7 @@ def is_pairwise(system: System) -> bool:
 
 def is_langevin(system: System) -> bool:
     """Whether the run has a thermostat, and so noise."""
-    return isinstance(system.spec.dynamics, Langevin)
+    return isinstance(system.spec.dynamics, LangevinTable)
 
 
 def no_sums(system: System, both: str | None) -> str | None:
