@@ -8,57 +8,72 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import shlex
+import tomllib
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 from command_line import call
-from goldens.commands import FILES, GOLDENS, Golden
 
 RECORDS = Path(__file__).parent / "goldens"
-BY_NAME = {golden.name: golden for golden in GOLDENS}
+COMMANDS = tomllib.loads((RECORDS / "commands.toml").read_text(encoding="utf-8"))
 EXACT = 1e-6
 #: what is smaller is rounding error, and another processor's is another
 ROUNDING = 1e-12
 
 
+@dataclass(frozen=True)
+class Golden:
+    """One command of `commands.toml`, which says what its keys mean."""
+
+    name: str
+    call: str
+    numbers: str = ""
+    tables: str = ""
+    needs: str = ""
+    out: bool = True
+    slow: bool = False
+
+    def chosen(self) -> list[tuple[str, str, str]]:
+        """Label, path and tolerance of each number."""
+        words = [word for one in self.numbers.split() for word in COMMANDS["numbers"].get(one, one).split()]
+        parts = [word.partition("~") for word in words]
+        return [(a.rpartition("=")[0] or a, a.rpartition("=")[2], tolerance) for a, _, tolerance in parts]
+
+
+BY_NAME = {name: Golden(name, **told) for name, told in COMMANDS["golden"].items()}
+
+
 def walk(document: Any, path: str) -> Any:
-    """What stands at a path of `goldens.commands`; "absent" where nothing does."""
+    """What stands at a path of `goldens.commands`; None where nothing does."""
     if not path:
         return document
     key, _, rest = path.partition(".")
     if key.endswith("[]"):
         found = walk(document, key[:-2])
-        return [walk(one, rest) for one in found] if isinstance(found, list) else "absent"
+        return [walk(one, rest) for one in found] if isinstance(found, list) else found
     if key.endswith("{}"):
         found = walk(document, key[:-2])
-        return {name: walk(one, rest) for name, one in found.items()} if isinstance(found, dict) else "absent"
-    if not isinstance(document, dict) or key not in document:
-        return "absent"
-    return walk(document[key], rest)
+        return {name: walk(one, rest) for name, one in found.items()} if isinstance(found, dict) else found
+    return walk(document[key], rest) if isinstance(document, dict) and key in document else None
 
 
 def numbers(golden: Golden, document: Any) -> dict[str, Any]:
     """The chosen numbers by label; a limit is recorded as whether it is kept."""
     found = {}
-    for word in golden.numbers:
-        word, _, tolerance = word.partition("~")
-        label, _, path = word.rpartition("=")
+    for label, path, tolerance in golden.chosen():
         value = walk(document, path)
-        if tolerance.startswith("<"):
-            value = f"within {tolerance[1:]}" if value is not None and abs(value) < float(tolerance[1:]) else value
-        found[label or path] = value
+        if tolerance.startswith("<") and isinstance(value, float) and abs(value) < float(tolerance[1:]):
+            value = f"within {tolerance[1:]}"
+        # a list of what no row has is as if it were not asked for
+        if value is not None and value != [None] * len(value if isinstance(value, list) else "x"):
+            found[label] = value
     return found
-
-
-def tolerances(golden: Golden) -> dict[str, float]:
-    """Relative tolerance by label, where it is another than the usual one."""
-    words = [word.partition("~") for word in golden.numbers]
-    return {(a.rpartition("=")[0] or a): float(b) for a, _, b in words if b and not b.startswith("<")}
 
 
 def table(path: Path) -> dict[str, Any]:
@@ -97,13 +112,14 @@ def alike(recorded: Any, seen: Any, tolerance: float, scale: float = 0.0) -> boo
 
 def differences(golden: Golden, recorded: dict[str, Any], seen: dict[str, Any]) -> list[str]:
     """One line for each label that is not as recorded."""
-    loose, told = tolerances(golden), []
+    loose = {label: float(word) for label, _, word in golden.chosen() if word and word[0] != "<"}
+    told = []
 
     def compare(label: str, a: Any, b: Any, tolerance: float = EXACT, scale: float = 0.0) -> None:
         if not alike(a, b, tolerance, scale):
             told.append(f"{label}: recorded {json.dumps(a)}, seen {json.dumps(b)}")
 
-    for part in ("exit", "findings", "verdicts"):
+    for part in ("exit", "findings"):
         compare(part, recorded.get(part), seen.get(part))
     for part in ("numbers", "tables"):
         compare(f"names of {part}", sorted(recorded[part]), sorted(seen[part]))
@@ -117,11 +133,21 @@ def differences(golden: Golden, recorded: dict[str, Any], seen: dict[str, Any]) 
             x, y = a["columns"][column], b["columns"][column]
             if isinstance(x, list) and isinstance(y, list) and len(x) == len(y) == 3:
                 largest = max(abs(x[0]), abs(x[1]))
-                compare(f"{name}.{column}: least and largest", x[:2], y[:2], golden.loose)
-                compare(f"{name}.{column}: sum", x[2], y[2], golden.loose, largest * math.sqrt(a["rows"]))
+                compare(f"{name}.{column}: least and largest", x[:2], y[:2], EXACT)
+                compare(f"{name}.{column}: sum", x[2], y[2], EXACT, largest * math.sqrt(a["rows"]))
             else:
                 compare(f"{name}.{column}", x, y)
     return told
+
+
+def written(value: Any, depth: int = 0) -> str:
+    """JSON with a line for each label: name, part, label."""
+    if depth == 3 or not isinstance(value, dict) or not value:
+        return json.dumps(value, ensure_ascii=False)
+    inner = ",\n".join(
+        f"{' ' * (depth + 1)}{json.dumps(key)}: {written(one, depth + 1)}" for key, one in value.items()
+    )
+    return f"{{\n{inner}\n{' ' * depth}}}" + "\n" * (depth == 0)
 
 
 class Seen:
@@ -130,15 +156,15 @@ class Seen:
     def __init__(self, folder: Path):
         self.folder = folder
         self.answers: dict[str, dict[str, Any]] = {}
-        for name, text in FILES.items():
-            (folder / name).write_text(text)
+        for name, text in COMMANDS["files"].items():
+            (folder / f"{name}.py").write_text(text.replace("{tests!r}", repr(str(RECORDS.parent))))
 
     def of(self, golden: Golden, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
         if golden.name in self.answers:
             return self.answers[golden.name]
         for name in golden.needs.split():
             self.of(BY_NAME[name], capsys)
-        words = [*golden.words, "--json", *(("-o", golden.name) if golden.out else ())]
+        words = [*shlex.split(golden.call), "--json", *(("-o", golden.name) if golden.out else ())]
         capsys.readouterr()
         code = call(*words)
         document = json.loads(capsys.readouterr().out)
@@ -163,20 +189,20 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> Seen:
 # as a user calls it: dtypes are not strict
 @pytest.mark.jax_md
 @pytest.mark.parametrize(
-    "name", [pytest.param(one.name, marks=[pytest.mark.slow] * one.slow) for one in GOLDENS]
+    "name", [pytest.param(one.name, marks=[pytest.mark.slow] * one.slow) for one in BY_NAME.values()]
 )
 def test_golden(name: str, seen: Seen, request, capsys, monkeypatch):
     monkeypatch.chdir(seen.folder)
     golden = BY_NAME[name]
     answer = json.loads(json.dumps(seen.of(golden, capsys)))
-    path = RECORDS / f"{golden.verb}.json"
+    path = RECORDS / f"{name.partition('-')[0]}.json"
     records = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     if request.config.getoption("--rewrite-goldens"):
         records[name] = answer
         # records of goldens that are no more go
         kept = {one: records[one] for one in sorted(records) if one in BY_NAME}
-        path.write_text(json.dumps(kept, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        path.write_text(written(kept), encoding="utf-8")
         return
     assert name in records, f"no record of {name}: write it with --rewrite-goldens"
     told = differences(golden, records[name], answer)
-    assert not told, f"mdnum {golden.arguments}\n  " + "\n  ".join(told)
+    assert not told, f"mdnum {golden.call}\n  " + "\n  ".join(told)
