@@ -134,6 +134,8 @@ class Registry(Generic[T]):
             a_kind = isinstance(value, type) and issubclass(value, self.kind or object)
             if not (a_kind or inspect.isroutine(value) or isinstance(value, self.kind or object)):
                 raise TypeError(f"{point.value} is no {self.kind}")
+            if getattr(value, "name", point.name) != point.name:
+                raise ValueError(f"its name is {value.name!r}")
             if self.check:
                 self.check(value)
         except Exception as error:

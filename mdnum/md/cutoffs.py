@@ -145,6 +145,8 @@ def check(cutoff: type[Cutoff] | Cutoff) -> None:
         ValueError: it is not; names the quantity and the distance.
     """
     made = cutoff if isinstance(cutoff, Cutoff) else cutoff()
+    if not isinstance(getattr(made, "name", None), str):
+        raise ValueError("it has no name")
     at = AtCutoff(*map(np.float64, (2.0, 1.6, 0.25, -0.25)))
     r = np.linspace(1.0, 2.0, 41)[:-1]
     energy, slope = made.cut(r**2, r**-2, -(r**-4), at)

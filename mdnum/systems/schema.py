@@ -8,6 +8,7 @@ file: Å, eV, amu, ps and K for "metal"; multiples of σ, ε, m and τ for "lj".
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import fields
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args
 
 from pydantic import BeforeValidator, ConfigDict, Discriminator, Field, Tag, model_validator
@@ -183,7 +184,7 @@ class OtherTable(PairTable):
         """Names of the constants of one pair."""
         from mdnum.md.potentials import POTENTIALS
 
-        return tuple(POTENTIALS[self.kind].__dataclass_fields__)
+        return tuple(field.name for field in fields(POTENTIALS[self.kind]))
 
     @model_validator(mode="after")
     def _known(self) -> Any:
