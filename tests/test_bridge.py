@@ -10,12 +10,12 @@ from ase import Atoms
 from small_systems import make
 
 from mdnum import ball
-from mdnum.md.stepper import MdState, PairDynamics
+from mdnum.md.pairforce import MdState, PairDynamics
 from mdnum.numerics import Hysteresis, Ledger, Threshold, broken_alternations
 from mdnum.numerics.reductions import BY_NAME
 from mdnum.numerics.saltation import carry
+from mdnum.rollout.checks import rebuild_ledger
 from mdnum.rollout.engine import first_state
-from mdnum.rollout.health import rebuild_ledger
 from mdnum.rollout.run import run
 from mdnum.store import RunFolder
 from mdnum.systems.build import Simulation, build

@@ -16,7 +16,9 @@ from ase import Atoms
 from ase.io import read as ase_read
 
 from mdnum.errors import FolderError
-from mdnum.store import COLUMNS, TABLES, RunFolder, atomic, columns_of, frames, tables
+from mdnum.store import COLUMNS, TABLES, RunFolder, columns_of, tables
+from mdnum.store import checkpoint as frames
+from mdnum.store import files as atomic
 
 
 def series_rows(start: int, stop: int) -> dict[str, np.ndarray]:

@@ -18,8 +18,8 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from mdnum.errors import InputError
 from mdnum.md.cell import Cell
+from mdnum.md.neighbors import SLOTS
 from mdnum.md.potentials import of_type
-from mdnum.md.verlet import SLOTS
 from mdnum.numerics import Reach, Threshold, distance_bound, squared_distance_bound
 from mdnum.numerics.exact import squared_norm
 from mdnum.numerics.rounding import unit_roundoff

@@ -253,12 +253,7 @@ def _closest(model: CutPotential, lattice: Lattice) -> float:
 
 
 class _Reproducible(eqx.Module):
-    """A cut potential whose results do not depend on how it is compiled.
-
-    Attributes:
-        model: the potential, in float64.
-        zero: an integer zero that XLA must not know.
-    """
+    """A cut potential whose results do not depend on how it is compiled."""
 
     model: CutPotential
     zero: Array

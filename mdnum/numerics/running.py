@@ -11,10 +11,9 @@ term, so that their last digits may differ.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
-from functools import singledispatch
 from typing import Any
 
 import jax
@@ -24,8 +23,7 @@ from jaxtyping import Float
 from numpy.typing import DTypeLike
 
 from mdnum.errors import InputError
-from mdnum.numerics.reductions import Exact, FixedPoint, nearest
-from mdnum.numerics.sums import Blocked, Kahan, Neumaier, Permuted, Reduction, Sequential, Sorted, Whole
+from mdnum.numerics.sums import Permuted, Reduction, Sequential, Sorted, Whole
 
 
 @dataclass(frozen=True)
@@ -33,10 +31,10 @@ class Row:
     """One addition.
 
     Attributes:
-        term: index of the term that was added, or the first and last index under a node of a tree.
-        addend: what was added to the accumulator (in a tree, the right operand).
+        term: index of the term that was added.
+        addend: what was added to the accumulator.
         running: the accumulator afterwards.
-        exact: the sum of the terms so far (in a tree, of those under this node).
+        exact: the sum of the terms so far.
         bits_lost: binary digits of the exact result of this addition below the last place that was kept;
             0 where the addition was exact.
         absorbed: a nonzero addend left no trace.
@@ -103,11 +101,11 @@ def running_sum_table(
 
     Args:
         terms: the numbers, shape (n,).
-        reduction: any of `mdnum.numerics.reductions`.
+        reduction: a loop: sequential, reversed, permuted or sorted.
         dtype: terms are rounded to it first; that of the terms where None.
 
     Raises:
-        InputError: no terms, a number that is not finite, or a reduction without a history.
+        InputError: no terms, a number that is not finite, or a reduction that is no loop.
     """
     terms = np.asarray(terms)
     terms = terms.astype(np.dtype(dtype) if dtype is not None else terms.dtype)
@@ -116,7 +114,7 @@ def running_sum_table(
     if not np.isfinite(terms.astype(np.float64)).all():
         raise InputError("a term is not finite, so the sum has no history")
     with np.errstate(all="ignore"):
-        rows = tuple(_history(reduction, terms))
+        rows = tuple(_loop(terms, _order(reduction, terms)))
     exact = sum((Fraction(float(t)) for t in terms), Fraction(0))
     return RunningSum(str(terms.dtype), reduction, rows, rows[-1].running, exact)
 
@@ -155,123 +153,19 @@ def _loop(terms: np.ndarray, order: Sequence[int]) -> Iterator[Row]:
         total = new
 
 
-@singledispatch
-def _history(reduction: Any, terms: np.ndarray) -> Iterator[Row]:
-    raise InputError(f"{reduction} has no history of additions")
-
-
-@_history.register
-def _(reduction: Sequential, terms: np.ndarray) -> Iterator[Row]:
-    return _loop(terms, range(len(terms))[:: -1 if reduction.order == "reversed" else 1])
-
-
-@_history.register
-def _(reduction: Permuted, terms: np.ndarray) -> Iterator[Row]:
-    return _loop(terms, np.random.default_rng(reduction.seed).permutation(len(terms)).tolist())
-
-
-@_history.register
-def _(reduction: Sorted, terms: np.ndarray) -> Iterator[Row]:
-    order = np.lexsort((terms.astype(np.float64), np.abs(terms.astype(np.float64)))).tolist()
-    return _loop(terms, order if reduction.order == "ascending" else order[::-1])
-
-
-@_history.register
-def _(reduction: Blocked, terms: np.ndarray) -> Iterator[Row]:
-    nodes = [(k, k, t, Fraction(float(t))) for k, t in enumerate(terms)]
-    if len(nodes) == 1:
-        yield from _loop(terms, [0])
-    while len(nodes) > 1:
-        level = []
-        for start in range(0, len(nodes), reduction.width):
-            first, last, total, exact = nodes[start]
-            for _, last, addend, part in nodes[start + 1 : start + reduction.width]:
-                new, exact = total + addend, exact + part
-                true = Fraction(float(total)) + Fraction(float(addend))
-                yield Row(
-                    f"{first}-{last}",
-                    float(addend),
-                    float(new),
-                    exact,
-                    _lost(true, Fraction(float(new)), _place(new)) if np.isfinite(new) else 0,
-                    bool(new == total and addend != 0),
-                )
-                total = new
-            level.append((first, last, total, exact))
-        nodes = level
-
-
-def _compensated(
-    terms: np.ndarray, step: Callable[[Any, Any, Any], tuple[Any, Any, Any, int]]
-) -> Iterator[Row]:
-    """`step` gives the addend, the new total, the new correction (to be added with its sign)."""
-    total = lost = terms.dtype.type(0)
-    exact = Fraction(0)
-    for k, term in enumerate(terms):
-        addend, new, correction, sign = step(total, lost, term)
-        true = Fraction(float(total)) + sign * Fraction(float(lost)) + Fraction(float(term))
-        kept = Fraction(float(new)) + sign * Fraction(float(correction))
-        exact += Fraction(float(term))
-        place = min(_place(new), _place(correction)) if correction else _place(new)
-        traced = new != total or correction != lost
-        yield Row(
-            str(k), float(addend), float(new), exact, _lost(true, kept, place), not traced and bool(term)
-        )
-        total, lost = new, correction
-
-
-@_history.register
-def _(reduction: Kahan, terms: np.ndarray) -> Iterator[Row]:
-    def step(total, lost, term):
-        addend = term - lost
-        new = total + addend
-        return addend, new, (new - total) - addend, -1
-
-    return _compensated(terms, step)
-
-
-@_history.register
-def _(reduction: Neumaier, terms: np.ndarray) -> Iterator[Row]:
-    state: list[Any] = []
-
-    def step(total, lost, term):
-        new = total + term
-        gap = (total - new) + term if abs(total) >= abs(term) else (term - new) + total
-        state[:] = [new, lost + gap]
-        return term, new, lost + gap, 1
-
-    exact = Fraction(0)
-    for row in _compensated(terms, step):
-        exact = row.exact
-        yield row
-    total, lost = state
-    end = total + lost
-    true = Fraction(float(total)) + Fraction(float(lost))
-    kept = Fraction(float(end))
-    yield Row("correction", float(lost), float(end), exact, _lost(true, kept, _place(end)), False)
-
-
-@_history.register
-def _(reduction: Exact, terms: np.ndarray) -> Iterator[Row]:
-    exact = Fraction(0)
-    for k, term in enumerate(terms):
-        exact += Fraction(float(term))
-        yield Row(str(k), float(term), float(nearest(exact, terms.dtype)), exact, 0, False)
-    end = nearest(exact, terms.dtype)
-    kept = Fraction(float(end)) if np.isfinite(end) else exact
-    yield Row("rounding", 0.0, float(end), exact, _lost(exact, kept, _place(end)), False)
-
-
-@_history.register
-def _(reduction: FixedPoint, terms: np.ndarray) -> Iterator[Row]:
-    exact, total, unit = Fraction(0), 0, Fraction(2) ** reduction.bits
-    for k, term in enumerate(terms):
-        value = Fraction(float(term))
-        integer = round(value * unit)
-        exact, total = exact + value, total + integer
-        lost = _lost(value, integer / unit, -reduction.bits)
-        running = float(np.float64(total / unit).astype(terms.dtype))
-        yield Row(str(k), float(integer / unit), running, exact, lost, integer == 0 and value != 0)
+def _order(reduction: Any, terms: np.ndarray) -> Sequence[int]:
+    match reduction:
+        case Sequential():
+            return range(len(terms))[:: -1 if reduction.order == "reversed" else 1]
+        case Permuted():
+            return np.random.default_rng(reduction.seed).permutation(len(terms)).tolist()
+        case Sorted():
+            wide = terms.astype(np.float64)
+            order = np.lexsort((wide, np.abs(wide))).tolist()
+            return order if reduction.order == "ascending" else order[::-1]
+    raise InputError(
+        f"{reduction} is no loop over the terms", remedy="Give sequential, reversed, permuted or sorted"
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,6 +1,5 @@
 # shim
+import importlib
 import sys
 
-import mdnum.numerics.formats
-
-sys.modules[__name__] = sys.modules["mdnum.numerics.formats"]
+sys.modules[__name__] = importlib.import_module("mdnum.numerics.formats")

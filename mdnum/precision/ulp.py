@@ -1,6 +1,5 @@
 # shim
+import importlib
 import sys
 
-import mdnum.numerics.rounding
-
-sys.modules[__name__] = sys.modules["mdnum.numerics.rounding"]
+sys.modules[__name__] = importlib.import_module("mdnum.numerics.rounding")

@@ -20,8 +20,8 @@ from jaxtyping import Array, Float, Int
 
 from mdnum.errors import InputError, NumericalError
 from mdnum.md.decide import Tables
-from mdnum.md.latticestep import LatticeLangevin
-from mdnum.md.verlet import PairTable, VerletList
+from mdnum.md.lattice import LatticeLangevin
+from mdnum.md.neighbors import PairTable, VerletList
 from mdnum.rollout.engine import Engine
 from mdnum.rollout.epoch import Program, Record, State, write_row
 from mdnum.systems.build import Simulation

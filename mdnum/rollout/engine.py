@@ -16,9 +16,8 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from mdnum.md.cell import wrap_positions
-from mdnum.md.verlet import PairTable, VerletList
-from mdnum.rollout.epoch import Outcome, Program, Record, State, empty_record, run_epoch
-from mdnum.rollout.pins import Pins
+from mdnum.md.neighbors import PairTable, VerletList
+from mdnum.rollout.epoch import Outcome, Pins, Program, Record, State, empty_record, run_epoch
 from mdnum.systems.build import Simulation
 
 # bytes that the rows of one epoch's record may take, and the most rows; both bound memory, not accuracy

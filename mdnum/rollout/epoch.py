@@ -1,24 +1,89 @@
-"""The life of one Verlet list: a jitted loop that advances with fixed pairs and records as it goes.
-
-The loop ends when the skin is used up, the record is full, the last step is done, or a number is not
-finite. The host then rebuilds the list and starts the next epoch.
-"""
+"""Decisions of single pairs that a run is told, while it makes all others itself."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from mdnum.md.cell import Cell
 from mdnum.md.decide import Tables
 from mdnum.md.integrators import Integrator
+from mdnum.md.neighbors import PairTable
 from mdnum.md.pairforce import Forces
+
+
+@dataclass(frozen=True)
+class Pin:
+    """What a run is told about one pair.
+
+    Attributes:
+        i, j: the pair, i < j.
+        first, last: steps at which it is told.
+        changes: steps at which what it is told changes, ascending.
+        inside: what it is told before the first of them.
+    """
+
+    i: int
+    j: int
+    first: int
+    last: int
+    changes: tuple[int, ...] = ()
+    inside: bool = False
+
+    def at(self, steps: Int[np.ndarray, "steps"]) -> Bool[np.ndarray, "steps"]:
+        """What it is told at given steps."""
+        turned = np.searchsorted(np.asarray(self.changes, np.int64), steps, side="right")
+        return (turned % 2 == 1) ^ self.inside
+
+
+@dataclass(frozen=True)
+class Pins:
+    """The pairs whose decisions a run is told."""
+
+    pins: Sequence[Pin]
+
+    def rows(
+        self, table: PairTable, first: int, count: int
+    ) -> tuple[UInt8[np.ndarray, "rows words atoms"], UInt8[np.ndarray, "rows words atoms"]]:
+        """Packed decisions and where they hold, for consecutive steps of one list.
+
+        A pair that the list does not hold is too far away to be inside, and cannot be told to be.
+
+        Args:
+            table: the list.
+            first: step of the first row.
+            count: number of rows.
+        """
+        atoms = len(table.order)
+        shape = (count, table.slots // 8, atoms)
+        told, where = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
+        place = np.argsort(table.order)
+        steps = np.arange(first, first + count)
+        index = table.index.reshape(-1, atoms)
+        for pin in self.pins:
+            held = (steps >= pin.first) & (steps <= pin.last)
+            if not held.any():
+                continue
+            inside = pin.at(steps)
+            for atom, other in ((pin.i, pin.j), (pin.j, pin.i)):
+                column = place[atom]
+                for slot in np.flatnonzero(index[:, column] == place[other]):
+                    bit = np.uint8(1 << (slot % 8))
+                    where[held, slot // 8, column] |= bit
+                    told[held & inside, slot // 8, column] |= bit
+        return told, where
+
+
+# --- the life of one Verlet list: a jitted loop that advances with fixed pairs and records as it goes -
 
 
 class Program(eqx.Module):

@@ -14,13 +14,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from mdnum.rollout.compared import Apart, differ
-from mdnum.rollout.crossing import CrossFlip, Crossing
+from mdnum.rollout.compared import Apart, CrossFlip, Crossing, Frame, differ
 from mdnum.rollout.engine import Segment, Start
 from mdnum.rollout.flips import Ambiguous
-from mdnum.rollout.frame import Frame
-from mdnum.rollout.handed import Handed, Overridden
-from mdnum.rollout.tracks import Rows, Track, joined
+from mdnum.rollout.tracks import Handed, Overridden, Rows, Track, joined
 from mdnum.systems.build import Simulation
 
 

@@ -14,8 +14,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from mdnum.errors import FolderError
-from mdnum.store import manifest
-from mdnum.store.atomic import disk_errors, opened, replacing, subfolder
+from mdnum.store import files as manifest
+from mdnum.store.files import disk_errors, opened, replacing, subfolder
 
 _FLOAT, _INT, _SHORT, _BOOL, _TEXT = pa.float64(), pa.int64(), pa.int32(), pa.bool_(), pa.string()
 

@@ -11,7 +11,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from mdnum.errors import InputError
-from mdnum.store.atomic import disk_errors, write_text
+from mdnum.store.files import disk_errors, write_text
 from mdnum.systems import ball_checks, toml
 from mdnum.systems.ball import BallSpec, ValuesControl
 from mdnum.systems.grammar import Grammar, apply_overrides, explain, place, read_overrides

@@ -17,13 +17,11 @@ from mdnum.md.cell import Cell, displacement
 from mdnum.md.cutoffs import CUTOFFS, Cutoff
 from mdnum.md.decide import PairDecider, Tables
 from mdnum.md.integrators import Integrator, Langevin, VelocityVerlet
-from mdnum.md.lattice import Lattice, LatticeDecider
+from mdnum.md.lattice import Lattice, LatticeDecider, LatticeStep, on_lattice
 from mdnum.md.latticeforce import LatticeForce
-from mdnum.md.latticestep import LatticeStep, on_lattice
-from mdnum.md.manyforce import ManyBodyForce
-from mdnum.md.pairforce import PairForce
+from mdnum.md.neighbors import BUILDERS, SLOTS, PairTable, RebuildRule, VerletList, check_radius
+from mdnum.md.pairforce import ManyBodyForce, PairForce
 from mdnum.md.potentials import POTENTIALS, CutPotential, pair_type
-from mdnum.md.verlet import BUILDERS, SLOTS, PairTable, RebuildRule, VerletList, check_radius
 from mdnum.numerics import PrecisionPolicy, unit_roundoff
 from mdnum.numerics.reductions import REDUCTIONS
 from mdnum.numerics.roles import LATTICE
@@ -179,7 +177,7 @@ class Simulation:
     def verlet_list(self, skin: float | None = None) -> VerletList:
         """A new Verlet list for this system, with another skin where one is given."""
         rule = self.rule if skin is None else replace(self.rule, skin=skin)
-        return VerletList(BUILDERS[self.builder], rule, self.r_cut, guard=self._guard)
+        return VerletList(BUILDERS.parse(self.builder), rule, self.r_cut, guard=self._guard)
 
     @property
     def _guard(self) -> float:
@@ -264,13 +262,13 @@ def _pair_model(system: System) -> CutPotential:
 
 
 def _many_body_model(system: System):
-    from mdnum.md import manybody
+    from mdnum.md import embedded_atom, manybody
 
     potential = system.spec.potential
     a, b, c = (bool(flag) for flag in system.atoms.pbc)
     pbc = (a, b, c)
     if isinstance(potential, schema.EmbeddedAtomTable):
-        return manybody.embedded_atom(
+        return embedded_atom.embedded_atom(
             system.folder / potential.file, system.atoms.get_chemical_symbols(), pbc
         )
     if isinstance(potential, schema.TersoffTable):

@@ -144,11 +144,7 @@ def start(spec: ball.BallSpec) -> tuple[Float[np.ndarray, "balls"], Float[np.nda
 
 
 def _on_the_boundary(spec: ball.BallSpec, boundary: ball.Boundary) -> Float[np.ndarray, "balls"]:
-    """One penetration an ulp short of the tolerance, and the ulp in equal parts.
-
-    Summed largest first, each part is less than half an ulp of the sum and is rounded away; their exact sum
-    is the tolerance.
-    """
+    """One penetration an ulp short of the tolerance, and the ulp in equal parts."""
     assert spec.stop is not None and not isinstance(spec.stop, ball.FixedRule)
     tol = spec.stop.tol
     below = float(np.nextafter(np.asarray(tol, limits.DTYPES[boundary.format]), 0))

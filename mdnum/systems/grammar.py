@@ -43,16 +43,19 @@ class Named:
 
     Args:
         registry: "module:attribute"; imported when a name is checked, because the module may be a slow one.
+        others: further words that are allowed.
     """
 
-    def __init__(self, registry: str):
-        self.registry = registry
+    def __init__(self, registry: str, *others: str):
+        self.registry, self.others = registry, others
 
     def _check(self, value: Any) -> Any:
+        if value in self.others:
+            return value
         module, _, attribute = self.registry.partition(":")
         registry = getattr(importlib.import_module(module), attribute)
         if isinstance(value, str) and value.partition(registry.separator)[0] not in registry:
-            raise PydanticCustomError("unknown_name", "unknown name", {"known": list(registry)})
+            raise PydanticCustomError("unknown_name", "unknown name", {"known": [*self.others, *registry]})
         if isinstance(value, str):
             try:
                 registry.parse(value)
@@ -69,7 +72,7 @@ class Named:
         lines = [f"{name}: {registry.description(name)}" for name in registry.shipped]
         # an editor offers those shipped, and lets others pass: packages add theirs
         return {
-            "anyOf": [{"enum": list(registry.shipped)}, {"type": "string"}],
+            "anyOf": [{"enum": [*self.others, *registry.shipped]}, {"type": "string"}],
             "description": "; ".join(lines),
         }
 

@@ -17,7 +17,7 @@ from pydantic import ValidationError
 from mdnum import units as unit_systems
 from mdnum.errors import InputError
 from mdnum.registry import nearest
-from mdnum.store.atomic import disk_errors, replacing, write_text
+from mdnum.store.files import disk_errors, replacing, write_text
 from mdnum.systems import pairs, schema, structures, toml
 from mdnum.systems.ball_system import BALL_SCHEMA, BallSystem, Source, kind_first
 from mdnum.systems.ball_system import make as make_ball

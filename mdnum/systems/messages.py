@@ -1,4 +1,5 @@
 # shim
+import importlib
 import sys
 
-sys.modules[__name__] = sys.modules["mdnum.systems.grammar"]
+sys.modules[__name__] = importlib.import_module("mdnum.systems.grammar")

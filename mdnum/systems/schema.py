@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args
 from pydantic import BeforeValidator, ConfigDict, Discriminator, Field, Tag, model_validator
 
 from mdnum import units as unit_systems
-from mdnum.md.cutoffs import CUTOFFS
 from mdnum.systems.grammar import Named, NonNegative, Table
 
 Length = Annotated[float, Field(gt=0, description="length (Å or σ)")]
@@ -218,6 +217,13 @@ Potential = Annotated[
 # --- cutoff -------------------------------------------------------------------------------------------
 
 
+def _switches(kind: Any) -> bool:
+    # imported here, because a file of the ball needs no molecular dynamics
+    from mdnum.md.cutoffs import CUTOFFS
+
+    return kind not in CUTOFFS or CUTOFFS[kind].switches
+
+
 class CutoffTable(Table):
     """How a pair potential ends, and where."""
 
@@ -239,7 +245,7 @@ class CutoffTable(Table):
     @property
     def switches(self) -> bool:
         """Whether the kind has an onset."""
-        return CUTOFFS[self.kind].switches
+        return _switches(self.kind)
 
     @property
     def base(self) -> float | None:
@@ -250,7 +256,7 @@ class CutoffTable(Table):
     def foreign_keys(table: Mapping[str, Any]) -> set[str]:
         """Keys without a meaning for the kind that a table names."""
         kind = table.get("kind")
-        return {"onset"} if kind in CUTOFFS and not CUTOFFS[str(kind)].switches else set()
+        return set() if _switches(kind) else {"onset"}
 
     @model_validator(mode="after")
     def _one_radius(self) -> Any:
@@ -367,7 +373,7 @@ class NeighborsTable(Table):
     skin: NonNegative | None = Field(
         default=None, description="extra radius of the list (Å or σ); default 1.0 Å for metal, 0.3 σ for lj"
     )
-    builder: Literal["auto", "host", "jax-md"] = Field(
+    builder: Annotated[str, Named("mdnum.md.neighbors:BUILDERS", "auto")] = Field(
         default="auto", description="who searches for neighbors"
     )
     rebuild: RebuildTable = Field(default_factory=lambda: RebuildTable())

@@ -298,16 +298,7 @@ def _check_overlap(atoms: Atoms, smallest: float, length: str) -> None:
 def _nearest(
     atoms: Atoms, within: float
 ) -> tuple[Float64[np.ndarray, " atoms"], Int64[np.ndarray, " atoms"], int]:
-    """Of each atom the nearest other one within a distance, over periodic faces, and how many such pairs.
-
-    A tree and not a grid of cells, which has more cells than memory where a box is large or flat.
-
-    Args:
-        within: length, less than half of any periodic width.
-
-    Returns:
-        distance (inf where there is none) and index of the nearest, and the number of pairs.
-    """
+    """Of each atom the nearest other one within a distance, over periodic faces, and how many such pairs."""
     from ase.geometry import complete_cell
     from scipy.spatial import KDTree
 

@@ -20,7 +20,7 @@ from ase.neighborlist import neighbor_list
 
 from mdnum.errors import CapacityError, InputError, NumericalError
 from mdnum.md import jaxmd, manybody
-from mdnum.md.relaxation import relax
+from mdnum.md.jaxmd import relax
 
 pytestmark = pytest.mark.jax_md
 ALWAYS = (True, True, True)
@@ -235,7 +235,7 @@ def test_tersoff_forces_are_nan_beside_padding(md):
     gradient = np.asarray(jax.grad(energy_fn)(positions, neighbor))
     assert np.isnan(gradient).any(), mended(
         "masks the bond order after its power (NaN forces)",
-        "mdnum.md.manybody.tersoff may wrap jax-md's energy function, if its cosines are mended too",
+        "mdnum.md.manybody may wrap jax-md's energy function, if its cosines are mended too",
     )
     cell = jnp.asarray(atoms.cell.array)
     assert np.isfinite(np.asarray(manybody.tersoff().forces(positions, neighbor, cell))).all()
@@ -296,7 +296,7 @@ def test_eam_loader_wants_a_word_and_no_newline_and_rounds_to_float32(md):
     charge, embedding, _, _ = md.energy.load_lammps_eam_parameters(io.StringIO("\n".join([*table, ""])))
     value = float(embedding(jnp.asarray(0.5)))
     assert value != float(numbers[5]) and value == pytest.approx(float(numbers[5]), rel=1e-6), mended(
-        "rounds EAM tables to float32", "mdnum.md.manybody.setfl may go"
+        "rounds EAM tables to float32", "mdnum.md.embedded_atom may go"
     )
     assert float(charge(jnp.asarray(100.0))) == 0.0, mended(
         "returns 0 off its splines", "the NaN of EmbeddedAtom.embed may be reconsidered"

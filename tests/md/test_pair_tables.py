@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 from mdnum.errors import CapacityError, InputError
 from mdnum.md.cell import Cell, wrap_positions
-from mdnum.md.cells import neighbor_table
-from mdnum.md.verlet import BUILDERS, RebuildRule, VerletList, check_radius
+from mdnum.md.neighbors import BUILDERS, RebuildRule, VerletList, check_radius, neighbor_table
 
 FLAGS = st.tuples(st.booleans(), st.booleans(), st.booleans())
 

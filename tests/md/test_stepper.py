@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mdnum.dynamics import Dynamics
-from mdnum.md.stepper import MdState, PairDynamics
+from mdnum.md.pairforce import MdState, PairDynamics
 from mdnum.rollout.engine import Engine, first_state
 from mdnum.systems.build import build
 

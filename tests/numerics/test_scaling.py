@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mdnum.errors import InputError, NumericalError
-from mdnum.numerics.scaling import DynamicScale, StaticScale
+from mdnum.errors import InputError
+from mdnum.numerics.scaling import check_scale, scaled_gradient
 
 X = np.array([0.9, 1.1, 2.3])
 
@@ -23,8 +23,7 @@ TRUE = 2 * X.astype(np.float16).astype(float) / 3 * float(np.float16(3e-7))
 
 
 def test_without_scaling_the_gradient_is_quantized_and_with_it_restored():
-    bare = StaticScale(1.0).value_and_grad(loss, jnp.asarray(X))
-    scaled = StaticScale(2.0**12).value_and_grad(loss, jnp.asarray(X))
+    bare, scaled = (scaled_gradient(loss, scale, jnp.asarray(X)) for scale in (1.0, 2.0**12))
     assert np.abs(np.asarray(bare.gradient) / TRUE - 1).max() > 0.1
     assert np.abs(np.asarray(scaled.gradient) / TRUE - 1).max() < 2e-3
     assert scaled.gradient.dtype == jnp.float64
@@ -36,48 +35,22 @@ def test_scaling_by_a_power_of_two_changes_no_bit_of_a_wide_gradient():
         return jnp.sum(jnp.sin(x) ** 3)
 
     plain = jax.grad(wide)(jnp.asarray(X))
-    scaled = StaticScale().value_and_grad(wide, jnp.asarray(X)).gradient
-    assert np.array_equal(np.asarray(scaled), np.asarray(plain))
+    assert np.array_equal(
+        np.asarray(scaled_gradient(wide, 2.0**15, jnp.asarray(X)).gradient), np.asarray(plain)
+    )
 
 
-def steep(x):
-    return jnp.sum(x.astype(jnp.float16) * jnp.asarray(100.0, jnp.float16)).astype(jnp.float16)
+@pytest.mark.parametrize(("exponent", "finite"), [(9, True), (10, False)])
+def test_a_scale_that_overflows_is_noticed(exponent, finite):
+    def steep(x):
+        return jnp.sum(x.astype(jnp.float16) * jnp.asarray(100.0, jnp.float16)).astype(jnp.float16)
 
-
-def test_a_dynamic_scale_skips_halves_and_grows():
-    rule = DynamicScale(initial=2.0**12, interval=3)
-    state, step = rule.start(), jax.jit(lambda state, x: rule.value_and_grad(state, steep, x))
-    seen = []
-    for _ in range(12):
-        scale = float(state.scale)
-        result, state = step(state, jnp.asarray(X))
-        seen.append((scale, bool(result.finite)))
-        if bool(result.finite):
-            assert np.array_equal(np.asarray(result.gradient), [100, 100, 100])
     # 100 * 2^10 overflows 65504, 100 * 2^9 does not
-    assert seen[:6] == [(4096, False), (2048, False), (1024, False), (512, True), (512, True), (512, True)]
-    assert seen[6:] == [(1024, False), (512, True), (512, True), (512, True), (1024, False), (512, True)]
-    assert int(state.skipped) == 5
+    assert bool(scaled_gradient(steep, 2.0**exponent, jnp.asarray(X)).finite) is finite
 
 
-def test_settling_finds_the_largest_factor_that_is_finite():
-    result, state = DynamicScale().settle(steep, jnp.asarray(X))
-    assert float(result.scale) == 512 == float(state.scale)
-    low, _ = DynamicScale(initial=1.0).settle(steep, jnp.asarray(X))
-    assert float(low.scale) == 512
-    tiny, _ = DynamicScale().settle(loss, jnp.asarray(X))
-    assert np.abs(np.asarray(tiny.gradient) / TRUE - 1).max() < 2e-3
-
-
-def test_a_gradient_that_is_never_finite_is_said():
-    with pytest.raises(NumericalError, match="not finite even with a scale of 1"):
-        DynamicScale().settle(lambda x: jnp.sum(jnp.sqrt(x - x)), jnp.asarray(X))
-
-
-def test_factors_that_are_not_exact_are_refused():
-    with pytest.raises(InputError, match="scale 1000 is not a power of two"):
-        StaticScale(1000.0)
-    with pytest.raises(InputError, match="outside"):
-        DynamicScale(initial=2.0**30)
-    with pytest.raises(InputError, match="interval of 0"):
-        DynamicScale(interval=0)
+@pytest.mark.parametrize("scale", [1000.0, 0.0, -2.0, float("inf"), float("nan")])
+def test_factors_that_are_not_exact_are_refused(scale):
+    with pytest.raises(InputError, match="is not a power of two"):
+        check_scale(scale)
+    check_scale(2.0**-30)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mdnum.rollout.crossing import Crossing, Flips
+from mdnum.rollout.compared import Crossing, Flips
 
 ATOMS = 6
 

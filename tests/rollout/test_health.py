@@ -8,7 +8,7 @@ import pytest
 from oracles import all_pairs, margins
 from rollout.harness import assert_ledger_is_complete, go, liquid, write_system
 
-from mdnum.rollout.health import rebuild_ledger
+from mdnum.rollout.checks import rebuild_ledger
 from mdnum.systems import load
 
 R_CUT = 2.0

@@ -19,9 +19,9 @@ from rollout.harness import (
     write_system,
 )
 
-from mdnum.md.verlet import VerletList
+from mdnum.md.neighbors import VerletList
 from mdnum.numerics import Ledger, broken_alternations
-from mdnum.rollout.budget import EnergyBudget
+from mdnum.rollout.checks import EnergyBudget
 from mdnum.systems import load
 
 
