@@ -22,7 +22,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from mdnum.ball.contacts import Penalty
-from mdnum.ball.exact_penalty import ExactPenalty
+from mdnum.ball.exact import ExactPenalty
 from mdnum.ball.integrators import ExplicitEuler, ImplicitMidpoint, SemiImplicitEuler, VelocityVerlet
 from mdnum.ball.state import Decisions
 from mdnum.ball.world import World

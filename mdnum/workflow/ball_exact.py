@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mdnum.ball.exact import ExactImpact
-from mdnum.ball.exact_penalty import ExactPenalty
+from mdnum.ball.exact import ExactImpact, ExactPenalty
 from mdnum.ball.rollout import BallRun
 from mdnum.systems import ball
 from mdnum.systems.ball_system import BallSystem
@@ -42,10 +41,10 @@ def exact(system: BallSystem, run: BallRun, gradient: Sequence[Mapping[str, Any]
     count = min(run.balls, FOLLOWED)
     if isinstance(contact, ball.PenaltyContact):
         motions = [ExactPenalty(y0[n], v0[n], pull, contact.k) for n in range(count)]
-        begins = [float(motion.contact_time(1).value) for motion in motions]
+        begins = [float(motion.first_contact().value) for motion in motions]
     else:
         motions = [ExactImpact(y0[n], v0[n], pull, contact.restitution) for n in range(count)]
-        begins = [float(motion.impact_time(1).value) for motion in motions]
+        begins = [float(motion.first_contact().value) for motion in motions]
     y = run.y[:, :count].astype(np.float64)
     right = np.stack([motion.height(run.time).value for motion in motions], axis=1)
     off = np.abs(y - right)

@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from mdnum.ball.compare import Difference, first_difference
 from mdnum.ball.integrators import EventLocated
-from mdnum.ball.rollout import BallRun
+from mdnum.ball.rollout import BallRun, Difference, first_difference
 from mdnum.ball.state import Reason
 from mdnum.systems.build_ball import BallSimulation, BallVariant
 from mdnum.workflow.ball_tables import ambiguous_flips, ambiguous_stops, rule_of, solved

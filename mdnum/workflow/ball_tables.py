@@ -7,10 +7,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from mdnum.ball.bounds import residual_bound
-from mdnum.ball.compare import Difference
 from mdnum.ball.contacts import Penalty, Projection
-from mdnum.ball.rollout import BallRun
+from mdnum.ball.rollout import BallRun, Difference, residual_bound
 from mdnum.ball.state import Reason
 from mdnum.ball.stopping import Fixed
 from mdnum.store import RunFolder

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from mpmath import mp, mpf
 
-from mdnum.ball.exact import ExactImpact, _geometric, _geometric_slope
-from mdnum.ball.exact_penalty import ExactPenalty, _lag, _sine_lag
+from mdnum.ball.exact import ExactImpact, ExactPenalty, _geometric, _geometric_slope, _lag, _sine_lag
 from mdnum.errors import InputError
 
 EPS = 2.0**-52

@@ -9,8 +9,7 @@ from mpmath import mpf
 
 from mdnum.ball.contacts import Penalty
 from mdnum.ball.convergence import converge
-from mdnum.ball.exact_damped import ExactDamped
-from mdnum.ball.exact_penalty import ExactPenalty
+from mdnum.ball.exact import ExactPenalty
 from mdnum.ball.gradients import EventAware
 from mdnum.ball.integrators import SemiImplicitEuler
 from mdnum.ball.problem import Problem

@@ -10,7 +10,7 @@ import numpy as np
 from mdnum.ball.contacts import Penalty
 from mdnum.ball.convergence import arrive, converge
 from mdnum.ball.demos.base import Check, Demo, Plot, Series, Table
-from mdnum.ball.exact_penalty import ExactPenalty
+from mdnum.ball.exact import ExactPenalty
 from mdnum.ball.integrators import ExplicitEuler, ImplicitMidpoint, SemiImplicitEuler, VelocityVerlet
 from mdnum.ball.rollout import simulate
 from mdnum.ball.world import World

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from mdnum.ball.compare import Difference, first_difference
 from mdnum.ball.contacts import Impact, Penalty
 from mdnum.ball.demos.base import Check, Demo, Plot, Series, Table
 from mdnum.ball.integrators import SemiImplicitEuler
 from mdnum.ball.problem import Problem
-from mdnum.ball.rollout import BallRun, simulate
+from mdnum.ball.rollout import BallRun, Difference, first_difference, simulate
 from mdnum.ball.world import World
 from mdnum.precision import neighbor, ordinal, ulp_distance
 

@@ -10,8 +10,7 @@ from mdnum.ball.gradients import FixedPoint, Implicit
 from mdnum.ball.gradients.cost import Accuracy, Memory, accuracy, memory
 from mdnum.ball.gradients.unrolled import scaled
 from mdnum.ball.integrators import SemiImplicitEuler
-from mdnum.ball.losses import ResidualPenetration
-from mdnum.ball.problem import Problem
+from mdnum.ball.problem import Problem, ResidualPenetration
 from mdnum.ball.stopping import GlobalSum
 from mdnum.ball.world import World
 

@@ -10,8 +10,7 @@ from mdnum.ball.boundaries import Boundary, BoundaryMap, boundaries
 from mdnum.ball.contacts import Projection
 from mdnum.ball.demos.base import Check, Demo, Plot, Series, Table
 from mdnum.ball.integrators import SemiImplicitEuler
-from mdnum.ball.losses import ResidualPenetration
-from mdnum.ball.problem import Problem
+from mdnum.ball.problem import Problem, ResidualPenetration
 from mdnum.ball.stopping import GlobalSum
 from mdnum.ball.world import World
 from mdnum.precision import ulp_distance

@@ -10,7 +10,7 @@ import numpy as np
 from mdnum.ball.contacts import Penalty
 from mdnum.ball.convergence import arrive
 from mdnum.ball.demos.base import Check, Demo, Plot, Series, Table
-from mdnum.ball.exact_penalty import ExactPenalty
+from mdnum.ball.exact import ExactPenalty
 from mdnum.ball.integrators import SemiImplicitEuler, VelocityVerlet
 from mdnum.ball.world import World
 
