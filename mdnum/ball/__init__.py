@@ -4,6 +4,8 @@ The names below are imported on first use, because most of them import jax and s
 without it.
 """
 
+# ruff: noqa: F401
+
 from __future__ import annotations
 
 import importlib

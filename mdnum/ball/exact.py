@@ -68,9 +68,7 @@ class _Motion:
         _positive("v0", abs(v0), zero=True)
         _positive("gravity", gravity)
         if y0 == 0 and v0 == 0:
-            raise InputError(
-                "the ball starts at rest on the floor", remedy="Give it a height or a velocity"
-            )
+            raise InputError("the ball starts at rest on the floor", remedy="Give it a height or a velocity")
 
     def first_contact(self) -> Known:
         """Time at which the ball first reaches the floor, s."""

@@ -8,19 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from mdnum.ball.contacts import Projection
-from mdnum.ball.demos.base import Check, Demo, Plot, Series, Table
+from mdnum.ball import BallRun, GlobalSum, Problem, Projection, ResidualPenetration, SemiImplicitEuler, World
 from mdnum.ball.gradients import Gradient, Unrolled
-from mdnum.ball.integrators import SemiImplicitEuler
-from mdnum.ball.problem import Problem, ResidualPenetration
-from mdnum.ball.rollout import BallRun
-from mdnum.ball.stopping import GlobalSum
-from mdnum.ball.world import World
 from mdnum.errors import InputError
 from mdnum.precision import RolePrecision, neighbor
 from mdnum.precision.policy import ALL
 from mdnum.precision.reductions import Reduction, Sequential
 from mdnum.precision.running import RunningSum, running_sum_table
+from mdnum.workflow.demos import Claim, Demo, Plot, Series, Table, table
 
 K = ALPHA = 0.5
 STEPS, MAX_ITER, TOL, SMALL = 4, 25, 1e-3, 8
@@ -158,14 +153,14 @@ def run() -> Demo:
     ran, did_not = [1, 0, 0, 0], [0, 0, 0, 0]
     fragile = [rows[dtype][1].gradient for dtype in FORMATS]
     checks = [
-        Check(
+        Claim(
             "the penetrations sum to the tolerance exactly",
             [float(sums[dtype][0].exact) for dtype in FORMATS],
             "the tolerance",
             all(sums[dtype][0].exact == Fraction(boundary_batch(dtype)[0]) for dtype in FORMATS),
         ),
         *(
-            Check(
+            Claim(
                 f"iterations by step on the boundary of {dtype}: wide, fragile, float32 sum",
                 counts[dtype],
                 f"{ran}, {did_not}, {ran}",
@@ -174,7 +169,7 @@ def run() -> Demo:
             for dtype in FORMATS
         ),
         *(
-            Check(
+            Claim(
                 f"losses on the boundary of {dtype} are those of the exact positions, to float32",
                 losses[dtype],
                 "one iteration, none, one, to 2^-20 relative",
@@ -185,7 +180,7 @@ def run() -> Demo:
             )
             for dtype in FORMATS
         ),
-        Check(
+        Claim(
             "the loss of a fragile run does not depend on k, and this is said",
             [one.why["k"] for one in fragile],
             "ended before k was used; derivative 0",
@@ -193,7 +188,7 @@ def run() -> Demo:
             and all("ended before k was used" in one.why["k"] for one in fragile),
         ),
         *(
-            Check(
+            Claim(
                 f"a float32 sum restores the derivative in {dtype}",
                 slopes[dtype][2],
                 expected,
@@ -204,16 +199,15 @@ def run() -> Demo:
                 ("float16", f"{truth['float16']:.4g}, but only in steps of 2^-24", 0.5),
             )
         ),
-        Check(
+        Claim(
             "the derivative in float16 is a whole number of its smallest subnormal",
             slopes["float16"][2] / step,
             "an integer",
             float(slopes["float16"][2] / step).is_integer(),
         ),
-        Check("loss scaling brings it back", restored, "below 1e-3 relative", restored < 1e-3),
+        Claim("loss scaling brings it back", restored, "below 1e-3 relative", restored < 1e-3),
     ]
     return Demo(
-        name="stopping-precision",
         title="The dtype of a sum decides whether the solver runs",
         question="A batch penetrates the floor by the tolerance in all. Does the solver start?",
         answer=(
@@ -277,11 +271,11 @@ def _table(rows: dict[str, list[Row]], truth: dict[str, float], scaled: Gradient
         "boundary of", "run", "iterations", "first residual (m)", "largest move by step (m)", "first contact",
         "loss (m²)", "dloss/dk", "exact", "depends on k",
     )  # fmt: skip
-    return Table("Three precisions on two boundaries", columns, tuple(lines))
+    return table("Three precisions on two boundaries", columns, tuple(lines))
 
 
 def _running(dtype: str, history: RunningSum) -> Table:
-    return Table(f"The fragile sum in {dtype}, addition by addition", history.columns, history.table())
+    return table(f"The fragile sum in {dtype}, addition by addition", history.columns, history.table())
 
 
 def _sum_plot(sums: dict[str, tuple[RunningSum, RunningSum]]) -> Plot:
@@ -296,6 +290,7 @@ def _sum_plot(sums: dict[str, tuple[RunningSum, RunningSum]]) -> Plot:
                 Series(f"{history.dtype}, boundary of {dtype}", np.arange(len(y)) + 1, y, "steps", role)
             )
     return Plot(
+        "running-sum",
         title="Running sum of the residual",
         x_label="terms added",
         y_label="sum - tolerance (ulps of the narrow dtype)",
@@ -315,6 +310,7 @@ def _penetrations(rows: dict[str, list[Row]]) -> Plot:
             name = f"{row.name} (boundary of {dtype})" if row.name == "float32" else row.name
             series.append(Series(name, np.arange(2), left, "line+points", role))
     return Plot(
+        "penetration-before",
         title="Penetration before and after the solver of the first step",
         x_label="0: before, 1: where the solver stopped",
         y_label="sum of penetrations (m)",

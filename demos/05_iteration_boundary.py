@@ -5,14 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
 
+from mdnum.ball import GlobalSum, Problem, Projection, ResidualPenetration, SemiImplicitEuler, World
 from mdnum.ball.boundaries import Boundary, BoundaryMap, boundaries
-from mdnum.ball.contacts import Projection
-from mdnum.ball.demos.base import Check, Demo, Plot, Series, Table
-from mdnum.ball.integrators import SemiImplicitEuler
-from mdnum.ball.problem import Problem, ResidualPenetration
-from mdnum.ball.stopping import GlobalSum
-from mdnum.ball.world import World
 from mdnum.precision import ulp_distance
 
 ALPHA, DEPTH, TOL = 0.5, 0.45, 1e-4
@@ -42,7 +38,6 @@ def run() -> Demo:
     inside = float(np.mean(found.gradient))
     smooth = abs(below.gradient) * (above.at - below.at)
     return Demo(
-        name="iteration-boundary",
         title="Between two floats the solver makes one iteration fewer",
         question="How does what a projection leaves depend on its gain, down to the last bit?",
         answer=(
@@ -68,38 +63,38 @@ def run() -> Demo:
             "secant": float(ends),
         },
         checks=[
-            Check("every boundary stands between adjacent floats", ulps, "1 ulp each", set(ulps) == {1}),
-            Check(
+            Claim("every boundary stands between adjacent floats", ulps, "1 ulp each", set(ulps) == {1}),
+            Claim(
                 "each takes one iteration away",
                 [b.below.iterations - b.above.iterations for b in found.boundaries],
                 "1 each",
                 all(b.below.iterations == b.above.iterations + 1 for b in found.boundaries),
             ),
-            Check(
+            Claim(
                 "all that real arithmetic has in the interval, and no other",
                 len(found.boundaries),
                 str(_expected()),
                 len(found.boundaries) == _expected(),
             ),
-            Check(
+            Claim(
                 "each is where real arithmetic has it, but for the rounding of its iterations",
                 off,
                 "within 64 ulps",
                 max(off) <= 64,
             ),
-            Check(
+            Claim(
                 "margins have opposite signs",
                 [[b.below.margin, b.above.margin] for b in found.boundaries],
                 "0 or less below, above 0 above",
                 all(b.below.margin <= 0 < b.above.margin for b in found.boundaries),
             ),
-            Check(
+            Claim(
                 "the loss jumps by what one iteration leaves less",
                 one.jump,
                 f"{TOL:g} * alpha * k to 1e-9 relative",
                 math.isclose(one.jump, TOL * ALPHA * above.at, rel_tol=1e-9),
             ),
-            Check("few rollouts", one.evaluations, "at most 60", one.evaluations <= 60),
+            Claim("few rollouts", one.evaluations, "at most 60", one.evaluations <= 60),
         ],
         tables=[_table(found)],
         plots=[_loss_plot(found), _gradient_plot(found)],
@@ -128,7 +123,7 @@ def _table(found: BoundaryMap) -> Table:
         "k below", "iterations", "above", "margin (m)", "above", "loss (m)", "above", "dloss/dk", "above",
         "rollouts",
     )  # fmt: skip
-    return Table("Boundaries along the gain", columns, tuple(cells(one) for one in found.boundaries))
+    return table("Boundaries along the gain", columns, tuple(cells(one) for one in found.boundaries))
 
 
 def _marks(found: BoundaryMap) -> tuple[tuple[float, str], ...]:
@@ -154,6 +149,7 @@ def _cut(found: BoundaryMap, grid: np.ndarray, side: str) -> tuple[np.ndarray, n
 def _loss_plot(found: BoundaryMap) -> Plot:
     x, y = _cut(found, found.loss, "loss")
     return Plot(
+        "penetration-that",
         title="Penetration that is left, along the gain",
         x_label="gain k",
         y_label="loss (m)",
@@ -168,6 +164,7 @@ def _gradient_plot(found: BoundaryMap) -> Plot:
     x, y = _cut(found, found.gradient, "gradient")
     flat = np.full(2, (found.loss[-1] - found.loss[0]) / (found.at[-1] - found.at[0]))
     return Plot(
+        "derivative-through",
         title="Its derivative, through the iterations that ran",
         x_label="gain k",
         y_label="dloss/dk (m)",

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
 
-from mdnum.ball.contacts import Projection
-from mdnum.ball.demos.base import Check, Demo, Plot, Series, Table
+from mdnum.ball import GlobalSum, Problem, Projection, ResidualPenetration, SemiImplicitEuler, World
 from mdnum.ball.gradients import FixedPoint, Implicit
 from mdnum.ball.gradients.cost import Accuracy, Memory, accuracy, memory
 from mdnum.ball.gradients.unrolled import scaled
-from mdnum.ball.integrators import SemiImplicitEuler
-from mdnum.ball.problem import Problem, ResidualPenetration
-from mdnum.ball.stopping import GlobalSum
-from mdnum.ball.world import World
 
 K = ALPHA = 0.5
 DEPTH = 0.45
@@ -52,7 +48,6 @@ def run() -> Demo:
     growth = tapes[-1].unrolled / tapes[-2].unrolled
     flat = tapes[-1].implicit / tapes[-2].implicit
     return Demo(
-        name="implicit",
         title="Iterations and their fixed point have different derivatives",
         question="A projection returns a ball to the floor. How does where it ends depend on the gain?",
         answer=(
@@ -76,34 +71,34 @@ def run() -> Demo:
             "solve_error_power": float(rate),
         },
         checks=[
-            Check(
+            Claim(
                 "the unrolled derivative is that of p0 (1 - alpha k)^n",
                 unrolled.tolist(),
                 "to 1e-12 relative",
                 bool(np.allclose(unrolled, exact, rtol=1e-12, atol=0)),
             ),
-            Check("the implicit derivative is 0 at every tolerance", fixed, "0", not np.any(fixed)),
-            Check("and mdnum says so", said.why["k"], "does not depend on k", not said.depends["k"]),
-            Check(
+            Claim("the implicit derivative is 0 at every tolerance", fixed, "0", not np.any(fixed)),
+            Claim("and mdnum says so", said.why["k"], "does not depend on k", not said.depends["k"]),
+            Claim(
                 "the artefact shrinks like the tolerance",
                 float(order),
                 "a power of 0.9 to 1",
                 bool(0.85 < order < 1.05),
             ),
-            Check(
+            Claim(
                 "taking the stopped iterate for the fixed point lets the tolerance back in as -p/k",
                 near,
                 "-p/k to 1e-10 relative",
                 bool(np.allclose(near, [-one.value / K for one in ran], rtol=1e-10, atol=0)),
             ),
-            Check(
+            Claim(
                 "ten times the iterations: memory of the unrolled derivative",
                 growth,
                 "8 to 11 times",
                 bool(8 < growth < 11),
             ),
-            Check("and of the implicit one", flat, "1", flat == 1),
-            Check(
+            Claim("and of the implicit one", flat, "1", flat == 1),
+            Claim(
                 f"at condition number {CONDITION:g} its error follows the tolerance of the solve",
                 float(rate),
                 "a power of 0.9 to 1.1",
@@ -111,7 +106,7 @@ def run() -> Demo:
             ),
         ],
         tables=[
-            Table(
+            table(
                 "derivative of the penetration that is left, by the gain k",
                 (
                     "tolerance (m)",
@@ -146,7 +141,7 @@ def run() -> Demo:
 
 
 def _memory_table(tapes: list[Memory]) -> Table:
-    return Table(
+    return table(
         "temporaries of value and gradient, 1,000 balls in float64 (bytes)",
         ("iterations", "unrolled, taped", "unrolled, tangents carried along", "implicit", "loss alone"),
         tuple((row.iterations, row.unrolled, row.carried, row.implicit, row.value) for row in tapes),
@@ -154,7 +149,7 @@ def _memory_table(tapes: list[Memory]) -> Table:
 
 
 def _accuracy_table(solved: list[Accuracy], moved: list[Accuracy]) -> Table:
-    return Table(
+    return table(
         f"error of an implicit derivative, 200 coupled unknowns, condition number {CONDITION:g}",
         ("tolerance of the solve", "regularization", "relative error"),
         tuple((row.tolerance, row.regularization, row.error) for row in (*solved, *moved)),
@@ -164,6 +159,7 @@ def _accuracy_table(solved: list[Accuracy], moved: list[Accuracy]) -> Table:
 def _artefact(unrolled: np.ndarray, near: list[float]) -> Plot:
     x = np.array(TOLERANCES)
     return Plot(
+        "tolerance-adds",
         title="What the tolerance adds to the derivative by the gain",
         x_label="tolerance (m)",
         y_label="|derivative by k| (m)",
@@ -181,6 +177,7 @@ def _artefact(unrolled: np.ndarray, near: list[float]) -> Plot:
 def _memory_plot(tapes: list[Memory]) -> Plot:
     x = np.array([row.iterations for row in tapes], float)
     return Plot(
+        "memory-gradient",
         title="Memory of a gradient against the number of iterations",
         x_label="iterations",
         y_label="temporaries (bytes)",
@@ -202,6 +199,7 @@ def _memory_plot(tapes: list[Memory]) -> Plot:
 def _accuracy_plot(solved: list[Accuracy]) -> Plot:
     x = np.array([row.tolerance for row in solved])
     return Plot(
+        "backward-solve",
         title="What the backward solve leaves",
         x_label="tolerance of the solve",
         y_label="relative error of the derivative",

@@ -7,15 +7,20 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
 
-from mdnum.ball.contacts import Projection
-from mdnum.ball.demos.base import Check, Demo, Plot, Series, Table
+from mdnum.ball import (
+    BallRun,
+    Fixed,
+    GlobalSum,
+    Maximum,
+    PerInstance,
+    Problem,
+    Projection,
+    SemiImplicitEuler,
+    World,
+)
 from mdnum.ball.gradients.unrolled import scaled
-from mdnum.ball.integrators import SemiImplicitEuler
-from mdnum.ball.problem import Problem
-from mdnum.ball.rollout import BallRun
-from mdnum.ball.stopping import Fixed, GlobalSum, Maximum, PerInstance
-from mdnum.ball.world import World
 
 K = ALPHA = 0.5
 TOL, CAP = 1e-3, 100
@@ -79,7 +84,6 @@ def run() -> Demo:
     total, own = found["global sum"], found["per instance"]
     drift = _growth()
     return Demo(
-        name="per-instance",
         title="A sum over the batch couples balls that never meet",
         question="A ball far from the others sinks below the floor. Do their solvers notice?",
         answer=(
@@ -95,26 +99,26 @@ def run() -> Demo:
             "grad_k": {name: row["grad_k"] for name, row in found.items()},
         },
         checks=[
-            Check(
+            Claim(
                 "global sum: share of other balls whose count changed",
                 total["coupling"],
                 "1",
                 total["coupling"] == 1,
             ),
-            Check("per instance: the same share", own["coupling"], "0", own["coupling"] == 0),
-            Check(
+            Claim("per instance: the same share", own["coupling"], "0", own["coupling"] == 0),
+            Claim(
                 "fixed count: the same share",
                 found["fixed count"]["coupling"],
                 "0",
                 found["fixed count"]["coupling"] == 0,
             ),
-            Check(
+            Claim(
                 "per instance: their loss and its derivative keep every bit",
                 [own["loss"], own["grad_k"]],
                 "equal pairs",
                 own["loss"][0] == own["loss"][1] and own["grad_k"][0] == own["grad_k"][1],
             ),
-            Check(
+            Claim(
                 "global sum: the derivative of their loss is that of another number of iterations",
                 total["grad_k"],
                 "n p (3/4)^(n-1) / 2 with n = 7 and 8",
@@ -123,7 +127,7 @@ def run() -> Demo:
                     for slope, n in zip(total["grad_k"], (7, 8), strict=True)
                 ),
             ),
-            Check(
+            Claim(
                 "the larger the batch, the more iterations under one sum, and not under one each",
                 [drift["global sum"], drift["per instance"]],
                 "rising; constant",
@@ -131,7 +135,7 @@ def run() -> Demo:
             ),
         ],
         tables=[
-            Table(
+            table(
                 "the five balls of the batch, without and with a sixth",
                 ("rule", "iterations before", "after", "coupling", "dloss/dk before", "after"),
                 tuple(
@@ -148,6 +152,7 @@ def run() -> Demo:
         ],
         plots=[
             Plot(
+                "iterations-ball",
                 title="Iterations of a ball against the size of its batch",
                 x_label="balls in the batch",
                 y_label="iterations",

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import numpy as np
+from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
 
-from mdnum.ball.contacts import Impact, Penalty
-from mdnum.ball.demos.base import Check, Demo, Plot, Series, Table
-from mdnum.ball.integrators import SemiImplicitEuler
-from mdnum.ball.problem import Problem
-from mdnum.ball.rollout import BallRun, Difference, first_difference, simulate
-from mdnum.ball.world import World
+from mdnum.ball import (
+    BallRun,
+    Difference,
+    Impact,
+    Penalty,
+    Problem,
+    SemiImplicitEuler,
+    World,
+    first_difference,
+    simulate,
+)
 from mdnum.precision import neighbor, ordinal, ulp_distance
 
 H, STEPS = 0.01, 200
@@ -67,7 +73,6 @@ def run() -> Demo:
     height = -parted.margins[0], -parted.margins[1]
     jump = H * abs(float(b.v[at - 1, 0]))
     return Demo(
-        name="fork",
         title="One ulp, another step of contact",
         question="Two balls start at neighboring floats. Do they touch the floor in the same step?",
         answer=(
@@ -91,33 +96,33 @@ def run() -> Demo:
             "runs": runs,
         },
         checks=[
-            Check("the starts are neighboring floats", apart, "1 ulp", apart == 1),
-            Check(
+            Claim("the starts are neighboring floats", apart, "1 ulp", apart == 1),
+            Claim(
                 "first contacts are one step apart",
                 contact[1] - contact[0],
                 "1",
                 contact[1] - contact[0] == 1,
             ),
-            Check(
+            Claim(
                 "the fork is in the contact channel, at the first contact of the lower ball",
                 [parted.channel, at],
                 f"contact, {contact[0]}",
                 parted.channel == "contact" and at == contact[0],
             ),
-            Check("before the fork they are rounding apart", before, "below 1e-14 m", before < 1e-14),
-            Check(
+            Claim("before the fork they are rounding apart", before, "below 1e-14 m", before < 1e-14),
+            Claim(
                 "after it they are the fall of a step apart",
                 after,
                 f"at least {jump:.3g} m",
                 after >= jump * (1 - 1e-9),
             ),
-            Check(
+            Claim(
                 "told the same decisions, they stay rounding apart",
                 float(held.separation.max()),
                 "below 1e-14 m",
                 bool(held.separation.max() < 1e-14),
             ),
-            Check(
+            Claim(
                 "on a spring the flip is there too, and parts nothing",
                 [soft.fork, float(soft.separation.max())],
                 f"fork at {contact[2]}, below 1e-13 m",
@@ -125,7 +130,7 @@ def run() -> Demo:
             ),
         ],
         tables=[
-            Table(
+            table(
                 "the pair",
                 ("ball", "start (m)", "as hexadecimal", "first contact", "height there (m)", "d y(T)/de (m)"),
                 tuple(
@@ -135,7 +140,7 @@ def run() -> Demo:
                     )
                 ),
             ),
-            Table(
+            table(
                 "what parts them",
                 ("contact", "second ball", "fork", "largest separation (m)"),
                 (
@@ -167,6 +172,7 @@ def run() -> Demo:
 
 def _heights(a: BallRun, b: BallRun, at: int) -> Plot:
     return Plot(
+        "heights-two",
         title="Heights of two balls that start one ulp apart",
         x_label="time (s)",
         y_label="height (m)",
@@ -185,6 +191,7 @@ def _separations(a: BallRun, parted: Difference, held: Difference, soft: Differe
 
     assert parted.fork is not None
     return Plot(
+        "separation-two",
         title="Separation of the two balls",
         x_label="time (s)",
         y_label="|difference of heights| (m)",

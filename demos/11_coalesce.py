@@ -5,8 +5,8 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
+from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
 
-from mdnum.ball.demos.base import Check, Demo, Plot, Series, Table
 from mdnum.precision.coalesce import orders, scatter_add, segment_sum
 from mdnum.precision.reductions import Exact, FixedPoint, Sequential
 
@@ -62,7 +62,6 @@ def run() -> Demo:
     held = sums["scatter-add, storage order"]
     rows = tuple((name, distinct[name], ulps[name], yields[name]) for name in sums)
     return Demo(
-        name="coalesce",
         title="Coalescing is a reduction",
         question=(
             f"{CONTACTS} contacts load {PANELS} panels. In how many ways can the same entries be added, and "
@@ -86,13 +85,13 @@ def run() -> Demo:
             "largest_error_ulps": ulps["scatter-add, storage order"],
         },
         checks=[
-            Check("storage order decides the bits", loose, "more than 100 of 1000", loose > 100),
-            Check("a sort by index does not help", by_index, f"{loose}, as scattered", by_index == loose),
+            Claim("storage order decides the bits", loose, "more than 100 of 1000", loose > 100),
+            Claim("a sort by index does not help", by_index, f"{loose}, as scattered", by_index == loose),
             *(
-                Check(f"{name}: one answer", distinct[name], "1", distinct[name] == 1)
+                Claim(f"{name}: one answer", distinct[name], "1", distinct[name] == 1)
                 for name in ("coalesced, sorted by index and value", "exact sum", "fixed point")
             ),
-            Check(
+            Claim(
                 "and with the bits a decision",
                 yields["scatter-add, storage order"],
                 f"some of {ORDERS}, not all",
@@ -100,7 +99,7 @@ def run() -> Demo:
             ),
         ],
         tables=[
-            Table(
+            table(
                 f"{ORDERS} storage orders of the same entries",
                 (
                     "way of adding",
@@ -125,6 +124,7 @@ def _spread(found: np.ndarray, exact: np.float32) -> Plot:
     values = np.arange(ulps.min() - 1, ulps.max() + 2)
     counts = np.array([(ulps == value).sum() for value in values])
     return Plot(
+        "load-first",
         title="Load of the first panel over all storage orders",
         x_label="computed - exact (ulps)",
         y_label="storage orders",

@@ -7,13 +7,9 @@ from fractions import Fraction
 import jax
 import jax.numpy as jnp
 import numpy as np
+from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
 
-from mdnum.ball.contacts import Projection
-from mdnum.ball.demos.base import Check, Demo, Plot, Series, Table
-from mdnum.ball.integrators import SemiImplicitEuler
-from mdnum.ball.rollout import BallRun, simulate
-from mdnum.ball.stopping import GlobalSum
-from mdnum.ball.world import World
+from mdnum.ball import BallRun, GlobalSum, Projection, SemiImplicitEuler, World, simulate
 from mdnum.precision.policy import RolePrecision
 from mdnum.precision.reductions import BY_NAME, Reduction
 from mdnum.precision.running import RunningSum, running_sum_table
@@ -51,7 +47,6 @@ def run() -> Demo:
     large, small = histories["large first"], histories["small first"]
     seen = residual["large first"], residual["small first"]
     return Demo(
-        name="sum-order",
         title="The order of a sum decides whether a solver stops",
         question="Five float16 penetrations add up to exactly the tolerance. Is their sum below it?",
         answer=(
@@ -71,23 +66,23 @@ def run() -> Demo:
             "iterations": [int(one.iterations[0]) for one in runs.values()],
         },
         checks=[
-            Check("large first is one last place below", seen[0], repr(LARGE), seen[0] == LARGE),
-            Check("large first stops", stopped["large first"], "True", stopped["large first"]),
-            Check("small first is the tolerance", seen[1], repr(TOL), seen[1] == TOL),
-            Check("small first goes on", not stopped["small first"], "True", not stopped["small first"]),
-            Check(
+            Claim("large first is one last place below", seen[0], repr(LARGE), seen[0] == LARGE),
+            Claim("large first stops", stopped["large first"], "True", stopped["large first"]),
+            Claim("small first is the tolerance", seen[1], repr(TOL), seen[1] == TOL),
+            Claim("small first goes on", not stopped["small first"], "True", not stopped["small first"]),
+            Claim(
                 "the exact sum is the tolerance",
                 float(large.exact),
                 repr(TOL),
                 large.exact == small.exact == Fraction(TOL),
             ),
-            Check(
+            Claim(
                 "the solver saw what the table says",
                 [large.result, small.result],
                 "the same bits",
                 (large.result, small.result) == seen,
             ),
-            Check(
+            Claim(
                 "jnp.sum hides it",
                 list(hidden.values()),
                 f"{TOL!r} twice",
@@ -95,11 +90,11 @@ def run() -> Demo:
             ),
         ],
         tables=[
-            Table(f"{name}, addition by addition", history.columns, history.table())
+            table(f"{name}, addition by addition", history.columns, history.table())
             for name, history in histories.items()
         ]
         + [
-            Table(
+            table(
                 "every reduction, large first",
                 ("reduction", "sum", "error (last places)", "stops"),
                 tuple((name, total, (total - TOL) * 2.0**21, total < TOL) for name, total in others.items()),
@@ -124,6 +119,7 @@ def _errors(histories: dict[str, RunningSum]) -> Plot:
 
     count = np.arange(1, len(TERMS) + 1)
     return Plot(
+        "accumulator-misses",
         title="What the accumulator misses after each addition",
         x_label="additions",
         y_label="running sum - exact sum (last places of the tolerance)",

@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 import numpy as np
+from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
 
-from mdnum.ball.contacts import Impact
-from mdnum.ball.convergence import arrive, saltated
-from mdnum.ball.demos.base import Check, Demo, Plot, Series, Table
-from mdnum.ball.exact import ExactImpact
-from mdnum.ball.integrators import EventLocated, SemiImplicitEuler
-from mdnum.ball.world import World
+from mdnum.ball import EventLocated, ExactImpact, Impact, SemiImplicitEuler, World, arrive, saltated
 
 TIME = 2.0
 COUNTS = (200, 632, 2000, 6325, 20_000, 63_246, 200_000)
@@ -52,7 +48,6 @@ def run() -> Demo:
     order = float(np.polyfit(np.log(h), np.log(restored), 1)[0])
     zero = all(np.all(slope == 0.0) for slope in by_steps)
     return Demo(
-        name="saltation",
         title="The derivative through an impact",
         question="How does the height after three impacts change with the height at the start?",
         answer=(
@@ -70,25 +65,25 @@ def run() -> Demo:
             "height_order": float(np.polyfit(np.log(h), np.log(values), 1)[0]),
         },
         checks=(
-            Check(
+            Claim(
                 "differentiating the steps gives zero at every step size",
                 float(max(np.max(np.abs(s)) for s in by_steps)),
                 "exactly 0.0",
                 zero,
             ),
-            Check(
+            Claim(
                 "with the saltation matrix the error is of order h", order, "1 ± 0.2", abs(order - 1) < 0.2
             ),
-            Check(
+            Claim(
                 "with the time of impact the derivative is exact to rounding",
                 float(np.max(np.abs(error))),
                 "below 1e-12",
                 bool(np.max(np.abs(error)) < 1e-12),
             ),
-            Check("so is the height", value_by_time, "below 1e-14", value_by_time < 1e-14),
+            Claim("so is the height", value_by_time, "below 1e-14", value_by_time < 1e-14),
         ),
         tables=(
-            Table(
+            table(
                 "Derivative of the height at 2 s by the height at the start",
                 ("by", "h (s)", "derivative, from 1 m", "error", "error, 31 starts"),
                 tuple(rows),
@@ -96,6 +91,7 @@ def run() -> Demo:
         ),
         plots=(
             Plot(
+                "error-derivative",
                 title="Error of the derivative against the step",
                 x_label="h (s)",
                 y_label="error of dy/dy0, root mean square",
@@ -125,6 +121,7 @@ def _history(world: World) -> Plot:
     salted = [float(np.asarray(saltated(world, one, int(n), "y0")[1])[0]) for n in steps]
     motion = ExactImpact(1.0).height(time).gradient["y0"]
     return Plot(
+        "derivative-along",
         title="The derivative along the way, from 1 m with h = 0.01 s",
         x_label="time (s)",
         y_label="dy/dy0",

@@ -6,13 +6,9 @@ from dataclasses import dataclass
 
 import jax.numpy as jnp
 import numpy as np
+from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
 
-from mdnum.ball.contacts import Penalty
-from mdnum.ball.convergence import arrive
-from mdnum.ball.demos.base import Check, Demo, Plot, Series, Table
-from mdnum.ball.exact import ExactPenalty
-from mdnum.ball.integrators import SemiImplicitEuler, VelocityVerlet
-from mdnum.ball.world import World
+from mdnum.ball import ExactPenalty, Penalty, SemiImplicitEuler, VelocityVerlet, World, arrive
 
 K, TIME, STEPS = 3000.0, 2.0, 200
 WIDTHS = (0.0, 0.001, 0.003, 0.01, 0.02, 0.03, 0.05, 0.1)
@@ -72,7 +68,6 @@ def run() -> Demo:
     bias = {eps: one.best - WANTED for eps, one in found.items()}
     calm = min(WIDTHS, key=lambda eps: found[eps].rough)
     return Demo(
-        name="smoothing-width",
         title="How soft a floor",
         question="Which width of a softplus contact makes the loss usable, and at what price?",
         answer=(
@@ -94,28 +89,28 @@ def run() -> Demo:
             "order_of_bias": order,
         },
         checks=(
-            Check(
+            Claim(
                 "a hard contact leaves many minima, a soft one a single one",
                 [found[0.0].minima, found[single].minima],
                 "above 20, and 1",
                 found[0.0].minima > 20 and found[single].minima == 1,
             ),
-            Check(
+            Claim(
                 "the derivative's error falls by a thousand and more",
                 found[0.0].rough / found[calm].rough,
                 "above 1000",
                 found[0.0].rough > 1000 * found[calm].rough,
             ),
-            Check(
+            Claim(
                 "and then the bias takes over",
                 [bias[calm], bias[WIDTHS[-1]]],
                 "the widest shifts the minimum at least five times as far as the calmest",
                 abs(bias[WIDTHS[-1]]) > 5 * abs(bias[calm]),
             ),
-            Check("the bias of small widths is quadratic", order, "2 ± 0.1", abs(order - 2) < 0.1),
+            Claim("the bias of small widths is quadratic", order, "2 ± 0.1", abs(order - 2) < 0.1),
         ),
         tables=(
-            Table(
+            table(
                 f"Start that ends at the wanted height after 2 s: k = {K:g} 1/s², h = {h:g} s",
                 ("width (m)", "minima", "best start (m)", "shift (m)", "error of dy/dy0", "largest |dy/dy0|"),
                 tuple(
@@ -126,6 +121,7 @@ def run() -> Demo:
         ),
         plots=(
             Plot(
+                "loss",
                 title="The loss",
                 x_label="height at the start (m)",
                 y_label="(y(2 s) - wanted)² (m²)",
@@ -137,6 +133,7 @@ def run() -> Demo:
                 caption="Hard: a noise of minima around the exact curve. Soft: one, in another place.",
             ),
             Plot(
+                "derivative-that",
                 title="The derivative that an optimizer would follow",
                 x_label="height at the start (m)",
                 y_label="dy/dy0",
@@ -148,6 +145,7 @@ def run() -> Demo:
                 caption="With a hard contact its sign is that of the last step of the contact.",
             ),
             Plot(
+                "trade",
                 title="The trade",
                 x_label="width (m)",
                 y_label="error",

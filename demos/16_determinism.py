@@ -13,15 +13,28 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from mdnum.ball.contacts import Impact
-from mdnum.ball.demos.base import Check, Demo, Plot, Series, Table
-from mdnum.ball.determinism import fingerprint
-from mdnum.ball.integrators import SemiImplicitEuler
-from mdnum.ball.rollout import BallRun, simulate
-from mdnum.ball.world import World
+from mdnum.ball import BallRun, Impact, SemiImplicitEuler, World, simulate
 from mdnum.errors import NumericalError
 from mdnum.precision import neighbor
 from mdnum.safe_path import environment, python
+from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
+
+#: What of a run is hashed: every state, and every decision.
+_PARTS = ("y", "v", "contact", "iterations", "reason")
+
+
+def fingerprint(run: BallRun) -> str:
+    """SHA-256 of every state and decision of a run, bit for bit.
+
+    Equal fingerprints: the same heights, velocities, contacts and iteration counts, to the last bit.
+    """
+    digest = hashlib.sha256()
+    for name in _PARTS:
+        array = np.ascontiguousarray(getattr(run, name))
+        digest.update(f"{name} {array.dtype.name} {array.shape}".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()
+
 
 G, H, RESTITUTION, STEPS = 9.81, 0.01, 0.8, 200
 #: Next to the boundary between a first contact in step 48 and one in step 49 (see the demonstration "fork").
@@ -30,15 +43,9 @@ START = float.fromhex("0x1.2755ffe6d58c9p+0")
 EAGER = 60
 #: An instruction set without fused multiply-add; the option is XLA's, and does nothing on another processor.
 OLD_ISA = "--xla_cpu_max_isa=SSE4_2"
-_CODE = "from mdnum.ball.demos.determinism import child; child()"
 _PATIENCE = 120
 
 Answers = dict[str, Any]
-
-
-def child() -> None:
-    """What each process does: the programs, and their answers as JSON on stdout."""
-    print(json.dumps(answers()))
 
 
 def answers() -> Answers:
@@ -78,7 +85,6 @@ def run() -> Demo:
     ulp = float(np.max(np.abs(higher.y - here.y)))
     contacts = [own["plain_contact"], old["plain_contact"]]
     return Demo(
-        name="determinism",
         title="The same bits every time, and what that is worth",
         question="Does a rollout give the same bits in a new process, compiled otherwise, in a batch?",
         answer=(
@@ -101,16 +107,16 @@ def run() -> Demo:
             "one_ulp_is_off": ulp,
         },
         checks=[
-            Check("a repeat run in a new process has the same bits", repeats, "yes", repeats),
-            Check(
+            Claim("a repeat run in a new process has the same bits", repeats, "yes", repeats),
+            Claim(
                 "mdnum's program has the same bits under an older instruction set",
                 old_same["fenced"],
                 "yes",
                 old_same["fenced"],
             ),
-            Check(f"and without a compiler ({EAGER} steps)", uncompiled, "yes", uncompiled),
-            Check("and as one ball of a batch of nine", in_batch, "yes", in_batch),
-            Check(
+            Claim(f"and without a compiler ({EAGER} steps)", uncompiled, "yes", uncompiled),
+            Claim("and as one ball of a batch of nine", in_batch, "yes", in_batch),
+            Claim(
                 "a start one ulp higher repeats as well, and is another trajectory",
                 ulp,
                 "above 0.01 m",
@@ -118,7 +124,7 @@ def run() -> Demo:
             ),
         ],
         tables=[
-            Table(
+            table(
                 "where the bits agree with those of this process",
                 ("where", "mdnum's program", "first contact", "plainly written", "first contact there"),
                 (
@@ -142,7 +148,7 @@ def run() -> Demo:
                     ("one ball of a batch of nine", in_batch, None, None, None),
                 ),
             ),
-            Table(
+            table(
                 "what equal bits tell",
                 ("question", "answer"),
                 (
@@ -158,6 +164,7 @@ def run() -> Demo:
         ],
         plots=[
             Plot(
+                "trajectories-that",
                 title="Trajectories that are each repeatable",
                 x_label="time (s)",
                 y_label="|difference of heights| (m)",
@@ -222,7 +229,7 @@ def _gap(label: str, here: BallRun, y: np.ndarray, role: Any, dashed: bool = Fal
 def _start(flags: str) -> subprocess.Popen[str]:
     changed = {"XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {flags}".strip()} if flags else {}
     return subprocess.Popen(
-        python("-c", _CODE),
+        python(__file__),
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -250,3 +257,8 @@ def _finish(name: str, process: subprocess.Popen[str]) -> Answers:
             where="determinism",
         )
     return json.loads(out.strip().splitlines()[-1])
+
+
+if __name__ == "__main__":
+    # each process: the programs, and their answers as JSON
+    print(json.dumps(answers()))

@@ -8,14 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array
+from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
 
-from mdnum.ball.contacts import Impact
-from mdnum.ball.demos.base import Check, Demo, Plot, Series, Table
-from mdnum.ball.exact import ExactImpact
-from mdnum.ball.integrators import EventLocated, SemiImplicitEuler
-from mdnum.ball.rollout import simulate
-from mdnum.ball.state import Reason
-from mdnum.ball.world import World
+from mdnum.ball import EventLocated, ExactImpact, Impact, Reason, SemiImplicitEuler, World, simulate
 
 G, E = 9.81, 0.8
 REST_SPEED = 1e-12
@@ -61,7 +56,6 @@ def run() -> Demo:
     left = [float(np.abs(r.v[-100:]).max()) for r in plain]
     gaps = [float(f"1e-{n}") for n in range(1, 11)]
     return Demo(
-        name="zeno",
         title="Infinitely many bounces",
         question="When does a bouncing ball come to rest, and which program knows?",
         answer=(
@@ -83,25 +77,25 @@ def run() -> Demo:
             "speed_left_in_fixed_steps": dict(zip(("0.01", "0.001"), left, strict=True)),
         },
         checks=(
-            Check(
+            Claim(
                 "located impacts rest at the time in closed form, whatever the step",
                 off,
                 "below 2e-12 s for 1, 7, 60 and 500 steps",
                 off < 2e-12,
             ),
-            Check(
+            Claim(
                 "they count every bounce up to then",
                 miscounted,
                 "0 steps with another count",
                 miscounted == 0 and counted_to_rest == last,
             ),
-            Check(
+            Claim(
                 "and lie still afterwards",
                 float(np.abs(located.y[-1, 0]) + np.abs(located.v[-1, 0])),
                 "exactly 0",
                 bool(located.y[-1, 0] == 0 and located.v[-1, 0] == 0 and at_rest.any()),
             ),
-            Check(
+            Claim(
                 "the time to rest has the derivatives in closed form",
                 [by_y0, by_e],
                 "the closed form within 1e-6 (by differences)",
@@ -110,13 +104,13 @@ def run() -> Demo:
                     for seen, name in ((by_y0, "y0"), (by_e, "restitution"))
                 ),
             ),
-            Check(
+            Claim(
                 "fixed steps touch the floor in every step long after the end",
                 late,
                 "every step of the last 2.9 s",
                 all(n >= round((8 - limit - 1) / h) - 1 for n, h in zip(late, steps, strict=True)),
             ),
-            Check(
+            Claim(
                 "with a speed proportional to the step",
                 left[0] / left[1],
                 "10 ± 0.1",
@@ -124,12 +118,12 @@ def run() -> Demo:
             ),
         ),
         tables=(
-            Table(
+            table(
                 "Bounces before a time (closed form)",
                 ("time before rest (s)", "bounces"),
                 tuple((float(x), int(exact.bounces(limit - x))) for x in gaps),
             ),
-            Table(
+            table(
                 "Time to rest (s)",
                 ("program", "steps", "time", "minus closed form"),
                 (
@@ -172,6 +166,7 @@ def _heights(exact: ExactImpact, plain, limit: float) -> Plot:
     time = np.linspace(0, 6, 1201)
     until = plain.time <= 6
     return Plot(
+        "height-closed",
         title="Height, in closed form and in fixed steps of 0.01 s",
         x_label="time (s)",
         y_label="height (m)",
@@ -190,6 +185,7 @@ def _staircase(exact: ExactImpact, located, counted: np.ndarray, limit: float) -
     seen = limit - located.time[1:]
     shown = (seen > 1e-12) & (seen < limit)
     return Plot(
+        "bounces-so",
         title="Bounces so far",
         x_label="time left to rest (s)",
         y_label="bounces",

@@ -6,13 +6,9 @@ import itertools
 from typing import Any
 
 import numpy as np
+from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
 
-from mdnum.ball.contacts import Penalty, Projection
-from mdnum.ball.demos.base import Check, Demo, Plot, Series, Table
-from mdnum.ball.integrators import SemiImplicitEuler
-from mdnum.ball.rollout import BallRun, simulate
-from mdnum.ball.stopping import GlobalSum, Hysteresis
-from mdnum.ball.world import World
+from mdnum.ball import BallRun, GlobalSum, Hysteresis, Penalty, Projection, SemiImplicitEuler, World, simulate
 from mdnum.precision import RolePrecision
 from mdnum.precision.reductions import Reduction, make
 
@@ -74,7 +70,6 @@ def run() -> Demo:
     low, high = rows[0.0], rows[LIFTS[2]]
     one, two = GAPS[1], None
     return Demo(
-        name="hysteresis",
         title="Two thresholds instead of one",
         question="A decision wavers about its threshold. What does a gap between two thresholds change?",
         answer=(
@@ -97,29 +92,29 @@ def run() -> Demo:
             "left_with": left[one],
         },
         checks=[
-            Check("contact flips shrink with the gap", list(rows.values()), "falling", _falls(rows)),
-            Check("a gap of 1 cm removes most of them", [low, high], "below a tenth", high < low / 10),
-            Check(
+            Claim("contact flips shrink with the gap", list(rows.values()), "falling", _falls(rows)),
+            Claim("a gap of 1 cm removes most of them", [low, high], "below a tenth", high < low / 10),
+            Claim(
                 "a ball leaves contact only above the gap",
                 float(_leaves(contact[LIFTS[2]])),
                 f"above {LIFTS[2]:g} m",
                 bool(_leaves(contact[LIFTS[2]]) > LIFTS[2]),
             ),
-            Check(
+            Claim(
                 "the solver's decision to start wavers without a gap",
                 starts[two],
                 "more than 100 times",
                 starts[two] > 100,
             ),
-            Check("and does not with one", starts[one], "0", starts[one] == 0),
-            Check(
+            Claim("and does not with one", starts[one], "0", starts[one] == 0),
+            Claim(
                 "without a gap the order of the sum decides in some steps",
                 apart[two],
                 "at least 1",
                 apart[two] > 0,
             ),
-            Check("and in none with one", apart[one], "0", apart[one] == 0),
-            Check(
+            Claim("and in none with one", apart[one], "0", apart[one] == 0),
+            Claim(
                 "the price: more penetration is left",
                 left[one] / left[two],
                 "above 1",
@@ -127,7 +122,7 @@ def run() -> Demo:
             ),
         ],
         tables=[
-            Table(
+            table(
                 "contact of 16 shaken balls, 2,000 steps",
                 ("gap (m)", "flips", "share of time in contact", "mean height (m)"),
                 tuple(
@@ -135,7 +130,7 @@ def run() -> Demo:
                     for lift, one in contact.items()
                 ),
             ),
-            Table(
+            table(
                 "start of the solver, 400 steps of 16 pressed balls",
                 (
                     "starts at (tol)",
@@ -169,6 +164,7 @@ def _leaves(run: BallRun) -> float:
 def _heights(plain: BallRun, gap: BallRun) -> Plot:
     shown = slice(0, 200)
     return Plot(
+        "shaken-ball",
         title="A shaken ball, and when it is in contact",
         x_label="time (s)",
         y_label="height (m)",
@@ -196,6 +192,7 @@ def _heights(plain: BallRun, gap: BallRun) -> Plot:
 
 def _gaps(rows: dict[float, int]) -> Plot:
     return Plot(
+        "contact-flips",
         title="Contact flips against the gap",
         x_label="gap (m)",
         y_label="flips",
@@ -208,6 +205,7 @@ def _gaps(rows: dict[float, int]) -> Plot:
 def _residuals(run: BallRun) -> Plot:
     start = np.abs(np.minimum(run.height, 0)).sum(axis=1, dtype=np.float64) / TOL
     return Plot(
+        "solver-finds",
         title="What the solver finds at the beginning of each step",
         x_label="step",
         y_label="sum of penetrations / tol",

@@ -6,14 +6,20 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
 
-from mdnum.ball.contacts import Penalty
-from mdnum.ball.convergence import arrive, converge
-from mdnum.ball.demos.base import Check, Demo, Plot, Series, Table
-from mdnum.ball.exact import ExactPenalty
-from mdnum.ball.integrators import ExplicitEuler, ImplicitMidpoint, SemiImplicitEuler, VelocityVerlet
-from mdnum.ball.rollout import simulate
-from mdnum.ball.world import World
+from mdnum.ball import (
+    ExactPenalty,
+    ExplicitEuler,
+    ImplicitMidpoint,
+    Penalty,
+    SemiImplicitEuler,
+    VelocityVerlet,
+    World,
+    arrive,
+    converge,
+    simulate,
+)
 
 K, TIME, STEPS = 100.0, 2.0, 200
 COUNTS = (400, 800, 1600, 3200, 6400)
@@ -53,7 +59,6 @@ def run() -> Demo:
     grown = float(explicit[0] / float(end.value))
     opposite = explicit[1] * semi[1] < 0
     return Demo(
-        name="euler-choice",
         title="Two Eulers, two gradients",
         question="Does it matter whether a step moves with the old velocity or with the new one?",
         answer=(
@@ -78,20 +83,20 @@ def run() -> Demo:
             "order_of_derivative": {name: slope for name, (_, slope) in orders.items()},
         },
         checks=(
-            Check(
+            Claim(
                 "the gradients of the two programs differ by more than the exact one's size",
                 abs(explicit[1] - semi[1]),
                 f"above {abs(float(end.gradient['y0'])):.3g}",
                 abs(explicit[1] - semi[1]) > abs(float(end.gradient["y0"])),
             ),
-            Check(
+            Claim(
                 "semi-implicit Euler is closer, in height and in both derivatives",
                 [abs(x - y) for x, y in zip(semi, rows[-1][1:], strict=True)],
                 "each below explicit Euler's error",
                 all(abs(s - x) < abs(e - x) for e, s, x in zip(explicit, semi, rows[-1][1:], strict=True)),
             ),
             *(
-                Check(
+                Claim(
                     f"{name}: order {order} in the height, 1 in the derivative",
                     [round(x, 2) for x in orders[name]],
                     f"{order} ± 0.2 and 1 ± 0.25",
@@ -101,7 +106,7 @@ def run() -> Demo:
             ),
         ),
         tables=(
-            Table(
+            table(
                 f"After {STEPS} steps of {h:g} s on a floor of k = {K:g} 1/s²",
                 ("scheme", "height (m)", "dy/dy0", "dy/dk (m s²)"),
                 tuple(rows),
@@ -109,6 +114,7 @@ def run() -> Demo:
         ),
         plots=(
             Plot(
+                "ball-both",
                 title="The ball by both programs",
                 x_label="time (s)",
                 y_label="height (m)",
@@ -119,8 +125,8 @@ def run() -> Demo:
                 horizontals=((0.0, "floor"),),
                 caption="Explicit Euler gains energy in every contact; semi-implicit Euler does not.",
             ),
-            _against_step("Error of the height against the step", "error of y (m)", lines),
-            _against_step("Error of the derivative against the step", "error of dy/dy0", slopes),
+            _against_step("height", "Error of the height against the step", "error of y (m)", lines),
+            _against_step("derivative", "Error of the derivative against the step", "error of dy/dy0", slopes),
         ),
         in_md="The integrator is part of the program that is differentiated: velocity Verlet and leapfrog "
         "with other half steps have other gradients, and a force that is only continuous costs the gradient "
@@ -134,8 +140,9 @@ def _first(world: World, name: str) -> list[float]:
     return [float(np.asarray(x)[0]) for x in arrive(world, jnp.asarray(STARTS), STEPS, name)]
 
 
-def _against_step(title: str, label: str, lines: list[Series]) -> Plot:
+def _against_step(name: str, title: str, label: str, lines: list[Series]) -> Plot:
     return Plot(
+        name,
         title=title,
         x_label="h (s)",
         y_label=f"{label}, root mean square",
