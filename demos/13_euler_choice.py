@@ -6,7 +6,6 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
 
 from mdnum.ball import (
     ExactPenalty,
@@ -20,6 +19,7 @@ from mdnum.ball import (
     converge,
     simulate,
 )
+from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
 
 K, TIME, STEPS = 100.0, 2.0, 200
 COUNTS = (400, 800, 1600, 3200, 6400)
@@ -126,7 +126,7 @@ def run() -> Demo:
                 caption="Explicit Euler gains energy in every contact; semi-implicit Euler does not.",
             ),
             _against_step("height", "Error of the height against the step", "error of y (m)", lines),
-            _against_step("derivative", "Error of the derivative against the step", "error of dy/dy0", slopes),
+            _against_step("slope", "Error of the derivative against the step", "error of dy/dy0", slopes),
         ),
         in_md="The integrator is part of the program that is differentiated: velocity Verlet and leapfrog "
         "with other half steps have other gradients, and a force that is only continuous costs the gradient "
