@@ -9,7 +9,8 @@ import ml_dtypes
 import numpy as np
 import pytest
 
-from mdnum.ball import contacts, integrators, problem, stopping
+from mdnum.ball import contacts, integrators, stopping
+from mdnum.ball import problem as losses
 from mdnum.errors import InputError
 from mdnum.precision.reductions import Blocked, Permuted
 from mdnum.systems import build_ball, load
@@ -141,7 +142,7 @@ def test_precision_and_loss():
     policy = made.world.policy
     assert (policy.state, policy.arithmetic, policy.loss) == ("float16", "float64", "float32")
     assert (policy.rounding, policy.seed) == ("stochastic", 5)
-    assert isinstance(made.loss, problem.MeanHeight)
+    assert isinstance(made.loss, losses.MeanHeight)
     assert problem(spec(SPRING, loss={"target": 0.5})).loss.target == 0.5
 
 

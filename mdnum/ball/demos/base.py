@@ -1,4 +1,4 @@
-"""Plots as the pages that are not on the frame yet declare them; mdnum.report.section has them for the others."""
+"""Plots as pages that are not on the frame yet declare them; mdnum.report.section has the others."""
 
 from __future__ import annotations
 
