@@ -13,12 +13,11 @@ import numpy as np
 
 from mdnum.ball.contacts import Projection
 from mdnum.ball.gradients.dependence import dependence, follow
-from mdnum.ball.losses import Loss
-from mdnum.ball.problem import START, Problem, loss_of
+from mdnum.ball.problem import START, Loss, Problem, loss_of
 from mdnum.ball.rollout import BallRun
 from mdnum.ball.state import Decisions
 from mdnum.ball.world import World
-from mdnum.precision.scaling import DynamicScale, ScaleState
+from mdnum.numerics.scaling import scaled_gradient
 
 
 @dataclass(frozen=True)
@@ -133,9 +132,7 @@ def evaluate(values, world, y0, v0, told, steps, loss):
 def differentiate(values, world, y0, v0, told, steps, loss, names, scale):
     """Loss and reverse-mode derivative under loss scaling, and what the run used, as one compiled program."""
     function, rest = _Rollout(steps, loss), (world, y0, v0, told)
-    state = ScaleState(scale, *(jnp.zeros((), jnp.int32),) * 2)
-    # of the dynamic scale, because its factor is an argument of the program and no constant
-    made, _ = DynamicScale().value_and_grad(state, lambda values: function(values, *rest), values)
+    made = scaled_gradient(lambda values: function(values, *rest), scale, values)
     return made, follow(function, values, rest, names)
 
 

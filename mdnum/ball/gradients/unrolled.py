@@ -13,7 +13,7 @@ from mdnum.ball.gradients.base import Gradient, differentiate, evaluate, origin,
 from mdnum.ball.problem import START, Problem
 from mdnum.ball.rollout import BallRun
 from mdnum.ball.state import Decisions
-from mdnum.precision.scaling import StaticScale
+from mdnum.numerics.scaling import check_scale
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class Unrolled:
 
     Attributes:
         loss_scale: the reverse pass starts with it instead of 1 and the derivative is divided by it, so that
-            a narrow dtype does not lose it below its smallest number (`mdnum.precision.scaling`); a power of
+            a narrow dtype does not lose it below its smallest number (`mdnum.numerics.scaling`); a power of
             two.
     """
 
@@ -99,7 +99,8 @@ def scaled(
         InputError: it is not.
     """
     values, start = origin(problem, names), start_of(problem)
-    factor = jnp.asarray(StaticScale(scale).scale, jnp.float64)
+    check_scale(scale)
+    factor = jnp.asarray(scale, jnp.float64)
     made, marks = differentiate(
         values, problem.world, *start, told, problem.steps, problem.loss, tuple(names), factor
     )
