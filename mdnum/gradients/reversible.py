@@ -22,7 +22,7 @@ from mdnum.gradients.losses import Loss
 from mdnum.gradients.symmetric import in_phase, pairs_only, wanted
 from mdnum.gradients.tape import Stretch, Tape, frame_of_start, pace_of, stretch_of, surroundings
 from mdnum.md.latticestep import LatticeLangevin, forgotten_bits
-from mdnum.rollout.backward import Backward, Stretched
+from mdnum.rollout.backward import BackwardRun, Stretched
 from mdnum.rollout.engine import FAILURES, Engine, Segment, State, first_state
 from mdnum.systems.build import Simulation
 
@@ -118,7 +118,7 @@ class ReversibleTape(Tape):
         """
         # the initial bath is empty
         baths = {**self.baths, 0: np.zeros((3, self.simulation.atoms), np.int64)}
-        way = Backward(self.simulation, self._end, baths)
+        way = BackwardRun(self.simulation, self._end, baths)
         self.stretches = 0
         for made in way.stretches():
             self._compare(made)
@@ -145,7 +145,7 @@ class ReversibleTape(Tape):
             where=self.simulation.system.name,
         )
 
-    def _arrive(self, way: Backward) -> None:
+    def _arrive(self, way: BackwardRun) -> None:
         """The first state, every bit of it."""
         state, back = self.start.state, way.back
         pairs = ((state.x, back.x), (state.v, back.v), (state.images, back.images))

@@ -20,7 +20,7 @@ from mdnum.numerics.roles import ALL
 
 
 @dataclass(frozen=True)
-class Format:
+class FloatFormat:
     """A binary floating-point format with subnormals and infinities, as IEEE 754 arranges them.
 
     Attributes:
@@ -66,14 +66,14 @@ class Format:
         return 2.0**-self.significand
 
 
-FORMATS: Mapping[str, Format] = {
+FORMATS: Mapping[str, FloatFormat] = {
     form.name: form
     for form in (
-        Format("float64", 64, 53, 11),
-        Format("float32", 32, 24, 8),
-        Format("tf32", 32, 11, 8),
-        Format("float16", 16, 11, 5),
-        Format("bfloat16", 16, 8, 8),
+        FloatFormat("float64", 64, 53, 11),
+        FloatFormat("float32", 32, 24, 8),
+        FloatFormat("tf32", 32, 11, 8),
+        FloatFormat("float16", 16, 11, 5),
+        FloatFormat("bfloat16", 16, 8, 8),
     )
 }
 
@@ -88,7 +88,7 @@ COLUMNS = (
 )
 
 
-def format_of(name: str) -> Format:
+def format_of(name: str) -> FloatFormat:
     """The format of a name.
 
     Raises:
@@ -99,7 +99,7 @@ def format_of(name: str) -> Format:
     return FORMATS[name]
 
 
-def _spacing(x: Float[Array, "..."], form: Format) -> Float[Array, "..."]:
+def _spacing(x: Float[Array, "..."], form: FloatFormat) -> Float[Array, "..."]:
     """Distance of the numbers of a format around x, a power of two; x is float64."""
     # jnp.frexp has no derivative rule for its exponent; the bits say the same
     field = (lax.bitcast_convert_type(x, jnp.int64) >> 52) & 0x7FF

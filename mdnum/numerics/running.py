@@ -27,7 +27,7 @@ from mdnum.numerics.sums import Permuted, Reduction, Sequential, Sorted, Whole
 
 
 @dataclass(frozen=True)
-class Row:
+class Addition:
     """One addition.
 
     Attributes:
@@ -62,7 +62,7 @@ class RunningSum:
 
     dtype: str
     reduction: Any
-    rows: tuple[Row, ...]
+    rows: tuple[Addition, ...]
     result: float
     exact: Fraction
 
@@ -136,13 +136,13 @@ def _lost(true: Fraction, kept: Fraction, place: int) -> int:
     return 0 if true == kept else max(1, place - _lowest(true))
 
 
-def _loop(terms: np.ndarray, order: Sequence[int]) -> Iterator[Row]:
+def _loop(terms: np.ndarray, order: Sequence[int]) -> Iterator[Addition]:
     total, exact = terms.dtype.type(0), Fraction(0)
     for k in order:
         new = total + terms[k]
         true = Fraction(float(total)) + Fraction(float(terms[k]))
         exact += Fraction(float(terms[k]))
-        yield Row(
+        yield Addition(
             str(k),
             float(terms[k]),
             float(new),

@@ -13,14 +13,10 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float
 
-from mdnum.md.cell import Cell
-from mdnum.numerics import Ledger, distance_bound, unit_roundoff
-from mdnum.numerics.roles import carrier
+from mdnum.numerics import unit_roundoff
 from mdnum.rollout.engine import Segment
 from mdnum.rollout.flips import decided_pairs, true_pairs
-from mdnum.store import RunFolder
 from mdnum.systems.build import Simulation
-from mdnum.systems.load import load
 
 # a missed flip shows as one jump; rounding of the sums must stay far below it
 _SHARE_OF_A_JUMP = 0.1
@@ -247,36 +243,3 @@ class ListHealth:
         current = None if values["current"] is None else Epoch.from_dict(values["current"])
         rest = {k: v for k, v in values.items() if k not in ("lost", "current")}
         return cls(simulation, current=current, lost=set(values["lost"]), **rest)
-
-
-def rebuild_ledger(folder: RunFolder) -> Ledger:
-    """The `rebuild` channel of a run: the decision that a list is used up, a row for every list that was.
-
-    Args:
-        folder: a run folder.
-
-    Returns:
-        step: the first step that the list could not serve; subject: the number of its life; margin: by how
-        much an atom had moved beyond half the skin (positive: the decision is yes, as everywhere; negative
-        where a blind rule rebuilt early), length. A rebuild does nothing to the energy: its jump is zero.
-
-    Error:
-        the bound is that of a displacement between two wrapped positions, in the dtype of the state.
-    """
-    rows = folder.read("epochs")
-    chosen = np.isin(rows["reason"].astype(str), ("displacement", "interval"))
-    margin = -rows["margin"][chosen]
-    moved = rows["displacement"][chosen]
-    system = load(folder.path, world="md")
-    reach = Cell.create(np.asarray(system.atoms.cell), system.atoms.pbc).reach(system.atoms.positions)
-    dtype = carrier(system.spec.precision.state)
-    count = int(chosen.sum())
-    return Ledger(
-        "rebuild",
-        rows["start"][chosen] + rows["length"][chosen],
-        rows["epoch"][chosen][:, None],
-        np.ones(count, bool),
-        margin,
-        np.asarray(distance_bound(moved, reach, dtype, dtype), np.float64),
-        np.zeros(count),
-    )

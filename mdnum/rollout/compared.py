@@ -103,7 +103,7 @@ class CrossFlip:
     bound: float
 
 
-class Flips(NamedTuple):
+class PairFlips(NamedTuple):
     """Flips of one run, in the labels of the first run, a column each.
 
     Attributes:
@@ -120,16 +120,16 @@ class Flips(NamedTuple):
     bound: Float[np.ndarray, "flips"]
 
     @classmethod
-    def joined(cls, parts: Sequence[Flips]) -> Flips:
+    def joined(cls, parts: Sequence[PairFlips]) -> PairFlips:
         """The flips of several stretches."""
         if not parts:
             whole, real = np.zeros(0, np.int64), np.zeros(0)
             return cls(whole, whole, np.zeros(0, bool), real, real)
         return cls(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
-    def where(self, chosen) -> Flips:
+    def where(self, chosen) -> PairFlips:
         """Some of them: a mask, a slice or indices."""
-        return Flips(*(column[chosen] for column in self))
+        return PairFlips(*(column[chosen] for column in self))
 
 
 @dataclass(frozen=True)
@@ -143,7 +143,7 @@ class CrossFlips(Sequence[CrossFlip]):
         atoms: number of atoms.
     """
 
-    flips: Flips
+    flips: PairFlips
     from_b: Bool[np.ndarray, "flips"]
     differs: Bool[np.ndarray, "flips"]
     atoms: int
@@ -170,7 +170,7 @@ class CrossFlips(Sequence[CrossFlip]):
             yield CrossFlip(step, i, j, differs, "B" if from_b else "A", entered, margin, bound)
 
 
-class Crossing:
+class CrossRecorder:
     """The pairs on which two runs differ now.
 
     Args:
@@ -188,7 +188,9 @@ class Crossing:
         pairs = zip(i.tolist(), j.tolist(), strict=True)
         return [CrossFlip(0, i, j, True, "B", False, np.nan, np.nan) for i, j in pairs]
 
-    def take(self, first: int, rows: int, a: Flips, b: Flips) -> tuple[Int[np.ndarray, "rows"], CrossFlips]:
+    def take(
+        self, first: int, rows: int, a: PairFlips, b: PairFlips
+    ) -> tuple[Int[np.ndarray, "rows"], CrossFlips]:
         """Number of pairs that differ at each of the next steps, and how that came about.
 
         Args:
@@ -196,7 +198,7 @@ class Crossing:
             rows: number of steps.
             a, b: the flips of either run among them.
         """
-        every = Flips.joined([a, b])
+        every = PairFlips.joined([a, b])
         from_b = np.repeat([False, True], [len(a.step), len(b.step)])
         order = np.lexsort((from_b, every.key, every.step))
         every, from_b = every.where(order), from_b[order]

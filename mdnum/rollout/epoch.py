@@ -111,7 +111,7 @@ class Program(eqx.Module):
     record: bool = eqx.field(static=True)
 
 
-class State(NamedTuple):
+class EpochState(NamedTuple):
     """Where a rollout stands between two force evaluations, in the user's order of atoms.
 
     Attributes:
@@ -133,7 +133,7 @@ class State(NamedTuple):
     bath: Int[Array, "3 atoms"] | None = None
 
 
-class Record(NamedTuple):
+class EpochRecord(NamedTuple):
     """One row per step of an epoch, atoms in the order of its tables.
 
     Attributes:
@@ -159,7 +159,7 @@ class Record(NamedTuple):
 _NUMBERS = ("potential", "kinetic", "virial", "heat", "nearest", "moved")
 
 
-class Outcome(NamedTuple):
+class EpochOutcome(NamedTuple):
     """How an epoch's loop ended.
 
     Attributes:
@@ -173,16 +173,16 @@ class Outcome(NamedTuple):
             list; all no where they were not asked for. None without recording.
     """
 
-    state: State
+    state: EpochState
     flags: Int[Array, "4"]
     moved: Float[Array, ""]
     before: UInt8[Array, "words atoms"] | None
 
 
-def empty_record(rows: int, words: int, atoms: int, dtype, record: bool) -> Record:
+def empty_record(rows: int, words: int, atoms: int, dtype, record: bool) -> EpochRecord:
     """Room for the rows of an epoch; without recording only the per-step numbers have room."""
     shape = (rows, 3, atoms) if record else (rows, 3, 0)
-    return Record(
+    return EpochRecord(
         x=jnp.zeros(shape, dtype),
         v=jnp.zeros(shape, dtype),
         images=jnp.zeros(shape, jnp.int32),
@@ -191,7 +191,7 @@ def empty_record(rows: int, words: int, atoms: int, dtype, record: bool) -> Reco
     )
 
 
-def write_row(record: Record, row, **values) -> Record:
+def write_row(record: EpochRecord, row, **values) -> EpochRecord:
     """Write one row of the named columns."""
     return record._replace(
         **{
@@ -210,15 +210,15 @@ def run_epoch(
     leaves: tuple[Array, ...],
     structure: Any,
     tables: Tables,
-    state: State,
+    state: EpochState,
     reference: Float[Array, "3 atoms"],
     built: Int[Array, ""],
     last: Int[Array, ""],
     look_back: Bool[Array, ""],
-    record: Record,
+    record: EpochRecord,
     told: UInt8[Array, "rows words atoms"] | None = None,
     pinned: UInt8[Array, "rows words atoms"] | None = None,
-) -> tuple[Outcome, Record]:
+) -> tuple[EpochOutcome, EpochRecord]:
     """Advance with one list until it is used up, the record is full or the last step is done.
 
     Args:
@@ -330,8 +330,8 @@ def run_epoch(
     def unsorted(a):
         return jnp.zeros_like(a).at[:, order].set(a)
 
-    end = State(step, unsorted(x), unsorted(v), unsorted(images), unsorted(x_before), heat)
+    end = EpochState(step, unsorted(x), unsorted(v), unsorted(images), unsorted(x_before), heat)
     if bath is not None:
         end = end._replace(bath=unsorted(bath))
     flags = jnp.stack([rows, due.astype(rows.dtype), finite.astype(rows.dtype), runaway.astype(rows.dtype)])
-    return Outcome(end, flags, largest, before), record
+    return EpochOutcome(end, flags, largest, before), record

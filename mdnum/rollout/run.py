@@ -17,7 +17,7 @@ from mdnum.numerics import Ledger
 from mdnum.rollout.checks import EnergyBudget, ListHealth
 from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, resume_point
 from mdnum.rollout.flips import PairRecorder, flip_columns
-from mdnum.rollout.summary import Tally, closest_pair, log_line, series_columns, summarize
+from mdnum.rollout.summary import RunTally, closest_pair, log_line, series_columns, summarize
 from mdnum.store import RunFolder
 from mdnum.store.files import default_folder
 from mdnum.systems.build import Simulation, build
@@ -51,7 +51,7 @@ class RunResult:
 class _Progress:
     """What has been done so far; all of it goes into a checkpoint."""
 
-    tally: Tally
+    tally: RunTally
     health: ListHealth
     budget: EnergyBudget
     first: np.ndarray | None = None
@@ -87,7 +87,7 @@ class Rollout:
 
     def __post_init__(self):
         self.recorder = PairRecorder(self.simulation)
-        self.done = _Progress(Tally(), ListHealth(self.simulation), EnergyBudget(self.simulation))
+        self.done = _Progress(RunTally(), ListHealth(self.simulation), EnergyBudget(self.simulation))
         self.start: Start | None = None
         self._earlier_seconds = 0.0
 
@@ -96,7 +96,7 @@ class Rollout:
         self.start = Start.from_arrays(saved)
         done = saved["done"]
         self.done = _Progress(
-            Tally.from_dict(done["tally"]),
+            RunTally.from_dict(done["tally"]),
             ListHealth.from_dict(self.simulation, done["health"]),
             EnergyBudget.from_dict(self.simulation, done["budget"]),
             saved.get("first"),

@@ -16,7 +16,7 @@ from mdnum.systems.build import Simulation
 
 
 @dataclass
-class Line:
+class LineFit:
     """A least-squares line through points that are not kept: a run's memory must not grow with its steps.
 
     Values are taken relative to the first, so the sums carry the drift and not the energy itself.
@@ -50,7 +50,7 @@ class Line:
 
 
 @dataclass
-class Tally:
+class RunTally:
     """Totals over the rows seen so far."""
 
     step: int = -1
@@ -65,8 +65,8 @@ class Tally:
     seconds: float = 0.0
     steps_per_second: float | None = None
     jumps: float = 0.0
-    conserved: Line = field(default_factory=Line)
-    without_jumps: Line = field(default_factory=Line)
+    conserved: LineFit = field(default_factory=LineFit)
+    without_jumps: LineFit = field(default_factory=LineFit)
 
     def take(
         self, segment: Segment, rows: dict[str, np.ndarray], ledger: Ledger, bounds: Float[np.ndarray, "..."]
@@ -92,9 +92,9 @@ class Tally:
         return asdict(self)
 
     @classmethod
-    def from_dict(cls, values: dict) -> Tally:
+    def from_dict(cls, values: dict) -> RunTally:
         """The inverse of `to_dict`."""
-        lines = {name: Line(**values[name]) for name in ("conserved", "without_jumps")}
+        lines = {name: LineFit(**values[name]) for name in ("conserved", "without_jumps")}
         return cls(**{**values, **lines})
 
 

@@ -15,9 +15,9 @@ from mdnum.errors import InputError
 from mdnum.md.neighbors import PairTable
 from mdnum.md.potentials import pair_type
 from mdnum.numerics import Ledger
-from mdnum.rollout.compared import Apart, Flips, Frame, in_user_order
+from mdnum.rollout.compared import Apart, Frame, PairFlips, in_user_order
 from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, first_state
-from mdnum.rollout.epoch import Pins, Record, State, empty_record, run_epoch
+from mdnum.rollout.epoch import EpochRecord, EpochState, Pins, empty_record, run_epoch
 from mdnum.rollout.flips import Ambiguous, PairRecorder, decided_pairs
 from mdnum.systems.build import Simulation
 
@@ -101,7 +101,7 @@ class Track:
         self._recorder = PairRecorder(simulation) if flips else None
         self._listener = listener
         self._ahead: list[Rows] = []
-        self._flips: list[Flips] = []
+        self._flips: list[PairFlips] = []
         self._doubts: list[Ambiguous] = []
         self.first_pairs: Int[np.ndarray, "pairs"] | None = None
         self.failed = ""
@@ -128,7 +128,7 @@ class Track:
         """The last step that has been read."""
         return self._ahead[-1].first + len(self._ahead[-1]) - 1
 
-    def until(self, last: int) -> tuple[Rows | None, Flips]:
+    def until(self, last: int) -> tuple[Rows | None, PairFlips]:
         """The rows not yet handed out up to a step, and the flips among them; fewer where the run ends."""
         while not self._ahead or self._ahead[-1].first + len(self._ahead[-1]) - 1 < last:
             if self.segment() is None:
@@ -140,7 +140,7 @@ class Track:
                 rows, rest = rows.cut(last - rows.first + 1)
                 self._ahead.insert(0, rest)
             taken.append(rows)
-        every = Flips.joined(self._flips)
+        every = PairFlips.joined(self._flips)
         self._flips = [every.where(every.step > last)]
         return (joined(taken) if taken else None), every.where(every.step <= last)
 
@@ -153,10 +153,10 @@ class Track:
         return taken._replace(i=i, j=j)
 
 
-def _flips_of(ledger: Ledger, frame: Frame) -> Flips:
+def _flips_of(ledger: Ledger, frame: Frame) -> PairFlips:
     """The columns that a comparison needs, in the labels of the first run."""
     keys = frame.keys_of(ledger.subject[:, 0], ledger.subject[:, 1])
-    return Flips(ledger.step, keys, ledger.entered, ledger.margin, ledger.bound)
+    return PairFlips(ledger.step, keys, ledger.entered, ledger.margin, ledger.bound)
 
 
 def rows_of(segment: Segment, frame: Frame, failed: str) -> Rows:
@@ -219,7 +219,7 @@ class Handed:
             )
         self.simulation = simulation
         self._engine = Engine(simulation, 0, start=start)
-        self.state: State = self._engine.start.state
+        self.state: EpochState = self._engine.start.state
         # with the same kind of list the leader's own lists serve, and its rebuilds with them
         self.frame = frame or Frame.same(simulation.atoms)
         self._shares = self.frame.is_same and simulation.lists == leader.lists
@@ -228,7 +228,7 @@ class Handed:
         self._led: PairTable | None = None
         self._apart = Apart(simulation.cell)
         self._r_cut = _by_species(simulation)
-        self._record: Record | None = None
+        self._record: EpochRecord | None = None
         self.failed = ""
 
     def follow(self, segment: Segment) -> tuple[Rows, Overridden]:

@@ -41,7 +41,7 @@ class Source:
 
 
 @dataclass(frozen=True)
-class Variant:
+class VariantSpec:
     """The same system with some keys changed.
 
     Attributes:
@@ -69,7 +69,7 @@ class BallSystem:
     name: str
     spec: BallSpec
     path: Path | None = None
-    variants: tuple[Variant, ...] = ()
+    variants: tuple[VariantSpec, ...] = ()
 
     @property
     def balls(self) -> int:
@@ -150,7 +150,7 @@ def make(source: Source, data: dict[str, Any]) -> BallSystem:
         raise explain(error, data, source.text, source.where, source.values, GRAMMAR) from None
     try:
         ball_checks.check(spec)
-    except ball_checks.Refusal as refusal:
+    except ball_checks.UnusableBall as refusal:
         raise _located(refusal, source) from None
     variants = tuple(
         vary(name, changes, spec, place(("variants", name), source.text, source.where, source.values))
@@ -190,14 +190,14 @@ def kind_first(spec: Mapping[str, Any]) -> dict[str, Any]:
     return ordered
 
 
-def _located(refusal: ball_checks.Refusal, source: Source) -> InputError:
+def _located(refusal: ball_checks.UnusableBall, source: Source) -> InputError:
     key = refusal.key
     # a default that cannot be run has no line of its own; the overrides that led there are named
     where = place(key, source.text, source.where, source.values)
     return InputError(refusal.message, remedy=refusal.remedy, where=where)
 
 
-def vary(name: str, changes: Mapping[str, Any], base: BallSpec, where: str) -> Variant:
+def vary(name: str, changes: Mapping[str, Any], base: BallSpec, where: str) -> VariantSpec:
     """The system with keys changed, checked.
 
     Args:
@@ -230,7 +230,7 @@ def vary(name: str, changes: Mapping[str, Any], base: BallSpec, where: str) -> V
     except ValidationError as error:
         said = explain(error, data, "", where, (), GRAMMAR)
         raise InputError(f"variant {name!r}: {said.message}", remedy=said.remedy, where=where) from None
-    except ball_checks.Refusal as refusal:
+    except ball_checks.UnusableBall as refusal:
         raise InputError(f"variant {name!r}: {refusal.message}", remedy=refusal.remedy, where=where) from None
     if ball_checks.balls(spec) != ball_checks.balls(base):
         raise InputError(
@@ -239,4 +239,4 @@ def vary(name: str, changes: Mapping[str, Any], base: BallSpec, where: str) -> V
             where=where,
             remedy="Keep the number of balls",
         )
-    return Variant(name, dict(changes), spec)
+    return VariantSpec(name, dict(changes), spec)

@@ -142,7 +142,7 @@ def start(spec: ball.BallSpec) -> tuple[Float[np.ndarray, "balls"], Float[np.nda
     return np.broadcast_to(height, count).copy(), np.broadcast_to(velocity, count).copy()
 
 
-def _on_the_boundary(spec: ball.BallSpec, boundary: ball.Boundary) -> Float[np.ndarray, "balls"]:
+def _on_the_boundary(spec: ball.BallSpec, boundary: ball.BoundaryTable) -> Float[np.ndarray, "balls"]:
     """One penetration an ulp short of the tolerance, and the ulp in equal parts."""
     assert spec.stop is not None and not isinstance(spec.stop, ball.FixedRule)
     tol = spec.stop.tol
@@ -204,7 +204,7 @@ def stop_rule(spec: ball.BallSpec) -> Any:
     return rule if table.enter is None else stopping.Hysteresis(rule, table.enter)
 
 
-def _loss(table: ball.Loss) -> Loss:
+def _loss(table: ball.LossTable) -> Loss:
     if table.kind == "mean-height":
         return MeanHeight()
     if table.kind == "residual-penetration":

@@ -77,7 +77,7 @@ class Named:
         }
 
 
-class Table(BaseModel):
+class TomlTable(BaseModel):
     """Base of every table: frozen, strict, no unknown keys, finite numbers only."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)

@@ -41,7 +41,7 @@ def pair_constants(spec: SystemSpec, species: tuple[str, ...]) -> dict[str, Tabl
         InputError: a pair of species has no constants.
     """
     potential = spec.potential
-    if not isinstance(potential, schema.PairTable):
+    if not isinstance(potential, schema.PairPotentialTable):
         raise TypeError(f"{potential.kind} is not a pair potential")
     given = {pair_key(*name.split("-")): row for name, row in (potential.pairs or {}).items()}
     tables = {name: np.zeros((len(species), len(species))) for name in potential.constants}

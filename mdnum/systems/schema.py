@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args
 from pydantic import BeforeValidator, ConfigDict, Discriminator, Field, Tag, model_validator
 
 from mdnum import units as unit_systems
-from mdnum.systems.grammar import Named, NonNegative, Table
+from mdnum.systems.grammar import Named, NonNegative, TomlTable
 
 Length = Annotated[float, Field(gt=0, description="length (Å or σ)")]
 Energy = Annotated[float, Field(gt=0, description="energy (eV or ε)")]
@@ -44,14 +44,14 @@ def _check_pairs(pairs: Mapping[str, Any] | None) -> None:
         seen[key] = name
 
 
-class LennardJonesPair(Table):
+class LennardJonesPair(TomlTable):
     """Constants of one pair of species, Lennard-Jones."""
 
     sigma: Length
     epsilon: Energy
 
 
-class MorsePair(Table):
+class MorsePair(TomlTable):
     """Constants of one pair of species, Morse."""
 
     depth: Energy = Field(description="well depth (eV or ε)")
@@ -59,7 +59,7 @@ class MorsePair(Table):
     r0: Length = Field(description="distance of the minimum (Å or σ)")
 
 
-class SoftSpherePair(Table):
+class SoftSpherePair(TomlTable):
     """Constants of one pair of species, soft sphere."""
 
     sigma: Length
@@ -67,7 +67,7 @@ class SoftSpherePair(Table):
     alpha: float = Field(default=2.0, gt=1, description="exponent")
 
 
-class PairTable(Table):
+class PairPotentialTable(TomlTable):
     """A pair potential: one set of constants, or one for each pair of species."""
 
     if TYPE_CHECKING:
@@ -90,7 +90,7 @@ class PairTable(Table):
         return tuple(key for key in type(self).model_fields if key not in ("kind", "pairs"))
 
 
-class LennardJonesTable(PairTable):
+class LennardJonesTable(PairPotentialTable):
     """4 ε [(σ/r)^12 - (σ/r)^6]."""
 
     kind: Literal["lennard-jones"]
@@ -101,7 +101,7 @@ class LennardJonesTable(PairTable):
     )
 
 
-class MorseTable(PairTable):
+class MorseTable(PairPotentialTable):
     """D [(1 - exp(-α (r - r0)))^2 - 1]."""
 
     kind: Literal["morse"]
@@ -113,7 +113,7 @@ class MorseTable(PairTable):
     )
 
 
-class SoftSphereTable(PairTable):
+class SoftSphereTable(PairPotentialTable):
     """(ε/α) (1 - r/σ)^α inside σ, nothing outside."""
 
     kind: Literal["soft-sphere"]
@@ -127,7 +127,7 @@ class SoftSphereTable(PairTable):
     )
 
 
-class ManyBodyTable(Table):
+class ManyBodyTable(TomlTable):
     """A potential that is no sum over pairs, and has its own cutoff."""
 
     if TYPE_CHECKING:
@@ -160,14 +160,14 @@ _MANY_BODY = (StillingerWeberTable, TersoffTable, EmbeddedAtomTable)
 _PAIRS = (LennardJonesTable, MorseTable, SoftSphereTable)
 
 
-class OtherRow(Table):
+class OtherRow(TomlTable):
     """Constants of one pair of species, of a potential that another package adds."""
 
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, float]
 
 
-class OtherTable(PairTable):
+class OtherTable(PairPotentialTable):
     """A pair potential that another package adds; its constants are the fields of its class."""
 
     model_config = ConfigDict(extra="allow")
@@ -202,7 +202,7 @@ def _kind_of_potential(value: Any) -> str | None:
     return "other" if kind in POTENTIALS else kind
 
 
-def _tagged(table: type[Table]) -> Any:
+def _tagged(table: type[TomlTable]) -> Any:
     (kind,) = get_args(table.model_fields["kind"].annotation)
     return Annotated[table, Tag(kind)]
 
@@ -224,7 +224,7 @@ def _switches(kind: Any) -> bool:
     return kind not in CUTOFFS or CUTOFFS[kind].switches
 
 
-class CutoffTable(Table):
+class CutoffTable(TomlTable):
     """How a pair potential ends, and where."""
 
     kind: Annotated[str, Named("mdnum.md.cutoffs:CUTOFFS")]
@@ -302,7 +302,7 @@ Triple = Annotated[tuple[float, float, float], BeforeValidator(_tuple)]
 Masses = dict[str, Annotated[float, Field(gt=0)]]
 
 
-class _Structure(Table):
+class _Structure(TomlTable):
     pbc: Flags | None = Field(
         default=None, description="periodic along each cell vector; overrides what the structure says"
     )
@@ -354,7 +354,7 @@ Structure = Annotated[
 ]
 
 
-class RebuildTable(Table):
+class RebuildTable(TomlTable):
     """When the list is rebuilt, in the words of LAMMPS's neigh_modify."""
 
     every: int = Field(default=1, ge=1, description="consider a rebuild every so many steps")
@@ -367,7 +367,7 @@ class RebuildTable(Table):
     )
 
 
-class NeighborsTable(Table):
+class NeighborsTable(TomlTable):
     """The Verlet list."""
 
     skin: NonNegative | None = Field(
@@ -379,7 +379,7 @@ class NeighborsTable(Table):
     rebuild: RebuildTable = Field(default_factory=lambda: RebuildTable())
 
 
-class _Dynamics(Table):
+class _Dynamics(TomlTable):
     timestep: float = Field(gt=0, description="time step (ps or τ)")
     steps: int = Field(default=1000, ge=0, description="steps of a run")
     seed: int = Field(default=0, ge=0, description="seed of drawn velocities and of the noise")
@@ -407,7 +407,7 @@ class LangevinTable(_Dynamics):
 Dynamics = Annotated[NVETable | LangevinTable, Discriminator("kind")]
 
 
-class PrecisionTable(Table):
+class PrecisionTable(TomlTable):
     """Which float plays which role."""
 
     state: StateName = Field(
@@ -434,7 +434,7 @@ class PrecisionTable(Table):
     )
 
 
-class ForkTable(Table):
+class ForkTable(TomlTable):
     """What `mdnum fork` does with this system where the command line does not say."""
 
     vary: str | None = Field(
@@ -446,7 +446,7 @@ class ForkTable(Table):
     )
 
 
-class RecordTable(Table):
+class RecordTable(TomlTable):
     """What is kept besides series, flips and epochs."""
 
     save_every: int = Field(
@@ -454,7 +454,7 @@ class RecordTable(Table):
     )
 
 
-class SystemSpec(Table):
+class SystemSpec(TomlTable):
     """A system file."""
 
     name: str | None = Field(default=None, description="what to call the system; default the file's name")
@@ -474,7 +474,7 @@ class SystemSpec(Table):
     @model_validator(mode="after")
     def _cutoff_fits_potential(self) -> SystemSpec:
         kind = self.potential.kind
-        if isinstance(self.potential, PairTable):
+        if isinstance(self.potential, PairPotentialTable):
             if self.cutoff is None:
                 raise ValueError(f"table [cutoff] missing; {kind} needs one")
             if self.cutoff.in_sigma is not None and "sigma" not in self.potential.constants:

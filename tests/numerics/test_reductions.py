@@ -257,11 +257,6 @@ def test_a_reduction_that_is_none(text, message):
         parse(text)
 
 
-def test_a_wider_dtype_is_one_of_the_known():
-    with pytest.raises(InputError, match="unknown dtype 'half'"):
-        Widened(Sequential(), "half")
-
-
 @pytest.mark.parametrize("count", [1, 2, 7, 24])
 def test_sums_of_two_ends_are_two_loops(count):
     """The orders of neighbor formats, against loops that round every result to float32."""

@@ -54,24 +54,12 @@ def test_a_neighbor_is_reached_by_so_many_steps_of_nextafter(dtype, data, ulps):
     assert int(ulp_distance(x, found, dtype)) == ulps
 
 
-@given(x=st.floats(1e-300, 1e300))
-def test_one_spacing_is_one_ulp(x):
-    assert int(ulp_distance(x, x + np.spacing(x))) == 1
-    assert int(ulp_distance(-x, -x - np.spacing(x))) == -1
-
-
 def test_both_zeros_are_one_place():
     for dtype in WIDTHS:
         assert int(ulp_distance(-0.0, 0.0, dtype)) == 0
         tiny = np.nextafter(dtype(0), dtype(1))
         assert int(ulp_distance(-tiny, tiny, dtype)) == 2
         assert neighbor(-tiny, 1, dtype) == 0
-
-
-def test_ordinals_work_on_arrays_at_once():
-    x = np.array([[-1.5, -0.0], [0.0, 2.0]])
-    assert np.array_equal(np.diff(ordinal(np.nextafter(x, np.inf)) - ordinal(x)), np.zeros((2, 1)))
-    assert np.array_equal(neighbor(x, 3), np.vectorize(lambda v: neighbor(v, 3))(x))
 
 
 def test_unit_roundoff_is_the_largest_error_of_one_rounding():

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -401,12 +399,6 @@ def test_copy_gives_a_ball_to_change(tmp_path: Path):
         systems.copy("ball/drop", tmp_path)
 
 
-def test_another_height_replaces_the_boundary():
-    system = load("ball/batch-on-the-boundary", {"start.height": "0.5"})
-    assert system.spec.start.boundary is None
-    assert system.balls == 1
-
-
 def test_a_batch_on_the_boundary_needs_a_tolerance_of_its_format():
     name = "ball/batch-on-the-boundary"
     with pytest.raises(InputError, match=r"is no bfloat16.*tol = 0\.00099945068359375"):
@@ -433,29 +425,3 @@ def test_methods_are_those_of_the_library():
     from mdnum.ball.gradients import BY_NAME
 
     assert set(typing.get_args(ball.MethodName)) == set(BY_NAME)
-
-
-def test_the_shipped_json_schema_is_current():
-    shipped = json.loads((systems.shipped_folder() / BALL_SCHEMA).read_text(encoding="utf-8"))
-    assert shipped == ball.json_schema(), "run scripts/make_systems.py --schema"
-
-
-def test_every_key_of_the_json_schema_says_what_it_means():
-    schema = ball.json_schema()
-    tables = {"start", "flight", "contact", "stop", "integrator", "precision", "loss", "gradient", "control"}
-    silent = [
-        f"{name}.{key}"
-        for name, table in {**schema["$defs"], "BallSpec": schema}.items()
-        for key, value in table.get("properties", {}).items()
-        if "description" not in value and key not in tables | {"kind", "rule"}
-    ]
-    assert silent == []
-
-
-def test_every_shipped_ball_names_its_schema():
-    assert len(systems.names("ball")) == 5
-    assert sorted(systems.names("ball") + systems.names("md")) == systems.names()
-    for name in systems.names("ball"):
-        text = (systems.shipped_folder() / f"{name}.toml").read_text(encoding="utf-8")
-        assert text.startswith(f"#:schema ../{BALL_SCHEMA}\n")
-        assert tomllib.loads(text)["world"] == "ball"
