@@ -142,7 +142,7 @@ def _values(plot: Plot, name: str) -> np.ndarray:
     sources = (*plot.series, *filter(None, [plot.region]))
     values = [np.ravel(getattr(source, name)).astype(float) for source in sources]
     joined = np.concatenate(values or [np.zeros(0)])
-    return joined[np.abs(joined) < 1e290]
+    return joined[np.abs(joined) < 1e250]
 
 
 def _base(plot: Plot, name: str) -> float:
@@ -189,7 +189,7 @@ def _series(axes: Axes, series: Series, bases: dict[str, float], covered: int) -
     """Draws a series; broader where later ones lie upon it, so that it is still seen."""
     x, y = (np.asarray(getattr(series, name), float) - bases[name] for name in "xy")
     # what is infinite, or too large for an axis to have room beyond it, leaves a gap
-    there = (np.abs(x) < 1e290) & (np.abs(y) < 1e290)
+    there = (np.abs(x) < 1e250) & (np.abs(y) < 1e250)
     y = np.where(there, y, np.nan)
     color, label = COLORS[series.role], typeset(series.label)
     kept = (thin.points if series.mark == "points" else thin.line)(x, y)
