@@ -286,3 +286,18 @@ def test_legends_stay_on_the_figure(name):
     figure = drawing.draw(PLOTS[name])
     figure.draw_without_rendering()
     assert figure.axes[0].get_legend().get_window_extent().x1 <= figure.bbox.x1 + 1
+
+
+def test_every_color_of_text_can_be_read():
+    """Contrast as WCAG 2.1 defines it: 4.5 for text, on the paper and on cards, light and dark."""
+
+    def luminance(color):
+        parts = [int(color[at : at + 2], 16) / 255 for at in (1, 3, 5)]
+        linear = [part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts]
+        return np.dot([0.2126, 0.7152, 0.0722], linear)
+
+    for theme, card in ((svg.LIGHT, "#f5f6f8"), (svg.DARK, "#1d232b")):
+        for role in set(theme) - {"paper", "grid"}:
+            for ground in (theme["paper"], card):
+                low, high = sorted((luminance(theme[role]), luminance(ground)))
+                assert (high + 0.05) / (low + 0.05) >= 4.5, (role, ground)
