@@ -1,14 +1,14 @@
 """The contract between a world and everything that runs its systems again, and what such runs leave.
 
-A world (molecular dynamics, the bouncing ball, a stranger's) implements `Program`: everything that decides the
-bits of a run, its start included. Forks, parameter maps, screening and certificates are written once against
-it and know neither atoms nor balls. Decide outside, act inside: a program acts on decisions that it is given,
-so a ledger holds what was used, and a replay can impose the decisions of one program on another.
+A world (molecular dynamics, the bouncing ball, a stranger's) implements `Program`: everything that decides
+the bits of a run, its start included. Forks, parameter maps, screening and certificates are written once
+against it and know neither atoms nor balls. Decide outside, act inside: a program acts on decisions that it
+is given, so a ledger holds what was used, and the decisions of one program can be imposed on another.
 
 Molecular dynamics: `mdnum.rollout.program.MdProgram`. The ball: `mdnum.ball.program.BallProgram`, made of a
-`Problem` (world, y0, v0, steps, loss). The ball's adapter needs these of `mdnum.ball`, which must keep working:
-`simulate(world, start, steps, imposed decisions) -> BallRun` with every decision, margin and height of a step;
-`Problem.with_values`, `Problem.value_and_grad`; `bounds.height_bound` and `bounds.residual_bound`.
+`Problem` (world, y0, v0, steps, loss). That adapter needs of `mdnum.ball`: `simulate(world, start, steps,
+told=decisions)` and its `BallRun` with all decisions, margins and heights; `Problem.with_values` and
+`Problem.value_and_grad`; `height_bound` and `residual_bound`; `counts_alike`.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class Program(Protocol):
 
     def lockstep(
         self, other: Any, last: int, *, forward: bool, back: bool, guard: float | None
-    ) -> Iterator[Stretch]:
+    ) -> Iterator[PairRows]:
         """Run this program (A) and another (B) side by side.
 
         Args:
@@ -88,7 +88,7 @@ class Program(Protocol):
         ...
 
     def nudged(self, size: float, count: int, seed: int) -> list[Any]:
-        """The program from starts that are displaced at random, the furthest by about `size`; an ulp at least."""
+        """The program from starts displaced at random, the furthest by about `size`, an ulp at least."""
         ...
 
     def decision(self, other: Any, flips: Sequence[Any], separation: float) -> Decision:
@@ -108,17 +108,22 @@ class Program(Protocol):
         """
         ...
 
-    def history(self, steps: int, loss: Callable[..., float] | None = None) -> History:
+    def history(self, steps: int, loss: Callable[..., float] | None = None) -> DecisionHistory:
         """What a run of so many steps decides, and where it ends."""
         ...
 
-    def differing(self, other: Any, steps: int, step: int) -> Differing:
-        """What this program and another decide differently at a step of their runs of so many steps."""
+    def differing(self, other: Any, steps: int, step: int, key: str) -> Differing:
+        """What this program and another, at an adjacent value of a number, decide differently at a step.
+
+        Args:
+            steps: of their runs.
+            key: of the number.
+        """
         ...
 
 
 @dataclass(frozen=True)
-class Pair:
+class Twin:
     """Two programs that differ in one numerical choice.
 
     Attributes:
@@ -134,7 +139,7 @@ class Pair:
 
 
 @dataclass(frozen=True)
-class Stretch:
+class PairRows:
     """Some steps of two runs side by side.
 
     Attributes:
@@ -175,7 +180,7 @@ class Stretch:
         """Number of steps."""
         return len(self.cross)
 
-    def until(self, last: int) -> Stretch:
+    def until(self, last: int) -> PairRows:
         """The rows up to a step, and what happened in them."""
         rows = last - self.first + 1
         if rows >= self.rows:
@@ -189,7 +194,7 @@ class Stretch:
             run: word if np.isnan(cut["separation"].get(run, np.zeros(rows))[-1]) else ""
             for run, word in self.failed.items()
         }
-        return Stretch(**{**cut, "flips": flips, "doubts": doubts, "failed": failed})
+        return PairRows(**{**cut, "flips": flips, "doubts": doubts, "failed": failed})
 
 
 def _first_rows(value: Any, rows: int) -> Any:
@@ -262,6 +267,7 @@ class Number:
         at: the program at another value, without compiling again.
         proper: the program at another value, as a user runs it.
         positive: whether only values above 0 make sense.
+        zero: whether 0 does too.
         dtype: of the floats that the number can have.
     """
 
@@ -271,6 +277,7 @@ class Number:
     at: Callable[[float], Any]
     proper: Callable[[float], Any]
     positive: bool
+    zero: bool = False
     dtype: Any = np.float64
 
     @property
@@ -280,16 +287,17 @@ class Number:
 
 
 @dataclass(frozen=True)
-class History:
+class DecisionHistory:
     """What a run decided, step by step, and where it ended.
 
     Attributes:
         marks: of each step, a number that any other decisions of that step have different (up to collisions
-            of 64 bits); shorter where the run failed, shape (steps + 1,), or (steps,) from step 1 on.
+            of 64 bits); shorter where the run failed, shape (rows,).
         digest: all decisions in one word of 32 hexadecimal digits.
         x: at the last step, unwrapped, length, shape (atoms, 3) or (balls,).
         loss, energy: at the last step; NaN where the run failed.
         failed: "blow-up" or "runaway" where it ended that way, else "".
+        first: step of the first row.
     """
 
     marks: UInt64[np.ndarray, "rows"]
@@ -298,14 +306,15 @@ class History:
     loss: float
     energy: float
     failed: str
+    first: int = 0
 
-    def first_difference(self, other: History) -> int | None:
-        """The first row in which two runs decide differently; None where they decide alike."""
+    def first_difference(self, other: DecisionHistory) -> int | None:
+        """The first step at which two runs decide differently; None where they decide alike."""
         common = min(len(self.marks), len(other.marks))
         differ = np.flatnonzero(self.marks[:common] != other.marks[:common])
         if len(differ):
-            return int(differ[0])
-        return None if len(self.marks) == len(other.marks) else common
+            return self.first + int(differ[0])
+        return None if len(self.marks) == len(other.marks) else self.first + common
 
 
 @dataclass(frozen=True)
