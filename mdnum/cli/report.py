@@ -15,8 +15,11 @@ def report(
 ) -> int:
     """Write the report of a run folder again."""
     from mdnum.report import write
+    from mdnum.store import RunFolder
+    from mdnum.workflow import frame
 
-    written = write(folder)
+    opened = RunFolder.open(folder)
+    written = frame.finish(opened).folder / "report.html" if frame.on_frame(opened) else write(folder)
     output.print_notes(folder)
     if as_json:
         output.print_json({"folder": folder, "report": written})
