@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
 
 from mdnum.ball import GlobalSum, Problem, Projection, ResidualPenetration, SemiImplicitEuler, World
 from mdnum.ball.gradients import FixedPoint, Implicit
 from mdnum.ball.gradients.cost import Accuracy, Memory, accuracy, memory
 from mdnum.ball.gradients.unrolled import scaled
+from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
 
 K = ALPHA = 0.5
 DEPTH = 0.45
