@@ -37,9 +37,9 @@ from _output import COLORS, figure, parser, save, say, start, table
 from ase import Atoms
 from ase.build import bulk
 from jaxtyping import Array, Float
+from mdnum.gradients.base import Method
 
 from mdnum.gradients import Problem, by_word
-from mdnum.gradients.base import Method
 from mdnum.gradients.ensemble import Replicas, settled
 from mdnum.gradients.losses import GreenKuboDiffusion, Loss, RadialDistribution
 from mdnum.gradients.tape import Tape

@@ -2,8 +2,8 @@
 
 A conservative force is a gradient, so its Jacobian is symmetric and the transpose of the Jacobian times a
 vector is the Jacobian times that vector. Of a pair potential that is a tangent evaluation, pair by pair,
-gathered as the forces are: nothing is scattered. Of any other energy it is one tangent through one gradient of
-the energy. No tape is kept, and the decisions are those that the run acted on.
+gathered as the forces are: nothing is scattered. Of any other energy it is one tangent through one gradient
+of the energy. No tape is kept, and the decisions are those that the run acted on.
 """
 
 from __future__ import annotations

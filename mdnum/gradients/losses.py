@@ -67,7 +67,7 @@ class Loss(eqx.Module):
         every: looks at every n-th step. first: from this step on.
         name, label, unit: its name on the command line, a few words, and its unit with the names of
             `Units` in braces.
-        of_single_frames: whether it is made of what each frame shows by itself, so that an ensemble has it too.
+        of_single_frames: whether each frame shows it by itself, so that an ensemble has it too.
     """
 
     name: ClassVar[str]
@@ -286,7 +286,7 @@ class GreenKuboDiffusion(Loss):
     @classmethod
     def named(cls, options, simulation, steps):
         every = options.get("every", 1)
-        return cls(**{"until": steps // every * every} | options)
+        return cls(**({"until": steps // every * every} | options))
 
     def looks_at(self, steps, last):
         if last < self.until:
@@ -344,10 +344,10 @@ class RadialDistribution(_OfFrames):
     @classmethod
     def named(cls, options, simulation, steps):
         # all pairs are examined, and neighboring steps look alike
-        options = {"every": 10, "bins": 60} | options
+        options: dict[str, Any] = {"every": 10, "bins": 60} | options
         # bins reach two widths further, and no further than nearest images do
         half = 0.5 * float(min(simulation.cell.widths))
-        return cls(**{"r_max": 0.999 * half / (1 + 2 / options["bins"])} | options)
+        return cls(**({"r_max": 0.999 * half / (1 + 2 / options["bins"])} | options))
 
     @property
     def width(self) -> float:

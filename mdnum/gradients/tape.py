@@ -97,7 +97,10 @@ def stretch_of(segment: Segment, start: Start, ledger: Ledger | None = None) -> 
     return Stretch(
         segment.first,
         segment.rows,
-        *(kept(name) for name in ("x", "v", "images", "bits")),
+        kept("x"),
+        kept("v"),
+        kept("images"),
+        kept("bits"),
         np.array(segment.before),
         np.asarray(start.state.x_before)[:, order],
         kept("potential"),

@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mdnum.gradients.base import Problem
 from small_systems import LENNARD_JONES, crystal, make
 
 from mdnum.errors import InputError
 from mdnum.gradients import differentiable, value_and_grad
-from mdnum.gradients.base import Problem
 from mdnum.gradients.losses import Custom, MeanPotential, MeanSquaredDisplacement
 from mdnum.systems import build
 

@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from ase import Atoms
+from mdnum.gradients.base import Problem
+from mdnum.gradients.boundary import Boundary
+from mdnum.gradients.frames import frames
+from mdnum.gradients.reweighting import Reweighting, weighed
 from scipy.integrate import quad
 from small_systems import LENNARD_JONES, crystal, make
 
 from mdnum.errors import InputError
-from mdnum.gradients.base import Problem
-from mdnum.gradients.boundary import Boundary
-from mdnum.gradients.frames import frames
 from mdnum.gradients.losses import MeanPotential, MeanPressure, MeanSquaredDisplacement
-from mdnum.gradients.reweighting import Reweighting, weighed
 from mdnum.gradients.tape import Tape
 from mdnum.systems import build
 

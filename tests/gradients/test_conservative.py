@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from ase.build import bulk
 from gradient_problems import everything
-from small_systems import LENNARD_JONES, crystal, make
-
-from mdnum.errors import InputError
 from mdnum.gradients.base import Problem
 from mdnum.gradients.conservative import EnergyFunction, with_potential
 from mdnum.gradients.forward import Forward
-from mdnum.gradients.parameters import names, value
 from mdnum.gradients.symmetric import EventAware, Symmetric
+from small_systems import LENNARD_JONES, crystal, make
+
+from mdnum.errors import InputError
+from mdnum.gradients.parameters import names, value
 from mdnum.gradients.unrolled import Epochs
 from mdnum.md.displacement import neighbor_vectors
 from mdnum.systems import build

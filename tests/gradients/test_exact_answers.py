@@ -7,12 +7,12 @@ import mpmath as mp
 import numpy as np
 import pytest
 from ase import Atoms
-from small_systems import LENNARD_JONES, make
-
 from mdnum.gradients.base import Problem
 from mdnum.gradients.forward import Forward
-from mdnum.gradients.losses import FinalProjection
 from mdnum.gradients.symmetric import Symmetric
+from small_systems import LENNARD_JONES, make
+
+from mdnum.gradients.losses import FinalProjection
 from mdnum.gradients.tape import Tape
 from mdnum.gradients.unrolled import Epochs, Recursive, Unrolled
 from mdnum.systems import build

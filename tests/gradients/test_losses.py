@@ -9,12 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from ase.neighborlist import neighbor_list
+from mdnum.gradients.base import Problem
+from mdnum.gradients.symmetric import Symmetric
 from scipy.integrate import trapezoid
 from scipy.interpolate import BSpline
 from small_systems import LENNARD_JONES, crystal, make
 
 from mdnum.errors import InputError
-from mdnum.gradients.base import Problem
 from mdnum.gradients.differences import FiniteDifferences
 from mdnum.gradients.losses import (
     Custom,
@@ -24,7 +25,6 @@ from mdnum.gradients.losses import (
     RadialDistribution,
     VelocityAutocorrelation,
 )
-from mdnum.gradients.symmetric import Symmetric
 from mdnum.rollout.engine import Engine, unwrapped
 from mdnum.systems import build
 

@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mdnum.gradients.primal import of_scan
 from small_systems import LENNARD_JONES, crystal, make
 
-from mdnum.gradients.primal import of_scan
 from mdnum.systems import build
 
 

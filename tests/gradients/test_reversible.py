@@ -11,15 +11,15 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mdnum.gradients.base import Problem
+from mdnum.gradients.reversible import Reversible, ReversibleTape
+from mdnum.gradients.symmetric import Symmetric
 from small_systems import LENNARD_JONES, crystal, make
 
 from mdnum.errors import InputError, NumericalError
 from mdnum.gradients.adjoint import reverse
-from mdnum.gradients.base import Problem
 from mdnum.gradients.differences import FiniteDifferences
 from mdnum.gradients.losses import Custom, FinalProjection
-from mdnum.gradients.reversible import Reversible, ReversibleTape
-from mdnum.gradients.symmetric import Symmetric
 from mdnum.rollout.engine import Engine
 from mdnum.systems import build
 

@@ -7,15 +7,15 @@ from functools import cache
 import numpy as np
 import pytest
 from gradient_problems import everything
-from small_systems import LENNARD_JONES, crystal, make
-
-from mdnum.errors import InputError
-from mdnum.gradients import memory
 from mdnum.gradients.base import Problem
 from mdnum.gradients.checkpoints import _split
 from mdnum.gradients.primal import Fingerprints
 from mdnum.gradients.steps import Steps
 from mdnum.gradients.symmetric import Symmetric
+from small_systems import LENNARD_JONES, crystal, make
+
+from mdnum.errors import InputError
+from mdnum.gradients import memory
 from mdnum.gradients.unrolled import Epochs, Recursive, Unrolled
 from mdnum.systems import build
 

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 from ase import Atoms
+from mdnum.gradients.diagnose.passes import passed
+from mdnum.gradients.symmetric import EventAware
 from scipy.optimize import brentq
 from small_systems import LENNARD_JONES, make
 
@@ -15,9 +17,7 @@ from mdnum.gradients import Problem
 from mdnum.gradients.diagnose import trust
 from mdnum.gradients.diagnose.horizons import halved, spread
 from mdnum.gradients.diagnose.near import Near
-from mdnum.gradients.diagnose.passes import passed
 from mdnum.gradients.losses import EinsteinDiffusion, MeanPotential, MeanSquaredDisplacement
-from mdnum.gradients.symmetric import EventAware
 from mdnum.gradients.tape import pace_of
 from mdnum.systems import build
 

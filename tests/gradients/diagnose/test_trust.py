@@ -9,14 +9,15 @@ import equinox as eqx
 import jax
 import numpy as np
 import pytest
+from mdnum.gradients.diagnose.places import Flips
+from mdnum.gradients.diagnose.results import Limit
+from mdnum.gradients.directions import Column
 from small_systems import LENNARD_JONES, crystal, make
 
 from mdnum.errors import InputError
 from mdnum.gradients import Problem
 from mdnum.gradients.diagnose.flips import sentence
 from mdnum.gradients.diagnose.horizons import Horizons, first_difference, horizons, spread
-from mdnum.gradients.diagnose.places import Flips
-from mdnum.gradients.diagnose.results import Limit
 from mdnum.gradients.diagnose.trust import (
     ambiguity,
     last_agreeing,
@@ -28,7 +29,6 @@ from mdnum.gradients.diagnose.trust import (
     verdict_of,
 )
 from mdnum.gradients.differences import richardson
-from mdnum.gradients.directions import Column
 from mdnum.gradients.losses import MeanPotential, MeanSquaredDisplacement
 from mdnum.systems import build
 
