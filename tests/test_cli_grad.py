@@ -10,9 +10,9 @@ import pytest
 from command_line import call, printed
 
 from mdnum.errors import InputError
-from mdnum.gradients.base import Problem
+from mdnum.gradients.problem import Problem
 from mdnum.gradients.ensemble import Ensemble
-from mdnum.gradients.smoothed import SmoothedDifferences
+from mdnum.gradients.ensemble import SmoothedDifferences
 from mdnum.report import write
 from mdnum.store import RunFolder
 from mdnum.systems import build

@@ -1,9 +1,9 @@
 """Derivatives of averages over states, from one run that is not differentiated.
 
 Averages do not care how frames hang together in time. What they need of a parameter is how it changes each
-frame's term at fixed positions; which pairs are inside (an average of what jumps when a pair enters changes with
-the radius by the jump times the density of pairs there, which no derivative at fixed decisions has); and,
-under a thermostat, how often such a frame is met: with the weight exp(-U/kT).
+frame's term at fixed positions; which pairs are inside (an average of what jumps when a pair enters changes
+with the radius by the jump times the density of pairs there, which no derivative at fixed decisions has);
+and, under a thermostat, how often such a frame is met: with the weight exp(-U/kT).
 """
 
 from __future__ import annotations

@@ -344,10 +344,11 @@ class RadialDistribution(_OfFrames):
     @classmethod
     def named(cls, options, simulation, steps):
         # all pairs are examined, and neighboring steps look alike
-        options: dict[str, Any] = {"every": 10, "bins": 60} | options
         # bins reach two widths further, and no further than nearest images do
         half = 0.5 * float(min(simulation.cell.widths))
-        return cls(**({"r_max": 0.999 * half / (1 + 2 / options["bins"])} | options))
+        bins = options.get("bins", 60)
+        own: dict[str, Any] = {"every": 10, "bins": bins, "r_max": 0.999 * half / (1 + 2 / bins)}
+        return cls(**(own | options))
 
     @property
     def width(self) -> float:

@@ -231,11 +231,9 @@ class Forward(Method):
             details |= {"guard": guard, "crossings": crossed, "grazing": grazing}
         notes = independent(problem, gradient, saltation=saltation)
         found = self.result(tape.value, gradient, notes, details)
-        return (
-            replace(found, kind="flow", description=f"{EventAware.description}, by tangents")
-            if saltation
-            else found
-        )
+        if saltation:
+            return replace(found, kind="flow", description=f"{EventAware.description}, by tangents")
+        return found
 
 
 @dataclass(frozen=True)

@@ -421,11 +421,8 @@ class Unrolled(Method):
             if progress is not None:
                 progress(last - ends[k], last, "reverse pass")
         parts = program.cotangents(onto, inputs)
-        details: dict[str, Any] = {
-            "steps linearized together": program.chunk,
-            "chunks": count,
-            "chunks run": chunks_run,
-        }
+        details: dict[str, Any] = {"steps linearized together": program.chunk, "chunks": count}
+        details["chunks run"] = chunks_run
         gradient = {name: parameters.gradient(simulation, parts, name) for name in names}
         notes = independent(problem, gradient, saltation=False)
         if self.compare:
@@ -455,8 +452,9 @@ def ahead(length: int, room: int) -> int:
     states, repeats = room + 1, 1
     while comb(states + repeats, states) < length:
         repeats += 1
-    # what lies behind it can be done with one state less and the same number of repeats
-    return max(1, length - comb(states - 1 + repeats, states - 1))
+    # as far ahead as one repeat less allows, and no nearer to the end than one state less allows
+    near, far = comb(states + repeats - 2, states - 1), comb(states + repeats - 1, states)
+    return max(1, min(far, length - near))
 
 
 def free() -> int:

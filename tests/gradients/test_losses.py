@@ -9,8 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from ase.neighborlist import neighbor_list
-from mdnum.gradients.base import Problem
-from mdnum.gradients.symmetric import Symmetric
 from scipy.integrate import trapezoid
 from scipy.interpolate import BSpline
 from small_systems import LENNARD_JONES, crystal, make
@@ -25,6 +23,8 @@ from mdnum.gradients.losses import (
     RadialDistribution,
     VelocityAutocorrelation,
 )
+from mdnum.gradients.problem import Problem
+from mdnum.gradients.recorded import Symmetric
 from mdnum.rollout.engine import Engine, unwrapped
 from mdnum.systems import build
 

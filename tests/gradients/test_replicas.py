@@ -7,17 +7,14 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 from ase.build import bulk
-from mdnum.gradients.base import Gradient, Problem
-from mdnum.gradients.shadow import ShadowDifferences
-from mdnum.gradients.smoothed import SmoothedDifferences
-from mdnum.gradients.surrogate import Surrogate
-from mdnum.gradients.symmetric import EventAware, Symmetric
 from small_systems import LENNARD_JONES, crystal, make
 
 from mdnum.errors import InputError
-from mdnum.gradients.differences import FiniteDifferences
-from mdnum.gradients.ensemble import Ensemble, Replicas, replica
+from mdnum.gradients.differences import FiniteDifferences, ShadowDifferences
+from mdnum.gradients.ensemble import Ensemble, Replicas, SmoothedDifferences, replica
 from mdnum.gradients.losses import Custom, MeanSquaredDisplacement, MeanTemperature
+from mdnum.gradients.problem import Gradient, Problem
+from mdnum.gradients.recorded import EventAware, Surrogate, Symmetric
 from mdnum.systems import build
 
 # so short that the force jumps by 0.8

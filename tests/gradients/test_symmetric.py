@@ -8,14 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from gradient_problems import everything
-from mdnum.gradients.base import Problem
-from mdnum.gradients.symmetric import Symmetric
 from small_systems import KOB_ANDERSEN as BINARY
 from small_systems import LENNARD_JONES, crystal, make, mixture
 
 from mdnum.errors import InputError
 from mdnum.gradients.differences import FiniteDifferences, richardson
 from mdnum.gradients.losses import Custom, FinalProjection
+from mdnum.gradients.problem import Problem
+from mdnum.gradients.recorded import Symmetric
 from mdnum.gradients.tape import Tape
 from mdnum.systems import build
 

@@ -11,6 +11,6 @@ from mdnum.gradients.diagnose.spectrum import Spectrum, spectrum
 from mdnum.gradients.diagnose.trust import Trust, trust
 
 __all__ = [
-    "PARTS", "GradientDiagnosis", "Growth", "Spectrum", "Trust", "agreement", "detective", "diagnose", "edges",
-    "flips", "growth", "horizons", "spectrum", "trust",
+    "PARTS", "GradientDiagnosis", "Growth", "Spectrum", "Trust", "agreement", "detective", "diagnose",
+    "edges", "flips", "growth", "horizons", "spectrum", "trust",
 ]  # fmt: skip

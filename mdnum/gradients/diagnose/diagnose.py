@@ -149,17 +149,20 @@ def diagnose(
         ),
         "spectrum": lambda: spectrum(problem, tape=tape, progress=progress),
         "detective": lambda: detective(problem, full, saltation=saltation, tape=tape, progress=progress),
-        **{f"edges of {name}": lambda name=name: edges(problem, name, progress=progress) for name in searched},
     }  # fmt: skip
-    around = {}
-    for part, attempt in attempts.items():
-        name = part.removeprefix("edges of ")
-        if part in failed or not (part in parts or name in searched):
-            continue
+    around: dict[str, DecisionEdges] = {}
+
+    def attempt(label: str, make: Callable[[], Any], into: dict[str, Any], name: str) -> None:
         try:
-            (around if name in searched else found)[name] = attempt()
+            into[name] = make()
         except MdnumError as error:
-            failed[part] = str(error)
+            failed[label] = str(error)
+
+    for part, make in attempts.items():
+        if part in parts and part not in failed:
+            attempt(part, make, found, part)
+    for name in searched:
+        attempt(f"edges of {name}", lambda name=name: edges(problem, name, progress=progress), around, name)
     opinions = found["agreement"].opinions if "agreement" in found else ()
     values = [one.found.value for one in opinions if one.found is not None]
     whole = tape.value if tape is not None else values[0] if values else problem.value()

@@ -9,11 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from ase import Atoms
-from mdnum.gradients.diagnose.operations import first_not_finite
 from small_systems import LENNARD_JONES, make
 
 from mdnum.gradients import Problem
-from mdnum.gradients.diagnose.detective import detective
+from mdnum.gradients.diagnose.detective import detective, first_not_finite
 from mdnum.gradients.losses import Custom, VelocityAutocorrelation
 from mdnum.gradients.parameters import with_values
 from mdnum.systems import build

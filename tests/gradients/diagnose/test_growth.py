@@ -7,14 +7,14 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from mdnum.gradients.base import Gradient
-from mdnum.gradients.symmetric import Symmetric
 from small_systems import LENNARD_JONES, crystal, make
 
 from mdnum.gradients import Problem
 from mdnum.gradients.diagnose.growth import growth, growth_rate
 from mdnum.gradients.losses import FinalProjection
 from mdnum.gradients.parameters import with_values
+from mdnum.gradients.problem import Gradient
+from mdnum.gradients.recorded import Symmetric
 from mdnum.rollout.engine import Engine, Start
 from mdnum.systems import build
 

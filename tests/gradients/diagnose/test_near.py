@@ -8,8 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 from ase import Atoms
-from mdnum.gradients.diagnose.passes import passed
-from mdnum.gradients.symmetric import EventAware
 from scipy.optimize import brentq
 from small_systems import LENNARD_JONES, make
 
@@ -18,6 +16,7 @@ from mdnum.gradients.diagnose import trust
 from mdnum.gradients.diagnose.horizons import halved, spread
 from mdnum.gradients.diagnose.near import Near
 from mdnum.gradients.losses import EinsteinDiffusion, MeanPotential, MeanSquaredDisplacement
+from mdnum.gradients.recorded import EventAware, passed
 from mdnum.gradients.tape import pace_of
 from mdnum.systems import build
 

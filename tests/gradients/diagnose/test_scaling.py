@@ -5,9 +5,9 @@ from __future__ import annotations
 import ml_dtypes
 import numpy as np
 import pytest
-from mdnum.gradients.diagnose.scaling import ScalingWatch
 
 from mdnum.errors import InputError
+from mdnum.gradients.diagnose.growth import ScalingWatch
 
 TYPES = {"float16": np.float16, "bfloat16": ml_dtypes.bfloat16, "float32": np.float32}
 

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from mdnum.gradients.diagnose.places import Flips
 from mdnum.gradients.diagnose.results import Limit
-from mdnum.gradients.directions import Column
 from small_systems import LENNARD_JONES, crystal, make
 
 from mdnum.errors import InputError
@@ -30,6 +29,7 @@ from mdnum.gradients.diagnose.trust import (
 )
 from mdnum.gradients.differences import richardson
 from mdnum.gradients.losses import MeanPotential, MeanSquaredDisplacement
+from mdnum.gradients.parameters import Column
 from mdnum.systems import build
 
 QUINTIC = {"kind": "quintic", "radius": 2.2, "onset": 1.8}
