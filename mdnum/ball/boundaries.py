@@ -16,10 +16,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Float, Int
 
-from mdnum.ball.compare import first_difference
 from mdnum.ball.contacts import Projection
 from mdnum.ball.problem import START, Problem, loss_of
-from mdnum.ball.rollout import BallRun
+from mdnum.ball.rollout import BallRun, first_difference
 from mdnum.errors import InputError
 from mdnum.precision.ulp import neighbor, ordinal
 

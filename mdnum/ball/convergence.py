@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -17,14 +16,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from mdnum.ball.exact import ExactImpact
-from mdnum.ball.exact_damped import ExactDamped
-from mdnum.ball.exact_penalty import ExactPenalty
+from mdnum.ball.exact import ExactImpact, ExactPenalty
 from mdnum.ball.world import World
 from mdnum.errors import InputError
 from mdnum.events.saltation import carry
-
-Exact = ExactImpact | ExactPenalty | ExactDamped
 
 
 @dataclass(frozen=True)
@@ -50,7 +45,7 @@ class Convergence:
 
 def converge(
     world: World,
-    exact: Callable[[float], Exact],
+    exact: Callable[[float], ExactImpact | ExactPenalty],
     y0: Float[np.ndarray, "balls"],
     time: float,
     counts: Sequence[int],
@@ -73,19 +68,17 @@ def converge(
     known = [exact(float(y)).height(time) for y in y0]
     heights = np.array([float(one.value) for one in known])
     slopes = np.array([float(one.gradient[name]) for one in known])
-    start = jnp.asarray(y0)
     errors = []
     for count in counts:
         here = world.with_values({"h": time / count})
-        y, dy = (saltated if saltation else arrive)(here, start, count, name)
+        y, dy = (saltated if saltation else arrive)(here, jnp.asarray(y0), count, name)
         off = (np.asarray(y) - heights, np.asarray(dy) - slopes)
         errors.append([*(np.sqrt(np.mean(x**2)) for x in off), np.max(np.abs(np.asarray(dy)))])
-    table = np.array(errors).T
-    return Convergence(time / np.asarray(counts, np.float64), *table)
+    return Convergence(time / np.asarray(counts, np.float64), *np.array(errors).T)
 
 
 def arrive(world: World, y0: Float[Array, "balls"], steps: int, name: str) -> tuple[Array, Array]:
-    """Heights after so many steps and the derivative of the program by a parameter, by forward mode.
+    """Heights after a number of steps and the derivative of the program by a parameter, by forward mode.
 
     One compilation serves all step sizes and numbers of steps.
     """
@@ -95,16 +88,16 @@ def arrive(world: World, y0: Float[Array, "balls"], steps: int, name: str) -> tu
 @eqx.filter_jit
 def _arrive(world: World, y0: Array, steps: Array, name: str) -> tuple[Array, Array]:
     def run(value):
-        here, start = _at(world, y0, name, value)
-        state = lax.fori_loop(0, steps, lambda _, state: here.advance(state)[0], start)
-        return state.y
+        here = world if name in ("y0", "v0") else world.with_values({name: value})
+        start = here.start(y0 + value if name == "y0" else y0, value if name == "v0" else 0.0)
+        return lax.fori_loop(0, steps, lambda _, state: here.advance(state)[0], start).y
 
     value = jnp.zeros(()) if name in ("y0", "v0") else jnp.asarray(world.value(name))
     return jax.jvp(run, (value,), (jnp.ones_like(value),))
 
 
 def saltated(world: World, y0: Float[Array, "balls"], steps: int, name: str) -> tuple[Array, Array]:
-    """Heights after so many steps and the derivative of the motion that the steps imitate.
+    """Heights after a number of steps and the derivative of the motion that the steps imitate.
 
     For an impact reset at the end of a step. Between impacts the tangent is that of the flight; at an impact
     it is multiplied by the saltation matrix there, with the speed that the program itself arrived with.
@@ -138,13 +131,3 @@ def _saltated(world: World, y0: Array, steps: Array, name: str) -> tuple[Array, 
     start = (world.start(y0, 0.0), one * float(name == "y0"), one * float(name == "v0"))
     state, dy, _ = lax.fori_loop(0, steps, step, start)
     return state.y, dy
-
-
-def _at(world: World, y0: Array, name: str, value: Array) -> tuple[World, Any]:
-    """World and start with one parameter at a value; for a start value that is an offset."""
-    if name == "y0":
-        return world, world.start(y0 + value, 0.0)
-    if name == "v0":
-        return world, world.start(y0, value)
-    here = world.with_values({name: value})
-    return here, here.start(y0, 0.0)

@@ -177,6 +177,7 @@ TABLES: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         "md": ("series", "flips", "epochs"),
         "ball": ("steps", "contacts", "solver", "heights", "separations"),
+        "demos": ("curves",),
         "ball-fork": ("separation", "cross_flips", "around"),
         "fork": ("separation", "cross_flips", "ambiguous_pairs", "neighborhood"),
         "along": ("boundaries", "intervals", "points"),
@@ -195,8 +196,8 @@ TABLES: Mapping[str, tuple[str, ...]] = MappingProxyType(
 VERBS: Mapping[str, str] = MappingProxyType(
     {
         **dict.fromkeys(TABLES, "fork"),
-        "md": "run", "ball": "ball", "audit": "audit", "grad": "grad", "conform": "conform", "flips": "flips",
-        "flips-compare": "flips",
+        "md": "run", "ball": "ball", "demos": "ball --demo", "audit": "audit", "grad": "grad",
+        "conform": "conform", "flips": "flips", "flips-compare": "flips",
     }
 )  # fmt: skip
 

@@ -11,8 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mdnum.ball import contacts, integrators, limits, stopping
-from mdnum.ball.losses import FinalHeight, Loss, MeanHeight, ResidualPenetration
-from mdnum.ball.problem import Problem
+from mdnum.ball.problem import FinalHeight, Loss, MeanHeight, Problem, ResidualPenetration
 from mdnum.ball.world import World
 from mdnum.errors import InputError
 from mdnum.precision import neighbor, reductions

@@ -13,11 +13,11 @@ from mdnum.systems import messages
 SYSTEM_FILE = "system.toml"
 
 
-def shipped_folder() -> Path:
-    """The folder of shipped systems: the packaged copy, else the repository's (editable installs)."""
+def shipped_folder(kind: Literal["systems", "demos"] = "systems") -> Path:
+    """The folder of shipped files: the packaged copy, else the repository's (editable installs)."""
     package = Path(str(importlib.resources.files("mdnum")))
-    packaged = package / "_systems"
-    return packaged if packaged.is_dir() else package.parent / "systems"
+    packaged = package / f"_{kind}"
+    return packaged if packaged.is_dir() else package.parent / kind
 
 
 def names(world: Literal["md", "ball"] | None = None) -> list[str]:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from mdnum.workflow.audit import AuditResult, audit
-from mdnum.workflow.ball import BallResult, bounce
+from mdnum.workflow.ball import bounce
 from mdnum.workflow.conform import ConformResult, conform
+from mdnum.workflow.demos import demonstrate
 from mdnum.workflow.flips import FlipsResult, flips
 from mdnum.workflow.fork import ForkResult, fork
 from mdnum.workflow.fork_certify import CertifyResult, fork_certify
@@ -17,7 +18,6 @@ from mdnum.workflow.run import run
 
 __all__ = [
     "AuditResult",
-    "BallResult",
     "CertifyResult",
     "ConformResult",
     "FlipsResult",
@@ -29,6 +29,7 @@ __all__ = [
     "audit",
     "bounce",
     "conform",
+    "demonstrate",
     "flips",
     "fork",
     "fork_certify",

@@ -47,7 +47,7 @@ def grad_ball(
     """
     from mdnum.ball.gradients import BY_NAME, method
     from mdnum.systems.build_ball import build_ball
-    from mdnum.workflow import ball_exact
+    from mdnum.workflow import ball_record
     from mdnum.workflow.ball import gradients
 
     began = time.perf_counter()
@@ -70,7 +70,7 @@ def grad_ball(
         if not applied:
             reasons = "; ".join(f"{one['method']}: {one['says']}" for one in found)
             raise InputError(f"no method applies: {reasons}", where=loaded.name)
-        summary = _summary(loaded, applied, ball_exact.exact(loaded, run, applied))
+        summary = _summary(loaded, applied, ball_record.exact(loaded, run, applied))
         folder.finalize()
         folder.write_summary(
             summary

@@ -8,8 +8,7 @@ import pytest
 from mdnum.ball.boundaries import boundaries
 from mdnum.ball.contacts import Impact, Projection
 from mdnum.ball.integrators import SemiImplicitEuler
-from mdnum.ball.losses import ResidualPenetration
-from mdnum.ball.problem import Problem
+from mdnum.ball.problem import Problem, ResidualPenetration
 from mdnum.ball.stopping import GlobalSum, PerInstance
 from mdnum.ball.world import World
 from mdnum.errors import InputError

@@ -7,8 +7,7 @@ import pytest
 
 from mdnum.ball.contacts import Impact, Penalty, Projection
 from mdnum.ball.convergence import Convergence, converge
-from mdnum.ball.exact import ExactImpact
-from mdnum.ball.exact_penalty import ExactPenalty
+from mdnum.ball.exact import ExactImpact, ExactPenalty
 from mdnum.ball.integrators import (
     EventLocated,
     ExplicitEuler,

@@ -13,8 +13,7 @@ import numpy as np
 
 from mdnum.ball.contacts import Projection
 from mdnum.ball.gradients.dependence import dependence, follow
-from mdnum.ball.losses import Loss
-from mdnum.ball.problem import START, Problem, loss_of
+from mdnum.ball.problem import START, Loss, Problem, loss_of
 from mdnum.ball.rollout import BallRun
 from mdnum.ball.state import Decisions
 from mdnum.ball.world import World

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mdnum.ball.elementwise import elementwise
 from mdnum.ball.gradients.implicit import FixedPoint, fixed_point_tangent
+from mdnum.ball.stopping import elementwise
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mdnum.ball.contacts import Penalty
-from mdnum.ball.contacts.base import Motion, Moved
+from mdnum.ball.contacts import Motion, Moved, Penalty
 from mdnum.ball.gradients.base import Gradient, used
 from mdnum.ball.gradients.unrolled import scaled
 from mdnum.ball.integrators import EventLocated, Push, VelocityVerlet

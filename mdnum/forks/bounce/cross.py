@@ -7,10 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from mdnum.ball.bounds import height_bound, residual_bound
-from mdnum.ball.compare import counts_alike
 from mdnum.ball.contacts import Projection
-from mdnum.ball.rollout import BallRun
+from mdnum.ball.rollout import BallRun, counts_alike, height_bound, residual_bound
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Shaped
 
-from mdnum.ball.compare import first_difference
 from mdnum.ball.limits import spacing
 from mdnum.ball.problem import Problem
-from mdnum.ball.rollout import BallRun, simulate
+from mdnum.ball.rollout import BallRun, first_difference, simulate
 from mdnum.ball.state import BallState, Decisions
 from mdnum.ball.world import World
 from mdnum.errors import InputError

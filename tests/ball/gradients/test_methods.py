@@ -10,8 +10,7 @@ from mdnum.ball.contacts import Impact, Penalty, Projection
 from mdnum.ball.exact import ExactImpact
 from mdnum.ball.gradients import BY_NAME, compare, method
 from mdnum.ball.integrators import EventLocated, SemiImplicitEuler, VelocityVerlet
-from mdnum.ball.losses import MeanHeight, ResidualPenetration
-from mdnum.ball.problem import Problem
+from mdnum.ball.problem import MeanHeight, Problem, ResidualPenetration
 from mdnum.ball.stopping import GlobalSum, PerInstance
 from mdnum.ball.world import World
 from mdnum.errors import InputError, NumericalError
