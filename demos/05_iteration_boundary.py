@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
 
 from mdnum.ball import GlobalSum, Problem, Projection, ResidualPenetration, SemiImplicitEuler, World
 from mdnum.ball.boundaries import Boundary, BoundaryMap, boundaries
 from mdnum.precision import ulp_distance
+from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
 
 ALPHA, DEPTH, TOL = 0.5, 0.45, 1e-4
 LOW, HIGH, POINTS = 0.48, 0.53, 101

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 import numpy as np
-from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
 
 from mdnum.ball import EventLocated, ExactImpact, Impact, SemiImplicitEuler, World, arrive, saltated
+from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
 
 TIME = 2.0
 COUNTS = (200, 632, 2000, 6325, 20_000, 63_246, 200_000)

@@ -95,6 +95,7 @@ class Gradient:
         notes: what a reader must know about single parameters, by name: no dependence, a missing term.
         details: plain values that belong to the method: counts, errors, tables.
         kind: what was differentiated.
+        depends: whether the run used each parameter on the way to the loss, where that is known.
     """
 
     method: str
@@ -104,6 +105,7 @@ class Gradient:
     notes: dict[str, str] = field(default_factory=dict)
     details: dict[str, Any] = field(default_factory=dict)
     kind: Kind = "steps"
+    depends: dict[str, bool] = field(default_factory=dict)
 
 
 class Method:

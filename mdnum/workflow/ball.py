@@ -173,7 +173,7 @@ def gradients(problem: Problem, asked: Any, first: bool = False) -> list[dict[st
         asked: the [gradient] table.
         first: only the first method.
     """
-    from mdnum.ball.gradients import compare
+    from mdnum.gradients.ball import compare
 
     if not asked.of:
         return []
@@ -181,11 +181,11 @@ def gradients(problem: Problem, asked: Any, first: bool = False) -> list[dict[st
     found: list[dict[str, Any]] = [
         {
             "method": one.method,
-            "says": one.says,
+            "says": one.description,
             "value": float(one.value),
             "gradient": {name: float(value) for name, value in one.gradient.items()},
             "depends": {name: bool(value) for name, value in one.depends.items()},
-            "why": dict(one.why),
+            "why": dict(one.notes),
             "details": dict(one.details),
             "refused": False,
         }

@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from gradient_problems import everything
 from small_systems import LENNARD_JONES, crystal, make
 
 from mdnum.errors import InputError, NumericalError

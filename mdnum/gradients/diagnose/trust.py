@@ -104,7 +104,7 @@ class Trust:
     limits: tuple[Limit, ...]
     unknown: tuple[str, ...]
     tolerance: float
-    table: dict[str, Float[np.ndarray, "points"]]
+    table: dict[str, np.ndarray]
     half: dict[str, Float[np.ndarray, "entries"]]
     digits: dict[str, int]
     turns: Turns | None
