@@ -19,7 +19,7 @@ from mdnum.ball import (
     SemiImplicitEuler,
     World,
 )
-from mdnum.ball.gradients.unrolled import scaled
+from mdnum.gradients.ball import scaled
 from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
 
 K = ALPHA = 0.5

@@ -12,7 +12,6 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from mdnum.ball.compare import Difference, first_difference
     from mdnum.ball.contacts import Impact, Penalty, Projection
     from mdnum.ball.convergence import Convergence, arrive, converge, saltated
     from mdnum.ball.exact import ExactImpact, ExactPenalty
@@ -24,7 +23,7 @@ if TYPE_CHECKING:
         VelocityVerlet,
     )
     from mdnum.ball.problem import FinalHeight, MeanHeight, Problem, ResidualPenetration, loss_of
-    from mdnum.ball.rollout import BallRun, simulate
+    from mdnum.ball.rollout import BallRun, Difference, first_difference, simulate
     from mdnum.ball.state import BallState, Decisions, Reason
     from mdnum.ball.stopping import Fixed, GlobalSum, Hysteresis, Maximum, PerInstance, Relative
     from mdnum.ball.world import World

@@ -438,7 +438,7 @@ def test_reductions_are_those_of_the_library():
 def test_methods_are_those_of_the_library():
     import typing
 
-    from mdnum.ball.gradients import BY_NAME
+    from mdnum.gradients.ball import BALL_METHODS as BY_NAME
 
     assert set(typing.get_args(ball.MethodName)) == set(BY_NAME)
 

@@ -8,13 +8,18 @@ from scipy.optimize import brentq
 
 from mdnum.ball.contacts import Impact, Penalty, Projection
 from mdnum.ball.exact import ExactImpact
-from mdnum.ball.gradients import BY_NAME, compare, method
 from mdnum.ball.integrators import EventLocated, SemiImplicitEuler, VelocityVerlet
 from mdnum.ball.problem import MeanHeight, Problem, ResidualPenetration
 from mdnum.ball.stopping import GlobalSum, PerInstance
 from mdnum.ball.world import World
 from mdnum.errors import InputError, NumericalError
+from mdnum.gradients.ball import BALL_METHODS, compare
 from mdnum.precision.policy import RolePrecision
+
+
+def method(name: str, **options):
+    """A method with options."""
+    return BALL_METHODS[name](**options)
 
 
 def relaxation(tol: float, p0=(0.45,), rule=GlobalSum) -> Problem:
@@ -63,7 +68,7 @@ def test_the_unrolled_gain_is_an_artefact_of_the_tolerance_and_the_implicit_one_
     implicit = method("implicit")(problem, ["k", "y0"])
     assert implicit.gradient == {"k": 0.0, "y0": 0.0}
     assert implicit.value == unrolled.value
-    assert implicit.why["k"] == "the fixed point does not depend on k"
+    assert implicit.notes["k"] == "the fixed point does not depend on k"
     assert unrolled.depends == {"k": True, "y0": True}
     assert implicit.depends == {"k": False, "y0": False}
     # taking the stopped iterate for the fixed point lets the tolerance back in: p / k
@@ -76,10 +81,10 @@ def test_a_gain_that_no_iteration_used_is_said_not_to_matter() -> None:
         found = method("unrolled")(relaxation(1.0, (0.25, 0.2), rule), ["k", "y0"])
         assert found.gradient["k"] == 0.0
         assert found.depends == {"k": False, "y0": True}
-        assert found.why["k"] == "the loop ended before k was used: the loss does not depend on k"
+        assert found.notes["k"] == "the loop ended before k was used: the loss does not depend on k"
     flying = method("unrolled")(bouncing(SemiImplicitEuler(1e-2), steps=10), ["restitution"])
     assert not flying.depends["restitution"]
-    assert flying.why["restitution"].startswith("no ball touched the floor")
+    assert flying.notes["restitution"].startswith("no ball touched the floor")
 
 
 @pytest.mark.slow
@@ -268,9 +273,21 @@ def test_a_comparison_runs_what_applies_and_says_why_the_rest_does_not() -> None
     made = compare(bouncing(SemiImplicitEuler(1e-2), steps=100), ["y0"])
     assert [one.method for one in made] == ["unrolled", "frozen", "event-aware", "smoothed", "randomized"]
     assert "no iterated projection" in made.refused["implicit"]
-    assert len({one.says for one in made}) == 5
-    assert set(BY_NAME) == {*made.refused, *(one.method for one in made)}
-    with pytest.raises(InputError, match="no gradient called 'adjoint'"):
+    assert len({one.description for one in made}) == 5
+    assert set(BALL_METHODS) == {*made.refused, *(one.method for one in made)}
+    with pytest.raises(InputError, match="no gradient 'adjoint'"):
         compare(relaxation(1e-2), ["k"], ["adjoint"])
     with pytest.raises(InputError, match="no parameter called 'damping'"):
         compare(relaxation(1e-2), ["damping"])
+
+
+@pytest.mark.parametrize(
+    ("damping", "word"), [(0.0, "derivative of the steps"), (2.0, "derivative of the motion")]
+)
+def test_a_spring_has_no_saltation(damping: float, word: str) -> None:
+    world = World.create(Penalty(900.0, damping), SemiImplicitEuler(0.01))
+    problem = Problem(world, 1.0, 0.0, 120)
+    aware, plain = (method(name)(problem, ["y0"]) for name in ("event-aware", "unrolled"))
+    assert word in aware.description
+    same = aware.gradient["y0"] == pytest.approx(plain.gradient["y0"], rel=1e-12)
+    assert same == (damping == 0.0)

@@ -48,14 +48,14 @@ class Dependence:
         written: whether any path of the program leads from it to the loss.
         used: whether the branches and iterations that ran do.
         derivative: the derivative of the loss, NaN where it was not asked for.
-        says: the answer in words.
+        message: the answer in words.
     """
 
     name: str
     written: bool
     used: bool
     derivative: float
-    says: str
+    message: str
 
 
 def dependence(
@@ -78,7 +78,7 @@ def dependence(
         rest: further arguments, pytrees of arrays. What must not become a constant of the compiled program
             (the zero of a fence) is passed here and not closed over.
         gradient: derivatives already known; by default they are taken here in forward mode.
-        marks: what `follow` said of the names, where it was asked already.
+        marks: what `follow` gave for the names, where it was asked already.
         why_unused: begins the sentence about a parameter that the run did not use.
 
     Returns:

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mdnum.ball.gradients.dependence import dependence
 from mdnum.errors import InputError
+from mdnum.gradients.dependence import dependence
 from mdnum.precision.exact import fence, zero_bits
 
 
@@ -39,21 +39,21 @@ def test_a_loop_that_ran_no_iteration_did_not_use_the_gain(tol: float, iteration
     np.testing.assert_allclose(found["k"].derivative, expected, rtol=1e-12)
     assert found["p0"].used
     if not iterations:
-        assert found["k"].says == "the loop ended before k was used: the loss does not depend on k"
+        assert found["k"].message == "the loop ended before k was used: the loss does not depend on k"
 
 
 def test_what_the_program_cannot_reach_is_not_written() -> None:
     found = dependence(lambda at: jnp.sin(at["a"]) + jax.lax.stop_gradient(at["b"]), {"a": 1.0, "b": 2.0})
     assert found["a"].written
     assert not found["b"].written
-    assert "no path from b" in found["b"].says
+    assert "no path from b" in found["b"].message
 
 
 def test_a_used_parameter_may_still_have_a_zero_derivative() -> None:
     found = dependence(lambda at: (at["a"] * 1e-200) * 1e-200, {"a": 1.0})
     assert found["a"].used
     assert found["a"].derivative == 0.0
-    assert "exactly zero" in found["a"].says
+    assert "exactly zero" in found["a"].message
 
 
 @pytest.mark.parametrize("x", [-1.0, 1.0])

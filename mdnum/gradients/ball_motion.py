@@ -1,9 +1,9 @@
-"""The derivative of the motion: with the time of each contact moving along."""
+"""The derivative of a ball's motion: with the time of each contact moving along."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import equinox as eqx
 import jax
@@ -11,28 +11,28 @@ import jax.numpy as jnp
 import numpy as np
 
 from mdnum.ball.contacts import Penalty, Projection
-from mdnum.ball.gradients.base import Gradient, origin, start_of, used
-from mdnum.ball.gradients.unrolled import scaled
 from mdnum.ball.integrators import EventLocated
 from mdnum.ball.problem import START, Problem
 from mdnum.ball.state import BallState, Decisions, Record
 from mdnum.ball.world import World
 from mdnum.errors import NumericalError
 from mdnum.events.saltation import carry, grazing
+from mdnum.gradients.ball import BallMethod, Used, origin, scaled, start_of, used
+from mdnum.gradients.problem import Gradient
 
 #: Parameters of how a projection is solved, not of what it stands for.
 _SOLVER = ("k", "alpha", "tol", "enter")
-#: What is said of a spring, sharp or soft.
+#: Which derivative that is of a spring, sharp or soft.
 _SPRING = (
-    "The derivative of the steps: a spring's force does not jump at a contact, so its time moves no "
-    "tangent (the saltation matrix is 1)."
+    "the derivative of the steps: a spring's force does not jump at a contact, so its time moves no "
+    "tangent (the saltation matrix is 1)"
 )
 #: |n · F-| below this share of |F-| counts as grazing.
 _NARROW = 1e-6
 
 
 @dataclass(frozen=True)
-class EventAware:
+class ThroughContacts(BallMethod):
     """The derivative of the ball's motion, contacts included, rather than of the steps that imitate it.
 
     A step decides about contact at its end, so its derivative does not know that a ball which starts higher
@@ -44,7 +44,8 @@ class EventAware:
     """
 
     name = "event-aware"
-    says = "The derivative of the motion, the times of its contacts moving along (saltation at each contact)."
+    kind = "flow"
+    description = "the derivative of the motion, the times of its contacts moving along (saltation at each)"
 
     def __call__(self, problem: Problem, names: Sequence[str]) -> Gradient:
         """The derivative, by tangents that are carried with the rollout.
@@ -78,8 +79,8 @@ class EventAware:
                 depends[name], why[name] = False, f"the impact that is solved for does not depend on {name}"
         details = {"events": events, "located": located}
         spring = isinstance(world.contact, Penalty) and not float(world.contact.damping)
-        says = _SPRING if spring else self.says
-        return Gradient(self.name, says, value, slopes, depends, why, details)
+        made = self.result(value, slopes, Used(depends, why), details)
+        return replace(made, description=_SPRING) if spring else made
 
 
 def _refuse(grazing: int) -> None:
