@@ -193,7 +193,7 @@ def run() -> Demo:
                 f"a float32 sum restores the derivative in {dtype}",
                 slopes[dtype][2],
                 expected,
-                abs(slopes[dtype][2] / truth[dtype] - 1) < limit and slopes[dtype][2] != 0,
+                bool(abs(slopes[dtype][2] / truth[dtype] - 1) < limit and slopes[dtype][2] != 0),
             )
             for dtype, expected, limit in (
                 ("bfloat16", f"{truth['bfloat16']:.4g} to 1e-3", 1e-3),
@@ -206,7 +206,7 @@ def run() -> Demo:
             "an integer",
             float(slopes["float16"][2] / step).is_integer(),
         ),
-        Claim("loss scaling brings it back", restored, "below 1e-3 relative", restored < 1e-3),
+        Claim("loss scaling brings it back", restored, "below 1e-3 relative", bool(restored < 1e-3)),
     ]
     return Demo(
         title="The dtype of a sum decides whether the solver runs",

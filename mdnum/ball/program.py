@@ -12,10 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from mdnum.ball.compare import CrossDecision, cross_decisions, overridden
 from mdnum.ball.contacts import Projection
 from mdnum.ball.limits import spacing
 from mdnum.ball.problem import START, Problem
-from mdnum.ball.rollout import BallRun, CrossDecision, cross_decisions, overridden, simulate
+from mdnum.ball.rollout import BallRun, simulate
 from mdnum.ball.state import Decisions
 from mdnum.errors import InputError
 from mdnum.events.ledger import Ledger
