@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from mdnum.ball import BallRun, GlobalSum, Problem, Projection, ResidualPenetration, SemiImplicitEuler, World
-from mdnum.ball.gradients import Gradient, Unrolled
 from mdnum.errors import InputError
+from mdnum.gradients.ball import ThroughIterations
+from mdnum.gradients.problem import Gradient
 from mdnum.precision import RolePrecision, neighbor
 from mdnum.precision.policy import ALL
 from mdnum.precision.reductions import Reduction, Sequential
@@ -112,7 +113,7 @@ class Row:
             "loss": self.gradient.value,
             "grad_k": self.gradient.gradient["k"],
             "depends_on_k": self.gradient.depends["k"],
-            "says": self.gradient.why["k"],
+            "says": self.gradient.notes["k"],
         }
 
 
@@ -122,7 +123,7 @@ def measure(dtype: str) -> list[Row]:
     for name, policy in policies(dtype).items():
         posed = problem(dtype, policy)
         run = posed.run(history=True)
-        rows.append(Row(dtype, name, run, Unrolled()(posed, ["k"], run)))
+        rows.append(Row(dtype, name, run, ThroughIterations()(posed, ["k"], run)))
     return rows
 
 
@@ -139,7 +140,7 @@ def run() -> Demo:
     rows = {dtype: measure(dtype) for dtype in FORMATS}
     half = rows["float16"][2]
     posed = problem("float16", policies("float16")[half.name])
-    scaled = Unrolled(loss_scale=2.0**15)(posed, ["k"], half.run)
+    scaled = ThroughIterations(loss_scale=2.0**15)(posed, ["k"], half.run)
     data = {dtype: {row.name: row.data() for row in rows[dtype]} for dtype in FORMATS}
     slopes = {dtype: [row.gradient.gradient["k"] for row in rows[dtype]] for dtype in FORMATS}
     counts = {dtype: [row.run.iterations.tolist() for row in rows[dtype]] for dtype in FORMATS}
@@ -182,17 +183,17 @@ def run() -> Demo:
         ),
         Claim(
             "the loss of a fragile run does not depend on k, and this is said",
-            [one.why["k"] for one in fragile],
+            [one.notes["k"] for one in fragile],
             "ended before k was used; derivative 0",
             all(not one.depends["k"] and one.gradient["k"] == 0.0 for one in fragile)
-            and all("ended before k was used" in one.why["k"] for one in fragile),
+            and all("ended before k was used" in one.notes["k"] for one in fragile),
         ),
         *(
             Claim(
                 f"a float32 sum restores the derivative in {dtype}",
                 slopes[dtype][2],
                 expected,
-                abs(slopes[dtype][2] / truth[dtype] - 1) < limit and slopes[dtype][2] != 0,
+                bool(abs(slopes[dtype][2] / truth[dtype] - 1) < limit and slopes[dtype][2] != 0),
             )
             for dtype, expected, limit in (
                 ("bfloat16", f"{truth['bfloat16']:.4g} to 1e-3", 1e-3),
@@ -205,7 +206,7 @@ def run() -> Demo:
             "an integer",
             float(slopes["float16"][2] / step).is_integer(),
         ),
-        Claim("loss scaling brings it back", restored, "below 1e-3 relative", restored < 1e-3),
+        Claim("loss scaling brings it back", restored, "below 1e-3 relative", bool(restored < 1e-3)),
     ]
     return Demo(
         title="The dtype of a sum decides whether the solver runs",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
 
 from mdnum.ball import (
     BallRun,
@@ -17,6 +16,7 @@ from mdnum.ball import (
     simulate,
 )
 from mdnum.precision import neighbor, ordinal, ulp_distance
+from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
 
 H, STEPS = 0.01, 200
 #: Heights (m) with different first contacts, between which the boundary lies.

@@ -6,11 +6,11 @@ import itertools
 from typing import Any
 
 import numpy as np
-from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
 
 from mdnum.ball import BallRun, GlobalSum, Hysteresis, Penalty, Projection, SemiImplicitEuler, World, simulate
 from mdnum.precision import RolePrecision
 from mdnum.precision.reductions import Reduction, parse
+from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
 
 #: A ball that rests on a soft spring and is shaken: it wavers about the floor.
 BALLS, STEPS, H, STIFFNESS, DAMPING, SHAKE = 16, 2000, 5e-3, 1000.0, 5.0, 9.0

@@ -7,7 +7,6 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
 
 from mdnum.ball import (
     BallRun,
@@ -20,7 +19,8 @@ from mdnum.ball import (
     SemiImplicitEuler,
     World,
 )
-from mdnum.ball.gradients.unrolled import scaled
+from mdnum.gradients.ball import scaled
+from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
 
 K = ALPHA = 0.5
 TOL, CAP = 1e-3, 100

@@ -5,10 +5,10 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
-from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
 
 from mdnum.precision.coalesce import orders, scatter_add, segment_sum
 from mdnum.precision.reductions import Exact, FixedPoint, Sequential
+from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
 
 #: Contacts, the floor panels that they load, and the orders in which they may be stored.
 CONTACTS, PANELS, ORDERS = 96, 6, 1000

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array
-from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
 
 from mdnum.ball import EventLocated, ExactImpact, Impact, Reason, SemiImplicitEuler, World, simulate
+from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
 
 G, E = 9.81, 0.8
 REST_SPEED = 1e-12

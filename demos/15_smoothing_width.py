@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import jax.numpy as jnp
 import numpy as np
-from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
 
 from mdnum.ball import ExactPenalty, Penalty, SemiImplicitEuler, VelocityVerlet, World, arrive
+from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
 
 K, TIME, STEPS = 3000.0, 2.0, 200
 WIDTHS = (0.0, 0.001, 0.003, 0.01, 0.02, 0.03, 0.05, 0.1)

@@ -28,7 +28,7 @@ import numpy as np
 from _output import COLORS, figure, parser, save, say, start, table
 
 from mdnum.ball import GlobalSum, Problem, Projection, ResidualPenetration, SemiImplicitEuler, World
-from mdnum.ball.gradients import Unrolled
+from mdnum.gradients.ball import ThroughIterations
 from mdnum.precision import RolePrecision
 from mdnum.precision.policy import ALL
 from mdnum.precision.reductions import parse
@@ -63,8 +63,8 @@ def measure(state: str, kind: str, order: str, balls: int, steps: int, tol: floa
     """Run it and differentiate it."""
     problem = pose(state, kind, order, balls, steps, tol)
     run = problem.run(keep=False)
-    made = Unrolled()(problem, ["k"], run)
-    return Row(kind, order, run.iterations, run.ended().get("cap", 0), made.value, made.gradient["k"])
+    made = ThroughIterations()(problem, ["k"], run)
+    return Row(kind, order, run.iterations, run.ended().get("cap", 0), made.value, float(made.gradient["k"]))
 
 
 def draw(rows: list[Row], path: Path) -> None:

@@ -12,8 +12,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from mdnum.ball.compare import Difference, first_difference
     from mdnum.ball.contacts import Impact, Penalty, Projection
-    from mdnum.ball.convergence import Convergence, arrive, converge, saltated
     from mdnum.ball.exact import ExactImpact, ExactPenalty
     from mdnum.ball.integrators import (
         EventLocated,
@@ -22,19 +22,19 @@ if TYPE_CHECKING:
         SemiImplicitEuler,
         VelocityVerlet,
     )
-    from mdnum.ball.problem import FinalHeight, MeanHeight, Problem, ResidualPenetration, loss_of
-    from mdnum.ball.rollout import BallRun, Difference, first_difference, simulate
+    from mdnum.ball.problem import FinalHeight, MeanHeight, Problem, ResidualPenetration, arrive, loss_of
+    from mdnum.ball.rollout import BallRun, simulate
     from mdnum.ball.state import BallState, Decisions, Reason
     from mdnum.ball.stopping import Fixed, GlobalSum, Hysteresis, Maximum, PerInstance, Relative
     from mdnum.ball.world import World
 
 _NAMES = {
     "contacts": "Impact Penalty Projection",
-    "convergence": "Convergence arrive converge saltated",
     "exact": "ExactImpact ExactPenalty",
     "integrators": "EventLocated ExplicitEuler ImplicitMidpoint SemiImplicitEuler VelocityVerlet",
-    "problem": "FinalHeight MeanHeight Problem ResidualPenetration loss_of",
-    "rollout": "BallRun Difference first_difference simulate",
+    "problem": "FinalHeight MeanHeight Problem ResidualPenetration arrive loss_of",
+    "compare": "Difference first_difference",
+    "rollout": "BallRun simulate",
     "state": "BallState Decisions Reason",
     "stopping": "Fixed GlobalSum Hysteresis Maximum PerInstance Relative",
     "world": "World",

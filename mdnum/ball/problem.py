@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
@@ -119,20 +119,6 @@ class Problem:
         """The loss."""
         return float(_loss(self._bare(), self.world, *self._start(), dict(overrides or {}), None))
 
-    def function(self, names: Sequence[str]) -> Callable[[Mapping[str, Any]], Float[Array, ""]]:
-        """The loss as a function of the named parameters, to be traced, differentiated and jitted by JAX.
-
-        The world's other numbers are constants of the function. Inside a jit of your own pass them as
-        arguments instead (`loss_of`), or the compiler folds the fences away.
-        """
-        self.values(names)
-        bare, world, start = self._bare(), self.world, self._start()
-
-        def loss(values: Mapping[str, Any]) -> Float[Array, ""]:
-            return _loss(bare, world, *start, dict(values), None)
-
-        return loss
-
     def value_and_grad(
         self, names: Sequence[str], told: Decisions | None = None
     ) -> tuple[float, dict[str, float]]:
@@ -211,3 +197,22 @@ def _loss(bare, world, y0, v0, values, told):
 @eqx.filter_jit
 def _value_and_grad(bare, values, world, y0, v0, told):
     return jax.value_and_grad(lambda given: _apply(bare, world, y0, v0, given, told, shifts=True))(values)
+
+
+def arrive(world: World, y0: Float[Array, "balls"], steps: int, name: str) -> tuple[Array, Array]:
+    """Heights after a number of steps and the derivative of the program by a parameter, by forward mode.
+
+    One compilation serves all step sizes and numbers of steps.
+    """
+    return _arrive(world, y0, jnp.asarray(steps), name)
+
+
+@eqx.filter_jit
+def _arrive(world: World, y0: Array, steps: Array, name: str) -> tuple[Array, Array]:
+    def run(value):
+        here = world if name in ("y0", "v0") else world.with_values({name: value})
+        start = here.start(y0 + value if name == "y0" else y0, value if name == "v0" else 0.0)
+        return lax.fori_loop(0, steps, lambda _, state: here.advance(state)[0], start).y
+
+    value = jnp.zeros(()) if name in ("y0", "v0") else jnp.asarray(world.value(name))
+    return jax.jvp(run, (value,), (jnp.ones_like(value),))

@@ -1,4 +1,4 @@
-"""The bouncing ball as a program: decide outside, act inside (the contract of mdnum.dynamics)."""
+"""The bouncing ball as a program: decide outside, act inside."""
 
 from __future__ import annotations
 
@@ -159,14 +159,6 @@ class World(eqx.Module):
         leave = Threshold(self.lift.astype(height.dtype), "<=", "height")
         return jnp.asarray(Hysteresis(enter, leave).decide(height, before))
 
-    def margins(self, state: BallState) -> Balls:
-        """Signed distances to contact, m: minus the height that the coming step decides on."""
-        return -self.advance(state)[1].height
-
-    def decide(self, state: BallState) -> Decisions:
-        """What the coming step decides."""
-        return self.advance(state)[1].decisions
-
     # -- act -------------------------------------------------------------------------------------------
 
     def start(self, y: Any, v: Any = 0.0) -> BallState:
@@ -186,14 +178,10 @@ class World(eqx.Module):
         )
         return BallState(step, y, v, a, touching)
 
-    def step(self, state: BallState, decisions: Decisions) -> BallState:
-        """The next state, acting on the decisions it is told."""
-        return self.advance(state, told=decisions)[0]
-
     def advance(
         self, state: BallState, *, told: Decisions | None = None, history: bool = False
     ) -> tuple[BallState, Record]:
-        """Decide and act: the bits of `step` with the decisions of `decide`.
+        """Decide and act.
 
         Args:
             state: at this step.

@@ -11,10 +11,11 @@ import secrets
 import stat
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import BinaryIO, Literal
 
+from mdnum import __version__
 from mdnum.errors import FolderError
 
 #: Folders inside a folder; the folder itself may be a link, for that is the choice of whoever names it.
@@ -208,11 +209,13 @@ class Manifest:
         world: which tables the folder has, a key of `TABLES`.
         finished: whether its writing came to an end.
         files: digests that a file may have, by its name in the folder.
+        version: of the mdnum that began it.
     """
 
     world: str
     finished: bool = False
     files: dict[str, list[str]] = field(default_factory=dict)
+    version: str = __version__
 
 
 def digest_of(data: bytes | memoryview) -> str:
@@ -257,7 +260,7 @@ def load(root: Path) -> Manifest | None:
         # names of files in the folder, or in one of the folders in it
         if not all(map(_INSIDE.fullmatch, files)):
             raise ValueError("it lists files of elsewhere")
-        return Manifest(str(held["world"]), bool(held["finished"]), files)
+        return Manifest(str(held["world"]), bool(held["finished"]), files, str(held["version"]))
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise FolderError(
             "is damaged, so that the other files cannot be checked against it",
@@ -268,7 +271,7 @@ def load(root: Path) -> Manifest | None:
 
 def save(root: Path, made: Manifest) -> None:
     """Replaces the manifest of a folder."""
-    held = {"world": made.world, "finished": made.finished, "files": dict(sorted(made.files.items()))}
+    held = {**asdict(made), "files": dict(sorted(made.files.items()))}
     text = json.dumps({**held, "digest": digest_of(_canonical(held))}, indent=1)
     with replacing(root / NAME) as file:
         file.write(text.encode() + b"\n")

@@ -13,7 +13,7 @@ from mdnum.workflow.fork_forecast import ForecastResult, fork_forecast
 from mdnum.workflow.fork_map import MapResult, fork_map
 from mdnum.workflow.fork_processes import ProcessesResult, fork_processes
 from mdnum.workflow.fork_replay import fork_folders
-from mdnum.workflow.grad import GradResult, grad
+from mdnum.workflow.grad import grad
 from mdnum.workflow.run import run
 
 __all__ = [
@@ -23,7 +23,6 @@ __all__ = [
     "FlipsResult",
     "ForecastResult",
     "ForkResult",
-    "GradResult",
     "MapResult",
     "ProcessesResult",
     "audit",

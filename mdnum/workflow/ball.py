@@ -145,7 +145,7 @@ def _differentiated(
     simulation: BallSimulation, run: BallRun, progress: Progress | None
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Loss, derivatives, closed form and variants; and the separations from the variants."""
-    from mdnum.ball.rollout import first_difference
+    from mdnum.ball.compare import first_difference
     from mdnum.workflow import ball_record
 
     problem, asked = simulation.problem, simulation.system.spec.gradient
@@ -180,7 +180,7 @@ def gradients(problem: Problem, asked: Any, first: bool = False) -> list[dict[st
         asked: the [gradient] table.
         first: only the first method.
     """
-    from mdnum.ball.gradients import compare
+    from mdnum.gradients.ball import compare
 
     if not asked.of:
         return []
@@ -188,11 +188,11 @@ def gradients(problem: Problem, asked: Any, first: bool = False) -> list[dict[st
     found: list[dict[str, Any]] = [
         {
             "method": one.method,
-            "says": one.says,
+            "says": one.description,
             "value": float(one.value),
             "gradient": {name: float(value) for name, value in one.gradient.items()},
             "depends": {name: bool(value) for name, value in one.depends.items()},
-            "why": dict(one.why),
+            "why": dict(one.notes),
             "details": dict(one.details),
             "refused": False,
         }

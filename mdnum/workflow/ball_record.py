@@ -8,9 +8,10 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from mdnum.ball.compare import Difference
 from mdnum.ball.contacts import Penalty, Projection
 from mdnum.ball.exact import ExactImpact, ExactPenalty
-from mdnum.ball.rollout import BallRun, Difference, residual_bound
+from mdnum.ball.rollout import BallRun, residual_bound
 from mdnum.ball.state import Reason
 from mdnum.ball.stopping import Fixed
 from mdnum.systems import ball

@@ -422,6 +422,6 @@ def test_a_batch_on_the_boundary_needs_a_tolerance_of_its_format():
 def test_methods_are_those_of_the_library():
     import typing
 
-    from mdnum.ball.gradients import BY_NAME
+    from mdnum.gradients.ball import BALL_METHODS as BY_NAME
 
     assert set(typing.get_args(ball.MethodName)) == set(BY_NAME)
