@@ -158,7 +158,7 @@ class Registry(Generic[T]):
         """
         name, separator, argument = text.strip().partition(self.separator)
         value: Any = self[name]
-        makes: bool = isinstance(value, type) or bool(inspect.isroutine(value))
+        makes = _makes(value)
         if not makes and not separator:
             return value
         arguments = (argument,) if separator else ()
@@ -183,6 +183,10 @@ class Registry(Generic[T]):
     def package(self, name: str) -> str:
         """The package that the value of this name comes from."""
         return "mdnum" if name in self._own else _package(self._added()[name])
+
+
+def _makes(value: object) -> bool:
+    return isinstance(value, type) or inspect.isroutine(value)
 
 
 def _package(point: metadata.EntryPoint) -> str:
