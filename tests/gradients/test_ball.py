@@ -8,12 +8,12 @@ from scipy.optimize import brentq
 
 from mdnum.ball.contacts import Impact, Penalty, Projection
 from mdnum.ball.exact import ExactImpact
-from mdnum.gradients.ball import BALL_METHODS, compare
 from mdnum.ball.integrators import EventLocated, SemiImplicitEuler, VelocityVerlet
 from mdnum.ball.problem import MeanHeight, Problem, ResidualPenetration
 from mdnum.ball.stopping import GlobalSum, PerInstance
 from mdnum.ball.world import World
 from mdnum.errors import InputError, NumericalError
+from mdnum.gradients.ball import BALL_METHODS, compare
 from mdnum.precision.policy import RolePrecision
 
 

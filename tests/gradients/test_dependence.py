@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mdnum.gradients.dependence import dependence
 from mdnum.errors import InputError
+from mdnum.gradients.dependence import dependence
 from mdnum.precision.exact import fence, zero_bits
 
 
