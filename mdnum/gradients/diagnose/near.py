@@ -22,8 +22,8 @@ from jaxtyping import Bool, Float, Int
 
 from mdnum.gradients.adjoint import Trace
 from mdnum.gradients.parameters import directions
-from mdnum.gradients.tangents import Tangents
-from mdnum.gradients.tape import Pace, Stretch
+from mdnum.gradients.tangents import StretchTangents
+from mdnum.gradients.tape import Pace, TapeStretch
 from mdnum.md.cell import HostCell
 from mdnum.systems.build import Simulation
 
@@ -133,7 +133,7 @@ class Near:
         """Whether a crossing adds anything at all: force or energy of a pair jump."""
         return self.simulation.pairwise and bool(np.any(np.asarray(self.simulation.jumps())))
 
-    def reverse(self, stretch: Stretch, trace: Trace) -> None:
+    def reverse(self, stretch: TapeStretch, trace: Trace) -> None:
         """One stretch of the event-aware reverse pass, last first: its turning points and their weights."""
         if not self.jumps:
             return
@@ -160,7 +160,7 @@ class Near:
         self._found.append(found)
         self._at[stretch.first] = found
 
-    def tangents(self, part: Tangents) -> None:
+    def tangents(self, part: StretchTangents) -> None:
         """One stretch of the tangents: how far each distance moves."""
         found = self._at.get(part.stretch.first)
         if found is None:
@@ -181,7 +181,7 @@ class Near:
         dr = np.einsum("rcb,rb->rc", apart, found.normal)
         found.moved = np.asarray(along.r_cut).T[found.kind] - dr
 
-    def compared(self, stretch: Stretch, per: int) -> None:
+    def compared(self, stretch: TapeStretch, per: int) -> None:
         """One stretch of another run, which makes `per` steps where this one makes one."""
         cell, place = HostCell(self.simulation.cell), np.argsort(stretch.table.order)
         for found in self._found:
@@ -281,7 +281,7 @@ def hermite(
     return u, r0 + u * (first + u * (square + u * cube)), (2 * square + 6 * u * cube) / time**2
 
 
-def turning(simulation: Simulation, stretch: Stretch) -> Turning:
+def turning(simulation: Simulation, stretch: TapeStretch) -> Turning:
     """The turning points of pairs near their cutoff within a stretch, from distances and their rates."""
     order, index = stretch.table.order, stretch.table.index
     slots, i = np.nonzero(index < simulation.atoms)

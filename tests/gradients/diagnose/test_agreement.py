@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mdnum.errors import InputError
-from mdnum.gradients.diagnose.agreement import Scale, agreement, compare
+from mdnum.gradients.diagnose.agreement import RoundingScale, agreement, compare
 from mdnum.gradients.differences import FiniteDifferences
 from mdnum.gradients.losses import Custom
 from mdnum.gradients.problem import Gradient, Problem
@@ -24,8 +24,8 @@ def told(method: str, value: float, **details: Any) -> Gradient:
     return Gradient(method, "", 0.0, {"q": np.asarray(value)}, {}, details, KINDS.get(method, "steps"))
 
 
-EXACT = Scale(unit=2.0**-53)
-CHAOTIC = Scale(unit=2.0**-53, growth=1e6)
+EXACT = RoundingScale(unit=2.0**-53)
+CHAOTIC = RoundingScale(unit=2.0**-53, growth=1e6)
 
 
 @pytest.mark.parametrize(

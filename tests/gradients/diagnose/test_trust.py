@@ -27,7 +27,7 @@ from mdnum.gradients.diagnose.trust import (
 )
 from mdnum.gradients.differences import richardson
 from mdnum.gradients.losses import MeanPotential, MeanSquaredDisplacement
-from mdnum.gradients.parameters import Column
+from mdnum.gradients.parameters import ParameterEntry
 from mdnum.systems import build
 
 QUINTIC = {"kind": "quintic", "radius": 2.2, "onset": 1.8}
@@ -59,7 +59,9 @@ def test_horizons_that_look_at_nothing_are_left_out(problem):
 
 def made(gradient, ledgers=()) -> Horizons:
     gradient = np.asarray(gradient, float)[:, None]
-    return Horizons(np.arange(len(gradient)), (Column("q"),), gradient[:, 0], gradient, tuple(ledgers))
+    return Horizons(
+        np.arange(len(gradient)), (ParameterEntry("q"),), gradient[:, 0], gradient, tuple(ledgers)
+    )
 
 
 AT = np.array([10, 20, 30, 40, 50])
