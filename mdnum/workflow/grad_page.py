@@ -402,7 +402,8 @@ def _flips(view: View) -> Iterator[Any]:
         )  # fmt: skip
         yield Plot(
             "ranked", "Contributions of single flips, the largest first", "rank",
-            "|contribution| / |derivative|", tuple(ranked), x_scale="log", y_scale="log", caption=TEXTS("caption_ranked"),
+            "|contribution| / |derivative|", tuple(ranked), x_scale="log", y_scale="log",
+            caption=TEXTS("caption_ranked"),
         )  # fmt: skip
     yield TEXTS("by_weight", shown=min(found["flips"], TABLE_ROWS), flips=found["flips"])
     yield _browse({name: values[:TABLE_ROWS] for name, values in table.items()})
