@@ -378,7 +378,7 @@ class BoundaryTerm(Method):
 class Reweighting(Method):
     """Differentiable trajectory reweighting: explicit derivative and response of the weights.
 
-    The explicit part is that of `Boundary`; the response is minus the covariance of the loss's terms with
+    The explicit part is that of `BoundaryTerm`; the response is minus the covariance of the loss's terms with
     the derivative of the energy, over kT.
 
     Attributes:

@@ -63,7 +63,7 @@ def test_a_smooth_cutoff_has_no_boundary():
     assert found.details["boundary"] == {"cutoff.radius": 0.0, "box.scale": 0.0}
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_hard_cutoffs_have_the_slopes_of_differences():
     """At the states of one run: pairs counted by numpy on either side of three radii."""
     simulation = liquid({"kind": "hard", "radius": 2.2})
@@ -108,7 +108,7 @@ def pair():
     return Problem(simulation, MeanPotential(every=5), 20_000)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_canonical_averages_have_the_derivatives_of_an_integral(pair):
     names = ("r_cut", "sigma", "epsilon", "temperature", "scale")
     found = Reweighting()(pair, names)
