@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from command_line import call, printed
 
-from mdnum.references.conformance.case import one
+from mdnum.references.conformance.case import once
 from mdnum.references.conformance.loading import from_object
 from mdnum.references.conformance.suite import examine
 from mdnum.report.conform.findings import judge
@@ -161,7 +161,7 @@ def test_what_refuses_everything_is_not_called_safe():
         raise RuntimeError("boom")
 
     two = [[0.0, 0, 0], [0.5, 0, 0]]
-    judged = _judged(refuses, [one("none", "few", []), one("two", "few", two), one("two", "images", two)])
+    judged = _judged(refuses, [once("none", "few", []), once("two", "few", two), once("two", "images", two)])
     assert judged.headline == "it answered no question."
     codes = {one.code: one for one in judged.findings}
     assert set(codes) == {"NOTHING_ANSWERED", "RAISED"} and codes["NOTHING_ANSWERED"].severity == "error"
@@ -174,7 +174,7 @@ def test_what_answers_rightly_or_not_at_all_is_told_as_that():
             raise IndexError("no such bin")
         return ([0, 1], [1, 0]) if len(positions) == 2 else ([], [])
 
-    tested = [one("two", "few", [[0.0, 0, 0], [0.5, 0, 0]]), one("far", "outside", [[2.0, 0, 0]])]
+    tested = [once("two", "few", [[0.0, 0, 0], [0.5, 0, 0]]), once("far", "outside", [[2.0, 0, 0]])]
     judged = _judged(far, tested)
     assert judged.headline == (
         "it raises an exception by accident in 1 of 2 cases; in the 1 that it answered, the pairs are right."
@@ -191,8 +191,8 @@ def test_what_ends_the_process_is_not_told_as_right():
         return ([0, 1], [1, 0]) if len(positions) == 2 else ([], [])
 
     two = [[0.0, 0, 0], [0.5, 0, 0]]
-    cases = [one("two", "few", two), one("four", "few", [*two, [0, 5, 0], [0, 9, 0]])]
-    cases.append(one("three", "outside", [*two, [5.0, 0, 0]]))
+    cases = [once("two", "few", two), once("four", "few", [*two, [0, 5, 0], [0, 9, 0]])]
+    cases.append(once("three", "outside", [*two, [5.0, 0, 0]]))
     judged = _judged(leaves, cases)
     assert judged.tone == "error"
     assert judged.headline == "it failed 2 of 3 cases."  # the pair of the four is missing, too
@@ -215,9 +215,9 @@ def test_what_fails_only_after_another_goes_below_it():
 
     two = [[0.0, 0, 0], [0.5, 0, 0]]
     cases = [
-        one("two", "few", two),
-        one("four", "few", [*two, [5.0, 0, 0], [9.0, 0, 0]]),
-        one("again", "outside", two),
+        once("two", "few", two),
+        once("four", "few", [*two, [5.0, 0, 0], [9.0, 0, 0]]),
+        once("again", "outside", two),
     ]
     found = examine(from_object(breaks), asked=cases, large=False, shrink=False)
     assert sorted(failed.code for failed in found.failed) == ["DUPLICATE", "ONE_SIDED"]
@@ -250,7 +250,7 @@ def test_time_that_is_up_is_told():
         return ([0, 1], [1, 0]) if len(positions) == 2 else ([], [])
 
     two = [[0.0, 0, 0], [0.5, 0, 0]]
-    cases = [one(f"{n}", "few", two) for n in range(5)]
+    cases = [once(f"{n}", "few", two) for n in range(5)]
     found = examine(from_object(right), asked=cases, deadline=cast(Any, TwoQuestions()))
     assert (found.asked, found.left, found.questions) == (2, 3, 5)
     judged = judge(cast(Any, SimpleNamespace(name="it", summary=_summary(found, [], 0))))
@@ -342,13 +342,13 @@ def test_one_mistake_has_one_script_and_names_all_areas():
         return [], []
 
     two = [[0.0, 0, 0], [0.5, 0, 0]]
-    cases = [one(area, area, [*two, [n, 2.0, 3.0]], 4.0) for n, area in enumerate(("few", "boxes", "ties"))]
-    judged = _judged(leaves, [*cases, one("free", "axes", two)])
+    cases = [once(area, area, [*two, [n, 2.0, 3.0]], 4.0) for n, area in enumerate(("few", "boxes", "ties"))]
+    judged = _judged(leaves, [*cases, once("free", "axes", two)])
     (crashed,) = (one for one in judged.findings if one.code == "CRASHED")
     assert crashed.text.startswith("In 4 cases, in every area. ")
     assert crashed.remedy.startswith("Raise an exception")
-    judged = _judged(nothing, [*cases, one("none", "axes", [[0.0, 0, 0]])])
+    judged = _judged(nothing, [*cases, once("none", "axes", [[0.0, 0, 0]])])
     (missing,) = (one for one in judged.findings if one.code == "MISSING")
     assert missing.text.startswith("In 3 cases, about few, boxes and ties. ")
-    report = examine(from_object(nothing), asked=[*cases, one("images", "images", two, 0.7)], large=False)
+    report = examine(from_object(nothing), asked=[*cases, once("images", "images", two, 0.7)], large=False)
     assert [(failed.code, failed.case.atoms) for failed in report.failed] == [("MISSING", 2), ("MISSING", 1)]

@@ -19,7 +19,7 @@ from typing import Any
 
 from mdnum.errors import InputError
 from mdnum.safe_path import search_last
-from mdnum.systems.messages import nearest
+from mdnum.registry import nearest
 
 _counter = itertools.count()
 

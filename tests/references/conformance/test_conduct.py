@@ -11,19 +11,19 @@ import planted_lists
 import pytest
 
 from mdnum.references.conformance import reproduction
-from mdnum.references.conformance.alike import alike
-from mdnum.references.conformance.case import one, script
+from mdnum.references.conformance.case import once, sequence
 from mdnum.references.conformance.catalog import gas
-from mdnum.references.conformance.lists import Limits, PairList, Session
+from mdnum.references.conformance.lists import Limits, PairList
 from mdnum.references.conformance.loading import from_object, load
-from mdnum.references.conformance.remote import RemoteSession
+from mdnum.references.conformance.results import alike
+from mdnum.references.conformance.session import RemoteSession, Session
 from mdnum.references.conformance.suite import examine
 from mdnum.report.conform.findings import judge
 from mdnum.report.verdict import Finding
 from mdnum.workflow.conform import _summary
 
-_TWO = one("two", "few", [[0.0, 0, 0], [0.5, 0, 0]], 4.0)
-_THREE = one("three", "images", [[0.1, 0, 0], [0.5, 0, 0], [0.6, 0, 0]], 4.0)
+_TWO = once("two", "few", [[0.0, 0, 0], [0.5, 0, 0]], 4.0)
+_THREE = once("three", "images", [[0.1, 0, 0], [0.5, 0, 0], [0.6, 0, 0]], 4.0)
 
 
 def _findings(tested: PairList, cases) -> dict[str, Finding]:
@@ -73,7 +73,7 @@ def test_a_buffer_of_a_list_that_is_kept_is_told():
             return self.buffer[0, :count], self.buffer[1, :count]
 
     start = gas(12, 4.0, 3)
-    moving = script("moving", "motion", [start, start[::-1], start], 4.0)
+    moving = sequence("moving", "motion", [start, start[::-1], start], 4.0)
     assert examine(from_object(Filled), asked=[moving], shrink=False).aliased == "moving"
     assert examine(from_object(planted_lists.Kept), asked=[moving], shrink=False).aliased is None
 
@@ -109,13 +109,13 @@ def test_a_refusal_that_hangs_on_what_was_asked_before_is_told():
 
 
 def test_what_a_refusal_may_hang_on_is_told_with_it():
-    outside = one("outside", "outside", [[0.25, 0, 0], [4.5, 0, 0]], 4.0, r_cut=4 / 3)
+    outside = once("outside", "outside", [[0.25, 0, 0], [4.5, 0, 0]], 4.0, r_cut=4 / 3)
     found = _findings(_refusing(lambda x, _: x.max() > 4.0), [_TWO, outside])
     assert set(found) == {"REFUSES"}  # and nothing uneven
     assert found["REFUSES"].text.endswith(
         "about outside. Asked about outside: the same is answered with its atoms wrapped into the box."
     )
-    far = one("far", "few", 8 * _TWO.stills[0].positions, 40.0, r_cut=8.0)
+    far = once("far", "few", 8 * _TWO.stills[0].positions, 40.0, r_cut=8.0)
     found = _findings(_refusing(lambda _, r_cut: r_cut > 4.0), [_TWO, far])
     assert "the same is answered with all lengths multiplied by 0.12" in found["REFUSES"].text
     # what it does not claim to do is not asked here either
@@ -127,7 +127,7 @@ def test_a_question_told_otherwise_has_the_same_pairs():
     skewed = np.array([[5.0, 0, 0], [2.0, 5.0, 0], [-1.5, 1.0, 5.0]])
     start = gas(9, skewed, 4) + 7.0
     stills = [(start, skewed), (start + 0.2, skewed), (start + 0.4, 1.01 * skewed)]
-    case = script("moving", "motion", stills, skewed, r_cut=2.3)
+    case = sequence("moving", "motion", stills, skewed, r_cut=2.3)
     right = planted_lists.search(start + 0.4, 1.01 * skewed, (True,) * 3, 2.3)
     told = list(alike(case))
     assert [even for _, even, _ in told] == [True, True, False, False, False]
@@ -192,7 +192,7 @@ class HangsLater:
 def test_time_is_what_a_list_computes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Not what the clock says on a machine that does other things; and each step has its own."""
     (tmp_path / "slow.py").write_text(_SLOW)
-    monkeypatch.setattr("mdnum.references.conformance.remote.CALL", 0.6)
+    monkeypatch.setattr("mdnum.references.conformance.session.CALL", 0.6)
 
     def asked(name: str, case):
         session = RemoteSession(load(f"{tmp_path / 'slow.py'}:{name}"))
@@ -204,7 +204,7 @@ def test_time_is_what_a_list_computes(tmp_path: Path, monkeypatch: pytest.Monkey
     (outcome,) = asked("waits", _TWO)
     assert outcome.late is None and outcome.answer is not None
     at = _TWO.stills[0].positions
-    first, second = asked("HangsLater", script("still", "motion", [at, at, at], 4.0))
+    first, second = asked("HangsLater", sequence("still", "motion", [at, at, at], 4.0))
     assert first.answer is not None and "computed nothing" in str(second.late)
 
 

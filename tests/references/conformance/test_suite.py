@@ -17,18 +17,16 @@ import pytest
 
 from mdnum.errors import InputError
 from mdnum.references.conformance import NeighborListConformance
-from mdnum.references.conformance.case import AREAS, one, script
-from mdnum.references.conformance.catalog import catalog, gas
-from mdnum.references.conformance.crowds import crowds, lattice
+from mdnum.references.conformance.case import AREAS, once, sequence
+from mdnum.references.conformance.catalog import catalog, crowds, gas, lattice
 from mdnum.references.conformance.judge import Failure
-from mdnum.references.conformance.lists import Limits, Session
+from mdnum.references.conformance.lists import Limits
 from mdnum.references.conformance.loading import from_object, installed, known, load
-from mdnum.references.conformance.movers import movers
-from mdnum.references.conformance.remote import RemoteSession
+from mdnum.references.conformance.motions import motions, movers
+from mdnum.references.conformance.questions import PLACES, SHAPES, SIZES, drawn, questions
 from mdnum.references.conformance.results import Failed
-from mdnum.references.conformance.rule import motions
-from mdnum.references.conformance.strategies import PLACES, SHAPES, SIZES
-from mdnum.references.conformance.suite import Examiner, _distinct, drawn, examine, questions
+from mdnum.references.conformance.session import RemoteSession, Session
+from mdnum.references.conformance.suite import Examiner, distinct, examine
 
 _PLANTED = str(Path(planted_lists.__file__))
 
@@ -79,7 +77,7 @@ def test_a_list_that_people_use(name: str):
     areas = ("few", "boxes", "axes", "outside", "ties", "coincident", "reuse", "wrapping")
     cases = [
         case
-        for case in questions(tested, 10, 1, False)
+        for case in questions(tested, 10, 1)
         # far from the origin vesin takes seconds for some of these
         if case.area in areas and case.atoms < 60 and "thousand" not in case.name
     ]
@@ -115,27 +113,31 @@ def test_limits_are_not_asked_and_are_counted():
 @pytest.mark.parametrize(
     ("limits", "case", "why"),
     [
-        (Limits(all_axes=True), one("", "axes", gas(3, 4.0, 0), 4.0, (True, False, True)), "axis by axis"),
-        (Limits(periodic=True), one("", "few", gas(3, 4.0, 0)), "no free atoms"),
-        (Limits(free=True), one("", "few", gas(3, 4.0, 0), 4.0), "free atoms only"),
+        (Limits(all_axes=True), once("", "axes", gas(3, 4.0, 0), 4.0, (True, False, True)), "axis by axis"),
+        (Limits(periodic=True), once("", "few", gas(3, 4.0, 0)), "no free atoms"),
+        (Limits(free=True), once("", "few", gas(3, 4.0, 0), 4.0), "free atoms only"),
         (
             Limits(right_handed=True),
-            one("", "boxes", gas(3, 4.0, 0), np.eye(3)[[1, 0, 2]] * 4),
+            once("", "boxes", gas(3, 4.0, 0), np.eye(3)[[1, 0, 2]] * 4),
             "left-handed",
         ),
-        (Limits(lower=True), one("", "boxes", gas(3, 4.0, 0), np.triu(np.ones((3, 3))) * 4), "lower"),
+        (
+            Limits(lower_triangular=True),
+            once("", "boxes", gas(3, 4.0, 0), np.triu(np.ones((3, 3))) * 4),
+            "lower",
+        ),
         (
             Limits(orthorhombic=True),
-            one("", "boxes", gas(3, 4.0, 0), np.tril(np.ones((3, 3)))),
+            once("", "boxes", gas(3, 4.0, 0), np.tril(np.ones((3, 3)))),
             "right angles",
         ),
-        (Limits(whole_cell=True), one("", "few", gas(3, 4.0, 0)), "lacks a vector"),
-        (Limits(most_atoms=2), one("", "few", gas(3, 4.0, 0), 4.0), "at most 2"),
-        (Limits(least_cutoff=2.0), one("", "few", gas(3, 4.0, 0), 4.0), "no cutoff below 2"),
-        (Limits(roomy=10.0), one("", "boxes", gas(3, 4.0, 0), 4.0), "cells"),
+        (Limits(whole_cell=True), once("", "few", gas(3, 4.0, 0)), "lacks a vector"),
+        (Limits(most_atoms=2), once("", "few", gas(3, 4.0, 0), 4.0), "at most 2"),
+        (Limits(least_cutoff=2.0), once("", "few", gas(3, 4.0, 0), 4.0), "no cutoff below 2"),
+        (Limits(roomy=10.0), once("", "boxes", gas(3, 4.0, 0), 4.0), "cells"),
         (
             Limits(fixed_cell=True),
-            script("", "strain", [(gas(3, 4.0, 0), edge * np.eye(3)) for edge in (4, 3.9)], 4.0),
+            sequence("", "strain", [(gas(3, 4.0, 0), edge * np.eye(3)) for edge in (4, 3.9)], 4.0),
             "box that changes",
         ),
     ],
@@ -143,7 +145,7 @@ def test_limits_are_not_asked_and_are_counted():
 def test_each_limit_refuses_what_it_says(limits: Limits, case, why: str):
     assert why in str(limits.refusal(case))
     assert (
-        limits.refusal(one("", "few", gas(2, 2.0, 0) + 1.0, 4.0, r_cut=2.0)) is None
+        limits.refusal(once("", "few", gas(2, 2.0, 0) + 1.0, 4.0, r_cut=2.0)) is None
         or limits.free
         or limits.roomy
     )
@@ -169,7 +171,7 @@ def test_what_a_call_does_is_told_whatever_it_is():
     def forgets(positions, cell, pbc, r_cut):
         return None
 
-    case = one("two", "few", [[0.0, 0, 0], [0.5, 0, 0]], 4.0)
+    case = once("two", "few", [[0.0, 0, 0], [0.5, 0, 0]], 4.0)
     for function, code in ((raises, "RAISED"), (writes, "CHANGED_INPUT"), (forgets, "MALFORMED")):
         report = examine(from_object(function), asked=[case], shrink=False)
         assert [failed.code for failed in report.failed] == [code]
@@ -244,7 +246,7 @@ def generated(positions, cell, pbc, r_cut):
 @pytest.mark.parametrize("name", re.findall(r"^(?:def|class) (\w+)[(:](?!Exc)", _REFUSALS, re.MULTILINE))
 def test_only_an_exception_of_its_own_is_a_refusal(name: str, tmp_path: Path):
     (tmp_path / "refusals.py").write_text(_REFUSALS)
-    case = one("two", "few", [[0.0, 0, 0], [0.5, 0, 0]], 4.0)
+    case = once("two", "few", [[0.0, 0, 0], [0.5, 0, 0]], 4.0)
     (outcome,) = Session(load(f"{tmp_path / 'refusals.py'}:{name}")).ask(case)
     assert outcome.raised is not None
     meant = ("Kept", "says_so", "says_so_after", "compiled", "own_class")
@@ -264,7 +266,7 @@ def test_an_adopted_list_that_refuses_everything_fails():
         pairs = staticmethod(refuses)
 
         def asked(self, tested, area):
-            return [one("two", area, [[0.0, 0, 0], [0.5, 0, 0]])]
+            return [once("two", area, [[0.0, 0, 0], [0.5, 0, 0]])]
 
     class RefusingFree(Refusing):
         pairs = staticmethod(refuses_free)
@@ -330,10 +332,10 @@ def test_what_is_wrong_otherwise_is_not_taken_for_single_precision(kind: str):
 
 def test_what_fails_after_other_questions_alone_is_told_once():
     def failed(atoms: int, alone: bool) -> Failed:
-        case = one(f"{atoms}", "few", gas(atoms, 4.0, 0), 4.0)
+        case = once(f"{atoms}", "few", gas(atoms, 4.0, 0), 4.0)
         return Failed(case, (Failure("MISSING", "a pair"),), case, alone)
 
-    kept = _distinct([failed(9, False), failed(2, False), failed(1, False), failed(2, True), failed(7, True)])
+    kept = distinct([failed(9, False), failed(2, False), failed(1, False), failed(2, True), failed(7, True)])
     assert {(found.case.atoms, found.alone) for found in kept} == {(1, False), (2, True), (7, True)}
 
 
@@ -350,7 +352,10 @@ def test_a_process_that_crashes_or_hangs_is_a_failure(tmp_path: Path, monkeypatc
         "def leaves(positions, cell, pbc, r_cut):\n"
         "    os._exit(3)\n"
     )
-    one_atom, two = one("one", "few", [[0.0, 0, 0]], 4.0), one("two", "few", [[0.0, 0, 0], [0.5, 0, 0]], 4.0)
+    one_atom, two = (
+        once("one", "few", [[0.0, 0, 0]], 4.0),
+        once("two", "few", [[0.0, 0, 0], [0.5, 0, 0]], 4.0),
+    )
     session = RemoteSession(load(f"{tmp_path / 'sick.py'}:crashes"))
     assert session.ask(one_atom)[0].answer is not None
     crashed = session.ask(two)[0].crashed
@@ -360,7 +365,7 @@ def test_a_process_that_crashes_or_hangs_is_a_failure(tmp_path: Path, monkeypatc
     session.close()
     report = examine(load(f"{tmp_path / 'sick.py'}:leaves"), asked=[two], apart=True, shrink=False)
     assert report.failed[0].code == "CRASHED" and "exit code 3" in report.failed[0].worst.text
-    monkeypatch.setattr("mdnum.references.conformance.remote.CALL", 0.5)
+    monkeypatch.setattr("mdnum.references.conformance.session.CALL", 0.5)
     began = time.perf_counter()
     session = RemoteSession(load(f"{tmp_path / 'sick.py'}:hangs"))
     assert session.ask(two)[0].late == "no answer within 0.5 s, in which it computed nothing"
@@ -371,7 +376,7 @@ def test_a_process_that_crashes_or_hangs_is_a_failure(tmp_path: Path, monkeypatc
 @pytest.mark.usefixtures("strangers_folder")
 def test_another_process_gives_the_same_answers():
     tested = load(f"{_PLANTED}:search")
-    case = one("a gas", "few", gas(30, 4.0, 1), 4.0)
+    case = once("a gas", "few", gas(30, 4.0, 1), 4.0)
     session = RemoteSession(tested)
     here, there = Session(tested).ask(case)[0].answer, session.ask(case)[0].answer
     session.close()
@@ -393,11 +398,11 @@ def test_an_object_that_is_kept_is_asked_anew_only_where_it_should_be():
     examiner = Examiner(from_object(Counts))
     calls.clear()
     start = gas(6, 6.0, 0)
-    moving = script("moving", "motion", [start, start + 0.1, start + 0.2], 6.0)
+    moving = sequence("moving", "motion", [start, start + 0.1, start + 0.2], 6.0)
     assert examiner.failures(moving) == []
     assert calls == ["allocate", "update", "update"]
     calls.clear()
-    growing = script("growing", "reuse", [start[:4], start, start], 6.0)
+    growing = sequence("growing", "reuse", [start[:4], start, start], 6.0)
     assert examiner.failures(growing) == []
     assert calls == ["allocate", "allocate", "update"]
     calls.clear()
