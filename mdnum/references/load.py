@@ -18,8 +18,8 @@ from types import ModuleType
 from typing import Any
 
 from mdnum.errors import InputError
-from mdnum.safe_path import search_last
 from mdnum.registry import nearest
+from mdnum.safe_path import search_last
 
 _counter = itertools.count()
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from mdnum.workflow.audit import AuditResult, audit
 from mdnum.workflow.ball import BallResult, bounce
-from mdnum.workflow.conform import ConformResult, conform
+from mdnum.workflow.conform import conform
 from mdnum.workflow.flips import FlipsResult, flips
 from mdnum.workflow.fork import ForkResult, fork
 from mdnum.workflow.fork_certify import CertifyResult, fork_certify
@@ -19,7 +19,6 @@ __all__ = [
     "AuditResult",
     "BallResult",
     "CertifyResult",
-    "ConformResult",
     "FlipsResult",
     "ForecastResult",
     "ForkResult",

@@ -1,10 +1,8 @@
-"""What a list does beside giving pairs: buffers handed out, refusals that hang on the telling, time used."""
+"""How a list is called: buffers, exceptions and the time it takes; and questions put in other ways."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
 
 import numpy as np
 import planted_lists
@@ -13,53 +11,12 @@ import pytest
 from mdnum.references.conformance import reproduction
 from mdnum.references.conformance.case import once, sequence
 from mdnum.references.conformance.catalog import gas
-from mdnum.references.conformance.lists import Limits, PairList
 from mdnum.references.conformance.loading import from_object, load
 from mdnum.references.conformance.results import alike
 from mdnum.references.conformance.session import RemoteSession, Session
 from mdnum.references.conformance.suite import examine
-from mdnum.report.conform.findings import judge
-from mdnum.report.verdict import Finding
-from mdnum.workflow.conform import _summary
 
 _TWO = once("two", "few", [[0.0, 0, 0], [0.5, 0, 0]], 4.0)
-_THREE = once("three", "images", [[0.1, 0, 0], [0.5, 0, 0], [0.6, 0, 0]], 4.0)
-
-
-def _findings(tested: PairList, cases) -> dict[str, Finding]:
-    found = examine(tested, asked=cases, large=False)
-    names = [f"{number}.py" for number in range(len(found.failed))]
-    run = cast(Any, SimpleNamespace(name="it", summary=_summary(found, names, 0)))
-    return {finding.code: finding for finding in judge(run).findings}
-
-
-class _Elsewhere:
-    """A part of an answer that lies on another device."""
-
-    def __array__(self, *_):
-        raise TypeError("copy it to the host first")
-
-
-@pytest.mark.parametrize("form", ["mapping", "tuple", "rows", "attributes"])
-def test_buffers_that_are_handed_out_are_told(form: str):
-    buffer = np.zeros((2, 100), int)
-
-    def filled(positions, cell, pbc, r_cut):
-        rows = planted_lists.search(positions, cell, pbc, r_cut)
-        count = len(rows["i"])
-        buffer[0, :count], buffer[1, :count] = rows["i"], rows["j"]
-        i, j = buffer[:, :count]
-        return {
-            "mapping": {"i": i, "j": j, "energy": _Elsewhere()},
-            "tuple": (i, j),
-            "rows": buffer[:, :count].T,
-            "attributes": SimpleNamespace(i=i, j=j),
-        }[form]
-
-    found = _findings(from_object(filled), [_TWO, _THREE])
-    assert set(found) == {"ALIASED"} and found["ALIASED"].severity == "info"
-    assert "seen when it was asked two" in found["ALIASED"].text  # after what its conventions are found by
-    assert _findings(from_object(planted_lists.planted("")), [_TWO, _THREE]) == {}
 
 
 def test_a_buffer_of_a_list_that_is_kept_is_told():
@@ -76,51 +33,6 @@ def test_a_buffer_of_a_list_that_is_kept_is_told():
     moving = sequence("moving", "motion", [start, start[::-1], start], 4.0)
     assert examine(from_object(Filled), asked=[moving], shrink=False).aliased == "moving"
     assert examine(from_object(planted_lists.Kept), asked=[moving], shrink=False).aliased is None
-
-
-def _refusing(when):
-    def refuses(positions, cell, pbc, r_cut):
-        if when(positions, r_cut):
-            raise ValueError(f"{len(positions)} atoms are too many.")
-        rows = planted_lists.search(positions, cell, pbc, r_cut)
-        return rows["i"], rows["j"]
-
-    return from_object(refuses)
-
-
-def test_a_refusal_that_hangs_on_the_order_of_atoms_is_told():
-    found = _findings(_refusing(lambda x, _: len(x) > 1 and x[0, 0] < x[-1, 0]), [_TWO, _THREE])
-    told = found["UNEVEN_REFUSALS"]
-    assert told.severity == "warning"
-    assert told.text == (
-        "ValueError: 2 atoms are too many (two); but it answers the same with its atoms in reverse order."
-    )
-
-
-def test_a_refusal_that_hangs_on_what_was_asked_before_is_told():
-    asked = []
-
-    def second(x, _):
-        asked.append(len(x))
-        return len(asked) == 3  # the first finds out its conventions
-
-    found = _findings(_refusing(second), [_TWO, _THREE])
-    assert "but it answers the same when it is asked anew" in found["UNEVEN_REFUSALS"].text
-
-
-def test_what_a_refusal_may_hang_on_is_told_with_it():
-    outside = once("outside", "outside", [[0.25, 0, 0], [4.5, 0, 0]], 4.0, r_cut=4 / 3)
-    found = _findings(_refusing(lambda x, _: x.max() > 4.0), [_TWO, outside])
-    assert set(found) == {"REFUSES"}  # and nothing uneven
-    assert found["REFUSES"].text.endswith(
-        "about outside. Asked about outside: the same is answered with its atoms wrapped into the box."
-    )
-    far = once("far", "few", 8 * _TWO.stills[0].positions, 40.0, r_cut=8.0)
-    found = _findings(_refusing(lambda _, r_cut: r_cut > 4.0), [_TWO, far])
-    assert "the same is answered with all lengths multiplied by 0.12" in found["REFUSES"].text
-    # what it does not claim to do is not asked here either
-    limited = _refusing(lambda _, r_cut: r_cut > 4.0).with_options(limits=Limits(least_cutoff=4.0))
-    assert examine(limited, asked=[far], shrink=True).refusals[0].answers == ()
 
 
 def test_a_question_told_otherwise_has_the_same_pairs():
@@ -206,12 +118,3 @@ def test_time_is_what_a_list_computes(tmp_path: Path, monkeypatch: pytest.Monkey
     at = _TWO.stills[0].positions
     first, second = asked("HangsLater", sequence("still", "motion", [at, at, at], 4.0))
     assert first.answer is not None and "computed nothing" in str(second.late)
-
-
-def test_what_is_known_of_a_failure_is_told_with_it():
-    def nothing(positions, cell, pbc, r_cut):
-        return [], []
-
-    tested = from_object(nothing).with_options(known={"MISSING": "It lists none.", "EXTRA": "It lists all."})
-    found = _findings(tested, [_TWO])
-    assert set(found) == {"MISSING"} and found["MISSING"].text.endswith("It lists none.")
