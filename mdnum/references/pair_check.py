@@ -1,4 +1,4 @@
-"""`mdnum check pairs`: the pair set of every neighbor search against brute force, and where each stops counting."""
+"""`mdnum check pairs`: the pairs of neighbor searches against brute force, and where each stops counting."""
 
 from __future__ import annotations
 
@@ -67,10 +67,10 @@ class Search:
         """Whether it lists every pair from both of its atoms."""
         if self.listed.full is not None:
             return self.listed.full
-        pair, free = np.array([[0.0, 0, 0], [0.5, 0, 0]]), np.zeros(3, bool)
-        if self.listed.limits.periodic:
-            return len(read(self._call(pair, 4 * np.eye(3), ~free, 1.0))) > 1
-        return len(read(self._call(pair, np.zeros((3, 3)), free, 1.0))) > 1
+        pair, cell, pbc = np.array([[0.0, 0, 0], [0.5, 0, 0]]), 4.0 * np.eye(3), np.ones(3, bool)
+        if self.listed.limits.free:
+            cell, pbc = np.zeros((3, 3)), np.zeros(3, bool)
+        return len(read(self._call(pair, cell, pbc, 1.0))) > 1
 
     def refusal(self, positions: ndarray, cell: ndarray, pbc: ndarray, r_cut: float) -> str | None:
         """Why it cannot be asked about these atoms, or None when it can."""
@@ -79,9 +79,7 @@ class Search:
         positions, cell = self._placed(positions, cell, pbc)
         return self.listed.limits.refusal(once("", "few", positions, cell, pbc.tolist(), r_cut))
 
-    def pairs(
-        self, positions: ndarray, cell: ndarray, pbc: ndarray, r_cut: float
-    ) -> tuple[ndarray, ndarray]:
+    def pairs(self, positions: ndarray, cell: ndarray, pbc: ndarray, r_cut: float) -> tuple[ndarray, ndarray]:
         """(i, j) of the pairs within r_cut, one row for each image, i <= j."""
         positions, cell = self._placed(np.asarray(positions, float), np.asarray(cell, float), pbc)
         answer = read(self._call(positions, cell, np.array(pbc), float(r_cut)))
@@ -123,8 +121,8 @@ def all_searches(system: System) -> tuple[Search, ...]:
 def own_searches(system: System) -> tuple[Search, ...]:
     """What mdnum uses for this system.
 
-    "mdnum force loop" is the set of decisions that multiply the forces, out of jit. The other two are its list
-    builders with the same decision made on the host.
+    "mdnum force loop" is the set of decisions that multiply the forces, out of jit. The other two are its
+    list builders with the same decision made on the host.
     """
     compare = system.spec.cutoff.compare if system.spec.cutoff is not None else "r <"
     dtype = system.spec.precision.decision

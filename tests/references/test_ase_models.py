@@ -12,8 +12,7 @@ from ase.calculators.fd import calculate_numerical_forces, calculate_numerical_s
 from small_systems import make
 
 from mdnum.references.ase_models import evaluate, independent, reference
-from mdnum.references.closed_forms import pair_forms
-from mdnum.references.independent import OnNeighborList, StillingerWeberModel, TersoffModel
+from mdnum.references.independent import OnNeighborList, StillingerWeberModel, TersoffModel, pair_forms
 
 CUTOFFS = ["hard", "shifted", "force-shifted", "switched", "quintic", "cosine"]
 POTENTIALS = {
