@@ -455,10 +455,7 @@ def crystal() -> Row:
 
     arguments = (jnp.asarray(cell), jnp.asarray(fractional), jnp.asarray(slots))
     worst: dict[str, tuple[float, float]] = {}
-    for mode, function in (
-        ("jit", jax.jit(squared_distances)),
-        ("eager", squared_distances),
-    ):
+    for mode, function in (("jit", jax.jit(squared_distances)), ("eager", squared_distances)):
         r2 = np.asarray(function(*arguments))
         energy = jax.jit(pair_energy) if mode == "jit" else pair_energy
         worst[mode] = (

@@ -175,11 +175,7 @@ class SpeciesSum(Calculator):
             groups = (
                 [((symbols == a), 1.0)]
                 if a == b
-                else [
-                    ((symbols == a) | (symbols == b), 1.0),
-                    ((symbols == a), -1.0),
-                    ((symbols == b), -1.0),
-                ]
+                else [((symbols == a) | (symbols == b), 1.0), ((symbols == a), -1.0), ((symbols == b), -1.0)]
             )
             for chosen, sign in groups:
                 if not chosen.any():

@@ -47,12 +47,7 @@ def boxes(draw: Any, r_cut: float = 1.0) -> tuple[ndarray, Pbc, str]:
     """
     shape, size = draw(st.sampled_from(SHAPES)), draw(st.sampled_from(SIZES))
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
-    pbc = draw(
-        st.one_of(
-            st.just((True, True, True)),
-            st.tuples(st.booleans(), st.booleans(), st.booleans()),
-        )
-    )
+    pbc = draw(st.one_of(st.just((True, True, True)), st.tuples(st.booleans(), st.booleans(), st.booleans())))
     edges = _edges(size, rng)
     if shape == "cube":
         edges = np.full(3, edges[rng.integers(3)])

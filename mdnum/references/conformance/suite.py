@@ -29,15 +29,7 @@ from mdnum.references.conformance.judge import (
 from mdnum.references.conformance.lists import PairList
 from mdnum.references.conformance.questions import large as large_questions
 from mdnum.references.conformance.questions import questions
-from mdnum.references.conformance.results import (
-    Answers,
-    CaseResult,
-    Failed,
-    Refusal,
-    Report,
-    Shrunk,
-    alike,
-)
+from mdnum.references.conformance.results import Answers, CaseResult, Failed, Refusal, Report, Shrunk, alike
 from mdnum.references.conformance.session import Outcome, RemoteSession, Session
 from mdnum.references.conformance.shrink import kind, shrunk
 
