@@ -8,8 +8,9 @@ from types import MappingProxyType
 from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Ge
 from numpy import ndarray
-from pydantic import PlainSerializer, PlainValidator, StrictBool
+from pydantic import FiniteFloat, PlainValidator, StrictBool
 
 from mdnum.references.oracle import PairSet
 
@@ -44,8 +45,17 @@ def _rows(value: Any) -> ndarray:
     return rows
 
 
-#: An array of rows of three that JSON can hold: a double's shortest decimal is that double again.
-Rows = Annotated[ndarray, PlainValidator(_rows), PlainSerializer(lambda rows: rows.tolist())]
+def _vectors(value: Any) -> ndarray:
+    rows = _rows(value)
+    if rows.shape != (3, 3):
+        raise ValueError("not three lattice vectors")
+    return rows
+
+
+#: Arrays that JSON gives back: a double's shortest decimal is that double again.
+Rows = Annotated[ndarray, PlainValidator(_rows)]
+Vectors = Annotated[ndarray, PlainValidator(_vectors)]
+Length = Annotated[FiniteFloat, Ge(0)]
 
 
 @dataclass(frozen=True)
@@ -60,9 +70,9 @@ class Still:
     """
 
     positions: Rows
-    cell: Rows
+    cell: Vectors
     fresh: StrictBool = False
-    skin: float | None = None
+    skin: Length | None = None
 
     def __post_init__(self) -> None:
         for name in ("positions", "cell"):
@@ -90,8 +100,8 @@ class Case:
     area: str
     stills: tuple[Still, ...]
     pbc: Pbc
-    r_cut: float
-    skin: float = 0.0
+    r_cut: Length
+    skin: Length = 0.0
     known: Annotated[PairSet | None, PlainValidator(lambda pairs: pairs)] = field(
         default=None, repr=False, compare=False
     )

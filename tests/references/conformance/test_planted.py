@@ -146,7 +146,7 @@ def test_rows_beyond_4096_are_found_lost():
     assert report.failed[0].code == "MISSING"
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_keys_that_overflow_are_found_at_100_000_atoms():
     """Where the square of the number of atoms is more than 32 bits hold."""
     assert _found("32-bit keys", asked=[lattice(LARGE_EDGE)]).failed
@@ -243,7 +243,7 @@ def test_what_is_told_is_reproduced_whatever_is_returned(spoiled: str, capsys: p
         assert ("the list is wrong" if wanted else "the list is right") in said
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_10_000_clean_cases_raise_no_alarm():
     """Half of them drawn; the other half the same atoms in another order and elsewhere, which rounds anew."""
     asked = [case for seed in range(20) for case in drawn(250, seed)]
