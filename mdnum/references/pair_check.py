@@ -102,7 +102,9 @@ class Search:
         ):
             standard = np.asarray(AseCell(cell).standard_form()[0])
             positions, cell = positions @ np.linalg.solve(cell, standard), standard
-        if (limits.wrapped or limits.along_axes or limits.lower_triangular) and pbc.any():
+        # jax-md loses pairs of atoms outside of the box, which `mdnum conform` reports
+        wraps = limits.wrapped or limits.along_axes or self.listed.package == "jax-md"
+        if wraps and pbc.any():
             full = completed(cell, pbc)
             fraction = positions @ np.linalg.inv(full)
             positions = positions - np.where(pbc, np.floor(fraction), 0.0) @ full

@@ -338,8 +338,11 @@ def judge(view: View) -> Verdict:
         said = "nothing_answered"
     elif not wrong:
         said = "conforms"
+    elif summary["silent"] < wrong:
+        said = "failed"
     else:
-        said = "silent" if summary["silent"] == wrong else "failed"
+        codes = [code.lower() for code in SILENT if values[code.lower()]]
+        said = f"silent_{codes[0]}" if len(codes) == 1 else "silent"
     headline = TEXTS(said, **values)
     if left:
         headline = TEXTS(
@@ -365,9 +368,9 @@ def _evidence(view: View) -> Iterator[str]:
         yield TEXTS(name, **summary["rule"], padding=summary["padding"])
     if summary["status"] == "stopped":
         yield TEXTS("stopped", folder=view.folder.path.name)
-    refused, skipped = _total(summary, "refused"), _total(summary, "skipped")
-    if refused or skipped:
-        yield TEXTS("not_answered", refused=refused, skipped=skipped)
+    for name in ("refused", "skipped"):
+        if cases := _total(summary, name):
+            yield TEXTS(name, cases=cases)
 
 
 def _failures(summary: Mapping[str, Any]) -> Iterator[Finding]:
@@ -443,7 +446,9 @@ def page(view: View, verdict: Verdict) -> Page:
     kinds = many(len(summary["failures"]), "kind")
     keys = [
         Key("Right", count(_total(summary, "passed")), f"of {many(summary['asked'], 'case')}"),
-        Key("Wrong", count(summary["wrong"] - silent), f"{kinds}, shrunk" if summary["failures"] else ""),
+        Key(
+            "Wrong", count(summary["wrong"] - silent), f"{kinds}, shrunk" if summary["wrong"] > silent else ""
+        ),
         Key("No answer", count(silent), "ends the process, takes too long or raises"),
         Key("Not asked", count(skipped), "outside of what it claims"),
     ]
