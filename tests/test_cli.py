@@ -372,18 +372,17 @@ def test_systems_list_and_copy_shipped_ones(crystal: Path, capsys: pytest.Captur
 def test_check_prints_every_record_and_exits_by_agreement(
     crystal: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
-    import mdnum.references.check as checks
+    import mdnum.references.energy_check as checks
 
     @dataclass
     class Report:
         ok: bool
-        findings: tuple[dict[str, str], ...] = ()
+        frames: tuple[()] = ()
+        is_ase: bool = True
+        precision: str = "float64"
 
         def rows(self) -> list[dict[str, Any]]:
             return [{"frame": "first", "energy": 1.25}, {"frame": "last", "energy": 2.5, "note": None}]
-
-        def to_dict(self) -> dict[str, Any]:
-            return {"rows": self.rows()}
 
     asked = []
     for ok in (True, False):

@@ -21,7 +21,6 @@ _MODULES = {
     "certify": ("mdnum.report.fork.certify", "mdnum.report.fork.certify"),
     "forecast": ("mdnum.report.fork.forecast", "mdnum.report.fork.forecast"),
     "audit": ("mdnum.report.audit.html", "mdnum.report.audit.html"),
-    "conform": ("mdnum.report.conform.html", "mdnum.report.conform.html"),
     "flips": ("mdnum.report.flips.html", "mdnum.report.flips.html"),
     "flips-compare": ("mdnum.report.flips.compare", "mdnum.report.flips.compare"),
 }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from mdnum.workflow.audit import AuditResult, audit
 from mdnum.workflow.ball import bounce
-from mdnum.workflow.conform import ConformResult, conform
+from mdnum.workflow.conform import conform
 from mdnum.workflow.demos import demonstrate
 from mdnum.workflow.flips import FlipsResult, flips
 from mdnum.workflow.fork import ForkResult, fork
@@ -19,7 +19,6 @@ from mdnum.workflow.run import run
 __all__ = [
     "AuditResult",
     "CertifyResult",
-    "ConformResult",
     "FlipsResult",
     "ForecastResult",
     "ForkResult",

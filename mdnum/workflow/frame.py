@@ -241,3 +241,19 @@ def refuse(given: Mapping[str, bool], whose: str, remedy: str) -> None:
     if names:
         what = "is an option" if len(names) == 1 else "are options"
         raise InputError(f"{' and '.join(names)} {what} {whose}", remedy=remedy)
+
+
+def logged(folder: RunFolder, progress: Progress | None) -> Progress:
+    """Passes progress on, and writes a line of log.txt at each new phase and now and then."""
+    last = ("", -1)
+
+    def report(step: int, steps: int, info: dict[str, Any]) -> None:
+        nonlocal last
+        now = str(info.get("phase", "run")), 10 * step // steps if steps else 0
+        if now != last:
+            folder.log(f"{now[0]}: {step:,} of {steps:,} {info.get('unit', 'steps')}" if steps else now[0])
+            last = now
+        if progress is not None:
+            progress(step, steps, info)
+
+    return report

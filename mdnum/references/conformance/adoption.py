@@ -17,12 +17,11 @@ from typing import Any, ClassVar
 
 import pytest
 
-from mdnum.references.conformance.case import AREAS, Case, one
+from mdnum.references.conformance import questions
+from mdnum.references.conformance.case import AREAS, Case, once
 from mdnum.references.conformance.catalog import gas
-from mdnum.references.conformance.crowds import LARGE_EDGE, SMALL_EDGE, lattice
 from mdnum.references.conformance.lists import Limits, PairList
 from mdnum.references.conformance.loading import from_object, load
-from mdnum.references.conformance.questions import as_kept, questions
 from mdnum.references.conformance.reproduction import script
 from mdnum.references.conformance.suite import Examiner, examine
 
@@ -61,11 +60,11 @@ class NeighborListConformance:
     def asked(self, tested: PairList, area: str) -> list[Case]:
         """The cases of one area."""
         if area == "large":
-            return [lattice(edge) for edge in (SMALL_EDGE, LARGE_EDGE)] if self.large else []
+            return list(questions.large()) if self.large else []
         count = self.cases if area == "random" else 0
         padding = Examiner(tested).report.padding if area == "rule" and tested.kept else None
-        found = questions(replace(tested, affords=1.0), count, self.seed, large=False, padding=padding)
-        return [case for case in found if case.area == area]
+        every = questions.questions(replace(tested, affords=1.0), count, self.seed, padding)
+        return [case for case in every if case.area == area]
 
     @pytest.mark.parametrize("area", AREAS)
     def test_neighbor_list(self, area: str) -> None:
@@ -78,12 +77,12 @@ class NeighborListConformance:
         if not report.asked:
             pytest.skip("; ".join(report.areas[area].why))
         if report.failed:
-            said = [f"{failed.code}: {failed.worst.text}" for failed in report.failed]
-            lines = script(tested, report.failed[0], report.how, report.superset)
+            lines = [f"{failed.code}: {failed.worst.text}" for failed in report.failed]
+            text = script(tested, report.failed[0], report.how, report.superset)
             pytest.fail(
                 f"{report.wrong} of {report.asked} cases about {AREAS[area]}\n"
-                + "\n".join(said)
-                + f"\n\nThis reproduces the first:\n\n{lines}",
+                + "\n".join(lines)
+                + f"\n\nThis reproduces the first:\n\n{text}",
                 pytrace=False,
             )
         if not report.conforms:
@@ -95,6 +94,6 @@ class NeighborListConformance:
     @staticmethod
     def _answers(tested: PairList) -> bool:
         """Whether it answers the plainest of questions, as far as it claims to."""
-        plain = [one("a gas", "few", gas(20, 6.0, 0), 6.0), one("a free gas", "few", gas(20, 3.0, 0))]
-        report = examine(tested, asked=as_kept(tested, plain), large=False, shrink=False)
+        plain = [once("a gas", "few", gas(20, 6.0, 0), 6.0), once("a free gas", "few", gas(20, 3.0, 0))]
+        report = examine(tested, asked=questions.as_kept(tested, plain), large=False, shrink=False)
         return not report.asked or bool(report.failed) or report.conforms

@@ -1,23 +1,22 @@
-"""`mdnum check energy`: energy, forces and stress of mdnum against ASE, frame by frame."""
+"""`mdnum check energy` and `mdnum check dynamics`: mdnum against ASE, frame by frame and step by step."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from ase import Atoms
+from ase.md.verlet import VelocityVerlet
+from numpy import ndarray
 
 from mdnum.precision import unit_roundoff
 from mdnum.precision.policy import WIDE, carrier
 from mdnum.references.ase_models import Reference, evaluate, independent, reference
-from mdnum.references.closed_forms import pair_forms
-from mdnum.references.findings import finding, plain
-from mdnum.references.independent import Edges, PairModel, edges_of
+from mdnum.references.independent import Edges, PairModel, edges_of, pair_forms
 from mdnum.references.oracle import rounding_bound
-from mdnum.references.trajectory import trajectory
-from mdnum.systems import System
+from mdnum.systems import System, build, schema
 
 ENERGY_PAIR, FORCE, ENERGY_MANY_BODY = 1e-12, 1e-10, 1e-10
 """What float64 must meet: relative energy of pair and of many-body potentials; forces over their scale."""
@@ -87,7 +86,6 @@ class EnergyReport:
         conversion: what was done to make the conventions equal.
         precision: "float64", or the narrowest type in use.
         frames: one comparison per frame.
-        findings: what to look at.
         ok: every frame within tolerance.
     """
 
@@ -97,7 +95,6 @@ class EnergyReport:
     conversion: str
     precision: str
     frames: tuple[FrameComparison, ...]
-    findings: tuple[dict[str, str], ...]
     ok: bool
 
     @property
@@ -112,10 +109,6 @@ class EnergyReport:
             "force_scale": max(frame.force_scale for frame in self.frames),
             "ok": self.ok,
         }
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return {**plain(self), "worst": plain(self.worst)}
 
     def rows(self) -> list[dict[str, Any]]:
         """A row per frame."""
@@ -158,7 +151,7 @@ def check_energy(
     Raises:
         InputError: the system cannot be built.
     """
-    simulation = built(subject)
+    simulation = build(subject) if isinstance(subject, System) else subject
     system: System = simulation.system
     judge = reference(system) if judge is None else judge
     third = independent(system) if judge.is_ase and system.spec.potential.kind != "eam" else None
@@ -175,18 +168,8 @@ def check_energy(
         judge.conversion,
         precision,
         compared,
-        tuple(_findings(compared, judge, precision)),
         all(frame.ok for frame in compared),
     )
-
-
-def built(subject: Any) -> Any:
-    """A Simulation, from one or from a System."""
-    if isinstance(subject, System):
-        from mdnum.systems import build
-
-        return build(subject)
-    return subject
 
 
 def narrowest(system: System) -> str:
@@ -212,7 +195,7 @@ def _named(frames: Mapping[str, Atoms] | Sequence[Atoms] | None, simulation: Any
     system: System = simulation.system
     steps = min(SOME_STEPS, system.spec.dynamics.steps)
     positions = simulation.positions
-    for positions, _, _ in trajectory(simulation, steps):  # noqa: B007 the last one counts
+    for positions, _, _ in _rollout(simulation, steps):  # noqa: B007 the last one counts
         pass
     later = system.atoms.copy()
     later.set_positions(positions)
@@ -359,47 +342,158 @@ def _ambiguous(model: PairModel, atoms: Atoms, unit: float) -> int:
     return int((once & (np.abs(edges.r - radius) <= bound)).sum())
 
 
-def _findings(frames: Sequence[FrameComparison], judge: Reference, precision: str) -> list[dict[str, str]]:
-    found = []
-    wrong = [frame for frame in frames if not frame.ok]
-    if wrong:
-        worst = max(wrong, key=lambda frame: frame.force_rel)
-        third = ""
-        if worst.energy_third is not None:
-            third = " A third evaluation, in plain numpy, differs from mdnum by "
-            third += f"{worst.energy_third:.1e} in energy and {worst.force_third:.1e} in force."
-        found.append(
-            finding(
-                "ase-disagrees",
-                "error",
-                f"energies or forces differ from {judge.label}",
-                f"At the {worst.frame} frame the energy is {worst.energy:.12g} against "
-                f"{worst.energy_reference:.12g} (relative {worst.energy_rel:.1e}) and a force component "
-                f"differs by {worst.force_max:.1e} of {worst.force_scale:.1e}.{third}",
-                "Find the cause first; `mdnum check pairs` tells whether it is the list"
-                if not worst.ambiguous
-                else f"{worst.ambiguous} pairs lie within rounding of the cutoff: compare without them",
-            )
-        )
-    if not judge.is_ase:
-        found.append(
-            finding(
-                "not-ase",
-                "info",
-                "ASE has no class for this potential and cutoff",
-                "The comparison is with the same formulas in plain numpy on ASE's neighbor list.",
-            )
-        )
-    if precision != "float64":
-        worst_energy = max(frame.energy_roundings for frame in frames)
-        worst_force = max(frame.force_roundings for frame in frames)
-        found.append(
-            finding(
-                "narrow-precision",
-                "info",
-                f"compared in units of {precision} rounding",
-                f"Energy {worst_energy:.2g} and forces {worst_force:.2g} times the rounding to be expected; "
-                f"{ROUNDINGS:g} times is taken as agreement.",
-            )
-        )
-    return found
+def _rollout(simulation: Any, steps: int) -> Iterator[tuple[ndarray, ndarray, float]]:
+    """Unwrapped positions, velocities (atoms, 3) and potential energy of every step from 0 on."""
+    from mdnum.rollout.engine import Engine, unwrapped
+
+    for segment in Engine(simulation, steps).segments():
+        potential = segment.rows_of("potential")
+        for row in range(segment.rows):
+            x = np.asarray(segment.unsorted("x", row), np.float64)
+            x = unwrapped(simulation.cell.matrix, x, segment.unsorted("images", row))
+            yield x, np.asarray(segment.unsorted("v", row), np.float64), float(potential[row])
+
+
+AGREEMENT = {"float64": 1e-9, "float32": 1e-2, "float16": 1e-1, "bfloat16": 1e-1}
+"""Largest deviation of a position after 100 steps, in units of r_cut.
+
+Rounding starts near 1e-16 (6e-8) and chaos multiplies it, by e³ per LJ time in a liquid; five orders of
+magnitude are left for that. A wrong force or time step shows at 1e-6 or more within ten steps.
+"""
+
+_SUDDEN = 100.0  # growth of the deviation within one step that chaos cannot do
+
+
+@dataclass(frozen=True)
+class DynamicsReport:
+    """Two trajectories from one start.
+
+    Attributes:
+        system: name.
+        reference: whose forces ASE's VelocityVerlet used.
+        is_ase: whether those were a class of ASE.
+        precision: narrowest float type of mdnum's run.
+        steps: steps taken.
+        position: largest deviation of a coordinate at each step (length), from step 0.
+        velocity: largest deviation of a velocity component at each step (length per internal time).
+        energy: deviation of the potential energy at each step.
+        growth: factor by which the position deviation grew per step over the second half.
+        sudden: first step at which it grew a hundredfold at once, which a decision at a cutoff can do and
+            chaos cannot; None where it did not.
+        r_cut: unit of the tolerance.
+        tolerance: of the position at the last step, length.
+        ok: within tolerance at the last step.
+    """
+
+    system: str
+    reference: str
+    is_ase: bool
+    precision: str
+    steps: int
+    position: tuple[float, ...]
+    velocity: tuple[float, ...]
+    energy: tuple[float, ...]
+    growth: float
+    sudden: int | None
+    r_cut: float
+    tolerance: float
+    ok: bool
+
+    def rows(self) -> list[dict[str, Any]]:
+        """A row for about ten of the steps."""
+        shown = np.unique(np.linspace(0, self.steps, 11).round().astype(int))
+        return [
+            {
+                "step": int(step),
+                "position, largest": self.position[step],
+                "velocity, largest": self.velocity[step],
+                "energy": self.energy[step],
+            }
+            for step in shown
+        ]
+
+
+def check_dynamics(system: System, steps: int = 100, *, judge: Reference | None = None) -> DynamicsReport:
+    """Compare a rollout with ASE's velocity Verlet, from the same positions and velocities.
+
+    A Langevin system is run without its bath. A hard cutoff has the forces of ASE's shifted one, so the
+    trajectories must agree although the energies have different zeros.
+
+    Args:
+        system: what to run.
+        steps: how many steps.
+        judge: whose forces; default ASE's class, or plain numpy where ASE has none or needs minutes.
+    """
+    system = _without_bath(system)
+    judge = _forces(system) if judge is None else judge
+    simulation = build(system)
+    narrow = system.spec.precision.state == "float32"
+    start = simulation.positions.astype(np.float32).astype(np.float64) if narrow else simulation.positions
+    atoms = Atoms(
+        numbers=system.atoms.numbers,
+        positions=start,
+        cell=system.atoms.cell,
+        pbc=system.atoms.pbc,
+        masses=simulation.masses,
+    )
+    atoms.set_velocities(simulation.velocities)
+    atoms.calc = judge.make()
+    integrator = VelocityVerlet(atoms, timestep=system.spec.dynamics.timestep * system.units.time_factor)
+
+    position, velocity, energy = [], [], []
+    for step, (x, v, potential) in enumerate(_rollout(simulation, steps)):
+        if step:
+            integrator.run(1)
+        position.append(float(np.abs(x - atoms.positions).max()))
+        velocity.append(float(np.abs(v - atoms.get_velocities()).max()))
+        energy.append(abs(potential - float(atoms.get_potential_energy())))
+    precision = narrowest(system)
+    tolerance = AGREEMENT[precision] * simulation.r_cut
+    ok = len(position) == steps + 1 and position[-1] <= tolerance
+    sudden = _sudden(position, floor=1e-13 * simulation.r_cut if not narrow else 1e-5 * simulation.r_cut)
+    return DynamicsReport(
+        system.name,
+        judge.label,
+        judge.is_ase,
+        precision,
+        steps,
+        tuple(position),
+        tuple(velocity),
+        tuple(energy),
+        _growth(position),
+        sudden,
+        simulation.r_cut,
+        tolerance,
+        ok,
+    )
+
+
+def _without_bath(system: System) -> System:
+    dynamics = system.spec.dynamics
+    if isinstance(dynamics, schema.NVETable):
+        return system
+    shared = dynamics.model_dump(exclude={"kind", "friction"})
+    nve = schema.NVETable(kind="nve", **shared)
+    return replace(system, spec=system.spec.model_copy(update={"dynamics": nve}))
+
+
+def _forces(system: System) -> Reference:
+    """ASE's class where a step takes it a tenth of a second; Tersoff and sums over species take more."""
+    judge = reference(system)
+    slow = system.spec.potential.kind == "tersoff" or len(system.species) > 1
+    return independent(system) if slow and system.spec.potential.kind != "eam" else judge
+
+
+def _sudden(position: list[float], floor: float) -> int | None:
+    for step in range(2, len(position)):
+        if position[step] > _SUDDEN * max(position[step - 1], floor):
+            return step
+    return None
+
+
+def _growth(position: list[float]) -> float:
+    """Factor per step, from a line through log(deviation) over the second half."""
+    tail = np.array(position[len(position) // 2 :])
+    if len(tail) < 3 or not (tail > 0).all():
+        return 1.0
+    return float(np.exp(np.polyfit(np.arange(len(tail)), np.log(tail), 1)[0]))
