@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 #: (done, of how many, {"phase": words}) now and then.
 Progress = Callable[[int, int, dict[str, Any]], None]
 T = TypeVar("T")
+Severity = Literal["info", "warning", "error"]
 
 #: Why something was not asked that would have been.
 TIME_UP = "the time was up"
@@ -103,23 +104,25 @@ def ask_each(
 
 
 @dataclass(frozen=True)
-class Finding:
-    """What a check found: a code, and values for its sentences.
+class Observed:
+    """What a check found: a code, and values for its sentences in mdnum/workflow/audit.toml.
 
     Attributes:
         code: short stable name.
         severity: info (nothing to do), warning (look at it), error (the numbers are wrong).
-        values: fields of the sentences.
+        variants: of its sentences.
+        values: their fields; of a code without sentences `title`, `text` and `remedy`.
     """
 
     code: str
-    severity: Literal["info", "warning", "error"]
+    severity: Severity
+    variants: list[str] = field(default_factory=list)
     values: dict[str, Any] = field(default_factory=dict)
 
 
-def finding(code: str, severity: Literal["info", "warning", "error"], **values: Any) -> Finding:
-    """A finding; of its sentences, those are left out that name a value which is None."""
-    return Finding(code, severity, values)
+def finding(code: str, severity: Severity, *variants: str | None, **values: Any) -> Observed:
+    """What was found, with those of its variants that are not None."""
+    return Observed(code, severity, [one for one in variants if one], values)
 
 
 @dataclass(frozen=True)
@@ -147,7 +150,7 @@ class Outcome:
     """What one check found; all of it plain values, in eV and Å.
 
     Attributes:
-        says: code and values of the sentences that sum it up.
+        says: its summary: names of sentences, and values for all of them.
         tables: records by title.
         numbers: figures by name.
         skipped: (what, why) of what was not asked.
@@ -156,8 +159,8 @@ class Outcome:
         name, title, seconds: of the check, filled in by it.
     """
 
-    says: tuple[str, dict[str, Any]]
-    findings: list[Finding] = field(default_factory=list)
+    says: tuple[list[str], dict[str, Any]]
+    findings: list[Observed] = field(default_factory=list)
     tables: dict[str, list[dict[str, Any]]] = field(default_factory=dict)
     charts: list[Chart] = field(default_factory=list)
     numbers: dict[str, Any] = field(default_factory=dict)
@@ -185,8 +188,8 @@ class Settings:
 class AuditCheck:
     """One question to a calculator: a file in `mdnum.audit.checks`, or an entry point of another package.
 
-    A subclass has a name, a title, a one-line docstring and `ask`; its sentences are in audit.txt under the
-    codes of its findings. To add one, add the file `checks/NAME.py` with the class `NameCheck`.
+    A subclass has a name, a title, a one-line docstring and `ask`; its sentences are in mdnum/workflow/audit.toml
+    under the codes of its findings. To add one, add the file `checks/NAME.py` with the class `NameCheck`.
 
     Attributes:
         order: checks with a lower one are asked before.

@@ -10,7 +10,7 @@ import numpy as np
 from ase import Atoms
 from jaxtyping import Float
 
-from mdnum.audit.base import Finding, finding
+from mdnum.audit.base import Observed, finding
 from mdnum.audit.subject import CalculatorError, CalculatorSubject, no_rounding
 
 #: Å between the points of the line along which noise is measured: a smooth function's fourth difference over
@@ -312,7 +312,7 @@ def digits(values: np.ndarray) -> Digits:
     return Digits(None, bits)
 
 
-def precision(subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor) -> Iterator[Finding]:
+def precision(subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor) -> Iterator[Observed]:
     """A finding where answers carry fewer digits than a double: QUANTIZED, or LOW_PRECISION.
 
     Whether answers go in steps is measured along a line, whatever the numbers look like: forces that were
@@ -349,31 +349,33 @@ def precision(subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor) -> It
     yield finding(
         "LOW_PRECISION",
         "warning" if noise.energy > _SMALL_ENERGY * subject.kT > 0 else "info",
+        "format" if whose else None,
         whose=whose,
         format=narrow[whose] if whose else None,
         energy=noise.energy,
         ulps=float(ulps),
-        digits=float(max(-np.log10(max(share, eps)), 0)),
+        digits=round(max(-np.log10(max(share, eps)), 0)),
     )
 
 
 def _quantized(
     coarse: list[str], sizes: dict[str, float], read: dict[str, Digits], stairs: Staircase, typical: float
-) -> Finding:
-    values = {}
+) -> Observed:
+    bound, variants, values = 0.0, [], {}
     for word in coarse:
+        one = read[word]
+        how = "decimals" if one.quantum else "format" if one.format else None
+        variants += [f"{word}_{how}" if how else None, f"{word}_step" if sizes[word] else None]
         values |= {
-            f"{word}_decimals": read[word].decimals,
-            f"{word}_format": None if read[word].quantum else read[word].format,
-            f"{word}_step": sizes[word] or None,
-        }
-    bound = 0.0
+            f"{word}_decimals": one.decimals, f"{word}_format": one.format, f"{word}_step": sizes[word],
+        }  # fmt: skip
     if "forces" in coarse:
         bound = 0.5 * sizes["forces"] or 2.0 ** -read["forces"].bits * typical
-        values["forces_share"] = sizes["forces"] / typical if sizes["forces"] else None
+        values["forces_share"] = sizes["forces"] / typical
     return finding(
         "QUANTIZED",
         "error" if bound > _SMALL * typical else "warning",
+        *variants,
         **values,
         length=stairs.length,
         points=len(stairs.energies),

@@ -15,7 +15,7 @@ import numpy as np
 from ase import Atoms
 from jaxtyping import Float
 
-from mdnum.audit.base import Finding, Meter, finding
+from mdnum.audit.base import Meter, Observed, finding
 from mdnum.errors import MdnumError
 from mdnum.store.atomic import write_text
 from mdnum.units import METAL, Units
@@ -147,12 +147,14 @@ class Repeats:
             chance.force = max(chance.force, float(np.max(np.abs(now[1] - before[1]), initial=0.0)))
             chance.typical = rms(now[1])
 
-    def findings(self, kT: float) -> list[Finding]:
+    def findings(self, kT: float) -> list[Observed]:
         """That one question has two answers, where that has come up and is no rounding."""
         for seen, who in ((self.chance, "same"), (self.new, "new")):
             if seen.differ:
-                values: dict[str, Any] = {f"{who}_differ": seen.differ, "times": seen.times}
-                told = not_repeatable(seen.energy, seen.force, seen.typical, kT, **values)
+                told = not_repeatable(
+                    f"{who}_object", seen.energy, seen.force, seen.typical, kT,
+                    differ=seen.differ, times=seen.times,
+                )  # fmt: skip
                 # what differs in a last bit is told where repeats are the question
                 return [told] if told.severity == "error" else []
         return []
@@ -194,19 +196,21 @@ def _differ(before: EnergyForces, now: EnergyForces, kT: float) -> bool:
     return no_rounding(abs(now[0] - before[0]), before[0], force, before[1], kT)
 
 
-def not_repeatable(energy: float, force: float, typical: float, kT: float, **values: Any) -> Finding:
+def not_repeatable(
+    how: str, energy: float, force: float, typical: float, kT: float, **values: Any
+) -> Observed:
     """The finding that one question has two answers: an error where they differ by no rounding.
 
     Args:
+        how: it came up, a variant of the sentences.
         energy: by which answers differ, eV.
         force: by which they differ, eV/Å.
         typical: root mean square force, eV/Å.
-        values: of sentences that say what was asked.
     """
     values |= {"energy": energy, "force": force, "typical": typical}
     if force > _LARGE * typical or energy > _LARGE_ENERGY * kT:
-        return finding("NOT_REPEATABLE", "error", **values)
-    return finding("NOT_BIT_IDENTICAL", "warning", **values)
+        return finding("NOT_REPEATABLE", "error", how, **values)
+    return finding("NOT_BIT_IDENTICAL", "warning", how, **values)
 
 
 class CalculatorSubject:
