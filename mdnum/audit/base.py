@@ -74,7 +74,7 @@ def ask_each(
     spread: bool = False,
     failed: Callable[[int, CalculatorError], None] | None = None,
 ) -> dict[int, T]:
-    """The answers to many ways of asking by their place; of those after the deadline, that they were left out.
+    """The answers to many ways of asking, by their place; ways that come after the deadline are skipped.
 
     Args:
         subject: whose deadline it is.
@@ -146,7 +146,7 @@ class Chart:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class CheckResult:
     """What one check found; all of it plain values, in eV and Å.
 
     Attributes:
@@ -156,6 +156,7 @@ class Outcome:
         skipped: (what, why) of what was not asked.
         asked: ways of asking that were gone, those on which the calculator failed included.
         possible: ways that there are in all; more than asked where the time was up.
+        recorded: columns of further tables, by name of the table.
         name, title, seconds: of the check, filled in by it.
     """
 
@@ -167,6 +168,7 @@ class Outcome:
     skipped: list[tuple[str, str]] = field(default_factory=list)
     asked: int = 1
     possible: int = 1
+    recorded: dict[str, dict[str, list[Any]]] = field(default_factory=dict)
     name: str = ""
     title: str = ""
     seconds: float = 0.0
@@ -188,13 +190,13 @@ class Settings:
 class AuditCheck:
     """One question to a calculator: a file in `mdnum.audit.checks`, or an entry point of another package.
 
-    A subclass has a name, a title, a one-line docstring and `ask`; its sentences are in mdnum/workflow/audit.toml
-    under the codes of its findings. To add one, add the file `checks/NAME.py` with the class `NameCheck`.
+    A subclass has a name, a title, a one-line docstring and `ask`; its sentences are in
+    mdnum/workflow/audit.toml under the codes of its findings. To add one, add the file `checks/NAME.py`
+    with the class `NameCheck`.
 
     Attributes:
         order: checks with a lower one are asked before.
         structures: that show a finding, by name; those of a pair end in -before and -after.
-        recorded: columns of further tables, by name of the table.
     """
 
     name: ClassVar[str]
@@ -206,9 +208,8 @@ class AuditCheck:
     def __init__(self, settings: Settings | None = None):
         self.settings = settings or Settings()
         self.structures: dict[str, Atoms] = {}
-        self.recorded: dict[str, dict[str, Any]] = {}
 
-    def ask(self, subject: CalculatorSubject, progress: Progress) -> Outcome:
+    def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
         """The check itself.
 
         Raises:
@@ -217,7 +218,7 @@ class AuditCheck:
         """
         raise NotImplementedError
 
-    def __call__(self, subject: CalculatorSubject, progress: Progress | None = None) -> Outcome:
+    def __call__(self, subject: CalculatorSubject, progress: Progress | None = None) -> CheckResult:
         """Ask it, with name, title and the time that it took."""
         began = perf_counter()
         found = self.ask(subject, progress or (lambda done, total, info: None))

@@ -217,7 +217,7 @@ def _order(
 def _permuted(
     subject: CalculatorSubject, walk: PairWalk, radius: float, count: int
 ) -> tuple[float, float] | None:
-    """Changes of energy and force with the order of atoms; None if another order of summation explains them."""
+    """Changes of energy and force with the order of atoms; None if another order of sums explains them."""
     atoms, _ = cluster(walk.pair, radius, count)
     energy, forces = subject.energy(atoms), subject.forces(atoms)
     rng = np.random.default_rng(2)

@@ -1,4 +1,4 @@
-"""Where the energy of a run went: its flips at thresholds, jumps elsewhere, the work of its forces, and drift.
+"""Where the energy of a run went: flips at thresholds, jumps elsewhere, work of the forces, drift.
 
 The energy of every step is accounted for: ΔU plus the work of the forces on the straight way between two
 steps vanishes for a force that has this energy, whatever the integrator does. At a threshold it is the jump
@@ -244,7 +244,7 @@ def account(
 def _unexplained(
     first: tuple[float, tuple[float, float]], last: tuple[float, tuple[float, float]], asked: Along
 ) -> float:
-    """Energy gained plus work done between two places, by Simpson's rule; 0 if the forces have this energy."""
+    """Energy gained plus work done between two places, by Simpson's rule; 0 if forces have this energy."""
     width = last[0] - first[0]
     if width <= 0:
         return 0.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -243,10 +244,8 @@ def settled(
         # of few atoms, terms that cancel by symmetry leave no trace
         many = roomy(there, FEW)
         many.positions += RATTLE * rng.uniform(-1, 1, many.positions.shape)
-        try:
+        with contextlib.suppress(CalculatorError):
             noise = noise.louder(along_a_line(subject, many, rng))
-        except CalculatorError:
-            pass
     # what goes in steps may not move at all on so short a line
     stairs = steps(subject, there)
     noise = noise.louder(NoiseFloor(0.5 * stairs.energy, 0.5 * stairs.force))
@@ -328,7 +327,8 @@ def precision(subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor) -> It
         return
     read = {"energy": digits(stairs.energies), "forces": digits(stairs.forces)}
     sizes = {
-        word: one.quantum or step for (word, one), step in zip(read.items(), (stairs.energy, stairs.force))
+        word: one.quantum or step
+        for (word, one), step in zip(read.items(), (stairs.energy, stairs.force), strict=True)
     }
     # few bits show where a value has no room for steps on the line
     coarse = [

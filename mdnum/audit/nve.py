@@ -167,9 +167,11 @@ def run(
         if kinetic > limit:
             blown_up = True
             break
-    columns = (np.array(column, np.float64) for column in zip(*rows, strict=True))
+    potential, kinetics, positions, forces = (
+        np.array(column, np.float64) for column in zip(*rows, strict=True)
+    )
     atoms.calc = None
-    return NveRun(timestep, *columns, blown_up), atoms
+    return NveRun(timestep, potential, kinetics, positions, forces, blown_up), atoms
 
 
 def at(like: Atoms, positions: Float[np.ndarray, "atoms 3"]) -> Atoms:

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from ase import Atoms
 
-from mdnum.audit.subject import CalculatorError, CalculatorSubject, only_trying
 from mdnum.audit.pairs import FARTHEST, Pair, pairs
+from mdnum.audit.subject import CalculatorError, CalculatorSubject, only_trying
 from mdnum.audit.thresholds import rough
 from mdnum.errors import InputError
 from mdnum.references.load import described, place

@@ -94,7 +94,7 @@ class EnergyOffset:
 
 
 class Repeats:
-    """Keeps a few numbers of each answer of all objects of a calculator, and compares where a question recurs.
+    """A few numbers of each answer of all objects of a calculator, compared where a question recurs.
 
     Attributes:
         new: what new objects answered to the first question they were asked: nothing can be remembered there.

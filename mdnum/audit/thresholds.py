@@ -439,7 +439,7 @@ def _root(curve: Curve, edge: float, room: float, power: int) -> float:
     """Where a force that falls with this power of the distance to its end would vanish.
 
     The edge itself where it is no further off than the error of such an extrapolation: it falls to the power
-    only in the limit, while the edge is known to the last bit unless the force was lost in rounding before it.
+    only in the limit, while the edge is known to the last bit unless the force was lost in rounding.
     """
     places = edge - room * np.array([0.02, 0.01, 0.005])
     far, near, nearer = np.abs(curve.many(places)[1]) ** (1.0 / power)

@@ -21,7 +21,6 @@ _MODULES = {
     "processes": ("mdnum.report.fork.processes", "mdnum.report.fork.processes"),
     "certify": ("mdnum.report.fork.certify", "mdnum.report.fork.certify"),
     "forecast": ("mdnum.report.fork.forecast", "mdnum.report.fork.forecast"),
-    "audit": ("mdnum.report.audit.html", "mdnum.report.audit.html"),
     "grad": ("mdnum.report.grad.html", "mdnum.report.grad.html"),
     "conform": ("mdnum.report.conform.html", "mdnum.report.conform.html"),
     "flips": ("mdnum.report.flips.html", "mdnum.report.flips.html"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mdnum.workflow.audit import AuditResult, audit
+from mdnum.workflow.audit import audit
 from mdnum.workflow.ball import BallResult, bounce
 from mdnum.workflow.conform import ConformResult, conform
 from mdnum.workflow.flips import FlipsResult, flips
@@ -16,7 +16,6 @@ from mdnum.workflow.grad import GradResult, grad
 from mdnum.workflow.run import run
 
 __all__ = [
-    "AuditResult",
     "BallResult",
     "CertifyResult",
     "ConformResult",

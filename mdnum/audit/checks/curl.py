@@ -10,7 +10,7 @@ import numpy as np
 from ase import Atoms
 from jaxtyping import Float
 
-from mdnum.audit.base import AuditCheck, Outcome, Progress, TimeUp, ask_each, finding
+from mdnum.audit.base import AuditCheck, CheckResult, Progress, TimeUp, ask_each, finding
 from mdnum.audit.noise import FEW, NoiseFloor, displaced, settled
 from mdnum.audit.subject import CalculatorSubject
 
@@ -64,7 +64,7 @@ class CurlCheck(AuditCheck):
     needed_to = ("differentiate",)
     seed = 0
 
-    def ask(self, subject: CalculatorSubject, progress: Progress) -> Outcome:
+    def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
         """The circulation of the forces in planes of all kinds."""
         rng = np.random.default_rng(self.seed)
         worker = subject.fresh()
@@ -91,7 +91,7 @@ class CurlCheck(AuditCheck):
                 "error": worst.error, "share": worst.share,
             }  # fmt: skip
             found.append(finding("CURL", "error" if worst.share > _SMALL else "warning", **values))
-        return Outcome(
+        return CheckResult(
             says=(["curl_found" if worst else "curl_none"], values),
             findings=found,
             tables={"Work around closed loops": [_row(one) for one in loops]},

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mdnum.audit.base import AuditCheck, Chart, Observed, Outcome, Progress, finding
+from mdnum.audit.base import AuditCheck, Chart, CheckResult, Observed, Progress, finding
 from mdnum.audit.curve import SMOOTH
 from mdnum.audit.energy import Drift, EnergyBalance, balance, crossings, drift, ratio, wandering
 from mdnum.audit.noise import FEW, NoiseFloor, along_a_line, roomy
@@ -42,12 +42,12 @@ class DynamicsCheck(AuditCheck):
     needed_to = ("run",)
     seed = 0
 
-    def ask(self, subject: CalculatorSubject, progress: Progress) -> Outcome:
+    def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
         """Two runs and where their energy went."""
         with subject.meter.limited():
             return self._ask(subject, progress)
 
-    def _ask(self, subject: CalculatorSubject, progress: Progress) -> Outcome:
+    def _ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
         rng = np.random.default_rng(self.seed)
         limits, unknown = _limits(subject)
         atoms = roomy(subject.atoms, FEW)
@@ -58,7 +58,7 @@ class DynamicsCheck(AuditCheck):
         step = fitting if self.settings.timestep is None else self.settings.timestep
         if not np.isfinite(step):
             why = "no force and no thermal motion: there is nothing to integrate"
-            return Outcome(says=(["dynamics_nothing"], {}), skipped=[("a run", why)])
+            return CheckResult(says=(["dynamics_nothing"], {}), skipped=[("a run", why)])
         count = self.settings.steps or _STEPS
         total = 3 * count + count // 4
 
@@ -75,7 +75,7 @@ class DynamicsCheck(AuditCheck):
                 "timestep": step / subject.units.time_factor,
                 "time": subject.units.time,
             }
-            return Outcome(
+            return CheckResult(
                 says=(["dynamics_blew_up"], values),
                 findings=[finding("BLEW_UP", "error", **values)],
                 numbers={"steps": after, "blew_up": True, "drift": None},
@@ -97,7 +97,6 @@ class DynamicsCheck(AuditCheck):
             subject, whole, half, found, found.by_means(finer, len(half.potential)), limits,
             (float(stale), allowed), noise, period,
         )  # fmt: skip
-        self.recorded = {"energies": runs.energy_rows(), "crossings": runs.crossing_rows()}
         return runs.outcome(unknown)
 
 
@@ -179,7 +178,7 @@ class TwoRuns:
         factor = 1e3 * self.subject.units.time_factor / one.positions.shape[1]
         return {name: share.times(factor) for name, share in found.items()}
 
-    def outcome(self, unknown: str) -> Outcome:
+    def outcome(self, unknown: str) -> CheckResult:
         """What the check found.
 
         Args:
@@ -200,13 +199,14 @@ class TwoRuns:
             "drift": numbers["drift"], "error": numbers["drift_error"], "unit": unit,
             "ratio": abs(numbers["drift_ratio"]),
         }  # fmt: skip
-        return Outcome(
+        return CheckResult(
             says=(says, values),
             findings=list(self._findings(shares, numbers)),
             tables=self._tables(shares, numbers),
             charts=[self._chart()],
             numbers=numbers,
             skipped=skipped,
+            recorded={"energies": self.energy_rows(), "crossings": self.crossing_rows()},
         )
 
     def _numbers(self, shares: Mapping[str, Drift]) -> dict[str, Any]:
@@ -347,7 +347,7 @@ class TwoRuns:
             {name: (scale * line).tolist() for name, line in lines.items()},
         )
 
-    def energy_rows(self) -> dict[str, Any]:
+    def energy_rows(self) -> dict[str, list[Any]]:
         """Rows of energies.parquet."""
         jumps, elsewhere = self.balance.jumps, self.balance.elsewhere
         parts: list[dict[str, Any]] = []
@@ -366,26 +366,15 @@ class TwoRuns:
                     "entered": entered, "left": left, "jumps": brought, "rest": rest,
                 }
             )  # fmt: skip
-        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        return {name: np.concatenate([part[name] for part in parts]).tolist() for name in parts[0]}
 
-    def crossing_rows(self) -> dict[str, Any]:
+    def crossing_rows(self) -> dict[str, list[Any]]:
         """Rows of crossings.parquet."""
-        crossed, count = self.balance.crossed, len(self.balance.crossed)
-        kinds = {
-            "step": int,
-            "i": int,
-            "j": int,
-            "rank": int,
-            "entered": bool,
-            "distance": float,
-            "margin": float,
-        }
-        columns = {
-            name: np.array([getattr(one, name) for one in crossed], kind) for name, kind in kinds.items()
-        }
+        crossed, measured = self.balance.crossed, self.balance.measured
+        names = ("step", "i", "j", "rank", "entered", "distance", "margin")
         return {
-            "run": np.full(count, "run"),
-            **columns,
-            "threshold": np.array([self.limits[one.threshold].radius for one in crossed], float),
-            "energy_jump": np.array([self.balance.measured.get(n, np.nan) for n in range(count)], float),
+            "run": ["run"] * len(crossed),
+            **{name: [getattr(one, name) for one in crossed] for name in names},
+            "threshold": [self.limits[one.threshold].radius for one in crossed],
+            "energy_jump": [measured.get(n, float("nan")) for n in range(len(crossed))],
         }

@@ -12,7 +12,7 @@ from ase import Atoms
 from jaxtyping import Float
 
 from mdnum.audit import transformations
-from mdnum.audit.base import AuditCheck, Chart, Observed, Outcome, Progress, TimeUp, ask_each, finding
+from mdnum.audit.base import AuditCheck, Chart, CheckResult, Observed, Progress, TimeUp, ask_each, finding
 from mdnum.audit.noise import FEW, NoiseFloor, direction, displaced, precision, settled, steps
 from mdnum.audit.subject import CalculatorError, CalculatorSubject, no_rounding, only_trying, rms
 
@@ -82,7 +82,7 @@ class ForcesCheck(AuditCheck):
     needed_to = ("run", "differentiate")
     seed = 0
 
-    def ask(self, subject: CalculatorSubject, progress: Progress) -> Outcome:
+    def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
         """Forces against central differences, extrapolated, and sums that must vanish."""
         rng = np.random.default_rng(self.seed)
         worker = subject.fresh()
@@ -131,7 +131,7 @@ class ForcesCheck(AuditCheck):
             says = ["forces_wrong"]
         elif known > _DROWNED * scale or not clear:
             says = ["forces_drowned"]
-        return Outcome(
+        return CheckResult(
             says=(says, values),
             findings=observed,
             tables={

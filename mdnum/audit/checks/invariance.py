@@ -13,8 +13,8 @@ from mdnum.audit import transformations
 from mdnum.audit.base import (
     TIME_UP,
     AuditCheck,
+    CheckResult,
     Observed,
-    Outcome,
     Progress,
     TimeUp,
     ask_each,
@@ -74,7 +74,7 @@ class InvarianceCheck(AuditCheck):
     needed_to = ("run",)
     seed = 0
 
-    def ask(self, subject: CalculatorSubject, progress: Progress) -> Outcome:
+    def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
         """One structure, written down in many ways."""
         rng = np.random.default_rng(self.seed)
         judge = _Judge(subject, rng)
@@ -107,7 +107,7 @@ class InvarianceCheck(AuditCheck):
             "force": max((one.force for one in wrong), default=0.0),
         }  # fmt: skip
         says = "invariance_wrong" if wrong else "invariance_right" if differences else "invariance_none"
-        return Outcome(
+        return CheckResult(
             says=([says, "invariance_refused"] if refused else [says], values),
             findings=[*_refusals(refused), *self._findings(differences, judge, refused)],
             tables={"The same structure, written down otherwise": [one.row() for one in differences]},

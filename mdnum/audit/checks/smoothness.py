@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mdnum.audit.base import AuditCheck, Chart, Observed, Outcome, Progress, TimeUp, finding
+from mdnum.audit.base import AuditCheck, Chart, CheckResult, Observed, Progress, TimeUp, finding
 from mdnum.audit.crowds import Crowd, crowd
 from mdnum.audit.curve import SMOOTH
 from mdnum.audit.environments import Event, Surroundings, walk_surroundings
@@ -37,7 +37,7 @@ class SmoothnessCheck(AuditCheck):
     #: Neighbors that a crowded center gets, and routes through the structure that are scanned.
     neighbors, routes = 160, 2
 
-    def ask(self, subject: CalculatorSubject, progress: Progress) -> Outcome:
+    def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
         """Walk and crowd."""
         walks = walk_pairs(subject, progress)
         if not walks.walks and subject.meter.deadline.passed:
@@ -52,7 +52,7 @@ class SmoothnessCheck(AuditCheck):
                 ("caps on the number of neighbors", "the calculator takes no crowd of single atoms")
             )
         kT = subject.kT
-        return Outcome(
+        return CheckResult(
             says=summary(walks, around, crowds, kT),
             findings=[
                 *_jumps(walks, around, kT),

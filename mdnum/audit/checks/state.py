@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from ase import Atoms
 
-from mdnum.audit.base import TIME_UP, AuditCheck, Observed, Outcome, Progress, TimeUp, finding
+from mdnum.audit.base import TIME_UP, AuditCheck, CheckResult, Observed, Progress, TimeUp, finding
 from mdnum.audit.noise import FEW, NoiseFloor, digits, displaced, settled
 from mdnum.audit.pairs import molecules, pairs, whole
 from mdnum.audit.sequences import Asked, all_sequences, approaches
@@ -46,7 +46,7 @@ class StateCheck(AuditCheck):
     needed_to = ("run",)
     seed = 0
 
-    def ask(self, subject: CalculatorSubject, progress: Progress) -> Outcome:
+    def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
         """One object, asked again and again, beside new ones."""
         rng = np.random.default_rng(self.seed)
         atoms, noise = settled(subject.fresh(), rng, at_least=FEW)
@@ -89,7 +89,7 @@ class StateCheck(AuditCheck):
             "rows": len(rows), "stale": len(stale), "sequences": len({row["sequence"] for row in rows}),
             "answers": chance.get("answers", 0), "energy": max(largest, default=chance.get("energy", 0.0)),
         }  # fmt: skip
-        return Outcome(
+        return CheckResult(
             says=([f"state_{says}", f"state_{how}"], values),
             findings=[
                 *_unsteady(repeats, chance, subject.kT),
@@ -471,12 +471,10 @@ class Alone:
 
     def findings(self) -> Iterator[Observed]:
         """What is wrong with atoms alone."""
-        for code, severity, finite in (
-            ("LONELY_NOT_FINITE", "error", False), ("LONELY_FAILS", "warning", True),
-        ):  # fmt: skip
-            refused = [one for one in self.refused if (one[1].cause is not None) == finite]
-            if refused and (self.takes_atoms or not finite):
-                yield finding(code, severity, what=refused[0][0], why=refused[0][1].message)
+        for what, why in [one for one in self.refused if one[1].cause is None][:1]:
+            yield finding("LONELY_NOT_FINITE", "error", what=what, why=why.message)
+        for what, why in [one for one in self.refused if one[1].cause is not None and self.takes_atoms][:1]:
+            yield finding("LONELY_FAILS", "warning", what=what, why=why.message)
         if pushed := [row for row in self.rows if not row["no force"]]:
             worst = max(pushed, key=lambda row: row["force (eV/Å)"])
             yield finding("LONELY_FORCE", "error", what=worst["atoms"], force=worst["force (eV/Å)"])
