@@ -58,7 +58,7 @@ class Loop:
 
 
 class CurlCheck(AuditCheck):
-    """Do the forces work around closed loops? It needs no energy."""
+    """Do the forces work around closed loops?"""
 
     name, title, order = "curl", "Curl", 40
     needed_to = ("differentiate",)
