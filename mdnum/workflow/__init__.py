@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mdnum.workflow.audit import AuditResult, audit
+from mdnum.workflow.audit import audit
 from mdnum.workflow.ball import bounce
 from mdnum.workflow.conform import conform
 from mdnum.workflow.demos import demonstrate
@@ -17,7 +17,6 @@ from mdnum.workflow.grad import grad
 from mdnum.workflow.run import run
 
 __all__ = [
-    "AuditResult",
     "CertifyResult",
     "FlipsResult",
     "ForecastResult",

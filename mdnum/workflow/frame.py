@@ -214,6 +214,24 @@ def say(progress: Progress | None, phase: str, step: int = 0, steps: int = 0, **
         progress(step, steps, {"phase": phase, **counts})
 
 
+class Log:
+    """Passes progress on, and writes a line of log.txt at each new phase and now and then."""
+
+    def __init__(self, folder: RunFolder, progress: Progress | None):
+        self._folder, self._progress = folder, progress
+        self._last = ("", -1.0)
+
+    def __call__(self, step: int, steps: int, info: dict[str, Any]) -> None:
+        """As a rollout calls it."""
+        phase, share = str(info.get("phase", "run")), 10 * step // steps if steps else 0
+        if (phase, share) != self._last:
+            unit = info.get("unit", "steps")
+            self._folder.log(f"{phase}: {step:,} of {steps:,} {unit}" if steps else phase)
+            self._last = (phase, share)
+        if self._progress is not None:
+            self._progress(step, steps, info)
+
+
 def store(folder: RunFolder, summary: Mapping[str, Any], tables: Mapping[str, Mapping[str, Any]]) -> None:
     """Ends the filling of a folder: its tables, then its summary.
 

@@ -12,9 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import CubicSpline
 
-from mdnum.audit.curve import Curve, bisect
-from mdnum.audit.jumps import find_jumps
-from mdnum.audit.smoothness_words import place
+from mdnum.audit.checks.smoothness import place
+from mdnum.audit.curve import Curve, bisect, find_jumps
 from mdnum.audit.thresholds import STEP, find_thresholds, walk, walk_pairs
 
 BEFORE = float(np.nextafter(R_CUT, 0.0))

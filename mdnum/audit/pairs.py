@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations_with_replacement
 from typing import Literal
@@ -11,13 +10,11 @@ import numpy as np
 from ase import Atoms
 from jaxtyping import Float
 
-from mdnum.audit.base import Subject
 from mdnum.audit.curve import Curve
-from mdnum.audit.subject import CalculatorError, only_trying
+from mdnum.audit.subject import CalculatorError, CalculatorSubject
 
 #: What a calculator may want around two atoms, the simplest first: (a cell, periodic).
 _SURROUNDINGS = ((False, False), (True, False), (True, True))
-
 #: A scan does not go further apart than this, in the unit of length.
 FARTHEST = 30.0
 
@@ -56,12 +53,10 @@ class Pair:
 
     def others(self, distance: float) -> Float[np.ndarray, "pairs"]:
         """Distances between the two of all atoms but the reference atoms, at a distance of those."""
-        between = np.linalg.norm(
-            self.second.positions[None] + [distance, 0.0, 0.0] - self.first.positions[:, None], axis=2
-        )
-        return between.ravel()[1:]
+        moved = self.second.positions[None] + [distance, 0.0, 0.0]
+        return np.linalg.norm(moved - self.first.positions[:, None], axis=2).ravel()[1:]
 
-    def curve(self, subject: Subject) -> Curve:
+    def curve(self, subject: CalculatorSubject) -> Curve:
         """Energy against distance, and the force that drives the second away from the first."""
 
         def at(distance: float) -> tuple[float, float]:
@@ -72,7 +67,7 @@ class Pair:
         return Curve(at)
 
 
-def pairs(subject: Subject, most: int = 6) -> tuple[list[Pair], list[tuple[str, str]]]:
+def pairs(subject: CalculatorSubject, most: int = 6) -> tuple[list[Pair], list[tuple[str, str]]]:
     """Two of each species of the structure that the calculator answers for, the most frequent first.
 
     Single atoms where it takes them as near as they come in the structure; where it does not (a bond order
@@ -95,18 +90,14 @@ def pairs(subject: Subject, most: int = 6) -> tuple[list[Pair], list[tuple[str, 
         if pair is None:
             skipped.append((f"two atoms {one}-{other} by themselves", why))
             if nearest:
-                trios = _trio(one, nearest, -1.0), _trio(other, nearest, 1.0)
-                pair, _ = _answered(subject, (one, other), trios[0], trios[1], nearest)
+                trios = trio(one, nearest, -1.0), trio(other, nearest, 1.0)
+                pair, _ = _answered(subject, (one, other), *trios, nearest)
         if pair is not None:
             found.append(pair)
     skipped += [
         (f"pair {one}-{other}", f"the {most} most frequent pairs were walked") for one, other in wanted[most:]
     ]
-    if not found:
-        pair = _molecules(subject)
-        if pair is not None:
-            return [pair], skipped
-    return found, skipped
+    return found or _molecules(subject), skipped
 
 
 def _nearest(atoms: Atoms) -> float:
@@ -117,7 +108,7 @@ def _nearest(atoms: Atoms) -> float:
     return float(distances[~np.eye(len(distances), dtype=bool)].min())
 
 
-def _trio(symbol: str, side: float, way: float) -> Atoms:
+def trio(symbol: str, side: float, way: float) -> Atoms:
     """An atom at the origin with two companions behind it."""
     depth = way * side * np.sqrt(0.75)
     return Atoms([symbol] * 3, [(0, 0, 0), (depth, side / 2, 0), (depth, -side / 2, 0)])
@@ -144,51 +135,36 @@ def whole(atoms: Atoms, indices: np.ndarray) -> Atoms:
     return Atoms(part.get_chemical_symbols(), offsets)
 
 
-def _molecules(subject: Subject) -> Pair | None:
-    """Two molecules of the structure, where it consists of several."""
-    groups = molecules(subject.atoms)
-    if not 2 <= len(groups) <= len(subject.atoms) / 2:
-        return None
-    one, other = (whole(subject.atoms, group) for group in _two_alike(subject.atoms, groups))
-    leads = [part.get_chemical_symbols()[int(np.argmax(part.get_masses()))] for part in (one, other)]
-    pair, _ = _answered(subject, (leads[0], leads[1]), one, other, 0.0)
-    return replace(pair, moves="molecule") if pair else None
-
-
 def _part(atoms: Atoms, indices: np.ndarray) -> Atoms:
     part = atoms[indices]
     assert isinstance(part, Atoms)
     return part
 
 
-def _two_alike(atoms: Atoms, groups: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    first = groups[0]
-    formula = _part(atoms, first).get_chemical_formula()
-    for other in groups[1:]:
-        if _part(atoms, other).get_chemical_formula() == formula:
-            return first, other
-    return first, groups[1]
+def _molecules(subject: CalculatorSubject) -> list[Pair]:
+    """Two molecules of the structure, where it consists of several; alike if there are two alike."""
+    atoms, groups = subject.atoms, molecules(subject.atoms)
+    if not 2 <= len(groups) <= len(atoms) / 2:
+        return []
+    formulas = [_part(atoms, group).get_chemical_formula() for group in groups]
+    second = next((k for k in range(1, len(groups)) if formulas[k] == formulas[0]), 1)
+    one, other = whole(atoms, groups[0]), whole(atoms, groups[second])
+    leads = [part.get_chemical_symbols()[int(np.argmax(part.get_masses()))] for part in (one, other)]
+    pair, _ = _answered(subject, (leads[0], leads[1]), one, other, 0.0)
+    return [replace(pair, moves="molecule")] if pair else []
 
 
 def _answered(
-    subject: Subject, species: tuple[str, str], first: Atoms, second: Atoms, nearest: float
+    subject: CalculatorSubject, species: tuple[str, str], first: Atoms, second: Atoms, nearest: float
 ) -> tuple[Pair | None, str]:
     """The simplest surroundings in which the calculator gives energy and forces, or why there are none."""
     why = ""
     for cell, periodic in _SURROUNDINGS:
-        box = 2.5 * FARTHEST if cell else 0.0
         name = "-".join(part.get_chemical_formula() for part in (first, second))
-        pair = Pair(species, first, second, box, periodic, name)
-        for distance in (nearest, 3.0, 6.0):
-            if not distance:
-                continue
-            atoms = pair.at(distance)
-            try:
-                with only_trying(subject):
-                    subject.energy(atoms)
-                    subject.forces(atoms)
-            except CalculatorError as error:
-                why = why or error.message
+        pair = Pair(species, first, second, 2.5 * FARTHEST if cell else 0.0, periodic, name)
+        for distance in filter(None, (nearest, 3.0, 6.0)):
+            if isinstance(answer := subject.try_both(pair.at(distance)), CalculatorError):
+                why = why or answer.message
                 break
         else:
             return pair, ""
