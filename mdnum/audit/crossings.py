@@ -27,7 +27,7 @@ class Crossing:
 
     Attributes:
         step: after it; the step before is one less.
-        i, j, rank: the pair, as in `mdnum.trajectories.table.Flips`.
+        i, j, rank: the pair, as in `mdnum.trajectories.ledger.Flips`.
         entered: whether it is inside afterwards.
         threshold: its place among the thresholds.
         distance: at `step`, Å.

@@ -33,6 +33,7 @@ from mdnum.trajectories.checked import FrameError, check_frame
 from mdnum.trajectories.far import smallest_radius
 from mdnum.trajectories.frame import Frame
 from mdnum.trajectories.joined import Part, RuleResult, joined
+from mdnum.trajectories.ledger import Flips
 from mdnum.trajectories.mdanalysis_source import (
     READING_FAILS,
     first_line,
@@ -43,7 +44,6 @@ from mdnum.trajectories.mdanalysis_source import (
 from mdnum.trajectories.resolution import SAMPLE, Resolution, infer_from
 from mdnum.trajectories.rules import Rule
 from mdnum.trajectories.source import UnreadableFrame
-from mdnum.trajectories.table import Flips
 from mdnum.trajectories.tails import left_over, refuse_cut_text
 from mdnum.trajectories.tracker import Tracker
 from mdnum.trajectories.xtc import XtcFile, opened

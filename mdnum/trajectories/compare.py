@@ -11,10 +11,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float, Int
 
-from mdnum.trajectories.changes import image_distances
 from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.lattice import lattice_of
-from mdnum.trajectories.table import Flips, Members
+from mdnum.trajectories.ledger import Flips, Members
+from mdnum.trajectories.search import image_distances
 
 Pair = tuple[int, int, int]
 

@@ -18,7 +18,7 @@ class Contacts:
     between the frames `begin - 1` and `begin`, and it may have been outside for a while between two frames.
 
     Attributes:
-        i, j, rank: the pair; see `mdnum.trajectories.table.Members`.
+        i, j, rank: the pair; see `mdnum.trajectories.ledger.Members`.
         begin: first frame inside, a position among the frames looked at.
         end: first frame outside again; the number of frames where that was not seen.
         began: whether the pair was seen to enter. If not the stay is censored on the left: it is older than

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Int
 
-from mdnum.trajectories.table import Flips, Members
+from mdnum.trajectories.ledger import Flips, Members
 
 # a pair's three numbers are packed into one where they fit: sorting one column is ten times as fast
 _ROOM = 2**62
@@ -19,7 +19,7 @@ class History:
     """Pairs that were ever inside or flipped, each with its flips in the order of frames.
 
     Attributes:
-        i, j, rank: the pairs, sorted, each once; see `mdnum.trajectories.table.Members`.
+        i, j, rank: the pairs, sorted, each once; see `mdnum.trajectories.ledger.Members`.
         inside: whether each was inside at the first frame.
         rows: flips of pair p are rows `rows[p]` to `rows[p + 1]` of what follows.
         frame: position among the frames looked at, from 1.

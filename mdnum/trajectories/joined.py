@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mdnum.errors import InputError
+from mdnum.trajectories.ledger import Flips, Members
 from mdnum.trajectories.rules import Rule
-from mdnum.trajectories.table import Flips, Members
 
 
 @dataclass(frozen=True)

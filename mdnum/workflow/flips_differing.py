@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from mdnum.trajectories.resolution import Resolution
     from mdnum.trajectories.rules import Rule
     from mdnum.trajectories.source import Trajectory
-    from mdnum.trajectories.table import Flips
+    from mdnum.trajectories.ledger import Flips
     from mdnum.trajectories.tracker import Tracker
 
 

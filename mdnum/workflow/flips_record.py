@@ -24,7 +24,7 @@ from mdnum.workflow.interrupt import asked_to_stop
 if TYPE_CHECKING:
     from mdnum.trajectories.rules import Rule
     from mdnum.trajectories.source import Trajectory
-    from mdnum.trajectories.table import Flips, Members
+    from mdnum.trajectories.ledger import Flips, Members
 
 Progress = Callable[[int, int, dict[str, Any]], None]
 Groups = tuple[Int[np.ndarray, "first"] | None, Int[np.ndarray, "second"] | None]

@@ -10,7 +10,7 @@ from trajectories.membership import ledger, random_membership
 
 from mdnum.trajectories.compare import Difference, apart, displacements, distances, growth, same_lattice
 from mdnum.trajectories.frame import Box, Frame
-from mdnum.trajectories.table import Flips, Members
+from mdnum.trajectories.ledger import Flips, Members
 
 
 def of_frame(flips: Flips, frame: int) -> Flips:

@@ -15,8 +15,8 @@ from trajectories.boxes import atoms, boxes
 from mdnum.errors import InputError
 from mdnum.trajectories import superset
 from mdnum.trajectories.frame import Box, Frame
+from mdnum.trajectories.ledger import Flips
 from mdnum.trajectories.rules import Capped, Cutoff, Nearest, SpeciesCutoffs
-from mdnum.trajectories.table import Flips
 from mdnum.trajectories.tracker import HORIZON, Tracker
 
 PERIODIC = np.ones(3, bool)
