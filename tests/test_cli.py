@@ -21,6 +21,7 @@ import mdnum.workflow
 from mdnum.cli import main, output
 from mdnum.cli.progress import ProgressBar, describe
 from mdnum.errors import InputError, NumericalError
+from mdnum.plain import plain
 from mdnum.store.naming import default_folder
 
 SUMMARY: dict[str, Any] = {
@@ -297,9 +298,9 @@ def test_plain_makes_json_of_what_a_run_holds():
     document = {
         "a": np.float64("inf"), "b": np.arange(3), "c": Path("x"), "d": (True, None), "e": np.bool_(True)
     }  # fmt: skip
-    assert output.plain(document) == {"a": None, "b": [0, 1, 2], "c": "x", "d": [True, None], "e": True}
+    assert plain(document) == {"a": None, "b": [0, 1, 2], "c": "x", "d": [True, None], "e": True}
     with pytest.raises(TypeError, match="object has no JSON form"):
-        output.plain(object())
+        plain(object())
 
 
 CRYSTAL = """

@@ -86,7 +86,7 @@ def folders(a: str, b: Path, *, as_json: bool) -> int | None:
     found = compare_folders(*runs)
     output.print_notes(a, b)
     if as_json:
-        output.print_json({"question": "folders", **output.plain(found)})
+        output.print_json({"question": "folders", **plain(found)})
         return output.EXIT_FINE
     out = output.console()
     if found.differences:

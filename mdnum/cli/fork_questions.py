@@ -9,6 +9,7 @@ from typing import Any
 from mdnum.cli import output
 from mdnum.cli.fork_print import print_rows
 from mdnum.cli.progress import ProgressBar, watched
+from mdnum.plain import plain
 
 
 def consistent(
@@ -23,7 +24,7 @@ def consistent(
     with ProgressBar() as progress:
         found = benign(twin, steps=steps, progress=progress)
     if as_json:
-        output.print_json({"question": "benign", "vary": vary, **output.plain(found)})
+        output.print_json({"question": "benign", "vary": vary, **plain(found)})
         return output.EXIT_FINE if found.passed else output.EXIT_FINDINGS
     out = output.console()
     out.print(found.says, style="bold", markup=False)
@@ -47,7 +48,7 @@ def folders(a: Path, b: Path, *, as_json: bool) -> int:
     found = compare_folders(a, b)
     output.print_notes(a, b)
     if as_json:
-        output.print_json({"question": "folders", **output.plain(found)})
+        output.print_json({"question": "folders", **plain(found)})
         return output.EXIT_FINE
     out = output.console()
     # what was different comes first: no date means anything without it

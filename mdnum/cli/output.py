@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
-import math
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -13,9 +11,13 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from mdnum.errors import InputError, MdnumError, json_escape, printable
+from mdnum.plain import plain
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+    from mdnum.report.section import Table
+    from mdnum.workflow.frame import Outcome
 
 EXIT_FINE = 0
 EXIT_FINDINGS = 1
@@ -25,6 +27,7 @@ EXIT_STOPPED = 130  # what a shell reports for a process ended by control-C
 _PIPE_WIDTH = 200
 # records that are easier to read side by side than as rows
 _FEW, _MANY = 3, 6
+_MOST_ROWS = 12
 
 # how a person should read a severity; the exit code is 1 for the last two
 _STYLE = {"info": "dim", "ok": "green", "warning": "yellow", "error": "bold red", "unsafe": "bold red"}
@@ -60,26 +63,6 @@ def parse_overrides(settings: Sequence[str] | None) -> dict[str, str]:
             raise InputError(f"--set gives {key!r} twice", remedy="Keep one of them")
         overrides[key] = value.strip()
     return overrides
-
-
-def plain(value: Any) -> Any:
-    """value as JSON can say it: numpy to Python, paths to text, non-finite numbers to null."""
-    if value is None or isinstance(value, bool | str | int):
-        return value
-    if isinstance(value, float):
-        return float(value) if math.isfinite(value) else None
-    if isinstance(value, Path):
-        return str(value)
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    tolist = getattr(value, "tolist", None)  # numpy and jax arrays and scalars, without importing either
-    if tolist is not None:
-        return plain(tolist())
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {part.name: plain(getattr(value, part.name)) for part in dataclasses.fields(value)}
-    if isinstance(value, Iterable):
-        return [plain(item) for item in value]
-    raise TypeError(f"{type(value).__name__} has no JSON form here")
 
 
 def print_json(document: Mapping[str, Any]) -> None:
@@ -212,6 +195,43 @@ def exit_code(findings: Iterable[Any], *, ok: bool = True) -> int:
     """1 when a finding asks for attention or the check failed, else 0; information is no finding."""
     matters = any(field(finding, "severity") in ("warning", "error") for finding in findings)
     return EXIT_FINDINGS if matters or not ok else EXIT_FINE
+
+
+def print_outcome(outcome: Outcome, *, as_json: bool) -> int:
+    """What a verb answers, as JSON or for people: its page in brief. Returns the exit code."""
+    code = exit_code(outcome.verdict.findings, ok=outcome.summary.get("status", "complete") == "complete")
+    if as_json:
+        print_json({"folder": outcome.folder, **outcome.summary})
+        return code
+    out = console()
+    out.print(outcome.verdict.headline, style="bold", markup=False)
+    if outcome.page.about:
+        out.print(f"  {outcome.page.about}", markup=False)
+    if outcome.page.keys:
+        rows = [(key.label, f"{key.value}  {key.note}".rstrip()) for key in outcome.page.keys]
+        print_table("", ("", ""), rows)
+    for section in outcome.page.sections:
+        if section.terminal:
+            out.print(section.title, style="bold", markup=False)
+            for part in section.parts:
+                if isinstance(part, str):
+                    out.print(f"  {part}", markup=False)
+                elif type(part).__name__ == "Table":
+                    _print_part(part)
+    print_findings(finding for finding in outcome.verdict.findings if not finding.cause)
+    report = outcome.folder / "report.html"
+    out.print(f"wrote {report if report.exists() else outcome.folder}", markup=False)
+    return code
+
+
+def _print_part(table: Table) -> None:
+    from mdnum.report.section import cell
+
+    shown = min(table.shown, _MOST_ROWS)
+    rows = [[cell(value) for value in row] for row in table.rows[:shown]]
+    print_table(table.title, table.columns, rows)
+    if len(table.rows) > shown:
+        console().print(f"  and {len(table.rows) - shown} more, which report.html shows", markup=False)
 
 
 def answer(

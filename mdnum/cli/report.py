@@ -15,7 +15,14 @@ def report(
 ) -> int:
     """Write the report of a run folder again."""
     from mdnum.report import write
+    from mdnum.store import RunFolder
+    from mdnum.workflow import frame
 
+    opened = RunFolder.open(folder)
+    if frame.on_frame(opened):
+        outcome = frame.finish(opened)
+        output.print_notes(folder)
+        return output.print_outcome(outcome, as_json=as_json)
     written = write(folder)
     output.print_notes(folder)
     if as_json:

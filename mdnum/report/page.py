@@ -14,13 +14,83 @@ from markupsafe import Markup
 
 from mdnum.report import svg
 from mdnum.report.axes import PAGE_WIDTH, PHONE_WIDTH
+from mdnum.report.section import cell
 from mdnum.report.words import count, heading, many, number, percent, plain, typeset
 from mdnum.store.atomic import subfolder, write_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from mdnum.report.finding import Finding, Verdict
+    from mdnum.report.section import Page
+    from mdnum.store import RunFolder
+
 _HERE = files("mdnum.report")
+
+
+def write(folder: RunFolder, page: Page, verdict: Verdict) -> Path:
+    """Writes report.html and figures/*.svg of any folder.
+
+    Returns:
+        the path of report.html.
+
+    Raises:
+        FolderError: the folder cannot be written.
+    """
+    from mdnum.report import drawing
+    from mdnum.report.browse import Browse
+    from mdnum.report.section import Figure, Plot
+
+    parts = [part for section in page.sections for part in section.parts]
+    pictures, notes = {}, {}
+    for part in parts:
+        if isinstance(part, Figure | Plot):
+            image = svg.markup(drawing.draw(part), part.name)
+            write_text(subfolder(folder.path, "figures") / f"{part.name}.svg", svg.standalone(image))
+            pictures[part.name] = Markup(svg.inline(image, typeset(part.alt)))
+            notes[part.name] = drawing.notes(part)
+    anchors = {section.title: _anchor(section.title) for section in page.sections}
+    contents = [(each.title, anchors[each.title]) for each in page.sections if each.level == 2]
+    names = sorted(each.name for each in folder.path.iterdir() if each.suffix in _LINKED)
+    path = folder.path / "report.html"
+    text = render(
+        "page.html.j2",
+        page=page,
+        verdict=verdict,
+        findings=_under_causes(verdict.findings),
+        pictures=pictures,
+        notes=notes,
+        anchors=anchors,
+        contents=[("Findings", "findings")] * bool(verdict.findings) + contents,
+        files=names,
+        scripted=any(isinstance(part, Browse) and part.rows for part in parts),
+        provenance=list(flat(page.provenance)),
+    )
+    write_text(path, text)
+    return path
+
+
+#: Files beside a page that it links to.
+_LINKED = (".parquet", ".py", ".json", ".toml", ".extxyz", ".npz", ".traj")
+
+
+def _anchor(title: str) -> str:
+    return re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-") or "section"
+
+
+def _under_causes(findings: Iterable[Finding]) -> list[tuple[Finding, list[Finding]]]:
+    """Findings that stand by themselves, each with those that name it as their cause."""
+    findings = list(findings)
+    there = {finding.code for finding in findings}
+    heads = [finding for finding in findings if finding.cause not in there]
+    return [
+        (head, [one for one in findings if one.cause == head.code] if _first(head, heads) else [])
+        for head in heads
+    ]
+
+
+def _first(head: Finding, heads: list[Finding]) -> bool:
+    return next(one for one in heads if one.code == head.code) is head
 
 
 def render(template: str, **content: Any) -> str:
@@ -38,7 +108,8 @@ def render(template: str, **content: Any) -> str:
         lstrip_blocks=True,
     )
     environment.filters |= {"number": number, "count": count, "percent": percent, "plain": plain}
-    environment.filters |= {"typeset": typeset, "heading": heading}
+    environment.filters |= {"typeset": typeset, "heading": heading, "cell": cell}
+    environment.filters |= {"kind": lambda part: type(part).__name__}
     environment.globals |= {
         "many": many,
         "style": Markup(_text("report.css")),

@@ -1,0 +1,33 @@
+"""Anything mdnum computes as the plain values that JSON, TOML and a terminal can hold."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+
+def plain(value: Any) -> Any:
+    """value as JSON can hold it: dataclasses to dictionaries, arrays to lists, non-finite numbers to None.
+
+    Raises:
+        TypeError: there is no plain form of it.
+    """
+    if value is None or isinstance(value, bool | str | int):
+        return value
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    tolist = getattr(value, "tolist", None)  # numpy and jax arrays and scalars, without importing either
+    if tolist is not None:
+        return plain(tolist())
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    if isinstance(value, Iterable):
+        return [plain(item) for item in value]
+    raise TypeError(f"{type(value).__name__} has no plain form")

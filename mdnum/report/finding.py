@@ -1,0 +1,237 @@
+"""Findings, their sentences, and the verdict that they add up to: one of each for every verb.
+
+Code decides (code, values); a text file beside the verb has the sentences, by code, with named fields:
+
+    [LOST_PAIRS]
+    severity = "error"
+    title = "the neighbor list lost {lost:# pair}"
+    text = "{lost:# pair} inside the cutoff {lost:? was were} missing from the list in use."
+    remedy = "Raise neighbors.skin."
+    remedy_blind = "Set neighbors.rebuild.check = true."    # of the variant "blind", instead of remedy
+    more_first = "The first is at step {step}."             # of the variant "first", after text
+
+    [sentences]
+    lists = "No pair was lost in {lists:# list}."
+
+A field is written as its format asks: `{x}` a number or text as people read it, `{x:3}` with 3 significant
+digits, `{x:+3}` with its sign, `{x:g}` without trailing zeros, `{x:%}` a percentage, `{n:# pair}` "2 pairs"
+(`{n:# life lives}` with an irregular plural), `{n:? was were}` one word or the other.
+"""
+
+from __future__ import annotations
+
+import string
+import tomllib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from mdnum.plain import plain
+from mdnum.report import words
+
+if TYPE_CHECKING:
+    from mdnum.store import RunFolder
+
+Severity = Literal["info", "warning", "error"]
+Tone = Literal["good", "info", "warning", "error"]
+_ORDER = ("error", "warning", "info")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing a person should know about a result.
+
+    Attributes:
+        code: stable name, for scripts.
+        severity: error: do not use the numbers; warning: look before you do; info: good to know, which
+            changes neither the exit code nor the tone.
+        title: one line, without a capital or a full stop.
+        text: what was seen, with its numbers.
+        remedy: what to do, empty if nothing.
+        values: the numbers in it, by name, plain.
+        section: title of the section of the page that shows it, empty if none does.
+        cause: code of the finding that this one may follow from, empty if none.
+    """
+
+    code: str
+    severity: Severity
+    title: str
+    text: str
+    remedy: str = ""
+    values: Mapping[str, Any] = field(default_factory=dict)
+    section: str = ""
+    cause: str = ""
+
+
+class _Fields(string.Formatter):
+    def format_field(self, value: Any, format_spec: str) -> str:
+        if format_spec.startswith("#"):
+            return words.many(value, *format_spec[1:].split())
+        if format_spec.startswith("?"):
+            one, several = format_spec[1:].split()
+            return one if value == 1 else several
+        if format_spec == "%":
+            return words.percent(value)
+        if format_spec == "g":
+            return words.plain(value)
+        if format_spec.lstrip("+").isdigit():
+            return words.number(value, int(format_spec), signed=format_spec.startswith("+"))
+        if format_spec:
+            raise ValueError(f"{format_spec!r} is no format of a sentence's field")
+        if isinstance(value, bool):
+            return "yes" if value else "no"
+        if isinstance(value, int):
+            return words.count(value)
+        if value is None or isinstance(value, float):
+            return words.number(value)
+        return words.typeset(str(value))
+
+    def get_value(self, key: int | str, args: Any, kwargs: Any) -> Any:
+        try:
+            return super().get_value(key, args, kwargs)
+        except (KeyError, IndexError):
+            raise KeyError(
+                f"a sentence names {key!r}; given are {', '.join(kwargs) or 'no values'}"
+            ) from None
+
+
+class Texts:
+    """The sentences of a verb.
+
+    Args:
+        module: `__file__` of the module; its text file lies beside it with the suffix .toml.
+    """
+
+    def __init__(self, module: str | Path):
+        self.entries = _entries(Path(module).with_suffix(".toml"))
+
+    def finding(
+        self,
+        code: str,
+        *variants: str,
+        severity: Severity | None = None,
+        section: str = "",
+        cause: str = "",
+        **values: Any,
+    ) -> Finding:
+        """The finding of a code, its sentences filled in.
+
+        Args:
+            variants: alternatives to title, text and remedy, and further sentences (see the module).
+            severity: instead of the one in the text file.
+            values: for the fields.
+
+        Raises:
+            KeyError: the text file lacks the code, or a value for one of its fields.
+        """
+        entry = self.entries[code]
+        values = {name: value if isinstance(value, str) else _plain(value) for name, value in values.items()}
+
+        def text(part: str) -> str:
+            chosen = next(
+                (entry[f"{part}_{v}"] for v in variants if f"{part}_{v}" in entry), entry.get(part, "")
+            )
+            return fill(chosen, values)
+
+        more = [fill(entry[f"more_{v}"], values) for v in variants if f"more_{v}" in entry]
+        worst = severity or next((entry[f"severity_{v}"] for v in variants if f"severity_{v}" in entry), None)
+        return Finding(
+            code, worst or entry["severity"], text("title"), " ".join(filter(None, [text("text"), *more])),
+            text("remedy"), values, section, cause,
+        )  # fmt: skip
+
+    def __call__(self, name: str, /, **values: Any) -> str:
+        """A sentence of the table [sentences], its fields filled in."""
+        return fill(self.entries["sentences"][name], values)
+
+
+def _plain(value: Any) -> Any:
+    # infinite numbers are written as such in a sentence
+    return value if isinstance(value, float) else plain(value)
+
+
+def fill(text: str, values: Mapping[str, Any]) -> str:
+    """A sentence with its fields filled in.
+
+    Raises:
+        KeyError: a field has no value.
+    """
+    return _Fields().vformat(text, (), values)
+
+
+@lru_cache
+def _entries(path: Path) -> Mapping[str, Any]:
+    return tomllib.loads(path.read_text(encoding="utf-8"))
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What to think of a result.
+
+    Attributes:
+        tone: the worst severity; "good" (or "info", where nothing was to be good) if there is neither error
+            nor warning.
+        headline: one sentence, which names the worst thing on its page.
+        evidence: what it rests on, a sentence each.
+        findings: errors first.
+    """
+
+    tone: Tone
+    headline: str
+    evidence: tuple[str, ...]
+    findings: tuple[Finding, ...]
+
+    @property
+    def text(self) -> str:
+        """Headline and evidence."""
+        return " ".join((self.headline, *self.evidence))
+
+    def store(self, folder: RunFolder, summary: Mapping[str, Any]) -> dict[str, Any]:
+        """Writes headline, findings and verdict into a folder's summary.json, beside what summary holds."""
+        judged = {
+            **summary, "headline": self.headline, "findings": plain(self.findings), "verdict": self.text,
+        }  # fmt: skip
+        folder.write_summary(judged)
+        return judged
+
+
+def conclude(
+    found: Iterable[Finding],
+    evidence: Iterable[str] = (),
+    *,
+    headline: str,
+    best: Tone = "info",
+    judged: bool = False,
+) -> Verdict:
+    """The verdict on findings: its tone is that of the worst, which its headline names.
+
+    Args:
+        found: in the order in which they are to be read, whatever their severity.
+        evidence: what the verdict rests on, a sentence each.
+        headline: the answer to the verb's question.
+        best: tone where there is neither error nor warning.
+        judged: whether the headline follows from the findings already.
+    """
+    findings = tuple(sorted(found, key=lambda finding: _ORDER.index(finding.severity)))
+    worst = findings[0] if findings else None
+    tone = best if worst is None or worst.severity == "info" else worst.severity
+    if worst is not None and not judged and worst.title.lower() not in headline.lower():
+        if worst.severity == "error":
+            headline = f"{worst.title[:1].upper()}{worst.title[1:]}. {headline}"
+        elif worst.severity == "warning":
+            more = sum(finding.severity == "warning" for finding in findings) - 1
+            rest = f", and {words.many(more, 'more point')} below" if more else ""
+            headline = f"{headline} Look first: {worst.title}{rest}."
+    return Verdict(tone, headline, tuple(evidence), findings)
+
+
+def restore(kept: Mapping[str, Any]) -> Finding:
+    """A finding that was written into summary.json."""
+    severity = kept.get("severity")
+    texts = {
+        name: str(kept.get(name) or "") for name in ("code", "title", "text", "remedy", "section", "cause")
+    }
+    finding = Finding(severity="info", values=dict(kept.get("values") or {}), **texts)
+    return replace(finding, severity=severity) if severity in _ORDER else finding

@@ -1,0 +1,244 @@
+"""What every page and every terminal answer is made of: sections of text, tables and figures.
+
+Nothing here draws or prints: `page` renders sections as HTML, `cli.output` prints them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from mdnum.report.words import count, number, typeset
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Canvas
+
+AxisScale = Literal["linear", "log", "symlog"]
+Mark = Literal["line", "points", "steps", "line+points"]
+Role = Literal["first", "second", "third", "bad", "muted", "ink"]
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of values under named columns.
+
+    Attributes:
+        columns: names, with their unit in parentheses; all empty for a table without a head, whose first
+            column then names its rows.
+        rows: plain values; floats are written with 3 digits, None as a dash, text as it is.
+        title: a small heading, empty for none.
+        shown: rows that are shown at once; the others unfold.
+        bad: rows that are marked, by their number.
+    """
+
+    columns: tuple[str, ...]
+    rows: Sequence[Sequence[Any]]
+    title: str = ""
+    shown: int = 20
+    bad: frozenset[int] = frozenset()
+
+    def numeric(self, column: int) -> bool:
+        """Whether a column holds numbers alone, which are set flush right."""
+        values = [row[column] for row in self.rows]
+        return any(_is_number(value) for value in values) and all(
+            value is None or _is_number(value) for value in values
+        )
+
+
+def records(rows: Sequence[Mapping[str, Any]], title: str = "", shown: int = 20) -> Table:
+    """A table of dictionaries, its columns in the order in which they first occur."""
+    columns = tuple(dict.fromkeys(name for row in rows for name in row))
+    return Table(columns, [[row.get(name) for name in columns] for row in rows], title, shown)
+
+
+def pairs(rows: Sequence[tuple[str, Any]], title: str = "") -> Table:
+    """A table of names and values, without a head."""
+    return Table(("", ""), rows, title, shown=1000)
+
+
+def cell(value: Any) -> str:
+    """A value of a table as people read it."""
+    if value is None:
+        return "–"
+    if isinstance(value, bool | np.bool_):
+        return "yes" if value else "no"
+    if isinstance(value, int | np.integer):
+        return count(int(value))
+    if isinstance(value, float | np.floating):
+        return number(float(value), 3)
+    return typeset(str(value))
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float | np.number) and not isinstance(value, bool)
+
+
+@dataclass(frozen=True)
+class Code:
+    """A file or a command to copy, folded under its title.
+
+    Attributes:
+        title: what it is.
+        text: word for word.
+    """
+
+    title: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Series:
+    """One set of points of a plot.
+
+    Attributes:
+        x, y: equally long; NaN leaves a gap.
+        role: its color.
+        dashed: for what is expected rather than measured.
+    """
+
+    label: str
+    x: np.ndarray
+    y: np.ndarray
+    mark: Mark = "line"
+    role: Role = "first"
+    dashed: bool = False
+
+
+@dataclass(frozen=True)
+class Region:
+    """A map over a grid: small integers with a word for each (a stability map, say).
+
+    Attributes:
+        x, y: centers of the cells, shapes (columns,) and (rows,).
+        value: class of each cell, shape (rows, columns).
+        words: what each class means, in the order 0, 1, 2, ...
+    """
+
+    x: np.ndarray
+    y: np.ndarray
+    value: np.ndarray
+    words: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Plot:
+    """A figure that is declared: values against values.
+
+    Attributes:
+        name: of figures/<name>.svg, unique on its page.
+        title: what is seen, a phrase.
+        x_label, y_label: quantities with their units.
+        caption: what to see in it; the title by default.
+        verticals, horizontals: marked values with a word for each.
+    """
+
+    name: str
+    title: str
+    x_label: str
+    y_label: str
+    series: tuple[Series, ...] = ()
+    region: Region | None = None
+    x_scale: AxisScale = "linear"
+    y_scale: AxisScale = "linear"
+    caption: str = ""
+    verticals: tuple[tuple[float, str], ...] = ()
+    horizontals: tuple[tuple[float, str], ...] = ()
+
+    @property
+    def alt(self) -> str:
+        """What the figure shows, in words and numbers, for who cannot see it."""
+        parts = [f"{self.title}: {self.y_label} against {self.x_label}."]
+        for series in self.series:
+            y = np.asarray(series.y, float)
+            y = y[np.isfinite(y)]
+            name = series.label or self.y_label
+            if not len(y):
+                parts.append(f"{name}: no values.")
+            elif y.min() == y.max():
+                parts.append(f"{name}: {number(float(y[0]))} throughout.")
+            else:
+                ends = f"{number(float(y[0]))} at first, {number(float(y[-1]))} at last"
+                parts.append(f"{name}: {number(float(y.min()))} to {number(float(y.max()))}, {ends}.")
+        if self.region is not None:
+            shares = [float(np.mean(self.region.value == at)) for at in range(len(self.region.words))]
+            told = (
+                f"{word} {100 * share:.0f} %" for word, share in zip(self.region.words, shares, strict=True)
+            )
+            parts.append(f"Share of the map: {', '.join(told)}.")
+        for value, word in (*self.verticals, *self.horizontals):
+            parts.append(f"Marked: {word} at {number(float(value))}.")
+        return " ".join(parts)
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A figure that is drawn with matplotlib.
+
+    Attributes:
+        name: of figures/<name>.svg, unique on its page.
+        caption: what to see in it.
+        alt: what it shows, in words and numbers, for who cannot see it.
+        draw: draws into an empty matplotlib figure, in the colors of `figures`.
+        height: inches, of a width of `figures.WIDTH`.
+    """
+
+    name: str
+    caption: str
+    alt: str
+    draw: Callable[[Canvas], None]
+    height: float = 3.0
+
+
+#: What a section is made of; text is a paragraph.
+Part = Any  # str | Table | browse.Browse | Code | Plot | Figure
+
+
+@dataclass(frozen=True)
+class Section:
+    """A heading with what stands below it, in order.
+
+    Attributes:
+        title: also what a finding names that this section shows.
+        parts: paragraphs, tables, code, plots and figures.
+        terminal: whether its tables and text are printed in a terminal too.
+        level: 2, or 3 for a section within the one before.
+    """
+
+    title: str
+    parts: Sequence[Part] = ()
+    terminal: bool = False
+    level: Literal[2, 3] = 2
+
+
+@dataclass(frozen=True)
+class Key:
+    """A number that stands above everything else."""
+
+    label: str
+    value: str
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Page:
+    """A whole answer.
+
+    Attributes:
+        title: heading.
+        about: one line below it.
+        keys: the numbers in brief.
+        sections: in order; findings come before them, provenance after.
+        files: what is in the folder, a sentence.
+        system_toml: the system that was run, empty where none was.
+        provenance: of the folder.
+    """
+
+    title: str
+    about: str = ""
+    keys: Sequence[Key] = ()
+    sections: Sequence[Section] = ()
+    system_toml: str = ""
+    provenance: Mapping[str, Any] = field(default_factory=dict)

@@ -1,0 +1,243 @@
+"""The one frame of every verb: a folder is opened, filled, judged, shown; written once.
+
+A verb is a file that reads top to bottom: its function (options → a filled folder), `judge` (view → findings
+and a headline) and `page` (view → sections), with its sentences in a text file beside it. It says so once:
+
+    VERBS = {"flips": Verb(judge, page)}
+
+by the kind of its folders; `KINDS` names the module, so that `mdnum report DIR` finds it. What is computed
+goes into the folder first: judge and page read the folder alone, so a page can be written again from disk.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mdnum import units
+from mdnum.errors import FolderError, InputError
+from mdnum.plain import plain
+from mdnum.report.finding import Finding, Verdict, restore
+from mdnum.report.section import Page
+from mdnum.store import RunFolder
+from mdnum.store.naming import default_folder
+
+if TYPE_CHECKING:
+    from mdnum.units import Units
+
+#: Called now and then with (done, of how many, {"phase": ..., "unit": ...}); of how many is 0 if not known.
+Progress = Callable[[int, int, dict[str, Any]], None]
+
+#: The module whose VERBS judge and show a kind of folder.
+KINDS: dict[str, str] = {
+    "md": "mdnum.workflow.run",
+    "ball": "mdnum.workflow.ball",
+    "demos": "mdnum.workflow.ball",
+    "grad": "mdnum.workflow.grad",
+    "flips": "mdnum.workflow.flips",
+    "flips-compare": "mdnum.workflow.flips",
+    "audit": "mdnum.workflow.audit",
+    "conform": "mdnum.workflow.conform",
+}
+
+
+@dataclass(frozen=True)
+class View:
+    """A folder as the findings and sections of its verb read it.
+
+    Attributes:
+        folder: on disk.
+        summary: as written, without what was judged.
+        extra: what the verb's own `load` made of its tables, None without one.
+    """
+
+    folder: RunFolder
+    summary: Mapping[str, Any]
+    extra: Any = None
+    _tables: dict[str, Mapping[str, np.ndarray]] = field(default_factory=dict, repr=False)
+
+    @property
+    def name(self) -> str:
+        """The system's name, or what else was asked about."""
+        return str(self.summary.get("system") or self.summary.get("name") or self.folder.path.name)
+
+    @cached_property
+    def system(self) -> Mapping[str, Any]:
+        """The tables of system.toml, empty where there is none."""
+        return self.folder.system if (self.folder.path / "system.toml").exists() else {}
+
+    @cached_property
+    def system_toml(self) -> str:
+        """The text of system.toml, empty where there is none."""
+        return self.folder.system_toml if (self.folder.path / "system.toml").exists() else ""
+
+    @cached_property
+    def units(self) -> Units:
+        """The unit system of all numbers in the folder."""
+        return units.get(str(self.summary.get("units") or self.system.get("units") or "lj"))
+
+    def table(self, name: str) -> Mapping[str, np.ndarray]:
+        """A table of the folder: arrays by column name."""
+        if name not in self._tables:
+            self._tables[name] = self.folder.read(name)
+        return self._tables[name]
+
+    def kept(self, codes: Mapping[str, Any]) -> list[Finding]:
+        """Findings of summary.json that the verb does not decide again: those whose code it has not."""
+        found = self.summary.get("findings") or ()
+        return [restore(each) for each in found if each.get("code") not in codes]
+
+
+@dataclass(frozen=True)
+class Verb:
+    """How a kind of folder is judged and shown.
+
+    Attributes:
+        judge: findings and headline, from the folder alone.
+        page: everything else that is shown.
+        load: reads what both need once; default nothing beyond the summary.
+        unfinished: whether a folder without a summary can be judged (a run that was killed can).
+    """
+
+    judge: Callable[[View], Verdict]
+    page: Callable[[View, Verdict], Page]
+    load: Callable[[RunFolder], Any] | None = None
+    unfinished: bool = False
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What every verb returns.
+
+    Attributes:
+        folder: what was written.
+        summary: what summary.json says: numbers, findings, headline and verdict.
+        page: what report.html and the terminal show.
+        result: what the verb computed, as Python has it; None where a folder was only read.
+    """
+
+    folder: Path
+    summary: Mapping[str, Any]
+    verdict: Verdict
+    page: Page
+    result: Any = None
+
+
+@contextmanager
+def new_folder(
+    kind: str, name: str, out: str | Path | None = None, *, system: Any = None, overwrite: bool = False
+) -> Iterator[RunFolder]:
+    """An empty folder to be filled, with the system and its provenance; closed if filling it fails.
+
+    Args:
+        kind: of the folder.
+        name: runs/<name>-<n> is the folder where out is None.
+        system: what is simulated, with `write(path)`; None for a verb without a system.
+
+    Raises:
+        FolderError: the folder cannot be used.
+    """
+    from mdnum.provenance import collect, surroundings
+
+    folder = RunFolder.create(default_folder(name) if out is None else out, world=kind, overwrite=overwrite)
+    try:
+        if system is not None:
+            system.write(folder.path)
+        folder.write_provenance(collect(system) if system is not None else surroundings())
+        yield folder
+    finally:
+        # of a folder that was filled nothing is open any more
+        folder.close()
+
+
+def finish(
+    folder: RunFolder | str | Path,
+    *,
+    report: bool = True,
+    result: Any = None,
+    progress: Progress | None = None,
+) -> Outcome:
+    """Judges a folder, writes findings and verdict into its summary.json, and its page if it is wanted.
+
+    Args:
+        result: what the verb computed, for who called it from Python.
+
+    Raises:
+        FolderError: it holds no answer, is damaged or cannot be written.
+    """
+    folder = folder if isinstance(folder, RunFolder) else RunFolder.open(folder)
+    verb = verb_of(folder)
+    say(progress, "report" if report else "check")
+    with folder.explained():
+        summary = folder.summary
+        if not summary and not verb.unfinished:
+            raise FolderError(
+                f"holds no answer: `mdnum {folder.verb}` was stopped before it had one",
+                remedy=folder.again,
+                where=str(folder.path),
+            )
+        view = View(folder, summary, verb.load(folder) if verb.load is not None else None)
+        verdict = verb.judge(view)
+        judged = verdict.store(folder, summary)
+        page = verb.page(view, verdict)
+        if report:
+            from mdnum.report.page import write
+
+            write(folder, page, verdict)
+    return Outcome(folder.path, judged, verdict, page, result)
+
+
+def verb_of(folder: RunFolder) -> Verb:
+    """What judges and shows a folder."""
+    return importlib.import_module(KINDS[folder.world]).VERBS[folder.world]
+
+
+def on_frame(folder: RunFolder) -> bool:
+    """Whether the verb of a folder has come onto this frame."""
+    module = KINDS.get(folder.world)
+    if module is None or importlib.util.find_spec(module) is None:
+        return False
+    return hasattr(importlib.import_module(module), "VERBS")
+
+
+def say(progress: Progress | None, phase: str, step: int = 0, steps: int = 0, **counts: Any) -> None:
+    """Reports a phase, if anybody listens."""
+    if progress is not None:
+        progress(step, steps, {"phase": phase, **counts})
+
+
+def store(folder: RunFolder, summary: Mapping[str, Any], tables: Mapping[str, Mapping[str, Any]]) -> None:
+    """Ends the filling of a folder: its tables, then its summary.
+
+    Args:
+        summary: anything with plain values, dataclasses and arrays included.
+        tables: equally long arrays by column name, by table; those of the kind without rows may be left out.
+    """
+    for name, columns in tables.items():
+        folder.append(name, columns)
+    folder.finalize()
+    folder.write_summary(plain(summary))
+
+
+def refuse(given: Mapping[str, bool], whose: str, remedy: str) -> None:
+    """Refuses options that would change nothing.
+
+    Args:
+        given: by option, whether it was given.
+        whose: they are instead: "of one comparison, and all choices were asked for".
+
+    Raises:
+        InputError: one was given.
+    """
+    names = [name for name, present in given.items() if present]
+    if names:
+        what = "is an option" if len(names) == 1 else "are options"
+        raise InputError(f"{' and '.join(names)} {what} {whose}", remedy=remedy)
