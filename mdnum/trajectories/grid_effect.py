@@ -11,14 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import islice, pairwise
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from mdnum.trajectories.frame import Box, Frame
-from mdnum.trajectories.resolution import SAMPLE, Resolution
-from mdnum.trajectories.source import Trajectory
+from mdnum.trajectories.resolution import Resolution
 
 Places = tuple[Float[np.ndarray, "draws 3"], ...]
 
@@ -50,27 +49,6 @@ class GridEffect:
     move: float
     lag: int
     frames: int
-
-    def words(self) -> str:
-        """A sentence on it, for people."""
-        if max(self.missed, self.invented) < 5e-4:
-            return "At this stride the resolution of the file hides or makes up fewer than 1 flip in 1,000."
-        return (
-            f"At this stride the resolution of the file hides about {100 * self.missed:.2g} % of the flips "
-            f"that happened, and about {100 * self.invented:.2g} % of those in it did not happen where they "
-            "stand (estimated from how atoms move in it)."
-        )
-
-
-def effect_on(
-    trajectory: Trajectory,
-    resolution: Resolution,
-    radius: float,
-    first: Int[np.ndarray, "first"] | None = None,
-    second: Int[np.ndarray, "second"] | None = None,
-) -> GridEffect | None:
-    """As `grid_effect`, from the first frames of a trajectory."""
-    return grid_effect(resolution, list(islice(trajectory.frames(), SAMPLE)), radius, first, second)
 
 
 def grid_effect(

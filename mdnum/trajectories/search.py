@@ -381,7 +381,7 @@ def compared(before: Rows, now: Rows, room: int) -> Changed:
         room: decisions to make room for.
     """
     while True:
-        made = Changed(*(np.empty(room, np.int64) for _ in range(3)), np.empty(room, np.bool_))
+        made = Changed._make(np.empty(room, kind) for kind in (np.int64, np.int64, np.int64, np.bool_))
         total = _compared(before, now, made)
         if total <= room:
             return Changed._make(column[:total] for column in made)

@@ -361,7 +361,7 @@ def _follow(x, home, vectors, followed, shifts):
 
 @numba.njit(cache=True, nogil=True)
 def _evaluate(frame, pairs, groups, gone, limit, bound, guard, slack, flip, counts, smallest):
-    """Examine the pairs that are due; flips go into `flip`, numbers into counts = (flips, close, examined)."""
+    """Examine the pairs that are due; flips go into `flip`, numbers into (flips, close, examined)."""
     start, earliest, inside = groups.start, groups.earliest, pairs.inside
     x, home, vectors, species = frame.positions, frame.home, frame.vectors, frame.species
     radius, square, followed, shifts = frame.radius, frame.square, frame.followed, frame.shifts

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from mdnum.trajectories.frame import Frame
     from mdnum.trajectories.resolution import Resolution
     from mdnum.trajectories.rules import Rule
-    from mdnum.trajectories.source import Trajectory
+    from mdnum.trajectories.trajectory import Trajectory
     from mdnum.workflow.flips_record import Followed, Groups, Pass
 
 #: Frames within which a flip that is taken back is chatter, unless another number is asked for.

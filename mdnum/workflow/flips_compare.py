@@ -12,9 +12,8 @@ import numpy as np
 
 from mdnum.errors import InputError
 from mdnum.store import RunFolder
-from mdnum.trajectories.checked import checked
 from mdnum.trajectories.compare import Apart, Difference, apart, growth
-from mdnum.trajectories.far import smallest_radius
+from mdnum.trajectories.frame import checked, smallest_radius
 from mdnum.trajectories.resolution import infer_from
 from mdnum.trajectories.rules import Cutoff
 from mdnum.trajectories.tracker import Tracker
@@ -37,7 +36,7 @@ from mdnum.workflow.interrupt import asked_to_stop
 if TYPE_CHECKING:
     from mdnum.trajectories.frame import Frame
     from mdnum.trajectories.rules import Rule
-    from mdnum.trajectories.source import Trajectory
+    from mdnum.trajectories.trajectory import Trajectory
     from mdnum.workflow.flips_record import Groups
 
 #: Rows of the table of pairs that come to differ.

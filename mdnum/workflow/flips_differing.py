@@ -14,11 +14,11 @@ from mdnum.trajectories.rules import Cutoff, SpeciesCutoffs
 
 if TYPE_CHECKING:
     from mdnum.trajectories.frame import Box, Frame
+    from mdnum.trajectories.ledger import Flips
     from mdnum.trajectories.resolution import Resolution
     from mdnum.trajectories.rules import Rule
-    from mdnum.trajectories.source import Trajectory
-    from mdnum.trajectories.ledger import Flips
     from mdnum.trajectories.tracker import Tracker
+    from mdnum.trajectories.trajectory import Trajectory
 
 
 @dataclass

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from mdnum.trajectories.frame import Frame
     from mdnum.trajectories.resolution import Resolution
     from mdnum.trajectories.rules import Rule
-    from mdnum.trajectories.source import Trajectory
+    from mdnum.trajectories.trajectory import Trajectory
     from mdnum.workflow.flips_record import Groups
 
 #: Frames from which the resolution of a file is read.
@@ -64,7 +64,7 @@ def default_rules(trajectory: Trajectory) -> tuple[Rule, ...]:
 
 def selected(trajectory: Trajectory, between: tuple[str, str] | None) -> Groups:
     """Indices of the atoms on either side."""
-    from mdnum.trajectories.selection import select
+    from mdnum.trajectories.source import select
 
     if between is None:
         return None, None
@@ -155,7 +155,7 @@ def about(trajectory: Trajectory, question: str) -> dict[str, Any]:
 
 def cut_short(error: InputError | None, trajectory: Trajectory) -> bool:
     """Whether reading stopped at a frame that is not whole, the last of the file as far as that is known."""
-    from mdnum.trajectories.source import UnreadableFrame
+    from mdnum.trajectories.frame import UnreadableFrame
 
     if not isinstance(error, UnreadableFrame):
         return False

@@ -12,19 +12,17 @@ from jaxtyping import Int
 
 from mdnum.errors import InputError
 from mdnum.store import RunFolder
-from mdnum.trajectories.checked import checked
 from mdnum.trajectories.compare import displacements
-from mdnum.trajectories.far import leap, smallest_radius
-from mdnum.trajectories.frame import Box, Frame
+from mdnum.trajectories.frame import Box, Frame, checked, leap, smallest_radius
 from mdnum.trajectories.rules import Capped, Cutoff, SpeciesCutoffs
 from mdnum.trajectories.stride import crossings
 from mdnum.trajectories.tracker import Tracker
 from mdnum.workflow.interrupt import asked_to_stop
 
 if TYPE_CHECKING:
-    from mdnum.trajectories.rules import Rule
-    from mdnum.trajectories.source import Trajectory
     from mdnum.trajectories.ledger import Flips, Members
+    from mdnum.trajectories.rules import Rule
+    from mdnum.trajectories.trajectory import Trajectory
 
 Progress = Callable[[int, int, dict[str, Any]], None]
 Groups = tuple[Int[np.ndarray, "first"] | None, Int[np.ndarray, "second"] | None]
