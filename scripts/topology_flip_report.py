@@ -27,13 +27,19 @@ from _output import COLORS, figure, parser, save, say, start, table
 from matplotlib.ticker import MaxNLocator
 
 import mdnum
+from mdnum import units
 from mdnum.errors import InputError
 from mdnum.report import analysis
-from mdnum.report.html import write_report
-from mdnum.report.run import Run, load
 from mdnum.store import RunFolder
+from mdnum.workflow import frame
+from mdnum.workflow.run_page import Record, load
 
 CHATTER = 5
+
+
+def units_of(run: Record) -> units.Units:
+    """The units of all its numbers."""
+    return units.get(run.summary["units"])
 
 
 def found_or_made(subject: str, out: Path | None, steps: int | None) -> Path:
@@ -41,15 +47,15 @@ def found_or_made(subject: str, out: Path | None, steps: int | None) -> Path:
     if (Path(subject) / "summary.json").is_file():
         if steps is not None or out is not None:
             raise InputError("is a run already", where=subject, remedy="Leave out --steps and --folder")
-        write_report(subject)
+        frame.finish(subject)
         return Path(subject)
     say(f"running {subject}")
     return mdnum.run(subject, out=out, steps=steps).folder
 
 
-def facts(run: Run) -> list[tuple[str, str]]:
+def facts(run: Record) -> list[tuple[str, str]]:
     """The ledger in numbers."""
-    total, steps = run.flips_total, max(run.steps, 1)
+    total, steps = run.flips.total, max(run.steps, 1)
     atoms, summary = run.summary["atoms"], run.summary
     rows = [
         ("flips", f"{total:,}: {summary['flips_entered']:,} entered, {summary['flips_left']:,} left"),
@@ -57,10 +63,10 @@ def facts(run: Run) -> list[tuple[str, str]]:
         ("pairs inside, first and last step", f"{summary['pairs_first']:,}, {summary['pairs_last']:,}"),
     ]
     if total:
-        counts = run.busiest.flips
+        counts = run.flips.busiest.flips
         top = max(1, len(counts) // 100)
-        stays = run.stays
-        margins = run.margins
+        stays = run.flips.stays
+        margins = run.flips.ratios
         rows += [
             ("pairs that flipped", f"{len(counts):,}; {counts[0]} times at most"),
             (f"flips of the busiest {top:,} of them", f"{counts[:top].sum() / counts.sum():.1%}"),
@@ -74,7 +80,10 @@ def facts(run: Run) -> list[tuple[str, str]]:
         ]
     closes = "closes" if summary["energy_budget_closes"] else "does not close"
     rows += [
-        ("energy budget", f"{closes}: {summary['energy_budget_residual']:.2e} {run.units.energy} left"),
+        (
+            "energy budget",
+            f"{closes}: {summary['energy_budget_residual']:.2e} {units_of(run).energy} left",
+        ),
         ("lists", f"{summary['rebuilds']:,} rebuilds, {summary['lost_pairs']:,} pairs lost"),
     ]
     return rows
@@ -85,11 +94,13 @@ def _median(counts: np.ndarray) -> str:
     return "no" if found is None else f"{found:.0f}"
 
 
-def draw(run: Run, path: Path) -> None:
+def draw(run: Record, path: Path) -> None:
     """Flips per step, flips per pair, stays, and margins."""
     drawn = figure(9.0, 6.0)
     per_step, per_pair, stayed, margins = drawn.subplots(2, 2).flat
-    drawn.suptitle(f"{run.name}: {run.flips_total:,} flips in {run.steps:,} steps", x=0.01, ha="left")
+    drawn.suptitle(
+        f"{run.summary['system']}: {run.flips.total:,} flips in {run.steps:,} steps", x=0.01, ha="left"
+    )
     series = run.series
     for name, color in (("entered", COLORS[0]), ("left", COLORS[1])):
         values = series[name][1:].astype(float)
@@ -98,16 +109,16 @@ def draw(run: Run, path: Path) -> None:
         values = values[: len(values) // width * width].reshape(-1, width).mean(1)
         per_step.plot(series["time"][1:][: len(values) * width : width], values, color=color, label=name)
     per_step.set_title("flips per step")
-    per_step.set_xlabel(f"time ({run.units.time})")
+    per_step.set_xlabel(f"time ({units_of(run).time})")
     per_step.set_ylim(bottom=0)
     per_step.legend()
-    if run.flips_total:
-        counts = run.busiest.flips
+    if run.flips.total:
+        counts = run.flips.busiest.flips
         times, pairs = np.unique(counts, return_counts=True)
         per_pair.bar(times, pairs, log=True)
         per_pair.set_ylim(bottom=0.5)
         per_pair.xaxis.set_major_locator(MaxNLocator(integer=True))
-        lengths = run.stays
+        lengths = run.flips.stays
         longest = int(np.flatnonzero(lengths.inside + lengths.outside).max(initial=10))
         edges = np.unique(np.round(np.geomspace(1, longest + 1, 30)))
         for counts, label in ((lengths.inside, "inside"), (lengths.outside, "outside")):
@@ -116,7 +127,7 @@ def draw(run: Run, path: Path) -> None:
         stayed.legend()
         stayed.set_xscale("log")
         stayed.set_yscale("log", nonpositive="mask")
-        ratio = run.margins
+        ratio = run.flips.ratios
         ratio = ratio[np.isfinite(ratio) & (ratio > 0)]
         if len(ratio):
             low = np.floor(np.log10(min(ratio.min(), 1)))
@@ -141,19 +152,24 @@ def main() -> None:
     made.add_argument("--busiest", type=int, default=8, metavar="N", help="pairs to list (default 8)")
     chosen = made.parse_args()
     folder = found_or_made(chosen.subject, chosen.folder, chosen.steps)
-    run = load(folder)
+    run = load(RunFolder.open(folder))
     table(
-        f"{run.name}, {run.summary['atoms']} atoms, {run.steps:,} steps",
+        f"{run.summary['system']}, {run.summary['atoms']} atoms, {run.steps:,} steps",
         ("what", "value"),
         facts(run),
         words=2,
     )
-    if run.flips_total:
+    if run.flips.total:
         flips = RunFolder.open(folder).read("flips", ("i", "j", "distance", "radial_speed"))
-        busiest = zip(run.busiest.i, run.busiest.j, run.busiest.flips, strict=True)
+        busiest = zip(run.flips.busiest.i, run.flips.busiest.j, run.flips.busiest.flips, strict=True)
         table(
             "\npairs that flip most",
-            ("pair", "flips", f"mean distance ({run.units.length})", "fastest radial speed"),
+            (
+                "pair",
+                "flips",
+                f"mean distance ({units_of(run).length})",
+                "fastest radial speed",
+            ),
             (
                 (f"{i}-{j}", count, *_where(run, flips, i, j))
                 for i, j, count in islice(busiest, chosen.busiest)
@@ -163,10 +179,13 @@ def main() -> None:
     print(f"\n{run.summary['verdict']}\n\n{folder / 'report.html'}")
 
 
-def _where(run: Run, flips: dict[str, np.ndarray], i: int, j: int) -> tuple[str, str]:
+def _where(run: Record, flips: dict[str, np.ndarray], i: int, j: int) -> tuple[str, str]:
     mine = (flips["i"] == i) & (flips["j"] == j)
     speed = np.abs(flips["radial_speed"][mine]).max()
-    return f"{flips['distance'][mine].mean():.5f}", f"{speed:.3g} {run.units.length}/{run.units.time}"
+    return (
+        f"{flips['distance'][mine].mean():.5f}",
+        f"{speed:.3g} {units_of(run).length}/{units_of(run).time}",
+    )
 
 
 if __name__ == "__main__":

@@ -17,6 +17,10 @@ import pytest
 import typing_rules
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--rewrite-goldens", action="store_true", help="write the records of tests/goldens anew")
+
+
 def _share_programs() -> None:
     """Let workers and child processes of one run share what they compile, in a new folder.
 

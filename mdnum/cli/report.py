@@ -19,11 +19,7 @@ def report(
     from mdnum.workflow import frame
 
     opened = RunFolder.open(folder)
-    if frame.on_frame(opened):
-        outcome = frame.finish(opened)
-        output.print_notes(folder)
-        return output.print_outcome(outcome, as_json=as_json)
-    written = write(folder)
+    written = frame.finish(opened).folder / "report.html" if frame.on_frame(opened) else write(folder)
     output.print_notes(folder)
     if as_json:
         output.print_json({"folder": folder, "report": written})

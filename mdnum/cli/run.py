@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import typer
 
@@ -78,48 +76,4 @@ def run(
             progress=progress,
         )
     output.print_lines(notes)
-    return output.answer(result.folder, result.summary, _print_rows, as_json=as_json)
-
-
-def _speed(rate: float | None) -> str:
-    return "too short a run to tell" if rate is None else f"{output.show(rate)} steps/s"
-
-
-def _print_rows(summary: Mapping[str, Any]) -> None:
-    from mdnum.units import get
-
-    ase, units = summary.get("ase") or {}, get(str(summary.get("units") or "lj"))
-    energy = units.energy
-    rows = [
-        ("system", f"{summary.get('system')}, {summary.get('atoms')} atoms, {summary.get('steps'):,} steps"),
-        ("flips", f"{summary.get('flips_entered'):,} entered, {summary.get('flips_left'):,} left"),
-        ("ambiguous", summary.get("ambiguous")),
-        (
-            "neighbor lists",
-            f"{summary.get('rebuilds'):,} rebuilds, {summary.get('dangerous_builds'):,} dangerous,"
-            f" {summary.get('lost_pairs'):,} pairs lost",
-        ),
-        ("energy drift", _with(summary.get("energy_drift"), f"{energy}/atom/{units.time}")),
-        ("energy budget", _budget(summary, energy)),
-        (
-            "against ASE",
-            f"energy {output.show(ase.get('energy_rel'))} relative,"
-            f" forces {_with(ase.get('force_max'), f'{energy}/{units.length}')} at most"
-            if ase.get("energy_rel") is not None
-            else "not compared",
-        ),
-        ("speed", _speed(summary.get("steps_per_second"))),
-    ]
-    output.print_table("", ("", ""), rows)
-
-
-def _with(value: float | None, unit: str) -> str:
-    return output.show(value) if value is None else f"{output.show(value)} {unit}"
-
-
-def _budget(summary: Mapping[str, Any], unit: str) -> str:
-    closes = summary.get("energy_budget_closes")
-    residual = _with(summary.get("energy_budget_residual"), unit)
-    if closes is None:
-        return f"residual {residual}"
-    return f"{'closes' if closes else 'does not close'}, residual {residual}"
+    return output.print_outcome(result, as_json=as_json)

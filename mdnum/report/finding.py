@@ -15,7 +15,8 @@ Code decides (code, values); a text file beside the verb has the sentences, by c
 
 A field is written as its format asks: `{x}` a number or text as people read it, `{x:3}` with 3 significant
 digits, `{x:+3}` with its sign, `{x:g}` without trailing zeros, `{x:%}` a percentage, `{n:# pair}` "2 pairs"
-(`{n:# life lives}` with an irregular plural), `{n:? was were}` one word or the other.
+(`{n:# life lives}` with an irregular plural,
+`{n:# pair_step}` with a space), `{n:? was were}` one word or the other.
 """
 
 from __future__ import annotations
@@ -68,7 +69,7 @@ class Finding:
 class _Fields(string.Formatter):
     def format_field(self, value: Any, format_spec: str) -> str:
         if format_spec.startswith("#"):
-            return words.many(value, *format_spec[1:].split())
+            return words.many(value, *(word.replace("_", " ") for word in format_spec[1:].split()))
         if format_spec.startswith("?"):
             one, several = format_spec[1:].split()
             return one if value == 1 else several

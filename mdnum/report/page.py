@@ -75,7 +75,7 @@ _LINKED = (".parquet", ".py", ".json", ".toml", ".extxyz", ".npz", ".traj")
 
 
 def _anchor(title: str) -> str:
-    return re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-") or "section"
+    return "section-" + re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
 
 
 def _under_causes(findings: Iterable[Finding]) -> list[tuple[Finding, list[Finding]]]:

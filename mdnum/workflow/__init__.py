@@ -13,7 +13,7 @@ from mdnum.workflow.fork_map import MapResult, fork_map
 from mdnum.workflow.fork_processes import ProcessesResult, fork_processes
 from mdnum.workflow.fork_replay import fork_folders
 from mdnum.workflow.grad import GradResult, grad
-from mdnum.workflow.md import run
+from mdnum.workflow.run import run
 
 __all__ = [
     "AuditResult",

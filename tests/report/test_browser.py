@@ -10,8 +10,8 @@ import subprocess
 import pytest
 from report.synthetic import make_run
 
-from mdnum.report import html
-from mdnum.report.run import TABLE_ROWS, load
+from mdnum.workflow import frame
+from mdnum.workflow.run_page import TABLE_ROWS, load
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 
@@ -51,8 +51,9 @@ document.body.append(result);
 
 
 def test_sort_search_and_pages(tmp_path):
-    run = load(make_run(tmp_path / "run", steps=120, candidates=300))
-    page = html.write_report(run.path)
+    folder = make_run(tmp_path / "run", steps=120, candidates=300)
+    run = load(folder)
+    page = frame.finish(folder).folder / "report.html"
     i, j = int(run.flips.nearest["i"][0]), int(run.flips.nearest["j"][0])
     script = SCRIPT.replace("PAIR", f'"{j}-{i}"').replace("ATOM", f'"{i}"')
     page.write_text(page.read_text(encoding="utf-8").replace("</body>", script + "</body>"), encoding="utf-8")
@@ -66,7 +67,7 @@ def test_sort_search_and_pages(tmp_path):
     assert found, done.stderr[-2000:]
     seen = json.loads(found[1].replace("&gt;", ">").replace("&lt;", "<").replace("&amp;", "&"))
 
-    total = run.flips_total
+    total = run.flips.total
     assert 25 < total < TABLE_ROWS
     assert seen["start"] == [str(step) for step in run.flips.nearest["step"][:25]]
     assert seen["sorted"] == "ascending"

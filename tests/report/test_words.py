@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from mdnum.report import words
 from mdnum.report.ball.values import cells
 from mdnum.report.words import heading, typeset
 
@@ -44,3 +45,27 @@ def test_a_heading_has_a_capital_unless_it_begins_with_a_name():
 def test_thousands_are_set_apart_in_all_of_a_column_or_in_none():
     assert cells([6062, 15726, True, None]) == ["6,062", "15,726", "yes", "–"]
     assert cells([6062, 9999]) == ["6062", "9999"]
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.0, "0"), (None, "–"), (float("nan"), "–"), (float("-inf"), "−∞"), (123456.0, "123,456"),
+        (1234567.0, "1.23\u00a0×\u00a010⁶"), (-1.681e-4, "−1.68\u00a0×\u00a010⁻⁴"), (0.00123, "0.00123"),
+        (9.999e-4, "0.00100"), (999.96, "1,000"), (0.5, "0.500"),
+    ],
+)  # fmt: skip
+def test_numbers_as_words(value, text):
+    assert words.number(value) == text
+
+
+def test_shares_never_claim_all_or_nothing():
+    shares = {
+        0.0: "0 %",
+        1.0: "100 %",
+        1e-9: "under 0.1 %",
+        0.99999: "over 99.9 %",
+        0.021: "2.1 %",
+        1.08: "108 %",
+    }
+    assert {share: words.percent(share) for share in shares} == shares

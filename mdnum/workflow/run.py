@@ -1,0 +1,316 @@
+"""`mdnum run`: roll a system out into a folder, compare it with the reference, judge it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mdnum.errors import InputError, NumericalError
+from mdnum.report import analysis
+from mdnum.report.finding import Finding, Verdict, conclude
+from mdnum.store import RunFolder
+from mdnum.workflow import run_page
+from mdnum.workflow.frame import Outcome, Progress, Verb, View, finish, say
+from mdnum.workflow.run_page import CHATTER_STEPS, TEXTS, Record, load, residual
+
+if TYPE_CHECKING:
+    from mdnum.rollout.run import RunResult
+    from mdnum.systems.load import System
+
+#: Share of flips that must be chatter before it is worth a warning; free flight through the cutoff gives
+#: a few percent at usual time steps.
+CHATTER_SHARE = 0.15
+#: Drift over the run, per atom and in units of k_B T, from which on it is worth a warning.
+DRIFT_SHARE = 0.01
+#: Steps of a run in fixed-point numbers that are made in float64 too.
+_BESIDE = 2000
+
+
+def run(
+    system: System | str | Path | None,
+    *,
+    out: str | Path | None = None,
+    steps: int | None = None,
+    save_every: int | None = None,
+    overrides: Mapping[str, Any] | None = None,
+    resume: str | Path | None = None,
+    check: bool = True,
+    report: bool = True,
+    progress: Progress | None = None,
+) -> Outcome:
+    """Simulate a system, record every flip, compare the first and last frame with ASE, and write a report.
+
+    Args:
+        system: a loaded system, a shipped name or the path of a system file; None when resuming.
+        out: the new run folder; default runs/<name>-<n>.
+        steps: last step; default the system's.
+        save_every: a trajectory frame every so many steps; default the system's.
+        overrides: dotted keys to values, such as {"cutoff.kind": "switched"}.
+        resume: continue the run in this folder, bit for bit.
+        check: compare with ASE (or with plain numpy where ASE has no such potential).
+        report: write report.html.
+        progress: called now and then with step, steps and a dictionary of figures.
+
+    Returns:
+        folder, summary and page; its result is a `mdnum.rollout.run.RunResult`.
+
+    Raises:
+        InputError: the system cannot be run. FolderError: the folder cannot be used.
+        NumericalError: the run blew up; what came before is in the folder, with its report.
+    """
+    from mdnum.rollout.run import run as roll_out
+    from mdnum.systems import BallSystem
+
+    if isinstance(system, BallSystem):
+        raise InputError("this system is a ball", where=system.name, remedy="Use mdnum.bounce")
+    if resume is not None and Path(resume).is_dir() and (folder := RunFolder.open(resume)).world != "md":
+        ball = folder.world == "ball"
+        what = (
+            "is a run of the ball, which takes seconds and leaves nothing to resume"
+            if ball
+            else f"is the folder of `mdnum {folder.verb}`, and no run"
+        )
+        again = f"`mdnum report {resume}` shows it" if folder.summary else folder.again
+        remedy = f"Run it again with `mdnum ball {resume}`" if ball else again
+        raise InputError(what, where=str(resume), remedy=remedy)
+    try:
+        result = roll_out(
+            system, out=out, steps=steps, save_every=save_every, overrides=overrides, resume=resume,
+            progress=progress,
+        )  # fmt: skip
+    except NumericalError as error:
+        if error.folder is not None:
+            finish(error.folder, report=report)
+        raise
+    folder = RunFolder.open(result.folder)
+    if check:
+        say(progress, "check", result.summary["steps"], result.summary["steps_asked"])
+        _compare(folder, result)
+        _beside_float64(folder, result)
+    return finish(folder, report=report, result=result, progress=progress)
+
+
+def _compare(folder: RunFolder, result: RunResult) -> None:
+    """Puts the comparison of the first and the last frame with ASE into the summary."""
+    from mdnum.references.energy import check_energy
+
+    frames = {}
+    for name, positions in zip(("initial", "last"), result.frames, strict=True):
+        frames[name] = result.simulation.system.atoms.copy()
+        frames[name].set_positions(positions)
+    compared = check_energy(result.simulation, frames)
+    summary = folder.summary
+    summary["ase"] = compared.worst
+    summary["findings"] = [*summary["findings"], *compared.findings]
+    folder.write_summary(summary)
+
+
+def _beside_float64(folder: RunFolder, result: RunResult) -> None:
+    """Puts how well a run in fixed-point numbers keeps its energy into the summary, and float64's."""
+    from mdnum.md.integrators import Langevin
+    from mdnum.rollout.engine import FAILURES, Engine
+
+    simulation, summary = result.simulation, folder.summary
+    if simulation.lattice is None or isinstance(simulation.integrator, Langevin):
+        return
+    steps = min(int(summary["steps"]), _BESIDE)
+    float64 = []
+    for segment in Engine(simulation.smooth, steps).segments():
+        if segment.closes in FAILURES:
+            return
+        float64.append(segment.rows_of("potential") + segment.rows_of("kinetic"))
+    ours = np.asarray(folder.read("series")["total"])[: steps + 1]
+    for key, energy in (("energy_std", ours), ("energy_std_float64", np.concatenate(float64))):
+        summary["lattice"][key] = float(np.std(energy)) / simulation.atoms
+    summary["lattice"]["energy_steps"] = steps
+    folder.write_summary(summary)
+
+
+# -- what is wrong with a run, or should be known about it -------------------------------------------
+
+
+def judge(view: View) -> Verdict:
+    """Findings in the order in which they are read: the worst causes first."""
+    run: Record = view.extra
+    found = [
+        *_status(view, run), *_lists(view, run), *_ledger(view, run), *_energy(view, run), *_ase(view),
+        *_decisions(view, run), *_drift(view, run), *_cutoff(view, run),
+    ]  # fmt: skip
+    found += view.kept(TEXTS.entries)
+    severities = {finding.severity for finding in found}
+    complete = view.summary.get("status") == "complete"
+    failed = view.summary.get("status") == "failed"
+    name = (
+        "failed" if failed
+        else "errors" if "error" in severities
+        else "partial" if not complete
+        else "complete" if "warning" in severities
+        else "notes" if severities
+        else "clean"
+    )  # fmt: skip
+    return conclude(found, _evidence(view, run), headline=TEXTS(name), best="good")
+
+
+def _status(view: View, run: Record) -> Iterator[Finding]:
+    status = view.summary.get("status")
+    planned = view.summary.get("steps_asked") or (view.system.get("dynamics") or {}).get("steps")
+    of = f" of {planned:,}" if planned and planned > run.steps else ""
+    if status == "failed":
+        error = view.summary.get("error") or "It stopped at the first number that was not finite."
+        yield TEXTS.finding("RUN_FAILED", step=run.step(-1), of=of, error=str(error))
+    elif status != "complete":
+        yield TEXTS.finding("NOT_FINISHED", steps=run.steps, of=of)
+
+
+def _lists(view: View, run: Record) -> Iterator[Finding]:
+    lost, dangerous = run.total("lost_pairs"), run.total("dangerous_builds", "dangerous")
+    section = "List health"
+    if lost:
+        firsts = run.epochs["first_lost_step"]
+        since = int(firsts[firsts >= 0].min()) if np.any(firsts >= 0) else None
+        rebuild = (view.system.get("neighbors") or {}).get("rebuild") or {}
+        variants = ["since"] * (since is not None) + ["blind"] * (rebuild.get("check") is False)
+        yield TEXTS.finding(
+            "LOST_PAIRS", *variants, section=section, lost=lost, pair_steps=run.total("lost_pair_steps"),
+            since=since, every=rebuild.get("every", 1),
+        )  # fmt: skip
+    # a list that is known to have lost pairs disagrees with the next one for that reason
+    elif mismatches := view.summary.get("count_mismatches"):
+        yield TEXTS.finding("LISTS_DISAGREE", section=section, mismatches=mismatches)
+    if dangerous:
+        overdrawn = float(np.max(-run.epochs["margin"][run.epochs["dangerous"]], initial=0.0))
+        yield TEXTS.finding(
+            "DANGEROUS_BUILDS", "lost" if lost else "sound", section=section, dangerous=dangerous,
+            lists=len(run.epochs["epoch"]), overdrawn=overdrawn, unit=view.units.length,
+        )  # fmt: skip
+
+
+def _ledger(view: View, run: Record) -> Iterator[Finding]:
+    lost = ["lost"] * bool(run.total("lost_pairs"))
+    wrong = np.flatnonzero(~analysis.algebra_holds(run.series))
+    if len(wrong):
+        yield TEXTS.finding("EVENT_ALGEBRA", *lost, step=run.step(wrong[0]), steps=len(wrong))
+    counted = int(run.series["entered"].sum(dtype=np.int64) + run.series["left"].sum(dtype=np.int64))
+    wrong = np.flatnonzero(~run.flips.matches(run.series))
+    values = {"counted": counted, "listed": run.flips.total, "section": "Flips"}
+    if counted != run.flips.total:
+        yield TEXTS.finding("LEDGER_INCOMPLETE", **values)
+    elif len(wrong):
+        values |= {"steps": len(wrong), "step": run.step(wrong[0])}
+        yield TEXTS.finding("LEDGER_INCOMPLETE", "steps", **values)
+    elif not run.flips.alternates:
+        yield TEXTS.finding("LEDGER_INCOMPLETE", *lost, "twice", **values)
+
+
+def _energy(view: View, run: Record) -> Iterator[Finding]:
+    if view.summary.get("energy_budget_closes") is not False:
+        return
+    moves = np.abs(np.diff(run.budget["residual"]))
+    variants = ["lost"] * bool(run.total("lost_pairs")) + ["jump"] * bool(run.jump and len(moves))
+    worst = int(np.argmax(moves)) if len(moves) else 0
+    yield TEXTS.finding(
+        "BUDGET_OPEN", *variants, section="Energy and its budget", residual=residual(view, run),
+        unit=view.units.energy, tolerance=view.summary.get("energy_budget_tolerance"), jump=abs(run.jump),
+        largest=float(moves[worst]) if len(moves) else None, step=run.step(worst + 1) if len(moves) else None,
+    )  # fmt: skip
+
+
+def _ase(view: View) -> Iterator[Finding]:
+    ase, section = view.summary.get("ase") or {}, "Agreement with ASE"
+    if ase.get("ok") is False:
+        yield TEXTS.finding(
+            "ASE_DISAGREES", section=section, energy=ase.get("energy_rel"), force=ase.get("force_max"),
+            scale=ase.get("force_scale"), unit=f"{view.units.energy}/{view.units.length}",
+        )  # fmt: skip
+    elif ase.get("ok") is None:
+        note = ase.get("note")
+        yield TEXTS.finding("ASE_NOT_COMPARED", *["note"] * bool(note), note=str(note))
+
+
+def _decisions(view: View, run: Record) -> Iterator[Finding]:
+    margin = abs(float(run.series["min_margin"][0]))
+    if not margin or run.series["ambiguous"][0]:
+        yield TEXTS.finding("TIE_AT_CUTOFF", margin=margin)
+    ambiguous = view.summary.get("ambiguous") or int(run.series["ambiguous"].sum(dtype=np.int64))
+    if ambiguous:
+        yield TEXTS.finding(
+            "AMBIGUOUS_DECISIONS", section="Margins in units of rounding", ambiguous=ambiguous,
+            expected=run.expected_ambiguous,
+        )  # fmt: skip
+    undone = run.flips.stays.undone_within(CHATTER_STEPS)
+    # a handful of flips says nothing about the cutoff
+    if run.flips.total >= 20 and undone >= CHATTER_SHARE * run.flips.total:
+        busiest = run.flips.busiest
+        smooth = not run.jump and not run.cutoff.get("force_jump")
+        yield TEXTS.finding(
+            "CHATTER", *["smooth"] * smooth, section="Chatter and residence", undone=undone,
+            flips=run.flips.total, share=undone / run.flips.total, within=CHATTER_STEPS,
+            pair=f"{busiest.i[0]}–{busiest.j[0]}", times=int(busiest.flips[0]),
+        )  # fmt: skip
+
+
+def _drift(view: View, run: Record) -> Iterator[Finding]:
+    atoms, units = view.summary.get("atoms"), view.units
+    thermal = units.k_B * float(np.mean(run.series["temperature"]))
+    if not atoms or not thermal > 0:
+        return
+    time, left = run.series["time"], run.budget["residual"]
+    # jumps do not count: what they add follows the number of pairs, up and down
+    drift = view.summary.get("energy_drift_without_jumps")
+    if drift is None and np.isfinite(left).all():
+        from mdnum.rollout.summary import Line
+
+        fitted = Line()
+        fitted.add(time, left)
+        drift = None if fitted.slope is None else fitted.slope / atoms
+    if drift is not None and run.steps > 1 and np.isfinite(left).all():
+        span = float(time[-1] - time[0])
+        moved = abs(float(drift)) * span
+        if moved >= DRIFT_SHARE * thermal:
+            yield TEXTS.finding(
+                "DRIFT", *["jump"] * bool(run.cutoff.get("force_jump")), section="Energy and its budget",
+                drift=float(drift), moved=moved, share=moved / thermal, time=span, energy=units.energy,
+                time_unit=units.time,
+            )  # fmt: skip
+    if run.jump and run.conservative:
+        moves = np.cumsum(run.series["energy_jump"], dtype=np.float64)
+        low, high = min(float(moves.min()), 0.0), max(float(moves.max()), 0.0)
+        share = (high - low) / (atoms * thermal)
+        if share >= DRIFT_SHARE:
+            yield TEXTS.finding(
+                "WANDER", section="Energy and its budget", low=low, high=high, share=share, unit=units.energy
+            )
+
+
+def _cutoff(view: View, run: Record) -> Iterator[Finding]:
+    kind, force = run.cutoff.get("kind"), float(run.cutoff.get("force_jump") or 0.0)
+    values = {"kind": kind, "force": abs(force), "energy": view.units.energy, "length": view.units.length}
+    if kind and run.jump:
+        yield TEXTS.finding("HARD_CUTOFF", jump=run.jump, **values)
+    elif kind and force:
+        yield TEXTS.finding("FORCE_JUMP", *["shifted"] * (kind == "shifted"), "gradient", **values)
+
+
+def _evidence(view: View, run: Record) -> Iterator[str]:
+    summary, units = view.summary, view.units
+    if analysis.algebra_holds(run.series).all():
+        yield TEXTS("flips_accounted", flips=run.flips.total, steps=len(run.series["step"]))
+    if len(run.epochs["epoch"]) and not run.total("lost_pairs"):
+        yield TEXTS("lists_sound", lists=len(run.epochs["epoch"]))
+    if summary.get("energy_budget_closes"):
+        yield TEXTS(
+            "budget_closes" if run.jump else "budget_closes_smooth", residual=residual(view, run),
+            unit=units.energy, checks=int(summary.get("energy_budget_checks") or 0),
+        )  # fmt: skip
+    ase = summary.get("ase") or {}
+    if ase.get("ok") and ase.get("energy_rel") is not None:
+        yield TEXTS(
+            "ase_agrees", reference=ase.get("reference") or "ASE", energy=ase["energy_rel"],
+            force=ase.get("force_max"), unit=f"{units.energy}/{units.length}",
+        )  # fmt: skip
+
+
+VERBS = {"md": Verb(judge, run_page.page, load, unfinished=True)}

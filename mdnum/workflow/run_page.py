@@ -1,0 +1,465 @@
+"""What a run folder is read into, and the sections and figures that show it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.ticker import FuncFormatter, MaxNLocator
+
+from mdnum.errors import FolderError
+from mdnum.report import analysis
+from mdnum.report.browse import Browse, Column, plain_rows
+from mdnum.report.drawing import envelope, few_ticks, legend, line
+from mdnum.report.finding import Texts, Verdict
+from mdnum.report.page import in_words
+from mdnum.report.section import Figure, Key, Page, Plot, Section, Series, Table, pairs
+from mdnum.report.svg import BAD, FIRST, MUTED, SECOND, THIRD
+from mdnum.report.words import count, many, number, percent, plain
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Canvas
+
+    from mdnum.store import RunFolder
+    from mdnum.workflow.frame import View
+
+TEXTS = Texts(Path(__file__).with_name("run.py"))
+
+#: A flip that is undone within as many steps is chatter.
+CHATTER_STEPS = 10
+#: Rows of the flip table that the page carries: those nearest to their threshold.
+TABLE_ROWS = 5_000
+_BUSIEST = 10
+_COLUMNS = ("step", "i", "j", "entered", "distance", "margin", "radial_speed", "energy_jump", "bound")
+
+
+@dataclass(frozen=True)
+class Record:
+    """A run folder's tables on the host.
+
+    Attributes:
+        summary, system: as written.
+        series, epochs: arrays by column name.
+        flips: what the table of flips says, which may be larger than memory.
+    """
+
+    summary: Mapping[str, Any]
+    system: Mapping[str, Any]
+    series: Mapping[str, np.ndarray]
+    epochs: Mapping[str, np.ndarray]
+    flips: analysis.Scan
+
+    @property
+    def steps(self) -> int:
+        """Steps made."""
+        return max(0, len(self.series["step"]) - 1)
+
+    @property
+    def cutoff(self) -> Mapping[str, Any]:
+        """Kind, radius, comparison, jumps; empty where there is none."""
+        return self.summary.get("cutoff") or {}
+
+    @property
+    def jump(self) -> float:
+        """Energy of a pair at the cutoff, 0 where it ends at zero."""
+        return float(self.cutoff.get("energy_jump") or 0.0)
+
+    @property
+    def conservative(self) -> bool:
+        """Whether the total energy should stay what it was."""
+        return (self.system.get("dynamics") or {}).get("kind", "nve") == "nve"
+
+    @cached_property
+    def expected_ambiguous(self) -> float:
+        """Flips that one expects within their rounding bound."""
+        return analysis.expected_ambiguous(self.flips.ratios)
+
+    @cached_property
+    def budget(self) -> dict[str, np.ndarray]:
+        """Energy against time: its change, the ledger's jumps summed, and what is left between the two."""
+        conserved = self.series["conserved"]
+        change = conserved - conserved[0] if len(conserved) else conserved
+        jumps = np.cumsum(self.series["energy_jump"])
+        return {"change": change, "jumps": jumps, "residual": change - jumps}
+
+    def total(self, key: str, column: str | None = None) -> int:
+        """A count from the summary, or from the epochs where a killed run has no summary."""
+        return int(self.summary.get(key) or self.epochs[column or key].sum())
+
+    def step(self, row: int | np.integer) -> int:
+        """The step of a row of the series."""
+        return int(self.series["step"][row])
+
+
+def load(folder: RunFolder) -> Record:
+    """Reads a run folder, finished or not.
+
+    Raises:
+        FolderError: it holds no step of a run.
+    """
+    series = folder.read("series")
+    if not len(series["step"]):
+        raise FolderError("holds no step of a run", remedy=folder.again, where=str(folder.path))
+    flips = analysis.Scan(len(series["step"]), TABLE_ROWS)
+    for batch in folder.batches("flips", _COLUMNS):
+        flips.take({name: batch[name].to_numpy() for name in _COLUMNS})
+    if not flips.nearest:
+        flips.take(folder.read("flips", _COLUMNS, rows=1))
+    return Record(folder.summary, folder.system, series, folder.read("epochs"), flips)
+
+
+def residual(view: View, run: Record) -> float:
+    """How far the budget is from closing, as the run stated it or else |E(t) - E(0) - sum of jumps|."""
+    stated = view.summary.get("energy_budget_residual")
+    return float(np.max(np.abs(run.budget["residual"]))) if stated is None else abs(float(stated))
+
+
+def page(view: View, verdict: Verdict) -> Page:
+    """The page of a run."""
+    run: Record = view.extra
+    atoms, cutoff, units = view.summary.get("atoms"), run.cutoff, view.units
+    about = [many(atoms, "atom")] if atoms else []
+    about.append(many(run.steps, "step"))
+    if cutoff.get("kind"):
+        radius = cutoff.get("radius")
+        at = f" at {plain(radius, 6)} {units.length}" if isinstance(radius, int | float) else ""
+        about.append(f"{cutoff['kind']} cutoff{at}")
+    sections = [
+        Section("What was run", [pairs(list(_what(view, run)))]),
+        Section("Energy and its budget", list(_energy(view, run))),
+        Section("Flips per step", list(_flips_per_step(view, run))),
+        Section("Margins in units of rounding", list(_margins(run))),
+        Section("Chatter and residence", list(_chatter(run))),
+        Section("List health", list(_lists(run))),
+        Section("Flips", list(_nearest(view, run))),
+        Section("Agreement with ASE", list(_ase(view))),
+    ]
+    return Page(
+        view.name, ", ".join(about), list(_keys(view, run)), [each for each in sections if each.parts],
+        view.system_toml, view.folder.provenance,
+    )  # fmt: skip
+
+
+def _keys(view: View, run: Record) -> Iterator[Key]:
+    summary, atoms = view.summary, view.summary.get("atoms")
+    entered, left = (int(run.series[name].sum(dtype=np.int64)) for name in ("entered", "left"))
+    rate = (
+        f", {number(run.flips.total / run.steps / atoms, 2)} per atom and step" if atoms and run.steps else ""
+    )
+    yield Key("Flips", count(entered + left), f"{count(entered)} entered, {count(left)} left{rate}")
+    dangerous = count(run.total("dangerous_builds", "dangerous"))
+    rebuilds = f"in {many(len(run.epochs['epoch']), 'list')}, {dangerous} dangerous"
+    yield Key("Lost pairs", count(int(run.epochs["lost_pairs"].sum())), rebuilds)
+    yield Key(
+        "Ambiguous", count(int(run.series["ambiguous"].sum(dtype=np.int64))), "decisions within rounding"
+    )
+    closes = summary.get("energy_budget_closes")
+    budget = "" if closes is None else "; budget closes" if closes else "; budget is open"
+    yield Key("Budget residual", number(residual(view, run), 2), view.units.energy + budget)
+    ase = summary.get("ase") or {}
+    compared = "relative energy difference" if ase.get("energy_rel") is not None else "not compared"
+    yield Key("Against ASE", number(ase.get("energy_rel"), 2), compared)
+    speed = summary.get("steps_per_second")
+    yield Key("Speed", number(speed), "steps per second" if speed else "too short a run to tell")
+
+
+def _what(view: View, run: Record) -> Iterator[tuple[str, str]]:
+    """What was run; what the system file leaves out is left out."""
+    units, system, time = view.units, view.system, run.series["time"]
+    if system.get("about"):
+        yield "System", str(system["about"])
+    span = f"{many(run.steps, 'step')}, {plain(float(time[-1] - time[0]))} {units.time}"
+    atoms = view.summary.get("atoms")
+    yield "Size", f"{many(atoms, 'atom')}, {span}" if atoms else span
+    lengths = {"radius": units.length, "onset": units.length, "skin": units.length}
+    for key, title in (("potential", "Potential"), ("cutoff", "Cutoff"), ("neighbors", "Neighbor lists")):
+        if table := system.get(key):
+            yield title, in_words(table, lengths)
+    if run.cutoff.get("energy_jump") is not None:
+        energy, force = (number(run.cutoff.get(key)) for key in ("energy_jump", "force_jump"))
+        yield (
+            "At the cutoff",
+            f"energy jump {energy} {units.energy}, force jump {force} {units.energy}/{units.length}",
+        )
+    if dynamics := system.get("dynamics"):
+        # how many steps were made is said above; the file says how many were planned
+        made = {key: value for key, value in dynamics.items() if key != "steps"}
+        yield "Dynamics", in_words(made, {"timestep": units.time, "temperature": units.temperature})
+    mean = float(np.mean(run.series["temperature"]))
+    yield "Temperature", f"{number(mean, 4)} {units.temperature} (mean over the run)"
+    if precision := system.get("precision"):
+        yield "Precision", in_words(precision)
+
+
+def _energy(view: View, run: Record) -> Iterator[Any]:
+    budget, units, summary = run.budget, view.units, view.summary
+    smooth = not np.any(run.series["energy_jump"])
+
+    def draw(figure: Canvas) -> None:
+        above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+        time = run.series["time"]
+        if smooth:
+            line(above, time, budget["change"], FIRST, "E(t) − E(0)")
+        else:
+            # one upon the other where the budget closes: a broad pale line, and a thin one that runs in it
+            line(above, time, budget["change"], FIRST, "E(t) − E(0)", lw=4, alpha=0.4)
+            line(above, time, budget["jumps"], SECOND, "sum of the ledger’s jumps", lw=0.9)
+        below.axhline(0, color=MUTED, lw=0.6)
+        line(below, time, budget["residual"], THIRD)
+        above.set_ylabel(f"energy ({units.energy})")
+        below.set_ylabel(f"difference ({units.energy})")
+        below.set_xlabel(f"time ({units.time})")
+        few_ticks(below, 4)
+        legend(above)
+
+    change, left = budget["change"], budget["residual"]
+    alt = (
+        f"Change of the energy against time: {number(float(change.min()))} to {number(float(change.max()))} "
+        f"{units.energy}; what no flip explains: {number(float(left.min()))} to {number(float(left.max()))}."
+    )
+    caption = TEXTS("energy_caption_smooth" if smooth else "energy_caption")
+    if not run.conservative:
+        caption += " " + TEXTS("thermostat")
+    yield Figure("energy", caption, alt, draw, 3.7)
+    if run.jump and run.steps:
+        moves = float(np.max(np.abs(np.diff(left))))
+        yield TEXTS("one_flip", jump=abs(run.jump), unit=units.energy, moves=moves)
+        if checks := summary.get("energy_budget_checks"):
+            yield TEXTS("checked_smooth", checks=checks, residual=residual(view, run), unit=units.energy)
+    if summary.get("energy_drift") is not None:
+        yield TEXTS(
+            "drift", drift=summary["energy_drift"], without=summary.get("energy_drift_without_jumps"),
+            unit=units.energy, time_unit=units.time,
+        )  # fmt: skip
+    if state := summary.get("lattice"):
+        yield TEXTS("lattice", **state, length_unit=units.length, energy_unit=units.energy)
+        if state.get("energy_std_float64") is not None:
+            yield TEXTS(
+                "lattice_energy", steps=state["energy_steps"], ours=state["energy_std"], unit=units.energy,
+                float64=state["energy_std_float64"],
+            )  # fmt: skip
+
+
+def _flips_per_step(view: View, run: Record) -> Iterator[Any]:
+    series = run.series
+
+    def draw(figure: Canvas) -> None:
+        above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+        # no decision came before the first step, so it has no flips
+        time = series["time"][1:]
+        for name, color, sign in (("entered", FIRST, 1), ("left", SECOND, -1)):
+            if len(time):
+                low, middle, high, at = envelope(time, series[name][1:].astype(float), 240)
+                above.fill_between(at, sign * low, sign * high, color=color, alpha=0.3, lw=0, step="mid")
+                above.step(at, sign * middle, color=color, lw=1.1, where="mid", label=name)
+        above.axhline(0, color=MUTED, lw=0.6)
+        above.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{abs(value):g}"))
+        above.yaxis.set_major_locator(MaxNLocator(5, integer=True))
+        line(below, series["time"], series["pairs"].astype(float), THIRD)
+        below.yaxis.set_major_locator(MaxNLocator(4, integer=True))
+        below.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
+        above.set_ylabel("flips per step")
+        below.set_ylabel("pairs inside")
+        below.set_xlabel(f"time ({view.units.time})")
+        legend(above)
+
+    most = max(int(series[name].max(initial=0)) for name in ("entered", "left"))
+    inside = f"{count(int(series['pairs'].min()))} to {count(int(series['pairs'].max()))}"
+    alt = f"Flips per step against time: at most {count(most)} one way in a step; pairs inside: {inside}."
+    yield Figure("flips", TEXTS("flips_caption"), alt, draw, 3.5)
+    pairs_flipped = len(run.flips.busiest.i)
+    if run.flips.total and run.steps:
+        yield TEXTS("flip_rate", rate=run.flips.total / run.steps, pairs=pairs_flipped)
+    else:
+        yield TEXTS("no_flips")
+
+
+def _margins(run: Record) -> Iterator[Any]:
+    ratio = run.flips.ratios
+    ratio = ratio[np.isfinite(ratio)]
+    # without a bound (whole numbers are compared) there is no unit to measure margins in
+    if not len(ratio):
+        return
+    top = np.ceil(np.log10(max(ratio.max(initial=10.0), 10.0)))
+    edges = np.arange(-1, top + 0.25, 0.25)
+    counts, _ = np.histogram(np.log10(np.maximum(ratio, 0.1001)), edges)
+    expected = run.expected_ambiguous
+
+    def draw(figure: Canvas) -> None:
+        axes = figure.subplots()
+        axes.stairs(counts, 10.0**edges, color=FIRST, fill=True, alpha=0.35)
+        axes.stairs(counts, 10.0**edges, color=FIRST, lw=1.1, label="flips")
+        # a density that is even near zero puts counts in proportion to the width of a bin
+        even = expected * np.diff(10.0**edges)
+        shown = (even >= 0.5) & (even <= 2 * counts.max())
+        centers = 10.0 ** ((edges[1:] + edges[:-1]) / 2)
+        axes.plot(centers[shown], even[shown], color=MUTED, lw=1.1, ls="--", label="spread evenly")
+        axes.axvspan(0.1, 1, color=BAD, alpha=0.16, lw=0, label="ambiguous")
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        axes.set_xlim(0.1, 10.0**top)
+        axes.set_ylim(0.5, 3 * max(counts.max(initial=1), 1))
+        axes.set_ylabel("flips per quarter decade")
+        axes.set_xlabel("|margin| / rounding bound")
+        legend(axes)
+
+    closest, median = float(ratio.min()), float(np.median(ratio))
+    alt = (
+        f"Histogram of the margins of {many(len(ratio), 'flip')} in units of their rounding bound: closest "
+        f"at {number(closest)}, the median {number(median)}."
+    )
+    yield Figure("margins", TEXTS("margins_caption"), alt, draw, 2.9)
+    yield TEXTS("margins", closest=closest, median=median, expected=expected)
+
+
+def _chatter(run: Record) -> Iterator[Any]:
+    busiest, stays = run.flips.busiest, run.flips.stays
+    if not len(busiest.i):
+        return
+    if stays.total > 1:
+        steps = np.arange(len(stays.inside))
+        sides = (("inside", stays.inside, "first"), ("outside", stays.outside, "second"))
+        longest = max(10, *(np.flatnonzero(lengths).max(initial=0) for _, lengths, _ in sides))
+        edges = np.unique(np.round(np.geomspace(1, longest + 1, 36)))
+        series = []
+        for name, lengths, role in sides:
+            # per step of width: bins of a few steps would otherwise look fuller than they are
+            values = np.histogram(steps, edges, weights=lengths)[0] / np.diff(edges)
+            values = np.where(values > 0, values, np.nan)
+            series.append(Series(f"stays {name}", edges, np.append(values, values[-1]), "steps", role))  # type: ignore[arg-type]
+        yield Plot(
+            "residence", "Steps between two flips of a pair", "steps between two flips of a pair",
+            "stays per step of length", tuple(series), x_scale="log", y_scale="log",
+            caption=TEXTS("residence_caption"),
+        )  # fmt: skip
+    undone = stays.undone_within(CHATTER_STEPS)
+    yield TEXTS(
+        "chatter", undone=undone, share=undone / run.flips.total, within=CHATTER_STEPS,
+        inside=analysis.median(stays.inside), outside=analysis.median(stays.outside),
+    )  # fmt: skip
+    rows = [
+        (f"{i}–{j}", int(flips), run.steps / int(flips))
+        for i, j, flips in zip(
+            busiest.i[:_BUSIEST], busiest.j[:_BUSIEST], busiest.flips[:_BUSIEST], strict=True
+        )
+    ]
+    yield Table(("pair", "flips", "one in … steps"), rows, "Pairs that flip most")
+
+
+def _lists(run: Record) -> Iterator[Any]:
+    epochs = run.epochs
+    if not len(epochs["epoch"]):
+        return
+    step = epochs["start"].astype(float)
+    # of no skin nothing can be used up
+    skin = np.where(np.isfinite(epochs["skin_consumed"]), epochs["skin_consumed"], np.nan).astype(float)
+    length = epochs["length"].astype(float)
+    bad = epochs["dangerous"].astype(bool) | (epochs["lost_pairs"] > 0)
+
+    def draw(figure: Canvas) -> None:
+        above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+        above.axhline(1, color=BAD, lw=0.9, ls=(0, (4, 3)), zorder=1.5, label="skin used up")
+        for axes, values in ((above, skin), (below, length)):
+            if len(values) > 600:
+                line(axes, step, values, FIRST)
+            else:
+                axes.plot(step, values, "o", color=FIRST, ms=2.6, mew=0)
+            worst = np.flatnonzero(bad)
+            worst = worst[np.argsort(-values[worst])][:600]
+            label = "dangerous, or pairs lost" if len(worst) else ""
+            axes.plot(step[worst], values[worst], "o", color=BAD, ms=3.5, mew=0, label=label or None)
+        above.set_ylim(0, max(1.18, 1.08 * float(np.nanmax(skin, initial=0))))
+        below.set_ylim(0, 1.15 * float(np.max(length, initial=1)))
+        below.yaxis.set_major_locator(MaxNLocator(4, integer=True))
+        above.set_ylabel("skin consumed")
+        below.set_ylabel("steps per list")
+        below.set_xlabel("step at which the list was built")
+        legend(above)
+
+    # the last list was cut off by the end of the run: its length says nothing
+    whole = epochs["reason"] != "end"
+    lengths = epochs["length"][whole] if whole.any() else epochs["length"]
+    reasons, counts = np.unique(epochs["reason"].astype(str), return_counts=True)
+    skinned = bool(np.isfinite(skin).all())
+    consumed = f"{percent(float(np.median(skin)))} (median), {percent(float(np.max(skin)))} at most"
+    alt = f"Skin consumed by {many(len(skin), 'neighbor list')}: {consumed if skinned else 'there is none'}."
+    yield Figure("lists", TEXTS("lists_caption"), alt, draw, 3.3)
+    ended = ", ".join(f"{reason} {count(int(n))}" for reason, n in zip(reasons, counts, strict=True))
+    span = f"{count(int(lengths.min()))} to {count(int(lengths.max()))}"
+    grown = len(np.unique(epochs["capacity"])) - 1
+    used = float(np.max(epochs["occupancy"] / np.maximum(epochs["capacity"], 1)))
+    yield pairs([
+        ("Lists", f"{count(len(skin))} ({ended})"),
+        ("Steps per list", f"{plain(float(np.median(lengths)))} (median), {span}"),
+        ("Skin consumed", consumed if skinned else "there is none: a list serves one step"),
+        ("Dangerous builds", int(epochs["dangerous"].sum())),
+        ("Lost pairs", f"{count(int(epochs['lost_pairs'].sum()))}, by a count at every rebuild"),
+        ("Lost pair-steps", int(epochs["lost_pair_steps"].sum())),
+        ("Pairs listed", f"{plain(float(np.mean(epochs['pairs_listed'])))} (mean)"),
+        ("Capacity", f"{percent(used)} used at most, grown {many(grown, 'time')}"),
+        ("Build", f"{number(float(np.median(epochs['build_ms'])))} ms (median)"),
+    ])  # fmt: skip
+
+
+def _nearest(view: View, run: Record) -> Iterator[Any]:
+    """The flips nearest to the threshold, in the order of steps."""
+    flips, units = run.flips.nearest, view.units
+    if not len(flips["step"]):
+        yield TEXTS("no_flips")
+        return
+    compare = str(run.cutoff.get("compare", "r2 <"))
+    columns: list[tuple[np.ndarray, int | None]] = [(flips[name], None) for name in ("step", "i", "j")]
+    columns.append((flips["entered"].astype(int), None))
+    for name, digits in (
+        ("distance", 9),
+        ("margin", 4),
+        ("radial_speed", 4),
+        ("energy_jump", 4),
+        ("ratio", 3),
+    ):
+        columns.append((flips[name], digits))
+    rows = plain_rows(columns)
+    yield TEXTS("nearest", shown=len(rows), flips=run.flips.total, compare=compare)
+    yield Browse(
+        name="flips",
+        row_id="flip-rows",
+        label="Search flips",
+        placeholder="atom 17, pair 17-203, step:100..200, entered, ambiguous",
+        columns=(
+            Column(0, "step", kind="count"),
+            Column(1, "pair", kind="pair"),
+            Column(3, "decision", kind="word", words=("left", "entered"), colors=("out", "in")),
+            Column(4, "distance", units.length, kind="fixed", digits=6),
+            Column(5, "margin", compare),
+            Column(6, "radial speed", f"{units.length}/{units.time}"),
+            Column(7, "energy jump", units.energy),
+            Column(8, "margin", "÷ bound", digits=2, missing="∞"),
+        ),
+        rows=rows,
+        words={"entered": (3, 1), "in": (3, 1), "left": (3, 0), "out": (3, 0)},
+        ranges={"step": 0},
+        subjects=(1, 2),
+        nouns=("atom", "pair"),
+        ambiguous=8,
+    )
+
+
+def _ase(view: View) -> Iterator[Any]:
+    ase, units = view.summary.get("ase") or {}, view.units
+    if ase.get("energy_rel") is None:
+        yield TEXTS("not_compared")
+        return
+    if ase.get("reference"):
+        yield TEXTS("compared", reference=ase["reference"])
+    rows = [("energy", ase["energy_rel"], "relative")]
+    if ase.get("force_max") is not None:
+        scale = ase.get("force_scale")
+        share = f"; {number(ase['force_max'] / scale, 2)} of the force scale" if scale else ""
+        rows.append(("forces", ase["force_max"], f"{units.energy}/{units.length}, largest component{share}"))
+    if ase.get("stress_max") is not None:
+        rows.append(("stress", ase["stress_max"], f"{units.energy}/{units.length}³, largest component"))
+    yield Table(("quantity", "difference", ""), rows)
