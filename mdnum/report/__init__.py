@@ -24,8 +24,6 @@ _MODULES = {
     "audit": ("mdnum.report.audit.html", "mdnum.report.audit.html"),
     "grad": ("mdnum.report.grad.html", "mdnum.report.grad.html"),
     "conform": ("mdnum.report.conform.html", "mdnum.report.conform.html"),
-    "flips": ("mdnum.report.flips.html", "mdnum.report.flips.html"),
-    "flips-compare": ("mdnum.report.flips.compare", "mdnum.report.flips.compare"),
 }
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from mdnum.workflow.audit import AuditResult, audit
 from mdnum.workflow.ball import BallResult, bounce
 from mdnum.workflow.conform import ConformResult, conform
-from mdnum.workflow.flips import FlipsResult, flips
+from mdnum.workflow.flips import flips
 from mdnum.workflow.fork import ForkResult, fork
 from mdnum.workflow.fork_certify import CertifyResult, fork_certify
 from mdnum.workflow.fork_forecast import ForecastResult, fork_forecast
@@ -20,7 +20,6 @@ __all__ = [
     "BallResult",
     "CertifyResult",
     "ConformResult",
-    "FlipsResult",
     "ForecastResult",
     "ForkResult",
     "GradResult",
