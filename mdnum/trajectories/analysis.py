@@ -80,16 +80,13 @@ class _Part:
     Attributes:
         flips: of its frames that have any, frames counted from the first that it examined.
         rows: (pairs, near, smallest margin) of each frame of its own.
-        before: the pairs inside at the frame before its first; None for the first part.
-        initial: the pairs inside at its first frame, kept by the first part alone.
-        last: the pairs inside at its last frame; None where it has none.
     """
 
     flips: list[Flips] = field(default_factory=list)
     rows: list[tuple[int, int, float]] = field(default_factory=list)
-    before: Members | None = None
-    initial: Members | None = None
-    last: Members | None = None
+    before: Members | None = None  # the pairs inside at the frame before its first; None for the first part
+    initial: Members | None = None  # the pairs inside at its first frame, kept by the first part alone
+    last: Members | None = None  # the pairs inside at its last frame; None where it has none
 
 
 @dataclass(frozen=True)
@@ -237,12 +234,7 @@ class NeighborFlips(AnalysisBase):
         return super()._configure_backend(backend, *args, **kwargs)
 
     def _setup_computation_groups(
-        self,
-        n_parts: int,
-        start: Any = None,
-        stop: Any = None,
-        step: Any = None,
-        frames: Any = None,
+        self, n_parts: int, start: Any = None, stop: Any = None, step: Any = None, frames: Any = None
     ) -> list[np.ndarray]:
         """MDAnalysis's, and what all parts must agree on: done once, before frames are spread."""
         groups = super()._setup_computation_groups(n_parts, start, stop, step, frames)

@@ -29,30 +29,21 @@ class Sides(NamedTuple):
     """Who is asked for neighbors, and who can be one.
 
     Attributes:
-        centers: atoms whose neighbors are wanted.
         others: atoms that can be one; the same array as centers where all are on both sides.
-        species: number of each atom's species.
     """
 
-    centers: Bool[np.ndarray, "atoms"]
+    centers: Bool[np.ndarray, "atoms"]  # atoms whose neighbors are wanted
     others: Bool[np.ndarray, "atoms"]
-    species: Int[np.ndarray, "atoms"]
+    species: Int[np.ndarray, "atoms"]  # number of each atom's species
 
 
 class Limits(NamedTuple):
-    """Squared distances that a search distinguishes, by species.
+    """Squared distances that a search distinguishes, by species."""
 
-    Attributes:
-        kind: `INSIDE`, `BAND` or `DIRECTED`.
-        low: pairs nearer than this are inside for certain.
-        high: pairs further than this are not looked for.
-        largest: of high.
-    """
-
-    kind: int
-    low: Float[np.ndarray, "species species"]
-    high: Float[np.ndarray, "species species"]
-    largest: float
+    kind: int  # `INSIDE`, `BAND` or `DIRECTED`
+    low: Float[np.ndarray, "species species"]  # pairs nearer than this are inside for certain
+    high: Float[np.ndarray, "species species"]  # pairs further than this are not looked for
+    largest: float  # of high
 
     @classmethod
     def of(cls, radii: Float[np.ndarray, "species species"], kind: int, band: float) -> Limits:
@@ -66,13 +57,12 @@ class Candidates(NamedTuple):
     """Pairs as a search records them; what does not fit is counted only.
 
     Attributes:
-        i, j: pairs that are inside for certain.
         i_open, j_open, code, value: pairs that are not: with the code of j's lattice vector, and the square
             of their distance by wrapped coordinates.
         counts: of the first and of the second; a third number is free for whoever decides on them.
     """
 
-    i: Int[np.ndarray, "room"]
+    i: Int[np.ndarray, "room"]  # pairs that are inside for certain
     j: Int[np.ndarray, "room"]
     i_open: Int[np.ndarray, "open"]
     j_open: Int[np.ndarray, "open"]
@@ -91,32 +81,23 @@ class Binned(NamedTuple):
     """Atoms of one frame in bins: all that the loop of a search needs.
 
     Attributes:
-        lattice, species: of the frame.
-        bins, reach: number along each axis, and how many bins away a pair can be.
-        half: pairs of one set, each met once from one of its atoms.
-        both: atoms on both sides.
-        wrapped: positions in the box, length.
-        home: lattice vectors that wrapping took off each atom.
-        start, order: atoms that can be a neighbor, by bin.
         center_start, center_order: atoms that are asked, by bin; the same arrays where all are on both sides.
-        sorted_x: wrapped positions in the order of `order`.
-        atoms, runs: most atoms, and most runs of bins, around a bin.
     """
 
-    lattice: Lattice
+    lattice: Lattice  # of the frame
     species: Int[np.ndarray, "atoms"]
-    bins: Int[np.ndarray, "3"]
+    bins: Int[np.ndarray, "3"]  # number along each axis, and how many bins away a pair can be
     reach: Int[np.ndarray, "3"]
-    half: bool
-    both: Bool[np.ndarray, "atoms"]
-    wrapped: Float[np.ndarray, "atoms 3"]
-    home: Int[np.ndarray, "atoms 3"]
-    start: Int[np.ndarray, "edges"]
+    half: bool  # pairs of one set, each met once from one of its atoms
+    both: Bool[np.ndarray, "atoms"]  # atoms on both sides
+    wrapped: Float[np.ndarray, "atoms 3"]  # positions in the box, length
+    home: Int[np.ndarray, "atoms 3"]  # lattice vectors that wrapping took off each atom
+    start: Int[np.ndarray, "edges"]  # atoms that can be a neighbor, by bin
     order: Int[np.ndarray, "others"]
     center_start: Int[np.ndarray, "edges"]
     center_order: Int[np.ndarray, "centers"]
-    sorted_x: Float[np.ndarray, "3 others"]
-    atoms: int
+    sorted_x: Float[np.ndarray, "3 others"]  # wrapped positions in the order of `order`
+    atoms: int  # most atoms, and most runs of bins, around a bin
     runs: int
 
     def batches(self) -> list[tuple[int, int]]:

@@ -185,20 +185,14 @@ def growth(
 
 @dataclass
 class Side:
-    """One of the two trajectories.
-
-    Attributes:
-        distance_bound: how far a distance can be off at the last frame, length.
-        box_bound: the part of it that comes from the box, for a pair through one period.
-        bound: how far a margin can be off.
-    """
+    """One of the two trajectories."""
 
     trajectory: Trajectory
     tracker: Tracker
     resolution: Resolution
-    distance_bound: float = 0.0
-    box_bound: float = 0.0
-    bound: float = 0.0
+    distance_bound: float = 0.0  # how far a distance can be off at the last frame, length
+    box_bound: float = 0.0  # the part of it that comes from the box, for a pair through one period
+    bound: float = 0.0  # how far a margin can be off
 
     def step(self, frame: Frame) -> Flips:
         """The flips of the next frame."""
@@ -265,22 +259,15 @@ _SAME_TIME = 1e-6
 
 @dataclass
 class NeighborSets:
-    """The neighbor sets of one rule in the two trajectories.
-
-    Attributes:
-        first: what was seen at the first frame whose sets differ.
-        certain: first frame at which a pair differs that no resolution could have moved.
-        first_pairs: some of the pairs that differ there.
-        rows: pairs written to the table of those that come to differ.
-    """
+    """The neighbor sets of one rule in the two trajectories."""
 
     rule: Rule
     sides: list[Side]
     difference: Difference = field(default_factory=Difference)
-    first: dict[str, Any] | None = None
-    certain: int | None = None
-    first_pairs: list[dict[str, Any]] = field(default_factory=list)
-    rows: int = 0
+    first: dict[str, Any] | None = None  # what was seen at the first frame whose sets differ
+    certain: int | None = None  # first frame at which a pair differs that no resolution could have moved
+    first_pairs: list[dict[str, Any]] = field(default_factory=list)  # some of the pairs that differ there
+    rows: int = 0  # pairs written to the table of those that come to differ
 
 
 @dataclass
@@ -288,16 +275,14 @@ class Compared:
     """What the frames showed.
 
     Attributes:
-        seed: first frame whose positions differ at all.
         beyond: first frame at which an atom is further apart than the resolution of the two files explains.
-        other_box: the boxes at the first frame at which they are not the same.
         last: the separation at the last frame.
     """
 
     frames: int = 0
-    seed: int | None = None
+    seed: int | None = None  # first frame whose positions differ at all
     beyond: int | None = None
-    other_box: dict[str, Any] | None = None
+    other_box: dict[str, Any] | None = None  # the boxes at the first frame at which they are not the same
     times_differ: int = 0
     last: Separation = field(default_factory=lambda: Separation(0.0, 0.0, 0))
     stopped: InputError | None = None

@@ -75,19 +75,16 @@ class Followed:
     """One rule on its way through the frames.
 
     Attributes:
-        tracker: of it.
-        neighbors: known from the first frame on.
         flux: (flips, moment) at frames whose velocities were used.
         reach: the usual distance of a pair at the threshold, length; nan where there was none.
-        ranked: whether it is mostly the order of distances that decides there, and no radius.
     """
 
     rule: Rule
-    tracker: Tracker
-    neighbors: Neighbors | None = None
+    tracker: Tracker  # of it
+    neighbors: Neighbors | None = None  # known from the first frame on
     flux: list[tuple[int, float]] = field(default_factory=list)
     reach: float = float("nan")
-    ranked: bool = False
+    ranked: bool = False  # whether it is mostly the order of distances that decides there, and no radius
 
 
 @dataclass
@@ -95,14 +92,13 @@ class Pass:
     """What came of reading a trajectory.
 
     Attributes:
-        frames: examined.
         stopped: what was wrong with the frame after the last one, if the file did not come to its end.
         moved: root mean square displacement between frames over what the velocities say; nan without.
         leaps: (number of the frame, atom, how far) of what no atom does between two frames.
     """
 
     rules: list[Followed]
-    frames: int = 0
+    frames: int = 0  # examined
     stopped: InputError | None = None
     moved: float = float("nan")
     leaps: list[tuple[int, int, float]] = field(default_factory=list)

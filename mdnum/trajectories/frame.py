@@ -218,10 +218,7 @@ def smallest_radius(rules: Sequence[Rule]) -> float:
 
 
 def far_out(
-    frame: Frame,
-    atoms: Int[np.ndarray, "chosen"] | None = None,
-    radius: float = np.inf,
-    bits: int = 64,
+    frame: Frame, atoms: Int[np.ndarray, "chosen"] | None = None, radius: float = np.inf, bits: int = 64
 ) -> tuple[int, int, str] | None:
     """The atom that is furthest out, where that is further than can be; arguments as of `checked`.
 

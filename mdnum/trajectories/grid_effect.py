@@ -32,23 +32,14 @@ _WIDE = 4.0
 
 @dataclass(frozen=True)
 class GridEffect:
-    """Flips with and without the rounding of the file, estimated.
+    """Flips with and without the rounding of the file, estimated."""
 
-    Attributes:
-        missed: share of the flips that happened between two frames and are not in the file at that frame.
-        invented: share of the flips in the file that did not happen at that frame.
-        ratio: flips in the file over flips that happened.
-        move: root mean square displacement of an atom between two frames, along an axis, length.
-        lag: frames between the two that it was read from.
-        frames: frames it was estimated from.
-    """
-
-    missed: float
-    invented: float
-    ratio: float
-    move: float
-    lag: int
-    frames: int
+    missed: float  # share of the flips that happened between two frames and are not in the file at that frame
+    invented: float  # share of the flips in the file that did not happen at that frame
+    ratio: float  # flips in the file over flips that happened
+    move: float  # root mean square displacement of an atom between two frames, along an axis, length
+    lag: int  # frames between the two that it was read from
+    frames: int  # frames it was estimated from
 
 
 def grid_effect(
@@ -225,8 +216,11 @@ def _shortest(d: Float[np.ndarray, "atoms 3"], box: Box) -> Float[np.ndarray, "a
 
 
 def _rounded(places: Places, steps: Float[np.ndarray, "3 3"]) -> Places:
+    size = np.diag(steps)
+    if np.count_nonzero(steps) == 3 and size.all():
+        return tuple(np.rint(x / size) * size for x in places)
     inverse = np.linalg.inv(steps)
-    return tuple(np.round(x @ inverse) @ steps for x in places)
+    return tuple(np.rint(x @ inverse) @ steps for x in places)
 
 
 def _inside(places: Places, radius: float) -> np.ndarray:

@@ -56,10 +56,7 @@ class History:
 
     @classmethod
     def of(
-        cls,
-        flips: Flips | Mapping[str, np.ndarray],
-        first: Members | Mapping[str, np.ndarray],
-        frames: int,
+        cls, flips: Flips | Mapping[str, np.ndarray], first: Members | Mapping[str, np.ndarray], frames: int
     ) -> History:
         """The histories behind a ledger.
 

@@ -31,17 +31,15 @@ class Lattice(NamedTuple):
 
     Attributes:
         vectors: reduced lattice vectors as rows, length; zero along directions that do not repeat.
-        periodic: which rows repeat.
         inverse: of the vectors completed by unit vectors normal to them: x @ inverse are the coordinates.
         widths: distance between opposite faces, length; inf along directions that do not repeat.
-        combination: vectors = combination @ matrix of the box.
     """
 
     vectors: Float[np.ndarray, "3 3"]
-    periodic: Bool[np.ndarray, "3"]
+    periodic: Bool[np.ndarray, "3"]  # which rows repeat
     inverse: Float[np.ndarray, "3 3"]
     widths: Float[np.ndarray, "3"]
-    combination: Int[np.ndarray, "3 3"]
+    combination: Int[np.ndarray, "3 3"]  # vectors = combination @ matrix of the box
 
     @property
     def narrowest(self) -> float:

@@ -89,22 +89,14 @@ class Flips:
 
 
 class Thresholds(NamedTuple):
-    """What distances are compared with at two frames.
+    """What distances are compared with at two frames."""
 
-    Attributes:
-        directed: whether they are those of an atom; else those of a pair of species.
-        species: of each atom that takes part.
-        radii: by species, length.
-        last_in, first_out: of each atom, now, length; see `search.Chosen`.
-        old_last_in, old_first_out: of each atom, at the frame before, length.
-    """
-
-    directed: bool
-    species: Int[np.ndarray, "atoms"]
-    radii: Float[np.ndarray, "species species"]
-    last_in: Float[np.ndarray, "limits"]
+    directed: bool  # whether they are those of an atom; else those of a pair of species
+    species: Int[np.ndarray, "atoms"]  # of each atom that takes part
+    radii: Float[np.ndarray, "species species"]  # by species, length
+    last_in: Float[np.ndarray, "limits"]  # of each atom, now, length; see `search.Chosen`
     first_out: Float[np.ndarray, "limits"]
-    old_last_in: Float[np.ndarray, "old_limits"]
+    old_last_in: Float[np.ndarray, "old_limits"]  # of each atom, at the frame before, length
     old_first_out: Float[np.ndarray, "old_limits"]
 
 

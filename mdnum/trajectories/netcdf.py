@@ -32,41 +32,25 @@ _LONGEST = 1 << 24
 
 
 class RecordVariable(NamedTuple):
-    """A variable with a value in every record.
+    """A variable with a value in every record."""
 
-    Attributes:
-        begin: of the first value in the file, bytes.
-        dtype, shape: of a value, as stored.
-        size: of a value, bytes.
-        scale: factor that values are meant to be multiplied with; None for none.
-    """
-
-    begin: int
-    dtype: np.dtype
+    begin: int  # of the first value in the file, bytes
+    dtype: np.dtype  # of a value, as stored
     shape: tuple[int, ...]
-    size: int
-    scale: float | None
+    size: int  # of a value, bytes
+    scale: float | None  # factor that values are meant to be multiplied with; None for none
 
 
 @dataclass(frozen=True)
 class NetcdfHead:
-    """What the head of a NetCDF file says.
+    """What the head of a NetCDF file says."""
 
-    Attributes:
-        records: how many there should be; None where the writer did not get to say.
-        whole: how many there are from beginning to end.
-        rest: bytes behind them.
-        record: bytes of one.
-        atoms: the dimension of that name; 0 without one.
-        variables: those with a value in every record, by name.
-    """
-
-    records: int | None
-    whole: int
-    rest: int
-    record: int
-    atoms: int
-    variables: dict[str, RecordVariable]
+    records: int | None  # how many there should be; None where the writer did not get to say
+    whole: int  # how many there are from beginning to end
+    rest: int  # bytes behind them
+    record: int  # bytes of one
+    atoms: int  # the dimension of that name; 0 without one
+    variables: dict[str, RecordVariable]  # those with a value in every record, by name
 
     @property
     def cut(self) -> bool:

@@ -92,12 +92,6 @@ class Resolution:
         arithmetic = 16 * _UNIT[64] * (largest + lattice)
         return float(2 * np.sqrt(3) * coordinate + box + arithmetic)
 
-    def typical(self, frame: Frame) -> float:
-        """Standard deviation of a distance's error: rounding errors spread evenly within a step, length."""
-        frame = _of(frame, None)
-        # two atoms, each with variance step²/12 along the line between them
-        return float(np.sqrt(2 / 12)) * self.usual_step(frame)
-
     def usual_step(self, frame: Frame) -> float:
         """Root mean square of what the last digit of a coordinate is worth, length."""
         if not len(frame.positions):

@@ -31,36 +31,25 @@ class Found(NamedTuple):
     """What a search recorded, a row per pair, in no order.
 
     Attributes:
-        kind: `INSIDE` or `DIRECTED`.
         i, j: atoms; i the center of a directed one, else either. A pair appears once for each of its images.
-        value: `DIRECTED`: squared distance.
-        open: candidates that were decided from the coordinates as stored.
-        close: pairs within the bound of their threshold.
-        smallest: smallest |margin| among the pairs that were decided so; inf without one.
     """
 
-    kind: int
+    kind: int  # `INSIDE` or `DIRECTED`
     i: Int[np.ndarray, "pairs"]
     j: Int[np.ndarray, "pairs"]
-    value: Float[np.ndarray, "valued"]
-    open: int
-    close: int
-    smallest: float
+    value: Float[np.ndarray, "valued"]  # `DIRECTED`: squared distance
+    open: int  # candidates that were decided from the coordinates as stored
+    close: int  # pairs within the bound of their threshold
+    smallest: float  # smallest |margin| among the pairs that were decided so; inf without one
 
 
 class Rows(NamedTuple):
-    """Neighbors of each atom, one after the other.
+    """Neighbors of each atom, one after the other."""
 
-    Attributes:
-        first, count: where the row of each atom begins in `other`, and its length.
-        other: neighbors, in no order; an atom appears once for each of its images.
-        square: squared distances, where the rule is directed; else empty.
-    """
-
-    first: Int[np.ndarray, "atoms"]
+    first: Int[np.ndarray, "atoms"]  # where the row of each atom begins in `other`, and its length
     count: Int[np.ndarray, "atoms"]
-    other: Int[np.ndarray, "pairs"]
-    square: Float[np.ndarray, "stored"]
+    other: Int[np.ndarray, "pairs"]  # neighbors, in no order; an atom appears once for each of its images
+    square: Float[np.ndarray, "stored"]  # squared distances, where the rule is directed; else empty
 
     def pairs(self) -> tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]]:
         """(i, j) of all rows, one row after the other."""
@@ -231,14 +220,12 @@ class Chosen(NamedTuple):
     """The neighbors of each center, nearest first.
 
     Attributes:
-        rows: the squares are those of the neighbors.
-        close, smallest: as of `Found`.
         last_in: distance under which a neighbor stays one: that of the first outside, or the radius.
         first_out: distance under which another would be one: that of the last inside, or the radius.
     """
 
-    rows: Rows
-    close: int
+    rows: Rows  # the squares are those of the neighbors
+    close: int  # as of `Found`
     smallest: float
     last_in: Float[np.ndarray, "atoms"]
     first_out: Float[np.ndarray, "atoms"]

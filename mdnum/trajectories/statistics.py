@@ -82,21 +82,13 @@ class Durations(Sums):
 
 @dataclass(frozen=True)
 class Survival:
-    """Share of contacts that last longer than so many frames, from those seen to begin.
+    """Share of contacts that last longer than so many frames, from those seen to begin."""
 
-    Attributes:
-        frames: lengths at which some ended, from 1, rising.
-        share: still inside after that many frames.
-        error: its standard error (Greenwood).
-        at_risk: contacts followed for at least that long.
-        longest: frames for which any was followed: nothing is known beyond.
-    """
-
-    frames: Int[np.ndarray, "points"]
-    share: Float[np.ndarray, "points"]
-    error: Float[np.ndarray, "points"]
-    at_risk: Int[np.ndarray, "points"]
-    longest: int
+    frames: Int[np.ndarray, "points"]  # lengths at which some ended, from 1, rising
+    share: Float[np.ndarray, "points"]  # still inside after that many frames
+    error: Float[np.ndarray, "points"]  # its standard error (Greenwood)
+    at_risk: Int[np.ndarray, "points"]  # contacts followed for at least that long
+    longest: int  # frames for which any was followed: nothing is known beyond
 
     def at(self, share: float) -> int | None:
         """Frames after which at most this share is left: the median at 0.5; None if it stays above."""
@@ -237,18 +229,15 @@ class Tally(Sums):
     """Flips and time inside by pair of classes.
 
     Attributes:
-        names: of the classes.
-        entered, left: flips by class of the first and of the second atom.
-        inside: pairs inside, summed over frames.
         exposure: times that a pair inside at one frame was examined again at the next one.
     """
 
     _common = ("names",)
 
-    names: tuple[str, ...]
-    entered: Int[np.ndarray, "classes classes"]
+    names: tuple[str, ...]  # of the classes
+    entered: Int[np.ndarray, "classes classes"]  # flips by class of the first and of the second atom
     left: Int[np.ndarray, "classes classes"]
-    inside: Int[np.ndarray, "classes classes"]
+    inside: Int[np.ndarray, "classes classes"]  # pairs inside, summed over frames
     exposure: Int[np.ndarray, "classes classes"]
 
     @classmethod
@@ -298,13 +287,11 @@ class Chatter(Sums):
 
     Attributes:
         inside: visits inside by their length in frames, 0 to the window: a pair that left so soon again.
-        outside: excursions outside by their length.
-        flips: all flips.
     """
 
     inside: Int[np.ndarray, "lengths"]
-    outside: Int[np.ndarray, "lengths"]
-    flips: int
+    outside: Int[np.ndarray, "lengths"]  # excursions outside by their length
+    flips: int  # all flips
 
     @classmethod
     def of(cls, history: History, window: int) -> Chatter:
@@ -331,19 +318,13 @@ class Chatter(Sums):
 
 @dataclass(frozen=True)
 class Busiest:
-    """Pairs by the number of their flips, most first.
+    """Pairs by the number of their flips, most first."""
 
-    Attributes:
-        i, j, rank: the pairs.
-        flips: of each.
-        inside: frames inside.
-    """
-
-    i: Int[np.ndarray, "pairs"]
+    i: Int[np.ndarray, "pairs"]  # the pairs
     j: Int[np.ndarray, "pairs"]
     rank: Int[np.ndarray, "pairs"]
-    flips: Int[np.ndarray, "pairs"]
-    inside: Int[np.ndarray, "pairs"]
+    flips: Int[np.ndarray, "pairs"]  # of each
+    inside: Int[np.ndarray, "pairs"]  # frames inside
 
     @classmethod
     def of(cls, history: History, stays: Contacts, most: int = _BUSIEST) -> Busiest:
@@ -401,25 +382,18 @@ class Again(Sums):
 
 @dataclass(frozen=True)
 class Statistics(Sums):
-    """Everything that is counted of the pairs of a rule.
+    """Everything that is counted of the pairs of a rule."""
 
-    Attributes:
-        durations, intermittent: of contacts, and of contacts whose short gaps are overlooked.
-        by_species, by_residue_name, residues: None for residues where the file has none.
-        pairs: that flipped.
-        images: pairs through further images of an atom.
-    """
-
-    durations: Durations
+    durations: Durations  # of contacts, and of contacts whose short gaps are overlooked
     intermittent: Durations
-    by_species: Tally
+    by_species: Tally  # None for residues where the file has none
     by_residue_name: Tally | None
     residues: Residues | None
     chatter: Chatter
     strides: Strides
     busiest: Busiest
-    pairs: int
-    images: int
+    pairs: int  # that flipped
+    images: int  # pairs through further images of an atom
     again: Again
 
     @classmethod
@@ -485,22 +459,18 @@ class Lifetime:
     """Lifetimes in numbers, frames; None where the file does not tell.
 
     Attributes:
-        followed: contacts seen to begin.
-        median, quarter_gone, three_quarters_gone: frames after which so many are over.
         mean: the area below the curve, which is the mean where `mean_is_whole`, and less where some are left
             at its end.
-        longest: frames for which any was followed.
-        mean_by_rate, mean_by_rate_error, leaves: see `mean_by_rate`.
     """
 
-    followed: int
-    median: int | None
+    followed: int  # contacts seen to begin
+    median: int | None  # frames after which so many are over
     quarter_gone: int | None
     three_quarters_gone: int | None
     mean: float | None
     mean_is_whole: bool
-    longest: int
-    mean_by_rate: float
+    longest: int  # frames for which any was followed
+    mean_by_rate: float  # see `mean_by_rate`
     mean_by_rate_error: float
     leaves: int
 

@@ -32,17 +32,14 @@ class Strides(Sums):
     """Flips that are left when only every nth frame is examined.
 
     Attributes:
-        stride: 1, 2, 4, ...
-        flips: of the frames 0, stride, 2 stride, ...
-        of: flips of all frames, as far as these reach.
         doubtful: of those that are left out, flips that the rounding of the file may have made.
     """
 
     _common = ("stride",)
 
-    stride: Int[np.ndarray, "strides"]
-    flips: Int[np.ndarray, "strides"]
-    of: Int[np.ndarray, "strides"]
+    stride: Int[np.ndarray, "strides"]  # 1, 2, 4,
+    flips: Int[np.ndarray, "strides"]  # of the frames 0, stride, 2 stride,
+    of: Int[np.ndarray, "strides"]  # flips of all frames, as far as these reach
     doubtful: Int[np.ndarray, "strides"]
 
     @classmethod
@@ -76,18 +73,14 @@ class Between:
     Attributes:
         reason: "none_lost", "few" (too few lost to see a trend), "trend"; or why there is no number:
             "rounding" (the file's digits may have made them), "brownian" (losses do not die out).
-        lost: the estimate; None where the numbers do not tell.
-        low, high: the range of it, never of no width; None where `lost` is.
-        doubled, fourth: share that every second frame alone would lose, and every fourth.
-        rounded: share of the first that the rounding of the file may have made.
     """
 
     reason: str
-    doubled: float
+    doubled: float  # share that every second frame alone would lose, and every fourth
     fourth: float
-    rounded: float
-    lost: float | None = None
-    low: float | None = None
+    rounded: float  # share of the first that the rounding of the file may have made
+    lost: float | None = None  # the estimate; None where the numbers do not tell
+    low: float | None = None  # the range of it, never of no width; None where `lost` is
     high: float | None = None
 
 

@@ -38,20 +38,13 @@ GROUPS = 64
 
 
 class Listed(NamedTuple):
-    """The pairs of a list.
+    """The pairs of a list."""
 
-    Attributes:
-        i, j: pairs, batch by batch of the search, and by |margin| within a batch.
-        code: the lattice vector that is added to wrapped j, see `shift_code`.
-        due: reading of the odometer at which each pair has to be examined again.
-        inside: the decision on each pair at the last frame.
-    """
-
-    i: Int[np.ndarray, "room"]
+    i: Int[np.ndarray, "room"]  # pairs, batch by batch of the search, and by |margin| within a batch
     j: Int[np.ndarray, "room"]
-    code: UInt8[np.ndarray, "room"]
-    due: Float[np.ndarray, "room"]
-    inside: Bool[np.ndarray, "room"]
+    code: UInt8[np.ndarray, "room"]  # the lattice vector that is added to wrapped j, see `shift_code`
+    due: Float[np.ndarray, "room"]  # reading of the odometer at which each pair has to be examined again
+    inside: Bool[np.ndarray, "room"]  # the decision on each pair at the last frame
 
     @classmethod
     def room(cls, pairs: int) -> Listed:
@@ -60,35 +53,22 @@ class Listed(NamedTuple):
 
 
 class Groups(NamedTuple):
-    """Runs of pairs of a list, of about one |margin| each.
+    """Runs of pairs of a list, of about one |margin| each."""
 
-    Attributes:
-        start: first pair of each group; the last is the number of pairs.
-        earliest: reading before which no pair of the group is due.
-    """
-
-    start: Int[np.ndarray, "edges"]
-    earliest: Float[np.ndarray, "groups"]
+    start: Int[np.ndarray, "edges"]  # first pair of each group; the last is the number of pairs
+    earliest: Float[np.ndarray, "groups"]  # reading before which no pair of the group is due
 
 
 @dataclass
 class Superset:
-    """A list in use.
+    """A list in use."""
 
-    Attributes:
-        skin: no unlisted pair was nearer to its threshold when the list was made, length.
-        pairs, groups: what is listed.
-        home: lattice vectors that have been taken off each atom.
-        gone: reading of the odometer, length.
-        last: what the last frame added to it, length.
-    """
-
-    skin: float
-    pairs: Listed
+    skin: float  # no unlisted pair was nearer to its threshold when the list was made, length
+    pairs: Listed  # what is listed
     groups: Groups
-    home: Int[np.ndarray, "atoms 3"]
-    gone: float = 0.0
-    last: float = 0.0
+    home: Int[np.ndarray, "atoms 3"]  # lattice vectors that have been taken off each atom
+    gone: float = 0.0  # reading of the odometer, length
+    last: float = 0.0  # what the last frame added to it, length
 
     def serves(self, lattice: Lattice, radius: float, clear: float) -> bool:
         """Whether every pair within `clear` of its threshold is listed, where `radius` is the largest one."""
@@ -97,22 +77,14 @@ class Superset:
 
 
 class Examined(NamedTuple):
-    """What the pairs that were due turned out to be.
+    """What the pairs that were due turned out to be."""
 
-    Attributes:
-        i, j: of the pairs that flipped.
-        entered: what they became.
-        close: pairs within the bound of their threshold.
-        smallest: smallest |margin|; at least the horizon where it is not known.
-        count: pairs that were examined.
-    """
-
-    i: Int[np.ndarray, "flips"]
+    i: Int[np.ndarray, "flips"]  # of the pairs that flipped
     j: Int[np.ndarray, "flips"]
-    entered: Bool[np.ndarray, "flips"]
-    close: int
-    smallest: float
-    count: int
+    entered: Bool[np.ndarray, "flips"]  # what they became
+    close: int  # pairs within the bound of their threshold
+    smallest: float  # smallest |margin|; at least the horizon where it is not known
+    count: int  # pairs that were examined
 
 
 @numba.njit(cache=True, nogil=True, inline="always")

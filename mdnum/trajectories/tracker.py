@@ -38,18 +38,14 @@ class Participants:
     """The atoms that take part in a rule, numbered among themselves.
 
     Attributes:
-        labels: their numbers in the file.
-        sides: who is asked for neighbors, and who can be one.
         radii: by species, length; negative for pairs that are never inside.
-        both: atoms on both sides: images of themselves can be their neighbors.
-        own: how many of those there are, by species.
     """
 
-    labels: Int[np.ndarray, "participants"]
-    sides: Sides
+    labels: Int[np.ndarray, "participants"]  # their numbers in the file
+    sides: Sides  # who is asked for neighbors, and who can be one
     radii: Float[np.ndarray, "species species"]
-    both: Bool[np.ndarray, "participants"]
-    own: Int[np.ndarray, "species"]
+    both: Bool[np.ndarray, "participants"]  # atoms on both sides: images of themselves can be their neighbors
+    own: Int[np.ndarray, "species"]  # how many of those there are, by species
 
     @property
     def radius(self) -> float:
@@ -62,23 +58,17 @@ class Moment:
     """One frame as it was decided.
 
     Attributes:
-        positions: of the atoms that take part, length.
-        lattice: of its box.
-        rounding: how far a distance can be off through float64, length.
-        own: images of an atom itself that are inside, by species.
-        last_in, first_out: thresholds of each atom, where the rule is directed.
         found: pairs inside; None where they have not been searched for, or the rule is directed.
-        rows: neighbors, where the rule is directed.
     """
 
-    positions: Float[np.ndarray, "atoms 3"]
-    lattice: Lattice
-    rounding: float
-    own: Int[np.ndarray, "species"]
-    last_in: Float[np.ndarray, "limits"]
+    positions: Float[np.ndarray, "atoms 3"]  # of the atoms that take part, length
+    lattice: Lattice  # of its box
+    rounding: float  # how far a distance can be off through float64, length
+    own: Int[np.ndarray, "species"]  # images of an atom itself that are inside, by species
+    last_in: Float[np.ndarray, "limits"]  # thresholds of each atom, where the rule is directed
     first_out: Float[np.ndarray, "limits"]
     found: Found | None = None
-    rows: Rows | None = None
+    rows: Rows | None = None  # neighbors, where the rule is directed
 
 
 class Tracker:

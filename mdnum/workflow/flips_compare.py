@@ -19,16 +19,7 @@ from mdnum.trajectories.compare import NeighborSets, Side, follow_both, growth_o
 from mdnum.trajectories.follow import atoms_of
 from mdnum.trajectories.resolution import infer
 from mdnum.trajectories.tracker import Tracker
-from mdnum.workflow.flips_shared import (
-    Log,
-    Written,
-    about,
-    ending,
-    name_of,
-    resolution,
-    selected,
-    stem,
-)
+from mdnum.workflow.flips_shared import Log, Written, about, ending, name_of, resolution, selected, stem
 from mdnum.workflow.frame import Outcome, Progress, Verb, View, finish, new_folder, store
 from mdnum.workflow.interrupt import asked_to_stop
 

@@ -146,7 +146,7 @@ def test_no_distance_is_further_off_than_the_bound(seed, kind, step):
         # and no wider than it has to be: the worst of 1,770 distances comes within a factor of 4 (float: 12)
         assert np.abs(off).max() > bound / (12 if kind == "float32" else 4)
         if kind == "grid":
-            assert off.std() == pytest.approx(resolution.typical(frame), rel=0.25)
+            assert off.std() == pytest.approx((2 / 12) ** 0.5 * resolution.usual_step(frame), rel=0.25)
 
 
 def test_the_worst_case_is_met():
