@@ -30,9 +30,9 @@ import numpy as np
 from _output import COLORS, figure, parser, save, say, start, table
 
 import mdnum
+from mdnum.trajectories.ledger import Flips
 from mdnum.trajectories.rules import Cutoff
 from mdnum.trajectories.source import open_trajectory
-from mdnum.trajectories.table import Flips
 from mdnum.trajectories.tracker import Tracker
 
 

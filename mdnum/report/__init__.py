@@ -20,8 +20,6 @@ _MODULES = {
     "processes": ("mdnum.report.fork.processes", "mdnum.report.fork.processes"),
     "certify": ("mdnum.report.fork.certify", "mdnum.report.fork.certify"),
     "forecast": ("mdnum.report.fork.forecast", "mdnum.report.fork.forecast"),
-    "flips": ("mdnum.report.flips.html", "mdnum.report.flips.html"),
-    "flips-compare": ("mdnum.report.flips.compare", "mdnum.report.flips.compare"),
 }
 
 

@@ -6,7 +6,7 @@ from mdnum.workflow.audit import audit
 from mdnum.workflow.ball import bounce
 from mdnum.workflow.conform import conform
 from mdnum.workflow.demos import demonstrate
-from mdnum.workflow.flips import FlipsResult, flips
+from mdnum.workflow.flips import flips
 from mdnum.workflow.fork import ForkResult, fork
 from mdnum.workflow.fork_certify import CertifyResult, fork_certify
 from mdnum.workflow.fork_forecast import ForecastResult, fork_forecast
@@ -18,7 +18,6 @@ from mdnum.workflow.run import run
 
 __all__ = [
     "CertifyResult",
-    "FlipsResult",
     "ForecastResult",
     "ForkResult",
     "MapResult",

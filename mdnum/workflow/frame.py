@@ -43,7 +43,7 @@ KINDS: dict[str, str] = {
     "demos": "mdnum.workflow.demos",
     "grad": "mdnum.workflow.grad",
     "flips": "mdnum.workflow.flips",
-    "flips-compare": "mdnum.workflow.flips",
+    "flips-compare": "mdnum.workflow.flips_compare",
     "audit": "mdnum.workflow.audit",
     "conform": "mdnum.workflow.conform",
 }

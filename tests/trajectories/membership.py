@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mdnum.trajectories.table import Flips, Members
+from mdnum.trajectories.ledger import Flips, Members
 
 
 def ledger(inside: np.ndarray, names: list[tuple[int, int, int]]) -> tuple[Flips, Members]:

@@ -13,7 +13,7 @@ from MDAnalysisTests import datafiles
 
 from mdnum.errors import InputError
 from mdnum.trajectories import NeighborFlips
-from mdnum.trajectories.checked import FrameError
+from mdnum.trajectories.frame import FrameError
 from mdnum.trajectories.rules import Capped, Cutoff, Nearest
 
 warnings.filterwarnings("ignore", module="MDAnalysis")

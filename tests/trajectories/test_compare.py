@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from trajectories.membership import ledger, random_membership
 
-from mdnum.trajectories.compare import Difference, apart, displacements, distances, growth, same_lattice
+from mdnum.trajectories.compare import Difference, displacements, distances, growth, same_lattice, separation
 from mdnum.trajectories.frame import Box, Frame
-from mdnum.trajectories.table import Flips, Members
+from mdnum.trajectories.ledger import Flips, Members
 
 
 def of_frame(flips: Flips, frame: int) -> Flips:
@@ -58,7 +58,7 @@ def test_displacements_go_through_the_boundary_of_any_box() -> None:
     np.testing.assert_allclose(displacements(Frame(0, 0.0, start, box), end), moved, atol=1e-12)
     free = Frame(0, 0.0, start + 100.0, Box())
     np.testing.assert_allclose(displacements(Frame(0, 0.0, start, Box()), free), 100.0, atol=1e-12)
-    found = apart(Frame(0, 0.0, start, box), end, np.array([3, 8]))
+    found = separation(Frame(0, 0.0, start, box), end, np.array([3, 8]))
     sizes = np.linalg.norm(moved[[3, 8]], axis=1)
     assert found.furthest == pytest.approx(sizes.max()) and found.atom == (3, 8)[int(sizes.argmax())]
     assert found.typical == pytest.approx(np.sqrt((sizes**2).mean()))
@@ -101,5 +101,5 @@ def test_an_axis_that_repeats_in_one_frame_only_has_no_images() -> None:
     for boxes in ((every, slab), (slab, every)):
         start, end = Frame(0, 0.0, x, boxes[0]), Frame(0, 0.0, x + np.array([10.0, -20.0, 10.0]), boxes[1])
         np.testing.assert_array_equal(displacements(start, end), [[0, 0, 10.0]])
-        found = apart(start, end)
+        found = separation(start, end)
         assert found.furthest == 10.0 and found.periods == 2

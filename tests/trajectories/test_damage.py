@@ -18,12 +18,19 @@ from MDAnalysisTests import datafiles
 import mdnum
 from mdnum.errors import InputError
 from mdnum.trajectories import NeighborFlips
-from mdnum.trajectories.checked import FrameError, checked
-from mdnum.trajectories.far import far_out, leap, smallest_radius
-from mdnum.trajectories.frame import Box, Frame
+from mdnum.trajectories.frame import (
+    Box,
+    Frame,
+    FrameError,
+    UnreadableFrame,
+    checked,
+    far_out,
+    leap,
+    smallest_radius,
+)
 from mdnum.trajectories.netcdf import head_of
 from mdnum.trajectories.rules import Cutoff, Nearest, SpeciesCutoffs
-from mdnum.trajectories.source import UnreadableFrame, open_trajectory
+from mdnum.trajectories.source import open_trajectory
 
 DLPOLY = Path(datafiles.PSF).parent / "dlpoly" / "HISTORY"
 

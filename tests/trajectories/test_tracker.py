@@ -15,8 +15,8 @@ from trajectories.boxes import atoms, boxes
 from mdnum.errors import InputError
 from mdnum.trajectories import superset
 from mdnum.trajectories.frame import Box, Frame
+from mdnum.trajectories.ledger import Flips
 from mdnum.trajectories.rules import Capped, Cutoff, Nearest, SpeciesCutoffs
-from mdnum.trajectories.table import Flips
 from mdnum.trajectories.tracker import HORIZON, Tracker
 
 PERIODIC = np.ones(3, bool)
@@ -316,10 +316,7 @@ def test_positions_that_are_no_numbers():
 
 
 def test_selections_that_are_none():
-    for chosen, says in (
-        ([0, 4], "atom 4 is selected"),
-        ([-1, 2], "whole numbers"),
-    ):
+    for chosen, says in (([0, 4], "atom 4 is selected"), ([-1, 2], "whole numbers")):
         with pytest.raises(InputError, match=says):
             Tracker(Cutoff(1.0), first=np.array(chosen)).step(Frame(0, 0.0, np.zeros((4, 3)), Box()))
     with pytest.raises(InputError, match="3 species for frames of 4 atoms"):
