@@ -36,6 +36,7 @@ import numpy as np
 from _output import say, start
 from ase import Atoms
 from ase.build import bulk
+from mdnum.forks.repeats import perturbed, repeat
 from scipy.stats import beta
 
 from mdnum.events.chance import Delay, count
@@ -43,7 +44,6 @@ from mdnum.events.forks import Dates, Verdict, growth, judge
 from mdnum.forks import fork
 from mdnum.forks.choices import parse
 from mdnum.forks.pair import SPLIT
-from mdnum.forks.repeats import perturbed, repeat
 from mdnum.rollout.engine import Engine
 from mdnum.systems import System, SystemSpec, build, load
 

@@ -7,7 +7,6 @@ import json
 import pyarrow.parquet as pq
 import pytest
 from command_line import call, printed
-
 from mdnum.forks.bounce import certify, choices
 
 

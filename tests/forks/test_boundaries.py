@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from ase import Atoms
+from mdnum.forks.dials import dial, names
 from small_systems import LENNARD_JONES, crystal, make
 
 from mdnum.errors import InputError
 from mdnum.forks.boundaries import boundaries
 from mdnum.forks.confirm import digests, digests_elsewhere
-from mdnum.forks.dials import dial, names
 from mdnum.rollout.engine import Engine
 from mdnum.systems.build import build
 

@@ -12,10 +12,10 @@ import equinox as eqx
 import jax
 import numpy as np
 import pytest
+from mdnum.forks.twin import Twin
 
 from mdnum.forks.choices import BY_NAME, names, parse
 from mdnum.forks.choices.base import varied
-from mdnum.forks.twin import Twin
 from mdnum.md.integrators import Langevin
 from mdnum.precision import reductions
 from mdnum.systems.build import Simulation

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from ase import Atoms
+from mdnum.forks.histories import history
 from small_systems import LENNARD_JONES, make
 
 from mdnum.errors import InputError
 from mdnum.forks.forecast import forecast, trial
-from mdnum.forks.histories import history
 from mdnum.forks.tangent import tangents
 from mdnum.systems.build import build
 

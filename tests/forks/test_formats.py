@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import small_systems
+from mdnum.forks.choices.formats import FORMATS, FormattedSimulation
 
 from mdnum.forks.choices import Format, parse
-from mdnum.forks.choices.formats import FORMATS, FormattedSimulation
 from mdnum.md.cell import wrap_positions
 from mdnum.md.jaxmd import as_neighbor_list, displacement, upstream
 from mdnum.precision.orders import Halves, Sequential, Twice

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from ase import Atoms
 from ase.build import bulk
+from mdnum.forks.lyapunov import lyapunov
 from small_systems import LENNARD_JONES, make
 
 from mdnum.errors import InputError
 from mdnum.events.forks import Growth, growth
-from mdnum.forks.lyapunov import lyapunov
 from mdnum.rollout.lockstep import lockstep
 from mdnum.systems.build import build
 

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from mdnum.forks.minimal import minimal_cause
 
 from mdnum.errors import InputError
 from mdnum.forks import Twin, fork
-from mdnum.forks.minimal import minimal_cause
 from mdnum.rollout.engine import Engine
 from mdnum.rollout.pins import Pin, Pins
 from mdnum.systems.build import build

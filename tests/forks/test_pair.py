@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from mdnum.forks.repeats import nudged, seed_size
 
 from mdnum.errors import InputError
 from mdnum.forks import Twin, fork
-from mdnum.forks.repeats import nudged, seed_size
 from mdnum.rollout.engine import first_state
 from mdnum.systems.build import Simulation, build
 

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from mdnum.forks.take_back import disagreements, parse_pin
 
 from mdnum.errors import InputError
 from mdnum.forks import Fork, Twin, fork, pinned
-from mdnum.forks.take_back import disagreements, parse_pin
 from mdnum.rollout.frame import Frame
 from mdnum.systems.build import build
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
+from mdnum.forks.repeats import perturbed, repeat
 
 from mdnum.errors import InputError
 from mdnum.forks import fork
 from mdnum.forks.choices import parse
-from mdnum.forks.repeats import perturbed, repeat
 from mdnum.systems import load
 
 

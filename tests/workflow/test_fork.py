@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mdnum.forks.lyapunov import Lyapunov
 
 import mdnum
 from mdnum.errors import FolderError, InputError
 from mdnum.forks import Twin, choices
 from mdnum.forks.choices import Screened
-from mdnum.forks.lyapunov import Lyapunov
 from mdnum.rollout.engine import Engine
 from mdnum.store import RunFolder
 from mdnum.systems import build, load

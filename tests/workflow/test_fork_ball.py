@@ -9,10 +9,10 @@ import tomllib
 
 import numpy as np
 import pytest
+from mdnum.forks.bounce import choices
 
 import mdnum
 from mdnum.errors import InputError
-from mdnum.forks.bounce import choices
 from mdnum.report import judge, write
 from mdnum.store import RunFolder
 from mdnum.systems import load

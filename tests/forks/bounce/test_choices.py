@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-from mdnum.errors import InputError
 from mdnum.forks.bounce import Pin, choices, fork
 from mdnum.forks.bounce.choices import BY_NAME, parse, screen
+
+from mdnum.errors import InputError
 from mdnum.forks.choices.base import Choice
 from mdnum.precision import neighbor
 from mdnum.systems import BallSystem, load

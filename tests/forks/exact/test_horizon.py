@@ -8,9 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import small_systems
-
-from mdnum.errors import InputError
-from mdnum.events.forks import Growth
 from mdnum.forks.exact.horizon import (
     POLICIES,
     PolicyHorizon,
@@ -20,6 +17,9 @@ from mdnum.forks.exact.horizon import (
     rounded_start,
     taped,
 )
+
+from mdnum.errors import InputError
+from mdnum.events.forks import Growth
 from mdnum.forks.exact.program import ExactProgram, with_policy
 from mdnum.forks.exact.tape import first_difference
 from mdnum.precision import PrecisionPolicy
