@@ -23,7 +23,7 @@ from mdnum.ball.world import World
 from mdnum.errors import InputError, MdnumError
 from mdnum.gradients.dependence import dependence, follow
 from mdnum.gradients.problem import Gradient, Kind
-from mdnum.precision.scaling import DynamicScale, ScaleState, StaticScale
+from mdnum.numerics.scaling import check_scale, scaled_gradient
 from mdnum.registry import Registry
 
 
@@ -174,9 +174,7 @@ def evaluate(values, world, y0, v0, decisions, steps, loss):
 def differentiate(values, world, y0, v0, decisions, steps, loss, names, scale):
     """Loss and reverse-mode derivative under loss scaling, and what the run used, as one compiled program."""
     function, rest = _Rollout(steps, loss), (world, y0, v0, decisions)
-    state = ScaleState(scale, *(jnp.zeros((), jnp.int32),) * 2)
-    # of the dynamic scale, because its factor is an argument of the program and no constant
-    made, _ = DynamicScale().value_and_grad(state, lambda values: function(values, *rest), values)
+    made = scaled_gradient(lambda values: function(values, *rest), scale, values)
     return made, follow(function, values, rest, names)
 
 
@@ -301,7 +299,8 @@ def scaled(
         InputError: it is not.
     """
     values, start = origin(problem, names), start_of(problem)
-    factor = jnp.asarray(StaticScale(scale).scale, jnp.float64)
+    check_scale(scale)
+    factor = jnp.asarray(scale, jnp.float64)
     made, marks = differentiate(
         values, problem.world, *start, decisions, problem.steps, problem.loss, tuple(names), factor
     )

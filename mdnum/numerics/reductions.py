@@ -22,7 +22,6 @@ from jaxtyping import Array, Float, Int, UInt64
 
 from mdnum.errors import InputError
 from mdnum.numerics.exact import integer_of
-from mdnum.numerics.roles import ALL
 from mdnum.numerics.rounding import gamma, unit_roundoff
 from mdnum.numerics.sums import (
     Add,
@@ -233,33 +232,6 @@ REDUCTIONS.add("exact", lambda: Exact(), description="exact, rounded once")
 REDUCTIONS.add(
     "fixed-point", _numbered(FixedPoint, 40), description="of integers; a number is the bits after the point"
 )
-
-
-@dataclass(frozen=True)
-class Widened(Whole):
-    """Store low, accumulate high: terms as they come, sum and result in a wider dtype.
-
-    Attributes:
-        inner: the order of the sum.
-        dtype: name of the wider dtype.
-    """
-
-    inner: Reduction
-    dtype: str = "float32"
-
-    def __post_init__(self):
-        if self.dtype not in ALL:
-            raise InputError(f"unknown dtype {self.dtype!r}; known are {', '.join(ALL)}")
-
-    def __call__(
-        self, terms: Float[Array, "n ..."], zero: Int[Array, ""] | None = None
-    ) -> Float[Array, "..."]:
-        """The sum over the leading axis, in the wider dtype."""
-        return self.inner(terms.astype(ALL[self.dtype]), zero)
-
-    def bound(self, terms: Float[np.ndarray, "n ..."]) -> Float[np.ndarray, "..."]:
-        """As the inner reduction: widening the terms is exact."""
-        return self.inner.bound(terms.astype(ALL[self.dtype]))
 
 
 parse = REDUCTIONS.parse

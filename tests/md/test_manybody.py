@@ -83,7 +83,7 @@ CASES = {
 
 
 @pytest.mark.parametrize(
-    "case", [pytest.param(c, marks=pytest.mark.slow) if "hot" in c else c for c in CASES]
+    "case", [pytest.param(c, marks=pytest.mark.nightly) if "hot" in c else c for c in CASES]
 )
 def test_energy_forces_and_stress_agree_with_extended_precision_and_with_ase(case):
     make, oracle, kind, repeat, rattle = CASES[case]
@@ -147,7 +147,7 @@ def test_skin_masked_entries_images_and_folding_do_not_matter(case):
         np.testing.assert_allclose(np.asarray(other_forces), forces, rtol=0, atol=1e-11)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_triclinic_and_slab_agree_with_extended_precision():
     tilted = crystal("Si", 2, 0.1)
     tilted.set_cell(
@@ -300,7 +300,7 @@ def test_the_1989_constants_differ_from_those_of_1988():
 
 @pytest.mark.jax_md
 @pytest.mark.parametrize(
-    "format", [*(pytest.param(one, marks=pytest.mark.slow) for one in ("dense", "sparse")), "ordered-sparse"]
+    "format", [*(pytest.param(one, marks=pytest.mark.nightly) for one in ("dense", "sparse")), "ordered-sparse"]
 )
 def test_any_jax_md_energy_function_runs_in_every_format(format):
     from ase.calculators.lj import LennardJones

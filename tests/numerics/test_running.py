@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mdnum.errors import InputError
-from mdnum.numerics.reductions import BY_NAME, Sequential, Widened
+from mdnum.numerics.reductions import BY_NAME
 from mdnum.numerics.running import running_sum_table
 
 DTYPES = [np.float64, np.float32, np.float16, ml_dtypes.bfloat16]
@@ -68,7 +68,7 @@ def test_what_has_no_history_is_refused():
     with pytest.raises(InputError, match="not finite"):
         running_sum_table([1.0, math.inf])
     with pytest.raises(InputError, match="no loop over the terms"):
-        running_sum_table([1.0], Widened(Sequential()))
+        running_sum_table([1.0], BY_NAME["exact"])
 
 
 def test_the_table_has_a_row_for_each_addition():

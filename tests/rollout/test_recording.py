@@ -79,7 +79,7 @@ def test_hard_and_shifted_are_the_same_trajectory_with_other_energies(path, tmp_
     assert np.std(x["total"]) > 5 * np.std(y["total"])
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_order_of_the_sum_is_part_of_the_program(path, tmp_path):
     _, one = go(tmp_path / "s", path, STEPS)
     _, other = go(tmp_path / "p", path, STEPS, {"precision.reduction": "pairwise"})
