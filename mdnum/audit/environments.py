@@ -15,7 +15,8 @@ from ase import Atoms
 from ase.neighborlist import neighbor_list
 from jaxtyping import Float, Int
 
-from mdnum.audit.base import Progress, ask_each
+from mdnum.audit.base import Progress
+from mdnum.audit.check import ask_each
 from mdnum.audit.curve import SMOOTH, Curve, Jump, find_jumps, locate, measure
 from mdnum.audit.pairs import Pair, molecules, whole
 from mdnum.audit.subject import CalculatorError, CalculatorSubject

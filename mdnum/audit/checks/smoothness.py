@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from mdnum.audit.base import AuditCheck, Chart, CheckResult, Observed, Progress, TimeUp, finding
+from mdnum.audit.base import Chart, CheckResult, Observed, Progress, TimeUp, finding
+from mdnum.audit.check import AuditCheck
 from mdnum.audit.crowds import Crowd, crowd
 from mdnum.audit.curve import SMOOTH
 from mdnum.audit.environments import Event, Surroundings, walk_surroundings

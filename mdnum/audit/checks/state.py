@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from ase import Atoms
 
-from mdnum.audit.base import TIME_UP, AuditCheck, CheckResult, Observed, Progress, TimeUp, finding
+from mdnum.audit.base import TIME_UP, CheckResult, Observed, Progress, TimeUp, finding
+from mdnum.audit.check import AuditCheck
 from mdnum.audit.noise import FEW, NoiseFloor, digits, displaced, settled
 from mdnum.audit.pairs import molecules, pairs, whole
 from mdnum.audit.sequences import Asked, all_sequences, approaches
