@@ -1,25 +1,16 @@
-"""What a check of a calculator is, what it gives back, and the registry of all checks."""
+"""What every check of a calculator gives back, and how much it may ask."""
 
 from __future__ import annotations
 
-import pkgutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
-from time import perf_counter
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar
+from dataclasses import dataclass, field
+from typing import Any, Literal
 
 from mdnum.deadline import Deadline
-from mdnum.registry import Registry
-
-if TYPE_CHECKING:
-    from ase import Atoms
-
-    from mdnum.audit.subject import CalculatorError, CalculatorSubject
 
 #: (done, of how many, {"phase": words}) now and then.
 Progress = Callable[[int, int, dict[str, Any]], None]
-T = TypeVar("T")
 Severity = Literal["info", "warning", "error"]
 
 #: Why something was not asked that would have been.
@@ -62,45 +53,6 @@ class Meter:
             yield
         finally:
             self._limited -= 1
-
-
-def ask_each(
-    subject: CalculatorSubject,
-    ways: Sequence[tuple[str, Callable[[], T]]],
-    progress: Progress,
-    phase: str,
-    skipped: list[tuple[str, str]],
-    *,
-    spread: bool = False,
-    failed: Callable[[int, CalculatorError], None] | None = None,
-) -> dict[int, T]:
-    """The answers to many ways of asking, by their place; ways that come after the deadline are skipped.
-
-    Args:
-        subject: whose deadline it is.
-        ways: (name, what asks).
-        phase: words for the progress.
-        skipped: gets (name, why) of ways that were left out.
-        spread: ask in an order in which a few answers tell of the beginning, the middle and the end.
-        failed: called where the calculator fails; otherwise that is raised.
-    """
-    from mdnum.audit.subject import CalculatorError
-
-    found: dict[int, T] = {}
-    stride = 4 if spread else 1
-    for done, place in enumerate(k for first in range(stride) for k in range(first, len(ways), stride)):
-        what, ask = ways[place]
-        progress(done, len(ways), {"phase": phase, "unit": "ways"})
-        try:
-            with subject.meter.limited():
-                found[place] = ask()
-        except TimeUp:
-            skipped.append((what, TIME_UP))
-        except CalculatorError as error:
-            if failed is None:
-                raise
-            failed(place, error)
-    return dict(sorted(found.items()))
 
 
 @dataclass(frozen=True)
@@ -172,78 +124,3 @@ class CheckResult:
     name: str = ""
     title: str = ""
     seconds: float = 0.0
-
-
-@dataclass(frozen=True)
-class Settings:
-    """Of the run of an audit, as a person gave them.
-
-    Attributes:
-        timestep: internal time; None for a fraction of the fastest vibration.
-        steps: None for as many as a check thinks enough.
-    """
-
-    timestep: float | None = None
-    steps: int | None = None
-
-
-class AuditCheck:
-    """One question to a calculator: a file in `mdnum.audit.checks`, or an entry point of another package.
-
-    A subclass has a name, a title, a one-line docstring and `ask`; its sentences are in
-    mdnum/workflow/audit.toml under the codes of its findings. To add one, add the file `checks/NAME.py`
-    with the class `NameCheck`.
-
-    Attributes:
-        order: checks with a lower one are asked before.
-        structures: that show a finding, by name; those of a pair end in -before and -after.
-    """
-
-    name: ClassVar[str]
-    title: ClassVar[str]
-    order: ClassVar[int] = 100
-    #: Answers that are not known without this check, "run" or "differentiate".
-    needed_to: ClassVar[tuple[str, ...]] = ()
-
-    def __init__(self, settings: Settings | None = None):
-        self.settings = settings or Settings()
-        self.structures: dict[str, Atoms] = {}
-
-    def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
-        """The check itself.
-
-        Raises:
-            TimeUp: the time was up before anything was found out.
-            CalculatorError: the calculator fails where the check cannot go on.
-        """
-        raise NotImplementedError
-
-    def __call__(self, subject: CalculatorSubject, progress: Progress | None = None) -> CheckResult:
-        """Ask it, with name, title and the time that it took."""
-        began = perf_counter()
-        found = self.ask(subject, progress or (lambda done, total, info: None))
-        return replace(found, name=self.name, title=self.title, seconds=perf_counter() - began)
-
-
-#: All checks by name, those of other packages included.
-CHECKS: Registry[AuditCheck] = Registry("check", "mdnum.checks", AuditCheck)
-
-
-def _register() -> None:
-    from mdnum.audit import checks
-
-    for module in pkgutil.iter_modules(checks.__path__):
-        CHECKS.add(module.name, f"mdnum.audit.checks.{module.name}:{module.name.capitalize()}Check")
-
-
-_register()
-
-
-def in_order(names: Sequence[str]) -> list[str]:
-    """Names of checks in the order in which they are asked: what tells most by a call first."""
-    return sorted(names, key=lambda name: (CHECKS[name].order, name))
-
-
-def needed_to(question: str, names: Mapping[str, Any] | Sequence[str] | None = None) -> set[str]:
-    """Checks of these, or of all, without which a question ("run", "differentiate") has no answer."""
-    return {name for name in (CHECKS if names is None else names) if question in CHECKS[name].needed_to}

@@ -15,7 +15,8 @@ from ase import Atoms
 from ase.neighborlist import neighbor_list
 from jaxtyping import Float, Int
 
-from mdnum.audit.base import Progress, ask_each
+from mdnum.audit.base import Progress
+from mdnum.audit.check import ask_each
 from mdnum.audit.curve import SMOOTH, Curve, Jump, find_jumps, locate, measure
 from mdnum.audit.pairs import Pair, molecules, whole
 from mdnum.audit.subject import CalculatorError, CalculatorSubject
@@ -157,7 +158,7 @@ class Event:
 
 
 @dataclass(frozen=True)
-class Surroundings:
+class EnvironmentWalks:
     """What walks through surroundings found.
 
     Attributes:
@@ -184,7 +185,7 @@ class Surroundings:
 
 def walk_surroundings(
     subject: CalculatorSubject, progress: Progress, crossings: int = _CROSSINGS, routes: int = _ROUTES
-) -> Surroundings:
+) -> EnvironmentWalks:
     """Walk triples, and atoms of the structure, through the known thresholds and search for unknown ones.
 
     Args:
@@ -223,7 +224,7 @@ def walk_surroundings(
 
     found = ask_each(subject, ways, progress, "walking through the structure", skipped, failed=note)
     asked = {*found, *failed}
-    return Surroundings(
+    return EnvironmentWalks(
         tuple(one for events in found.values() for one in events if not _rounded(one, quantum)),
         sum(place < len(targeted) for place in asked),
         tuple(ways[place][0] for place in found if place >= len(targeted)),

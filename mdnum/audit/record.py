@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from ase import Atoms
 from ase.io.jsonio import decode, encode
+from pydantic import Field
 
 from mdnum.audit.base import CheckResult
 from mdnum.audit.thresholds import PairThreshold
@@ -47,7 +48,7 @@ class AuditState:
     named: bool
     structure: str
     kT: float
-    units: str
+    units: Annotated[str, Field(pattern="^(metal|lj)$")]
     checks: list[str]
     temperature: float | None
     timestep: float | None
@@ -86,14 +87,11 @@ def kept(folder: RunFolder) -> AuditState:
     Raises:
         FolderError: answers.json holds something else.
     """
-    from mdnum import units
-
     if not (folder.path / NAME).exists():
         raise FolderError("holds no audit", remedy="Begin a new one", where=str(folder.path))
     state = restored(folder, AuditState)
     with restoring(folder.path / NAME):
         assert state.atoms
-        units.get(state.units)
         expect(all(np.isfinite(one) for one in (state.temperature or 0, state.timestep or 0)), "no numbers")
         expect(state.checks and set(state.checks) >= {one.name for one in state.shown}, "no checks")
         expect(not any("/" in name for name in state.failed), "no names of files")

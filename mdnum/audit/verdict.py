@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Literal
 
-from mdnum.audit.base import CheckResult, needed_to
+from mdnum.audit.base import CheckResult
+from mdnum.audit.check import needed_to
 
 Answer = Literal["yes", "as far as asked", "with care", "no", "not asked"]
 

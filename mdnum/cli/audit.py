@@ -11,7 +11,7 @@ from mdnum.cli.progress import watched
 
 
 def _names() -> str:
-    from mdnum.audit.base import CHECKS
+    from mdnum.audit.checks import CHECKS
 
     return ", ".join(CHECKS)
 

@@ -1,6 +1,6 @@
 """`mdnum audit`: is this ASE calculator safe to run and to differentiate?
 
-Every check of `mdnum.audit.base.CHECKS` is asked in its order; the folder fills up check by check, so
+Every check of `mdnum.audit.checks.CHECKS` is asked in its order; the folder fills up check by check, so
 whatever ends an audit, what was found is in it and the rest can be asked later. A check gives codes and
 values, and its sentences are in audit.toml.
 """
@@ -32,7 +32,8 @@ from mdnum.workflow.frame import Outcome, Progress, Verb, View
 if TYPE_CHECKING:
     from ase import Atoms
 
-    from mdnum.audit.base import AuditCheck, CheckResult, Observed
+    from mdnum.audit.base import CheckResult, Observed
+    from mdnum.audit.check import AuditCheck
     from mdnum.audit.record import AuditState
     from mdnum.audit.structures import LoadedCalculator
     from mdnum.audit.subject import CalculatorSubject
@@ -150,7 +151,9 @@ def _ask_all(
     progress: Progress | None,
 ) -> Outcome:
     """Asks the checks that are not done, keeping each answer, and finishes the folder."""
-    from mdnum.audit.base import CHECKS, TIME_UP, Settings, TimeUp
+    from mdnum.audit.base import TIME_UP, TimeUp
+    from mdnum.audit.check import Settings
+    from mdnum.audit.checks import CHECKS
     from mdnum.audit.subject import CalculatorSubject
     from mdnum.audit.thresholds import find_thresholds
 
@@ -256,7 +259,8 @@ def _write_structures(folder: RunFolder, structures: Mapping[str, Atoms]) -> Non
 
 
 def _wanted(checks: str | Sequence[str] | None) -> list[str]:
-    from mdnum.audit.base import CHECKS, in_order
+    from mdnum.audit.check import in_order
+    from mdnum.audit.checks import CHECKS
 
     if checks is None:
         return in_order(list(CHECKS))
@@ -447,10 +451,8 @@ def _judge(view: View) -> Verdict:
     for head, below in groups:
         found.append(_finding(head, titles[id(head)], ""))
         found += [_finding(one, titles[id(one)], head.code) for one in below]
-    found = [
-        replace(one, **{name: _in_units(getattr(one, name), given) for name in ("title", "text", "remedy")})
-        for one in found
-    ]
+    texts = ("title", "text", "remedy", "values")
+    found = [replace(one, **{name: _in_units(getattr(one, name), given) for name in texts}) for one in found]
     headline = _in_units(_headline(state, [one for one in found if not one.cause]), given)
     return conclude(found, headline=headline, best="good", judged=True)
 

@@ -10,7 +10,7 @@ from ase.calculators.lj import LennardJones
 from audit import planted
 from audit.planted import Good, codes, subject, values
 
-from mdnum.audit.base import Settings
+from mdnum.audit.check import Settings
 from mdnum.audit.checks.dynamics import DynamicsCheck
 from mdnum.audit.energy import Drift, account, crossings, drift, ratio, wandering
 from mdnum.audit.nve import fitting_timestep, prepared, rigid, rigid_bonds, run

@@ -73,11 +73,7 @@ class Wide(Good):
 
 @pytest.mark.parametrize(
     ("make", "expected"),
-    [
-        (planted.NearestImage, {"NARROW_CELL": "warning"}),
-        (Good, {}),
-        (Wide, {"NARROW_CELL_REFUSED": "info"}),
-    ],
+    [(planted.NearestImage, {"NARROW_CELL": "warning"}), (Good, {}), (Wide, {"NARROW_CELL_REFUSED": "info"})],
 )
 def test_a_structure_with_room_does_not_hide_the_nearest_image(make, expected, monkeypatch):
     rng = np.random.default_rng(0)

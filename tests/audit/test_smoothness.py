@@ -14,7 +14,7 @@ from mdnum.audit import pairs, thresholds
 from mdnum.audit.checks.smoothness import SmoothnessCheck, reach, summary
 from mdnum.audit.crowds import cluster, crowd, gap
 from mdnum.audit.curve import Curve, find_jumps, smallest_steps
-from mdnum.audit.environments import Route, Surroundings, walk_surroundings
+from mdnum.audit.environments import EnvironmentWalks, Route, walk_surroundings
 from mdnum.audit.pairs import Pair
 from mdnum.audit.structures import default_structure, load_calculator
 from mdnum.audit.subject import CalculatorSubject
@@ -223,7 +223,7 @@ def test_the_smallest_step_is_reported():
     asked = Bare(laws.soft)
     low, high, half, everywhere = walked(asked).steps or (0,) * 4
     assert low < 1.5 and high == pytest.approx(R_CUT - 0.35, abs=0.1) and 0 < half <= everywhere < 1e-6
-    names, told = summary(walk_pairs(asked), Surroundings((), 0, (), ()), (), asked.kT)
+    names, told = summary(walk_pairs(asked), EnvironmentWalks((), 0, (), ()), (), asked.kT)
     assert names[-2:] == ["smoothness_least", "smoothness_least_but"] and told["beside"] == 0.35
     assert everywhere <= told["everywhere"] < 2 * everywhere + 1e-7
 

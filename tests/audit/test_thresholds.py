@@ -21,8 +21,7 @@ AFTER = float(np.nextafter(R_CUT, 9.0))
 
 
 @pytest.mark.parametrize(
-    ("pair", "inside", "outside"),
-    [(laws.hard, BEFORE, R_CUT), (laws.including, R_CUT, AFTER)],
+    ("pair", "inside", "outside"), [(laws.hard, BEFORE, R_CUT), (laws.including, R_CUT, AFTER)]
 )
 def test_a_hard_cutoff_is_located_to_neighboring_doubles(pair, inside: float, outside: float):
     (found,) = find_thresholds(pair_subject(pair))

@@ -10,7 +10,8 @@ import numpy as np
 from ase import Atoms
 from jaxtyping import Float
 
-from mdnum.audit.base import AuditCheck, CheckResult, Progress, TimeUp, ask_each, finding
+from mdnum.audit.base import CheckResult, Progress, TimeUp, finding
+from mdnum.audit.check import AuditCheck, ask_each
 from mdnum.audit.noise import FEW, NoiseFloor, displaced, settled
 from mdnum.audit.subject import CalculatorSubject
 

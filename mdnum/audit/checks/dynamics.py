@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from mdnum.audit.base import AuditCheck, Chart, CheckResult, Observed, Progress, finding
+from mdnum.audit.base import Chart, CheckResult, Observed, Progress, finding
+from mdnum.audit.check import AuditCheck
 from mdnum.audit.curve import SMOOTH
 from mdnum.audit.energy import Drift, EnergyBalance, balance, crossings, drift, ratio, wandering
 from mdnum.audit.noise import FEW, NoiseFloor, along_a_line, roomy

@@ -12,7 +12,8 @@ from ase import Atoms
 from jaxtyping import Float
 
 from mdnum.audit import transformations
-from mdnum.audit.base import AuditCheck, Chart, CheckResult, Observed, Progress, TimeUp, ask_each, finding
+from mdnum.audit.base import Chart, CheckResult, Observed, Progress, TimeUp, finding
+from mdnum.audit.check import AuditCheck, ask_each
 from mdnum.audit.noise import FEW, NoiseFloor, direction, displaced, precision, settled, steps
 from mdnum.audit.subject import CalculatorError, CalculatorSubject, no_rounding, only_trying, rms
 

@@ -10,16 +10,8 @@ import numpy as np
 from ase import Atoms
 
 from mdnum.audit import transformations
-from mdnum.audit.base import (
-    TIME_UP,
-    AuditCheck,
-    CheckResult,
-    Observed,
-    Progress,
-    TimeUp,
-    ask_each,
-    finding,
-)
+from mdnum.audit.base import TIME_UP, CheckResult, Observed, Progress, TimeUp, finding
+from mdnum.audit.check import AuditCheck, ask_each
 from mdnum.audit.noise import NoiseFloor, along_a_line, settled, under_jitter
 from mdnum.audit.subject import CalculatorError, CalculatorSubject, Forces, rms
 from mdnum.audit.transformations import Same

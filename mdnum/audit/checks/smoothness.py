@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from mdnum.audit.base import AuditCheck, Chart, CheckResult, Observed, Progress, TimeUp, finding
+from mdnum.audit.base import Chart, CheckResult, Observed, Progress, TimeUp, finding
+from mdnum.audit.check import AuditCheck
 from mdnum.audit.crowds import Crowd, crowd
 from mdnum.audit.curve import SMOOTH
-from mdnum.audit.environments import Event, Surroundings, walk_surroundings
+from mdnum.audit.environments import EnvironmentWalks, Event, walk_surroundings
 from mdnum.audit.pairs import FARTHEST
 from mdnum.audit.subject import CalculatorSubject
 from mdnum.audit.thresholds import BESIDE, PairThreshold, PairWalk, PairWalks, find_thresholds, walk_pairs
@@ -87,7 +88,7 @@ def _two(threshold: PairThreshold) -> str:
 
 
 def summary(
-    walks: PairWalks, around: Surroundings, crowds: Sequence[Crowd], kT: float
+    walks: PairWalks, around: EnvironmentWalks, crowds: Sequence[Crowd], kT: float
 ) -> tuple[list[str], dict[str, Any]]:
     """Names of sentences, and their values."""
     thresholds = _all(walks)
@@ -135,7 +136,7 @@ def _rounded_up(value: float) -> float:
     return float(np.ceil(value / digit) * digit)
 
 
-def _jumps(walks: PairWalks, around: Surroundings, kT: float) -> Iterator[Observed]:
+def _jumps(walks: PairWalks, around: EnvironmentWalks, kT: float) -> Iterator[Observed]:
     """Findings of pair thresholds, by the lowest derivative that jumps."""
     for order, code in enumerate(("ENERGY_JUMP", "FORCE_JUMP", "CURVATURE_JUMP")):
         same = [one for one in _all(walks) if one.order == order]
@@ -170,7 +171,7 @@ def _jumps(walks: PairWalks, around: Surroundings, kT: float) -> Iterator[Observ
         )
 
 
-def _among_many(around: Surroundings, kT: float, not_walked: Sequence[str]) -> Iterator[Observed]:
+def _among_many(around: EnvironmentWalks, kT: float, not_walked: Sequence[str]) -> Iterator[Observed]:
     if sharp := [one for one in around.unexplained if one.jump.order <= 1]:
         worst = max(sharp, key=lambda one: (one.force, abs(one.jump.energy)))
         size = abs(worst.jump.energy) / kT if worst.jump.order == 0 else 0.0
@@ -275,7 +276,7 @@ def _first_to_jump(event: Event) -> str:
 
 
 def _tables(
-    walks: PairWalks, around: Surroundings, crowds: Sequence[Crowd], kT: float
+    walks: PairWalks, around: EnvironmentWalks, crowds: Sequence[Crowd], kT: float
 ) -> dict[str, list[dict[str, Any]]]:
     return {
         "Thresholds found by walking pairs": [
@@ -332,7 +333,9 @@ def _tables(
     }
 
 
-def _numbers(walks: PairWalks, around: Surroundings, crowds: Sequence[Crowd], kT: float) -> dict[str, Any]:
+def _numbers(
+    walks: PairWalks, around: EnvironmentWalks, crowds: Sequence[Crowd], kT: float
+) -> dict[str, Any]:
     thresholds = _all(walks)
     steps = [abs(one.jumps[0]) for one in thresholds if one.order == 0]
     steps += [abs(one.jump.energy) for one in around.events if one.jump.order == 0]

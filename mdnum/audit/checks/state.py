@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 from ase import Atoms
 
-from mdnum.audit.base import TIME_UP, AuditCheck, CheckResult, Observed, Progress, TimeUp, finding
+from mdnum.audit.base import TIME_UP, CheckResult, Observed, Progress, TimeUp, finding
+from mdnum.audit.check import AuditCheck
 from mdnum.audit.noise import FEW, NoiseFloor, digits, displaced, settled
 from mdnum.audit.pairs import molecules, pairs, whole
-from mdnum.audit.sequences import Asked, all_sequences, approaches
+from mdnum.audit.sequences import SequenceStep, all_sequences, approaches
 from mdnum.audit.subject import CalculatorError, CalculatorSubject, Forces, not_repeatable, only_trying, rms
 from mdnum.audit.thresholds import find_thresholds
 
@@ -147,7 +148,7 @@ class StateCheck(AuditCheck):
             yield finding("NOT_FINITE", "error", step=empty[0]["structure"], why=why)
 
 
-def _approached(subject: CalculatorSubject) -> tuple[dict[str, list[Asked]], list[tuple[str, str]]]:
+def _approached(subject: CalculatorSubject) -> tuple[dict[str, list[SequenceStep]], list[tuple[str, str]]]:
     """Sequences of two atoms at the cutoff; what could not be, and why."""
     what = "two atoms at the cutoff"
     try:
@@ -164,7 +165,7 @@ def _approached(subject: CalculatorSubject) -> tuple[dict[str, list[Asked]], lis
 
 
 def _through(
-    subject: CalculatorSubject, sequence: list[Asked], noise: NoiseFloor, word: str
+    subject: CalculatorSubject, sequence: list[SequenceStep], noise: NoiseFloor, word: str
 ) -> Iterator[tuple[int, dict[str, Any]]]:
     """One object through a sequence: a row for each answer, compared with that of a new object."""
     used = subject.used()
@@ -209,7 +210,7 @@ def _differences(one: tuple[float, Forces], other: tuple[float, Forces]) -> tupl
 
 
 def _again(
-    subject: CalculatorSubject, sequences: Mapping[str, list[Asked]], stale: list[dict[str, Any]]
+    subject: CalculatorSubject, sequences: Mapping[str, list[SequenceStep]], stale: list[dict[str, Any]]
 ) -> bool:
     """Whether another object, on the way on which the worst difference showed, answers as that one did."""
     worst = max(stale, key=lambda row: row["energy"])
