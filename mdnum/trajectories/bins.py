@@ -332,23 +332,13 @@ def meet(atoms, limits, first_bin, end_bin, found):
         for q in range(center_start[here + 1] - center_start[here]):
             i = center_order[center_start[here] + q]
             first = q + 1 if half else 0
-            kept = _within(
-                near,
-                first,
-                count,
-                wrapped[i, 0],
-                wrapped[i, 1],
-                wrapped[i, 2],
-                largest,
-                squares,
-                flags,
-                chosen,
-            )
-            si = species[i]
+            x0, x1, x2 = wrapped[i, 0], wrapped[i, 1], wrapped[i, 2]
+            kept = _within(near, first, count, x0, x1, x2, largest, squares, flags, chosen)
+            atom_here, run_here, si = atom[first:count], run[first:count], species[i]
             twice = not half and atoms.both[i] and kind != DIRECTED
             for m in range(kept):
                 k = chosen[m]
-                j = atom[first + k]
+                j = atom_here[k]
                 sj = species[j] if several else 0
                 if squares[k] > high[si, sj] or i == j or (twice and atoms.both[j] and j < i):
                     continue
@@ -359,7 +349,7 @@ def meet(atoms, limits, first_bin, end_bin, found):
                 else:
                     if left < found.i_open.shape[0]:
                         found.i_open[left], found.j_open[left] = i, j
-                        found.code[left], found.value[left] = codes[run[first + k]], squares[k]
+                        found.code[left], found.value[left] = codes[run_here[k]], squares[k]
                     left += 1
     found.counts[0], found.counts[1] = written, left
     return written, left

@@ -252,7 +252,7 @@ def test_wrapping_is_no_motion():
 def test_nothing_to_find_it_from():
     assert infer(frames_of(np.full((2, 3, 3), np.nan))).kind == "unknown"
     assert infer(frames_of(np.zeros((2, 3, 3)))).step == 0.0
-    with pytest.raises(InputError, match="5: leaves no frame of 1"):
+    with pytest.raises(InputError, match="@5: leaves no frame"):
         of_file(open_trajectory(datafiles.GRO, slice="5:"))
 
 

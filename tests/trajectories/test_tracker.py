@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import pickle
 import tracemalloc
 
@@ -270,6 +271,7 @@ def test_memory_does_not_grow_with_frames():
         tracker.step(Frame(k, 0.0, x, box))
         x = (x + rng.normal(size=x.shape) * (0.01 if k % 20 else 0.3)) % 12.0
         if k % 80 == 79:
+            gc.collect()
             seen.append(tracemalloc.get_traced_memory()[0])
     tracemalloc.stop()
     assert seen[2] < 1.15 * seen[0] + 50_000
