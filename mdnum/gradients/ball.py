@@ -19,11 +19,11 @@ from jax.scipy.sparse.linalg import cg
 from jaxtyping import Array, Bool, Float
 
 from mdnum.ball.contacts import Motion, Moved, Penalty, Projection
-from mdnum.ball.integrators import EventLocated, Push, VelocityVerlet
-from mdnum.ball.problem import START, Loss, Problem, loss_of
+from mdnum.ball.integrators import BallVerlet, EventLocated, Push
+from mdnum.ball.problem import START, BallLoss, BallProblem, loss_of
 from mdnum.ball.rollout import BallRun
-from mdnum.ball.state import Decisions, Record
-from mdnum.ball.stopping import Fixed
+from mdnum.ball.state import BallDecisions, BallRecord
+from mdnum.ball.stopping import FixedCount
 from mdnum.ball.world import World
 from mdnum.errors import InputError, MdnumError
 from mdnum.gradients.dependence import dependence, follow
@@ -49,7 +49,7 @@ class BallMethod:
     description: ClassVar[str]
     kind: ClassVar[Kind] = "steps"
 
-    def __call__(self, problem: Problem, names: Sequence[str]) -> Gradient:
+    def __call__(self, problem: BallProblem, names: Sequence[str]) -> Gradient:
         """The derivative of the loss by the named parameters; a batch moves as a whole along y0 and v0.
 
         Raises:
@@ -92,7 +92,7 @@ class BallGradients:
 
 
 def compare(
-    problem: Problem, names: Sequence[str], methods: Sequence[str | BallMethod] | None = None
+    problem: BallProblem, names: Sequence[str], methods: Sequence[str | BallMethod] | None = None
 ) -> BallGradients:
     """The derivative of one loss by several methods, and why some do not apply.
 
@@ -122,7 +122,7 @@ class Used(NamedTuple):
     notes: dict[str, str]
 
 
-def origin(problem: Problem, names: Sequence[str]) -> dict[str, jax.Array]:
+def origin(problem: BallProblem, names: Sequence[str]) -> dict[str, jax.Array]:
     """Where a problem is, for `moved_loss`: parameters by value, the start by how far it is moved (0)."""
     problem.values(names)
     dtype = problem.world.policy.dtype("arithmetic")
@@ -139,9 +139,9 @@ def moved_loss(
     world: World,
     y0: jax.Array,
     v0: jax.Array,
-    decisions: Decisions | None,
+    decisions: BallDecisions | None,
     steps: int,
-    loss: Loss,
+    loss: BallLoss,
 ) -> jax.Array:
     """The loss with parameters set and the start moved, everything an argument, so that no fence is folded.
 
@@ -157,7 +157,7 @@ def moved_loss(
     return loss_of(world.with_values(rest), y, v, steps, loss, decisions)
 
 
-def start_of(problem: Problem) -> tuple[jax.Array, jax.Array]:
+def start_of(problem: BallProblem) -> tuple[jax.Array, jax.Array]:
     """Heights and velocities at the start as floating arrays, shapes (balls,) and () or (balls,)."""
     y = jnp.atleast_1d(jnp.asarray(problem.y0))
     y = y if jnp.issubdtype(y.dtype, jnp.floating) else y.astype(jnp.float64)
@@ -168,7 +168,7 @@ class _Rollout(eqx.Module):
     """`moved_loss` of so many steps: equal for equal problems, so that it is compiled once."""
 
     steps: int = eqx.field(static=True)
-    loss: Loss
+    loss: BallLoss
 
     def __call__(self, values, world, y0, v0, decisions):
         return moved_loss(values, world, y0, v0, decisions, self.steps, self.loss)
@@ -191,7 +191,7 @@ def differentiate(values, world, y0, v0, decisions, steps, loss, names, scale):
 
 
 def used(
-    problem: Problem,
+    problem: BallProblem,
     names: Sequence[str],
     slopes: Mapping[str, float],
     run: BallRun | None = None,
@@ -241,7 +241,7 @@ class ThroughIterations(BallMethod):
         "the derivative of the iterations that ran; decisions are held, a solver's tolerance is in it"
     )
 
-    def __call__(self, problem: Problem, names: Sequence[str], run: BallRun | None = None) -> Gradient:
+    def __call__(self, problem: BallProblem, names: Sequence[str], run: BallRun | None = None) -> Gradient:
         """The derivative, by reverse mode.
 
         Args:
@@ -274,13 +274,13 @@ class Frozen(BallMethod):
         "the derivative of a program without branches, with the decisions and counts of a recorded run"
     )
 
-    def __call__(self, problem: Problem, names: Sequence[str]) -> Gradient:
+    def __call__(self, problem: BallProblem, names: Sequence[str]) -> Gradient:
         """The derivative, by reverse mode, with central differences of the pinned program beside it.
 
         Error: of the derivative, rounding; of the differences, about u^(2/3) relative.
         """
         run = problem.run(keep=False)
-        decisions = run.told()
+        decisions = run.decisions()
         decisions = type(decisions)(jnp.asarray(decisions.contact), jnp.asarray(decisions.iterations))
         value, slopes, marks = scaled(problem, names, decisions)
         details: dict = {"decisions": int(run.contact.size), "iterations": int(run.iterations.sum())}
@@ -299,7 +299,7 @@ class Scaled(NamedTuple):
 
 
 def scaled(
-    problem: Problem, names: Sequence[str], decisions: Decisions | None = None, scale: float = 1.0
+    problem: BallProblem, names: Sequence[str], decisions: BallDecisions | None = None, scale: float = 1.0
 ) -> Scaled:
     """Loss and reverse-mode derivative under loss scaling.
 
@@ -319,7 +319,7 @@ def scaled(
     return Scaled(float(made.value), slopes, np.asarray(marks))
 
 
-def pinned_differences(problem: Problem, names: Sequence[str], decisions) -> dict[str, float]:
+def pinned_differences(problem: BallProblem, names: Sequence[str], decisions) -> dict[str, float]:
     """Central differences of the loss with all decisions imposed.
 
     Error: about u^(2/3), relative to the loss over the size of the parameter.
@@ -477,7 +477,7 @@ class Implicit(BallMethod):
         "linear solve with a tolerance of its own"
     )
 
-    def __call__(self, problem: Problem, names: Sequence[str]) -> Gradient:
+    def __call__(self, problem: BallProblem, names: Sequence[str]) -> Gradient:
         """The derivative, by reverse mode through the linear solve.
 
         Raises:
@@ -502,7 +502,7 @@ class Implicit(BallMethod):
         attached = _with_contact(problem, replace(contact, derivative=rule))
         value, slopes, _ = scaled(attached, names)
         # what the run would be if every solve ended at its fixed point
-        ideal = _with_contact(problem, replace(contact, stop=Fixed(0), derivative=_Settled()))
+        ideal = _with_contact(problem, replace(contact, stop=FixedCount(0), derivative=_Settled()))
         asked = problem if self.at_iterate else ideal
         depends, why = used(asked, names, slopes)
         if not self.at_iterate:
@@ -516,7 +516,7 @@ class Implicit(BallMethod):
         return self.result(value, slopes, Used(depends, why), details)
 
 
-def _with_contact(problem: Problem, contact: Any) -> Problem:
+def _with_contact(problem: BallProblem, contact: Any) -> BallProblem:
     return replace(problem, world=replace(problem.world, contact=contact))
 
 
@@ -552,10 +552,10 @@ class SoftImpact(eqx.Module):
         def pull(y, v, contact):
             return self.acceleration(y, v, motion.free, contact, motion.rounding)
 
-        push = Push(motion.judge, pull, motion.policy, motion.told, motion.history)
+        push = Push(motion.judge, pull, motion.policy, motion.imposed, motion.history)
         made = motion.integrator.push(push, motion.y, motion.v, motion.carried, motion.rounding)
         left = jnp.maximum(-made.y, 0)
-        return Moved(made.y, made.v, made.a, Record(made.height, made.contact, left, made.solve))
+        return Moved(made.y, made.v, made.a, BallRecord(made.height, made.contact, left, made.solve))
 
 
 @dataclass(frozen=True)
@@ -576,7 +576,7 @@ class SoftFloor(BallMethod):
         "the derivative of another program, whose floor acts over a width eps; its loss is another too"
     )
 
-    def __call__(self, problem: Problem, names: Sequence[str]) -> Gradient:
+    def __call__(self, problem: BallProblem, names: Sequence[str]) -> Gradient:
         """The derivative, by reverse mode, of the smooth program; the value is its loss.
 
         Raises:
@@ -609,7 +609,7 @@ class SoftFloor(BallMethod):
         return self.result(value, slopes, Used(depends, why), details)
 
 
-def softened(problem: Problem, eps: float) -> Problem:
+def softened(problem: BallProblem, eps: float) -> BallProblem:
     """The problem with a soft floor: a softplus penalty, or a spring that an impact sinks into by about eps.
 
     Raises:
@@ -634,19 +634,19 @@ def softened(problem: Problem, eps: float) -> Problem:
         *(jnp.asarray(value, dtype) for value in (rate**2, eps / 4, speed / 20)),
     )
     scheme = (
-        VelocityVerlet(world.integrator.h) if isinstance(world.integrator, EventLocated) else world.integrator
+        BallVerlet(world.integrator.h) if isinstance(world.integrator, EventLocated) else world.integrator
     )
     return replace(problem, world=replace(world, contact=soft, integrator=scheme))
 
 
-def _speed(problem: Problem) -> float:
+def _speed(problem: BallProblem) -> float:
     """With which a ball of this problem arrives at the floor, m/s; 1 where none falls."""
     height = max(float(np.max(np.asarray(problem.y0, np.float64))), 0.0)
     square = float(np.max(np.asarray(problem.v0, np.float64) ** 2))
     return float(np.sqrt(square + 2 * abs(float(problem.world.gravity)) * height)) or 1.0
 
 
-def _suitable(problem: Problem) -> float:
+def _suitable(problem: BallProblem) -> float:
     contact = problem.world.contact
     if isinstance(contact, Penalty):
         return 0.1 * _speed(problem) / float(np.sqrt(float(contact.k)))
@@ -678,7 +678,7 @@ class RandomizedSmoothing(BallMethod):
         "with a standard error"
     )
 
-    def __call__(self, problem: Problem, names: Sequence[str]) -> Gradient:
+    def __call__(self, problem: BallProblem, names: Sequence[str]) -> Gradient:
         """The estimate; `details` holds its standard error for each name.
 
         Raises:
