@@ -312,7 +312,8 @@ def _independent(view: View) -> Iterator[Finding]:
         for place, names in places.items():
             groups.setdefault(names, []).append(place)
         told = "; ".join(f"along {listed(names)} {listed(where)}" for names, where in groups.items())
-        variants = ["implicit"] * ("by implicit" in places)
+        implicit = "by implicit" in places
+        variants = ["only_implicit" if len(places) == 1 else "implicit"] if implicit else []
         variants += ["variant"] * (not any(own.get(place) for place in own))
         names = listed(list(dict.fromkeys(name for names in places.values() for name in names)))
         finding = TEXTS.finding(
