@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from mdnum.ball import (
+    BallVerlet,
     ExactPenalty,
     ExplicitEuler,
     ImplicitMidpoint,
     Penalty,
     SemiImplicitEuler,
-    VelocityVerlet,
     World,
     arrive,
-    converge,
     simulate,
 )
 from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
@@ -26,13 +28,64 @@ COUNTS = (400, 800, 1600, 3200, 6400)
 SCHEMES: dict[str, Any] = {
     "explicit Euler": ExplicitEuler,
     "semi-implicit Euler": SemiImplicitEuler,
-    "velocity Verlet": VelocityVerlet,
+    "velocity Verlet": BallVerlet,
     "implicit midpoint": ImplicitMidpoint,
 }
 EULERS = tuple(SCHEMES)[:2]
 #: The ball of the headline first.
 STARTS = np.concatenate([[1.0], np.linspace(0.8, 1.2, 16)])
 ROLES = ("bad", "first", "second", "third")
+
+
+@dataclass(frozen=True)
+class Convergence:
+    """Errors at one time for several step sizes.
+
+    Attributes:
+        h: time steps, s, shape (sizes,).
+        value: root mean square error of the height over the batch, m, shape (sizes,).
+        slope: that of its derivative, shape (sizes,).
+        largest: the largest derivative that the program gave, by magnitude, shape (sizes,).
+    """
+
+    h: Float[np.ndarray, "sizes"]
+    value: Float[np.ndarray, "sizes"]
+    slope: Float[np.ndarray, "sizes"]
+    largest: Float[np.ndarray, "sizes"]
+
+    def order(self, of: str = "value") -> float:
+        """The exponent p of error ~ h^p: the slope of a straight line through the logarithms."""
+        return float(np.polyfit(np.log(self.h), np.log(getattr(self, of)), 1)[0])
+
+
+def converge(
+    world: World,
+    exact: Callable[[float], ExactImpact | ExactPenalty],
+    y0: Float[np.ndarray, "balls"],
+    time: float,
+    counts: Sequence[int],
+    name: str = "y0",
+) -> Convergence:
+    """Run a batch to the same time with several step sizes and compare with the exact motion.
+
+    Args:
+        world: the program; its time step is replaced.
+        exact: from a height at the start to the motion that the program approaches.
+        y0: heights at the start, m.
+        time: when heights are compared, s.
+        counts: numbers of steps.
+        name: what heights are differentiated by.
+    """
+    known = [exact(float(y)).height(time) for y in y0]
+    heights = np.array([float(one.value) for one in known])
+    slopes = np.array([float(one.gradient[name]) for one in known])
+    errors = []
+    for count in counts:
+        here = world.with_values({"h": time / count})
+        y, dy = arrive(here, jnp.asarray(y0), count, name)
+        off = (np.asarray(y) - heights, np.asarray(dy) - slopes)
+        errors.append([*(np.sqrt(np.mean(x**2)) for x in off), np.max(np.abs(np.asarray(dy)))])
+    return Convergence(time / np.asarray(counts, np.float64), *np.array(errors).T)
 
 
 def run() -> Demo:

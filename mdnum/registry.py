@@ -16,7 +16,7 @@ import functools
 import importlib
 import inspect
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from importlib import metadata
 from typing import Any, Generic, TypeVar
@@ -60,12 +60,14 @@ class Registry(Generic[T]):
         group: entry points by which other packages add theirs.
         kind: class that a value is an instance or a subclass of; functions are taken at their word.
         separator: between a name and its argument.
+        check: called with a value of another package when it is loaded; raises where it is not what it says.
     """
 
     noun: str
     group: str
     kind: type | None = None
     separator: str = "="
+    check: Callable[[Any], None] | None = None
     _own: dict[str, Any] = field(default_factory=dict, repr=False)
     _descriptions: dict[str, str] = field(default_factory=dict, repr=False)
 
@@ -85,6 +87,11 @@ class Registry(Generic[T]):
         if description:
             self._descriptions[name] = description
         return value
+
+    @property
+    def shipped(self) -> tuple[str, ...]:
+        """Names of mdnum's own."""
+        return tuple(self._own)
 
     def _added(self) -> dict[str, metadata.EntryPoint]:
         added: dict[str, metadata.EntryPoint] = {}
@@ -127,6 +134,8 @@ class Registry(Generic[T]):
             a_kind = isinstance(value, type) and issubclass(value, self.kind or object)
             if not (a_kind or inspect.isroutine(value) or isinstance(value, self.kind or object)):
                 raise TypeError(f"{point.value} is no {self.kind}")
+            if self.check:
+                self.check(value)
         except Exception as error:
             raise InputError(
                 f"{self.noun} {name!r} of package {_package(point)} cannot be used: "

@@ -63,7 +63,7 @@ def test_contact_is_a_pair_inside_the_cutoff():
         margin.append(float(nearest))
         inside.append(bool(touches))
 
-    world = ball.World.create(ball.Penalty(k), ball.VelocityVerlet(h), gravity=0.0)
+    world = ball.World.create(ball.Penalty(k), ball.BallVerlet(h), gravity=0.0)
     rollout = ball.simulate(world, world.start(0.2, -1.03), steps)
     np.testing.assert_allclose(rollout.y[:, 0] + 1, distance, rtol=0, atol=2e-13)
     np.testing.assert_array_equal(rollout.contact[:, 0], inside[1:])

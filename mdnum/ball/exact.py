@@ -113,8 +113,8 @@ class ExactImpact(_Motion):
     Raises:
         InputError: a parameter out of range, or a ball that starts at rest on the floor.
 
-    Error: values and derivatives are those of a program without cancellation: impact speeds, times and
-    apexes within some ten ulps plus n ulps for the n-th power of e, whatever e is, also at 1 and next to it;
+    Error: values and derivatives are those of a program without cancellation: impact speeds and
+    times within some ten ulps plus n ulps for the n-th power of e, whatever e is, also at 1 and next to it;
     height and velocity within that of the motion at a time some ulps earlier or later.
     """
 
@@ -137,18 +137,6 @@ class ExactImpact(_Motion):
         """Time of impact n, s."""
         n, e = _numbers(n), self.restitution
         return self._after_first(e * _geometric(e, n - 1), _geometric_slope(e, n))
-
-    def apex(self, n: Counts) -> Known:
-        """Greatest height between impacts n and n + 1, e^(2 n) s² / (2 g), m.
-
-        n = 0 is the apex before the first impact; for a ball thrown down that is where it would have come
-        from.
-        """
-        n = _numbers(n, least=0)
-        e, g, v0 = self.restitution, self.gravity, self.v0
-        share, top = e ** (2 * n), self.y0 + v0 * v0 / (2 * g)
-        own = {"y0": share, "v0": share * (v0 / g), "gravity": -share * (v0 * v0 / (2 * g * g))}
-        return _known(share * top, own | {"restitution": _power_slope(e, 2 * n) * top})
 
     def rest_time(self) -> Known:
         """Time after which the ball lies still, infinitely many impacts later, s.

@@ -13,9 +13,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Bool, Float, Int
 
-from mdnum.ball.contacts import Penalty, Projection
-from mdnum.ball.integrators import EventLocated, ImplicitMidpoint
-from mdnum.ball.state import BallState, Decisions, Reason
+from mdnum.ball.contacts import Penalty
+from mdnum.ball.state import BallDecisions, BallState, Reason
 from mdnum.ball.world import World
 from mdnum.errors import InputError
 from mdnum.events import Ledger, changes_in_time
@@ -23,8 +22,6 @@ from mdnum.precision.bounds import gamma
 
 #: Balls times steps that leave the device at once.
 _CHUNK = 2**21
-#: Of the record, what is kept only with `keep`.
-_STATES = ("y", "v", "height")
 
 
 @dataclass(frozen=True)
@@ -97,9 +94,9 @@ class BallRun:
         codes, counts = np.unique(self.reason, return_counts=True)
         return {Reason(code).word: int(n) for code, n in zip(codes, counts, strict=True)}
 
-    def told(self) -> Decisions:
-        """The decisions of all steps, to be told to another rollout."""
-        return Decisions(self.contact, self.iterations)  # type: ignore[arg-type]
+    def decisions(self) -> BallDecisions:
+        """The decisions of all steps, to be imposed on another rollout."""
+        return BallDecisions(self.contact, self.iterations)  # type: ignore[arg-type]
 
 
 def energy(world: World, y: np.ndarray, v: np.ndarray) -> Float[np.ndarray, "..."]:
@@ -121,7 +118,7 @@ def simulate(
     *,
     history: bool = False,
     keep: bool = True,
-    told: Decisions | None = None,
+    imposed: BallDecisions | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> BallRun:
     """Advance a batch of balls and record every decision.
@@ -132,7 +129,7 @@ def simulate(
         steps: steps to make.
         history: keep the residual of every stop decision too.
         keep: keep every state; otherwise the first and the last, and the flips.
-        told: decisions of every step to act on instead of the world's own, leading axis steps.
+        imposed: decisions of every step to act on instead of the world's own, leading axis steps.
         progress: called with the steps made and asked for.
 
     Returns:
@@ -145,60 +142,37 @@ def simulate(
         raise InputError(f"steps = {steps}; expected at least 1")
     balls = start.y.shape[0]
     chunk = max(1, min(steps, _CHUNK // max(balls, 1)))
-    parts: list[dict[str, np.ndarray]] = []
+    parts: list[dict[str, np.ndarray]] = [{"y": np.asarray(start.y)[None], "v": np.asarray(start.v)[None]}]
     ledgers: list[dict[str, np.ndarray]] = []
-    state, made = start, 0
-    before = np.asarray(start.touching)
-    y_rows, v_rows = [np.asarray(start.y)[None]], [np.asarray(start.v)[None]]
+    state, made, before = start, 0, np.asarray(start.touching)
     while made < steps:
         length = min(chunk, steps - made)
-        given = None if told is None else jax.tree.map(lambda x: x[made : made + length], told)  # noqa: B023
+        given = None if imposed is None else jax.tree.map(lambda x: x[made : made + length], imposed)  # noqa: B023
         state, out = _chunk(world, state, given, length, history)
         rows = {name: np.asarray(value) for name, value in out.items()}
-        ledgers.append(_flips(world, made, before, y_rows[-1][-1], v_rows[-1][-1], rows))
+        ledgers.append(_flips(world, made, before, parts[-1]["y"][-1], parts[-1]["v"][-1], rows))
         before = rows["contact"][-1]
-        last = slice(None) if keep else slice(-1, None)
-        y_rows.append(rows["y"][last])
-        v_rows.append(rows["v"][last])
-        parts.append({name: value for name, value in rows.items() if keep or name not in _STATES})
+        if not keep:
+            rows |= {"y": rows["y"][-1:], "v": rows["v"][-1:], "height": rows["height"][:0]}
+        parts.append(rows)
         made += length
         if progress is not None:
             progress(made, steps)
+    whole: dict[str, Any] = {
+        name: np.concatenate([part[name] for part in parts if name in part]) for name in parts[-1]
+    }
     if not keep:
-        y_rows, v_rows = [y_rows[0], y_rows[-1]], [v_rows[0], v_rows[-1]]
-
-    def whole(name: str) -> np.ndarray:
-        return np.concatenate([part[name] for part in parts])
-
-    return BallRun(
-        world=world,
-        steps=steps,
-        balls=balls,
-        y=np.concatenate(y_rows),
-        v=np.concatenate(v_rows),
-        height=whole("height") if keep else np.zeros((0, balls), y_rows[0].dtype),
-        contact=whole("contact"),
-        iterations=whole("iterations"),
-        reason=whole("reason"),
-        residual=whole("residual"),
-        margin=whole("margin"),
-        before=whole("before"),
-        history=whole("history") if history else None,
-        contacts=Ledger(
-            channel="contact",
-            **{name: np.concatenate([one[name] for one in ledgers]) for name in _LEDGER},
-            extra={"velocity": np.concatenate([one["velocity"] for one in ledgers])},
-        ),
-    )
-
-
-_LEDGER = ("step", "subject", "entered", "margin", "bound", "jump")
+        whole |= {name: whole[name][[0, -1]] for name in ("y", "v")}
+    flips = {name: np.concatenate([one[name] for one in ledgers]) for name in ledgers[0]}
+    velocity = flips.pop("velocity")
+    contacts = Ledger(channel="contact", **flips, extra={"velocity": velocity})
+    return BallRun(world=world, steps=steps, balls=balls, **{"history": None, **whole}, contacts=contacts)
 
 
 @eqx.filter_jit
-def _chunk(world: World, state: BallState, told: Any, length: int, history: bool) -> Any:
+def _chunk(world: World, state: BallState, imposed: Any, length: int, history: bool) -> Any:
     def step(state, given):
-        after, record = world.advance(state, told=given, history=history)
+        after, record = world.advance(state, imposed=given, history=history)
         solve = record.solve
         row = {
             "y": after.y,
@@ -213,7 +187,7 @@ def _chunk(world: World, state: BallState, told: Any, length: int, history: bool
         }
         return after, row | ({"history": solve.history} if history else {})
 
-    return lax.scan(step, state, told, length=length)
+    return lax.scan(step, state, imposed, length=length)
 
 
 def _flips(
@@ -287,116 +261,3 @@ def residual_bound(world: World, residual: Any, terms: int) -> Any:
         terms: balls that it is a residual of; 1 where each has its own.
     """
     return gamma(max(terms - 1, 1), world.policy.dtype("accumulate")) * residual
-
-
-@dataclass(frozen=True)
-class Difference:
-    """Where two rollouts of the same length part.
-
-    Attributes:
-        seed: first step whose state bits differ (0: the start itself); None where none do.
-        fork: first step whose decisions differ; None where none do.
-        channel: "contact" or "stop", whichever differs at the fork; "" without one.
-        ball: the first ball whose decision differs there; -1 where the decision is the batch's.
-        margins: the deciding margin in the first and in the second run: for a contact minus the height, for
-            a stop threshold minus residual at the decision that differed.
-        iterations_differ: number of steps whose iteration counts differ; 0 where the runs count other things
-            (impacts, iterations of one solver or another, nothing).
-        contacts_differ: number of contact decisions that differ.
-        separation: largest |difference| of heights at each step, m, shape (steps + 1,); empty where states
-            were not kept.
-    """
-
-    seed: int | None
-    fork: int | None
-    channel: str
-    ball: int
-    margins: tuple[float, float]
-    iterations_differ: int
-    contacts_differ: int
-    separation: Float[np.ndarray, "times"]
-
-
-def first_difference(a: BallRun, b: BallRun) -> Difference:
-    """Where two rollouts part.
-
-    Raises:
-        InputError: of other lengths or batch sizes.
-    """
-    if (a.steps, a.balls) != (b.steps, b.balls):
-        raise InputError(
-            f"the first run has {a.steps} steps of {a.balls} balls, the second {b.steps} of {b.balls}",
-            remedy="Compare runs of equal size",
-        )
-    separation = np.zeros(0)
-    seed = None
-    if a.kept and b.kept:
-        y = np.stack([run.y.astype(np.float64) for run in (a, b)])
-        v = np.stack([run.v.astype(np.float64) for run in (a, b)])
-        separation = np.max(np.abs(y[0] - y[1]), axis=1)
-        apart = np.any((y[0] != y[1]) | (v[0] != v[1]), axis=1)
-        seed = int(apart.argmax()) if apart.any() else None
-    contact = a.contact != b.contact
-    # a rule per ball and a rule for all have counts of other shapes: compare them per ball
-    counts = [_per_ball(run) for run in (a, b)]
-    stops = counts[0] != counts[1]
-    if not counts_alike(a, b):
-        # impacts are no iterations, and a run without a solver has stopped none: nothing to compare
-        stops = np.zeros_like(stops)
-    at = [
-        int(steps.argmax()) if (steps := differ.any(axis=1)).any() else a.steps for differ in (contact, stops)
-    ]
-    row = min(at)
-    if row == a.steps:
-        return Difference(seed, None, "", -1, (np.nan, np.nan), 0, 0, separation)
-    channel = "contact" if at[0] <= at[1] else "stop"
-    ball = int((contact if channel == "contact" else stops)[row].argmax())
-    if channel == "contact":
-        margins = _contact_margin(a, row, ball), _contact_margin(b, row, ball)
-    else:
-        margins = _stop_margins(a, b, row, ball)
-        ball = ball if a.iterations.ndim == 2 else -1
-    return Difference(
-        seed, row + 1, channel, ball, margins, int(stops.any(axis=1).sum()), int(contact.sum()), separation
-    )
-
-
-def counts_alike(a: BallRun, b: BallRun) -> bool:
-    """Whether the iteration counts of two runs count the same, so that they can be compared."""
-    return _counted(a) == _counted(b)
-
-
-def _counted(run: BallRun) -> str:
-    """What the iteration counts of a run count."""
-    contact, scheme = run.world.contact, run.world.integrator
-    if isinstance(scheme, EventLocated):
-        return "impacts"
-    if isinstance(contact, Projection):
-        return "iterations of a projection"
-    if isinstance(contact, Penalty) and isinstance(scheme, ImplicitMidpoint):
-        return "iterations of Newton's method"
-    return "nothing"
-
-
-def _per_ball(run: BallRun) -> np.ndarray:
-    counts = run.iterations
-    return counts if counts.ndim == 2 else np.broadcast_to(counts[:, None], run.contact.shape)
-
-
-def _contact_margin(run: BallRun, row: int, ball: int) -> float:
-    return -float(run.height[row, ball]) if len(run.height) else np.nan
-
-
-def _stop_margins(a: BallRun, b: BallRun, row: int, ball: int) -> tuple[float, float]:
-    """The margins of the decision after which one run stopped and the other went on."""
-
-    def at(run: BallRun, name: str) -> float:
-        values = getattr(run, name)
-        return float(values[row, ball] if values.ndim == 2 else values[row])
-
-    counts = [int(_per_ball(run)[row, ball]) for run in (a, b)]
-    shorter, longer = (a, b) if counts[0] < counts[1] else (b, a)
-    # the longer run's decision at that iteration is on record if it made just one more iteration
-    went_on = at(longer, "before") if abs(counts[0] - counts[1]) == 1 else np.nan
-    stopped = at(shorter, "margin")
-    return (stopped, went_on) if shorter is a else (went_on, stopped)

@@ -14,7 +14,6 @@ __all__ = ["judge", "write"]
 # which module judges a folder (`record`) and which writes its page (`write_report`); folders that answer
 # another question than what a run does or where two part go by that question
 _MODULES = {
-    "ball": ("mdnum.report.ball.findings", "mdnum.report.ball.html"),
     "ball-fork": ("mdnum.report.fork.ball", "mdnum.report.fork.ball"),
     "fork": ("mdnum.report.fork.findings", "mdnum.report.fork.html"),
     "along": ("mdnum.report.fork.map", "mdnum.report.fork.map"),

@@ -6,14 +6,14 @@ import dataclasses
 
 import numpy as np
 import pytest
-
-from mdnum import ball
 from mdnum.ball.determinism import fingerprint
-from mdnum.errors import InputError
 from mdnum.forks.bounce import BallTwin, Pin, fork
 from mdnum.forks.bounce.cross import differing, overridden
 from mdnum.forks.bounce.pair import between, reordered
 from mdnum.forks.bounce.twin import as_in_a, told
+
+from mdnum import ball
+from mdnum.errors import InputError
 
 
 def adjacent(differs, low: float, high: float) -> tuple[float, float]:
@@ -149,9 +149,9 @@ def runs() -> dict[str, ball.BallRun]:
 @pytest.mark.parametrize("name", WORLDS)
 def test_a_run_that_is_told_nothing_in_particular_has_its_own_bits(name, runs):
     world, run = WORLDS[name], runs[name]
-    own = run.told()
-    silent = ball.Decisions(np.full(own.contact.shape, -1, np.int8), np.full_like(own.iterations, -1))
-    again = ball.simulate(world, world.start(STARTS), 60, told=silent)
+    own = run.decisions()
+    silent = ball.BallDecisions(np.full(own.contact.shape, -1, np.int8), np.full_like(own.iterations, -1))
+    again = ball.simulate(world, world.start(STARTS), 60, imposed=silent)
     assert fingerprint(again) == fingerprint(run)
 
 
@@ -166,7 +166,7 @@ def contact_pin(run: ball.BallRun, number: int) -> Pin:
 def test_one_inverted_contact_is_found_exactly(name, runs):
     world, run = WORLDS[name], runs[name]
     pin = contact_pin(run, 1)
-    problem = ball.Problem(world, STARTS, 0.0, 60)
+    problem = ball.BallProblem(world, STARTS, 0.0, 60)
     found = fork(BallTwin(problem, problem, "planted", pins=(pin,)), repeats=0)
     made = found.decision
     assert made is not None
@@ -194,7 +194,7 @@ def test_one_more_iteration_is_found_exactly(name, runs):
     row = int(np.flatnonzero(busy.any(axis=1))[-1])
     one = int(busy[row].argmax()) if run.iterations.ndim == 2 else -1
     count = int(busy[row].max())
-    problem = ball.Problem(world, STARTS, 0.0, 60)
+    problem = ball.BallProblem(world, STARTS, 0.0, 60)
     pin = Pin("stop", row + 1, one, count + 1)
     found = fork(BallTwin(problem, problem, "planted", pins=(pin,)), repeats=0, counterfactual=False)
     made = found.decision
@@ -209,7 +209,7 @@ def test_what_a_told_run_would_have_decided(runs):
     count, far = overridden(run)
     assert not count.any() and not far.any()
     pin = contact_pin(run, 0)
-    other = ball.simulate(world, world.start(STARTS), 60, told=told((pin,), run))
+    other = ball.simulate(world, world.start(STARTS), 60, imposed=told((pin,), run))
     count, far = overridden(other)
     assert count[pin.step] == 1 and count[: pin.step].sum() == 0
     assert far[pin.step] == other.height[pin.step - 1, pin.ball] > 0
@@ -221,7 +221,7 @@ def test_what_a_told_run_would_have_decided(runs):
 def test_balls_in_another_order_are_compared_ball_by_ball(runs):
     world, run = WORLDS["per-instance"], runs["per-instance"]
     order = (2, 0, 1)
-    problem = ball.Problem(world, STARTS, 0.0, 60)
+    problem = ball.BallProblem(world, STARTS, 0.0, 60)
     turned = reordered(problem, order)
     np.testing.assert_array_equal(turned.y0, STARTS[[2, 0, 1]])
     back = as_in_a(turned.run(), order)
@@ -235,7 +235,7 @@ def test_rules_for_all_and_for_each_are_compared_where_iterations_do_something(r
     assert not len(differing(runs["global"], runs["per-instance"]))
     # the first two touch in one step, one of them deeper
     starts = np.array([0.3, 0.301, 0.52])
-    problems = (ball.Problem(WORLDS[name], starts, 0.0, 60) for name in ("global", "per-instance"))
+    problems = (ball.BallProblem(WORLDS[name], starts, 0.0, 60) for name in ("global", "per-instance"))
     found = fork(BallTwin(*problems, "rules"), repeats=0)
     rows = found.crossed
     assert len(rows) and np.all(rows.channel == "stop") and set(rows.ball.tolist()) <= {0, 1}
