@@ -13,7 +13,8 @@ from jaxtyping import Array, Float
 
 from mdnum.ball import BallProblem, GlobalSum, Projection, ResidualPenetration, SemiImplicitEuler, World
 from mdnum.ball.stopping import elementwise
-from mdnum.gradients.ball import FixedPointRule, Implicit, fixed_point_tangent, scaled
+from mdnum.gradients.ball import scaled
+from mdnum.gradients.ball_contacts import FixedPointRule, Implicit, fixed_point_tangent
 from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
 
 K = ALPHA = 0.5

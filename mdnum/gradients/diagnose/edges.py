@@ -1,6 +1,6 @@
 """The jump of a gradient across the nearest boundaries of decisions on either side of a parameter.
 
-Between two boundaries every run decides alike, and loss and gradient are smooth functions of the parameter.
+StepEnds two boundaries every run decides alike, and loss and gradient are smooth functions of the parameter.
 At a boundary one pair is decided otherwise between two adjacent floats. A step of an optimizer that is longer
 than the distance to the nearest boundary crosses into another program, and what the gradient does there says
 what that is worth.
