@@ -27,7 +27,7 @@ def consistent(
         output.print_json({"question": "benign", "vary": vary, **plain(found)})
         return output.EXIT_FINE if found.passed else output.EXIT_FINDINGS
     out = output.console()
-    out.print(found.says, style="bold", markup=False)
+    out.print("Benign." if found.passed else "Not benign.", style="bold", markup=False)
     rows = [
         ("step of the comparison", f"{found.window:,}"),
         ("principal components", found.components),

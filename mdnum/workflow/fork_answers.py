@@ -68,7 +68,7 @@ def take_back(fork: Fork, pin: str) -> tuple[dict[str, Any], Pinned | None]:
     """B run again with some decisions taken back, as summary.json holds it; a reason where it cannot be.
 
     Args:
-        pin: "fork", or a pair over a window, as `mdnum.forks.take_back.parse_pin` reads it.
+        pin: "fork", or a pair over a window, as `mdnum.forks.replays.parse_pin` reads it.
 
     Raises:
         InputError: a pair that there is not.

@@ -15,7 +15,7 @@ from mdnum.store import RunFolder
 from mdnum.workflow.fork_question import OF_A_BALL, Log, Progress, basics, finish, loaded, opened
 
 if TYPE_CHECKING:
-    from mdnum.forks.forecast import Forecast, Foretold, Range
+    from mdnum.forks.forecast import Forecast, ForecastRange, PredictedFlip
     from mdnum.systems.load import System
 
 #: Flips that are listed of each kind.
@@ -107,7 +107,7 @@ def fork_forecast(
     return ForecastResult(folder.path, found, finish(folder, report, progress))
 
 
-def _says(good: Range, last: int, examined: int) -> str:
+def _says(good: ForecastRange, last: int, examined: int) -> str:
     """How far a forecast goes, why no further, and what it looked at."""
     why = {
         "end": "",
@@ -120,11 +120,11 @@ def _says(good: Range, last: int, examined: int) -> str:
     return f"Good {until}{why}; {examined:,} decisions of listed pairs were examined."
 
 
-def _row(flip: Foretold) -> dict[str, Any]:
+def _row(flip: PredictedFlip) -> dict[str, Any]:
     return {name: getattr(flip, name) for name in ("step", "i", "j", "amplitude", "margin", "ulps")}
 
 
-def _write(folder: RunFolder, found: Forecast, lists: Mapping[str, tuple[Foretold, ...]]) -> None:
+def _write(folder: RunFolder, found: Forecast, lists: Mapping[str, tuple[PredictedFlip, ...]]) -> None:
     """Puts the flips that are listed, and the nearest one of every step, into the folder's tables."""
     for asked, flips in lists.items():
         rows = [_row(flip) for flip in flips]
