@@ -9,7 +9,6 @@ import pytest
 from ball import oracles
 from hypothesis import given
 from hypothesis import strategies as st
-from mdnum.forks.exact.dyadic import Dyadic
 
 from mdnum.ball import (
     BallVerlet,
