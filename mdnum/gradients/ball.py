@@ -6,6 +6,7 @@ parameters (randomized); those of other contacts are in `ball_contacts`, that of
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
@@ -16,9 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from mdnum.ball.contacts import Projection
-from mdnum.ball.problem import START, Loss, Problem, loss_of
+from mdnum.ball.problem import START, BallLoss, BallProblem, loss_of
 from mdnum.ball.rollout import BallRun
-from mdnum.ball.state import Decisions
+from mdnum.ball.state import BallDecisions
 from mdnum.ball.world import World
 from mdnum.errors import InputError, MdnumError
 from mdnum.gradients.dependence import dependence, follow
@@ -39,7 +40,7 @@ class BallMethod:
     description: ClassVar[str]
     kind: ClassVar[Kind] = "steps"
 
-    def __call__(self, problem: Problem, names: Sequence[str]) -> Gradient:
+    def __call__(self, problem: BallProblem, names: Sequence[str]) -> Gradient:
         """The derivative of the loss by the named parameters; a batch moves as a whole along y0 and v0.
 
         Raises:
@@ -82,7 +83,7 @@ class BallGradients:
 
 
 def compare(
-    problem: Problem, names: Sequence[str], methods: Sequence[str | BallMethod] | None = None
+    problem: BallProblem, names: Sequence[str], methods: Sequence[str | BallMethod] | None = None
 ) -> BallGradients:
     """The derivative of one loss by several methods, and why some do not apply.
 
@@ -112,7 +113,7 @@ class Used(NamedTuple):
     notes: dict[str, str]
 
 
-def origin(problem: Problem, names: Sequence[str]) -> dict[str, jax.Array]:
+def origin(problem: BallProblem, names: Sequence[str]) -> dict[str, jax.Array]:
     """Where a problem is, for `moved_loss`: parameters by value, the start by how far it is moved (0)."""
     problem.values(names)
     dtype = problem.world.policy.dtype("arithmetic")
@@ -129,9 +130,9 @@ def moved_loss(
     world: World,
     y0: jax.Array,
     v0: jax.Array,
-    decisions: Decisions | None,
+    decisions: BallDecisions | None,
     steps: int,
-    loss: Loss,
+    loss: BallLoss,
 ) -> jax.Array:
     """The loss with parameters set and the start moved, everything an argument, so that no fence is folded.
 
@@ -147,7 +148,7 @@ def moved_loss(
     return loss_of(world.with_values(rest), y, v, steps, loss, decisions)
 
 
-def start_of(problem: Problem) -> tuple[jax.Array, jax.Array]:
+def start_of(problem: BallProblem) -> tuple[jax.Array, jax.Array]:
     """Heights and velocities at the start as floating arrays, shapes (balls,) and () or (balls,)."""
     y = jnp.atleast_1d(jnp.asarray(problem.y0))
     y = y if jnp.issubdtype(y.dtype, jnp.floating) else y.astype(jnp.float64)
@@ -158,7 +159,7 @@ class _Rollout(eqx.Module):
     """`moved_loss` of so many steps: equal for equal problems, so that it is compiled once."""
 
     steps: int = eqx.field(static=True)
-    loss: Loss
+    loss: BallLoss
 
     def __call__(self, values, world, y0, v0, decisions):
         return moved_loss(values, world, y0, v0, decisions, self.steps, self.loss)
@@ -179,7 +180,7 @@ def differentiate(values, world, y0, v0, decisions, steps, loss, names, scale):
 
 
 def used(
-    problem: Problem,
+    problem: BallProblem,
     names: Sequence[str],
     slopes: Mapping[str, float],
     run: BallRun | None = None,
@@ -229,7 +230,7 @@ class ThroughIterations(BallMethod):
         "the derivative of the iterations that ran; decisions are held, a solver's tolerance is in it"
     )
 
-    def __call__(self, problem: Problem, names: Sequence[str], run: BallRun | None = None) -> Gradient:
+    def __call__(self, problem: BallProblem, names: Sequence[str], run: BallRun | None = None) -> Gradient:
         """The derivative, by reverse mode.
 
         Args:
@@ -262,13 +263,13 @@ class Frozen(BallMethod):
         "the derivative of a program without branches, with the decisions and counts of a recorded run"
     )
 
-    def __call__(self, problem: Problem, names: Sequence[str]) -> Gradient:
+    def __call__(self, problem: BallProblem, names: Sequence[str]) -> Gradient:
         """The derivative, by reverse mode, with central differences of the pinned program beside it.
 
         Error: of the derivative, rounding; of the differences, about u^(2/3) relative.
         """
         run = problem.run(keep=False)
-        decisions = run.told()
+        decisions = run.decisions()
         decisions = type(decisions)(jnp.asarray(decisions.contact), jnp.asarray(decisions.iterations))
         value, slopes, marks = scaled(problem, names, decisions)
         details: dict = {"decisions": int(run.contact.size), "iterations": int(run.iterations.sum())}
@@ -287,7 +288,7 @@ class Scaled(NamedTuple):
 
 
 def scaled(
-    problem: Problem, names: Sequence[str], decisions: Decisions | None = None, scale: float = 1.0
+    problem: BallProblem, names: Sequence[str], decisions: BallDecisions | None = None, scale: float = 1.0
 ) -> Scaled:
     """Loss and reverse-mode derivative under loss scaling.
 
@@ -308,7 +309,7 @@ def scaled(
     return Scaled(float(made.value), slopes, np.asarray(marks))
 
 
-def pinned_differences(problem: Problem, names: Sequence[str], decisions) -> dict[str, float]:
+def pinned_differences(problem: BallProblem, names: Sequence[str], decisions) -> dict[str, float]:
     """Central differences of the loss with all decisions imposed.
 
     Error: about u^(2/3), relative to the loss over the size of the parameter.
@@ -352,7 +353,7 @@ class RandomizedSmoothing(BallMethod):
         "with a standard error"
     )
 
-    def __call__(self, problem: Problem, names: Sequence[str]) -> Gradient:
+    def __call__(self, problem: BallProblem, names: Sequence[str]) -> Gradient:
         """The estimate; `details` holds its standard error for each name.
 
         Raises:

@@ -14,10 +14,10 @@ from jax.scipy.sparse.linalg import cg
 from jaxtyping import Array, Bool, Float
 
 from mdnum.ball.contacts import Motion, Moved, Penalty, Projection
-from mdnum.ball.integrators import EventLocated, Push, VelocityVerlet
-from mdnum.ball.problem import START, Problem
-from mdnum.ball.state import Record
-from mdnum.ball.stopping import Fixed
+from mdnum.ball.integrators import BallVerlet, EventLocated, Push
+from mdnum.ball.problem import START, BallProblem
+from mdnum.ball.state import BallRecord
+from mdnum.ball.stopping import FixedCount
 from mdnum.errors import InputError
 from mdnum.gradients.ball import BallMethod, Used, scaled, used
 from mdnum.gradients.problem import Gradient
@@ -167,7 +167,7 @@ class Implicit(BallMethod):
         "linear solve with a tolerance of its own"
     )
 
-    def __call__(self, problem: Problem, names: Sequence[str]) -> Gradient:
+    def __call__(self, problem: BallProblem, names: Sequence[str]) -> Gradient:
         """The derivative, by reverse mode through the linear solve.
 
         Raises:
@@ -192,7 +192,7 @@ class Implicit(BallMethod):
         attached = _with_contact(problem, replace(contact, derivative=rule))
         value, slopes, _ = scaled(attached, names)
         # what the run would be if every solve ended at its fixed point
-        ideal = _with_contact(problem, replace(contact, stop=Fixed(0), derivative=_Settled()))
+        ideal = _with_contact(problem, replace(contact, stop=FixedCount(0), derivative=_Settled()))
         asked = problem if self.at_iterate else ideal
         depends, why = used(asked, names, slopes)
         if not self.at_iterate:
@@ -206,7 +206,7 @@ class Implicit(BallMethod):
         return self.result(value, slopes, Used(depends, why), details)
 
 
-def _with_contact(problem: Problem, contact: Any) -> Problem:
+def _with_contact(problem: BallProblem, contact: Any) -> BallProblem:
     return replace(problem, world=replace(problem.world, contact=contact))
 
 
@@ -242,10 +242,10 @@ class SoftImpact(eqx.Module):
         def pull(y, v, contact):
             return self.acceleration(y, v, motion.free, contact, motion.rounding)
 
-        push = Push(motion.judge, pull, motion.policy, motion.told, motion.history)
+        push = Push(motion.judge, pull, motion.policy, motion.imposed, motion.history)
         made = motion.integrator.push(push, motion.y, motion.v, motion.carried, motion.rounding)
         left = jnp.maximum(-made.y, 0)
-        return Moved(made.y, made.v, made.a, Record(made.height, made.contact, left, made.solve))
+        return Moved(made.y, made.v, made.a, BallRecord(made.height, made.contact, left, made.solve))
 
 
 @dataclass(frozen=True)
@@ -266,7 +266,7 @@ class SoftFloor(BallMethod):
         "the derivative of another program, whose floor acts over a width eps; its loss is another too"
     )
 
-    def __call__(self, problem: Problem, names: Sequence[str]) -> Gradient:
+    def __call__(self, problem: BallProblem, names: Sequence[str]) -> Gradient:
         """The derivative, by reverse mode, of the smooth program; the value is its loss.
 
         Raises:
@@ -299,7 +299,7 @@ class SoftFloor(BallMethod):
         return self.result(value, slopes, Used(depends, why), details)
 
 
-def softened(problem: Problem, eps: float) -> Problem:
+def softened(problem: BallProblem, eps: float) -> BallProblem:
     """The problem with a soft floor: a softplus penalty, or a spring that an impact sinks into by about eps.
 
     Raises:
@@ -324,19 +324,19 @@ def softened(problem: Problem, eps: float) -> Problem:
         *(jnp.asarray(value, dtype) for value in (rate**2, eps / 4, speed / 20)),
     )
     scheme = (
-        VelocityVerlet(world.integrator.h) if isinstance(world.integrator, EventLocated) else world.integrator
+        BallVerlet(world.integrator.h) if isinstance(world.integrator, EventLocated) else world.integrator
     )
     return replace(problem, world=replace(world, contact=soft, integrator=scheme))
 
 
-def _speed(problem: Problem) -> float:
+def _speed(problem: BallProblem) -> float:
     """With which a ball of this problem arrives at the floor, m/s; 1 where none falls."""
     height = max(float(np.max(np.asarray(problem.y0, np.float64))), 0.0)
     square = float(np.max(np.asarray(problem.v0, np.float64) ** 2))
     return float(np.sqrt(square + 2 * abs(float(problem.world.gravity)) * height)) or 1.0
 
 
-def _suitable(problem: Problem) -> float:
+def _suitable(problem: BallProblem) -> float:
     contact = problem.world.contact
     if isinstance(contact, Penalty):
         return 0.1 * _speed(problem) / float(np.sqrt(float(contact.k)))

@@ -161,7 +161,8 @@ for _name, _class in {
     "finite-differences": "differences:FiniteDifferences",
     "shadow-differences": "differences:ShadowDifferences",
     "smoothed-differences": "ensemble:SmoothedDifferences", "surrogate": "recorded:Surrogate",
-    "ensemble": "ensemble:Ensemble", "reweighting": "averages:Reweighting", "boundary": "averages:BoundaryTerm",
+    "ensemble": "ensemble:Ensemble", "reweighting": "averages:Reweighting",
+    "boundary": "averages:BoundaryTerm",
 }.items():  # fmt: skip
     METHODS.add(_name, f"mdnum.gradients.{_class}")
 #: Names of what reverse mode keeps of its forward pass, which its method decides by the memory there is.
