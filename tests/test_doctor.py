@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from mdnum import doctor
-from mdnum.doctor import Diagnosis, Row, diagnose
+from mdnum.doctor import Diagnosis, DoctorRow, diagnose
 
 
 def _processor_seconds() -> float:
@@ -48,9 +48,9 @@ def test_it_answers_in_time(examined: tuple[Diagnosis, float]):
 
 
 def test_every_unsafe_row_says_what_to_do_and_decides_the_verdict():
-    bad = Row("x", "unsafe", "seen", "do this")
-    assert not Diagnosis((Row("y", "ok", ""), bad), 1.0).ok
-    assert Diagnosis((Row("y", "ok", ""), Row("z", "info", "")), 1.0).ok
+    bad = DoctorRow("x", "unsafe", "seen", "do this")
+    assert not Diagnosis((DoctorRow("y", "ok", ""), bad), 1.0).ok
+    assert Diagnosis((DoctorRow("y", "ok", ""), DoctorRow("z", "info", "")), 1.0).ok
     assert Diagnosis((bad,), 1.0).to_dict()["rows"][0]["remedy"] == "do this"
 
 

@@ -25,7 +25,7 @@ _counter = itertools.count()
 
 
 @dataclass(frozen=True)
-class Place:
+class NamedObject:
     """Where an object is, by the words of a person.
 
     Attributes:
@@ -180,16 +180,16 @@ class Place:
             ) from None
 
 
-def place(text: str) -> Place | None:
+def place(text: str) -> NamedObject | None:
     """Where words say that an object is; None where they name neither a file nor, by a colon, a module."""
     text = text.strip()
     head, separator, call = text.partition(".py:")
     if separator:
-        return Place(text, f"{head}.py", call.strip())
+        return NamedObject(text, f"{head}.py", call.strip())
     if text.endswith(".py"):
-        return Place(text, text, "")
+        return NamedObject(text, text, "")
     home, colon, call = text.partition(":")
-    return Place(text, home.strip(), call.strip()) if colon and home and call else None
+    return NamedObject(text, home.strip(), call.strip()) if colon and home and call else None
 
 
 def public(scope: Any) -> list[str]:

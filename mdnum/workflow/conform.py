@@ -18,7 +18,7 @@ from mdnum.errors import InputError
 from mdnum.references.conformance.case import AREAS
 from mdnum.references.conformance.judge import CODES, DOUBLE, SILENT, SINGLE
 from mdnum.references.conformance.lists import LIMITS, PairList
-from mdnum.references.conformance.results import Answers, Failed, Report
+from mdnum.references.conformance.results import CaseAnswers, Failed, Report
 from mdnum.report.finding import Finding, Texts, Verdict, conclude
 from mdnum.report.section import Code, Figure, Key, Page, Section, Table, pairs
 from mdnum.report.svg import BAD, FIRST, MUTED, SECOND
@@ -73,7 +73,7 @@ class Options:
 
 
 @dataclass
-class Examination(Answers):
+class Examination(CaseAnswers):
     """What answers.json holds, and an examination is resumed from.
 
     Attributes:
