@@ -26,7 +26,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-import mdnum.precision  # noqa: F401 (turns on float64)
+import mdnum.numerics  # noqa: F401 (turns on float64)
 from mdnum.plain import plain
 from mdnum.safe_path import environment, python
 

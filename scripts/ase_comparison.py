@@ -26,11 +26,11 @@ from pathlib import Path
 import numpy as np
 from _output import figure, parser, save, say, start, table
 
-from mdnum.md.cutoffs import BY_NAME
+from mdnum.md.cutoffs import CUTOFFS
 from mdnum.references import check_energy, check_pairs
 from mdnum.systems import System, load, names
 
-KINDS = tuple(BY_NAME)
+KINDS = tuple(CUTOFFS)
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,7 @@ from mdnum.events.chance import REPEATS
 from mdnum.forks import fork
 from mdnum.forks.choices import BY_NAME, Choice, parse
 from mdnum.forks.choices.base import varied
-from mdnum.md.cutoffs import BY_NAME as CUTOFFS
+from mdnum.md.cutoffs import CUTOFFS
 from mdnum.systems import System, load
 
 KINDS = ("hard", "shifted", "force-shifted", "switched")

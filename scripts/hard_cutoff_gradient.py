@@ -38,12 +38,10 @@ from ase import Atoms
 from ase.build import bulk
 
 from mdnum.gradients import Problem
-from mdnum.gradients.boundary import Boundary, distances
-from mdnum.gradients.ensemble import Ensemble, Replicas, settled
-from mdnum.gradients.frames import frames
+from mdnum.gradients.averages import Boundary, distances, frames
+from mdnum.gradients.ensemble import Ensemble, Replicas, SmoothedDifferences, settled
 from mdnum.gradients.losses import MeanPotential, MeanTemperature, VelocityAutocorrelation
-from mdnum.gradients.smoothed import SmoothedDifferences
-from mdnum.gradients.symmetric import EventAware, Symmetric
+from mdnum.gradients.recorded import EventAware, Symmetric
 from mdnum.gradients.tape import Tape
 from mdnum.systems import System, SystemSpec, build
 

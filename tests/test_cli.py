@@ -23,7 +23,7 @@ from mdnum.errors import InputError, NumericalError
 from mdnum.plain import plain
 from mdnum.report.finding import conclude, restore
 from mdnum.report.section import Key, Page, Section, records
-from mdnum.store.naming import default_folder
+from mdnum.store.files import default_folder
 from mdnum.workflow.frame import Outcome
 
 SUMMARY: dict[str, Any] = {

@@ -12,7 +12,7 @@ from command_line import call, printed
 
 from mdnum.cli.audit_print import print_rows
 from mdnum.store import RunFolder
-from mdnum.store.atomic import write_text
+from mdnum.store.files import write_text
 
 EMT = "ase.calculators.emt:EMT"
 

@@ -8,16 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import call, printed
+from mdnum.workflow.grad_words import loss, unit_of_loss, unit_of_parameter, words
 
 from mdnum.errors import InputError
-from mdnum.gradients.base import Problem
-from mdnum.gradients.ensemble import Ensemble
-from mdnum.gradients.smoothed import SmoothedDifferences
+from mdnum.gradients.ensemble import Ensemble, SmoothedDifferences
+from mdnum.gradients.problem import Problem
 from mdnum.report import write
 from mdnum.store import RunFolder
 from mdnum.systems import build
 from mdnum.workflow import grad_ball, grad_methods
-from mdnum.workflow.grad_words import loss, unit_of_loss, unit_of_parameter, words
 
 WELL = "pair/leaving-well"
 

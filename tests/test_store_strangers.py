@@ -17,7 +17,9 @@ from test_store import frame, series_rows, state_at, write_run
 
 from mdnum.errors import FolderError, InputError
 from mdnum.report import page
-from mdnum.store import RunFolder, atomic, checkpoint, manifest
+from mdnum.store import RunFolder, checkpoint
+from mdnum.store import files as atomic
+from mdnum.store import files as manifest
 
 PRECIOUS = b"somebody's only copy"
 

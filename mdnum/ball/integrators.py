@@ -15,9 +15,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from mdnum.ball.solver import iterate, no_solve
 from mdnum.ball.state import Solve
-from mdnum.ball.stopping import Maximum, StopRule
+from mdnum.ball.stopping import Maximum, StopRule, iterate, no_solve
 from mdnum.precision.exact import fence
 from mdnum.precision.policy import RolePrecision
 

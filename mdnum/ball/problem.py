@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Protocol
 
 import equinox as eqx
 import jax
@@ -12,13 +12,72 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from mdnum.ball.losses import FinalHeight, Loss
 from mdnum.ball.rollout import BallRun, simulate
-from mdnum.ball.state import Decisions
+from mdnum.ball.state import BallState, Decisions, Record
 from mdnum.ball.world import World
 
 #: Parameters of the start rather than of the world; a value moves the whole batch.
 START = ("y0", "v0")
+
+
+class Loss(Protocol):
+    """A sum over steps and a term of the end; both shape (), in the dtype they are given."""
+
+    def step(self, state: BallState, record: Record, dtype: Any) -> Float[Array, ""]:
+        """What the step that made this state adds."""
+        ...
+
+    def end(self, state: BallState, steps: int, total: Float[Array, ""]) -> Float[Array, ""]:
+        """The loss, from the sum over steps and the last state."""
+        ...
+
+
+class FinalHeight(eqx.Module):
+    """Mean height at the end, m; with a target the mean squared distance to it, m²."""
+
+    target: float | None = eqx.field(static=True, default=None)
+
+    def step(self, state, record, dtype):
+        """Nothing."""
+        return jnp.zeros((), dtype)
+
+    def end(self, state, steps, total):
+        """The mean over the batch."""
+        y = state.y.astype(total.dtype)
+        if self.target is None:
+            return jnp.mean(y, dtype=total.dtype)
+        return jnp.mean((y - self.target) ** 2, dtype=total.dtype)
+
+
+class MeanHeight(eqx.Module):
+    """Height averaged over balls and steps, m."""
+
+    def step(self, state, record, dtype):
+        """The mean over the batch."""
+        return jnp.mean(state.y.astype(dtype), dtype=dtype)
+
+    def end(self, state, steps, total):
+        """Divided by the number of steps."""
+        return total / max(steps, 1)
+
+
+class ResidualPenetration(eqx.Module):
+    """What the contact model leaves of the penetration, summed over steps, averaged over balls.
+
+    Attributes:
+        power: 2 for squares, m²; 1 for the penetration itself, m.
+    """
+
+    power: int = eqx.field(static=True, default=2)
+
+    def step(self, state, record, dtype):
+        """The mean of |p|^power over the batch."""
+        left = record.left.astype(dtype)
+        return jnp.mean(left if self.power == 1 else left**self.power, dtype=dtype)
+
+    def end(self, state, steps, total):
+        """The sum over steps."""
+        return total
 
 
 @dataclass(frozen=True)
@@ -59,20 +118,6 @@ class Problem:
     def value(self, overrides: Mapping[str, Any] | None = None) -> float:
         """The loss."""
         return float(_loss(self._bare(), self.world, *self._start(), dict(overrides or {}), None))
-
-    def function(self, names: Sequence[str]) -> Callable[[Mapping[str, Any]], Float[Array, ""]]:
-        """The loss as a function of the named parameters, to be traced, differentiated and jitted by JAX.
-
-        The world's other numbers are constants of the function. Inside a jit of your own pass them as
-        arguments instead (`loss_of`), or the compiler folds the fences away.
-        """
-        self.values(names)
-        bare, world, start = self._bare(), self.world, self._start()
-
-        def loss(values: Mapping[str, Any]) -> Float[Array, ""]:
-            return _loss(bare, world, *start, dict(values), None)
-
-        return loss
 
     def value_and_grad(
         self, names: Sequence[str], told: Decisions | None = None
@@ -152,3 +197,22 @@ def _loss(bare, world, y0, v0, values, told):
 @eqx.filter_jit
 def _value_and_grad(bare, values, world, y0, v0, told):
     return jax.value_and_grad(lambda given: _apply(bare, world, y0, v0, given, told, shifts=True))(values)
+
+
+def arrive(world: World, y0: Float[Array, "balls"], steps: int, name: str) -> tuple[Array, Array]:
+    """Heights after a number of steps and the derivative of the program by a parameter, by forward mode.
+
+    One compilation serves all step sizes and numbers of steps.
+    """
+    return _arrive(world, y0, jnp.asarray(steps), name)
+
+
+@eqx.filter_jit
+def _arrive(world: World, y0: Array, steps: Array, name: str) -> tuple[Array, Array]:
+    def run(value):
+        here = world if name in ("y0", "v0") else world.with_values({name: value})
+        start = here.start(y0 + value if name == "y0" else y0, value if name == "v0" else 0.0)
+        return lax.fori_loop(0, steps, lambda _, state: here.advance(state)[0], start).y
+
+    value = jnp.zeros(()) if name in ("y0", "v0") else jnp.asarray(world.value(name))
+    return jax.jvp(run, (value,), (jnp.ones_like(value),))

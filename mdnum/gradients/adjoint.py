@@ -19,13 +19,11 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from mdnum.errors import InputError
-from mdnum.gradients import conservative
 from mdnum.gradients.crossings import Crossings, crossings, onto_crossings
-from mdnum.gradients.loops import over_rows
+from mdnum.gradients.forces import FORCE, MODEL, SCALE, pull_back
 from mdnum.gradients.losses import Frame
-from mdnum.gradients.pairs import FORCE, MODEL, SCALE, pull_back
 from mdnum.gradients.parameters import Cotangents, quantities
-from mdnum.gradients.tape import Stretch, Tape, frame_of, rows_of, unsorted
+from mdnum.gradients.tape import Stretch, Tape, frame_of, over_rows, unsorted
 from mdnum.md.integrators import Integrator
 from mdnum.md.manyforce import ManyBodyForce
 from mdnum.md.pairforce import PairForce
@@ -176,7 +174,7 @@ class Backward:
             simulation.integrator,
             simulation.masses[order],
             simulation.tables(stretch.table),
-            rows_of(stretch),
+            stretch.columns,
             stretch.bits,
             stretch.rows,
             self.tape.seen(stretch),
@@ -231,7 +229,6 @@ def transposed(
     carry = carry._replace(x=carry.x[:, order], v=carry.v[:, order])
     dtype = rows[1].dtype
     mass_row = masses.astype(dtype)
-    transpose: Any = pull_back if isinstance(force, PairForce) else conservative.pull_back
     # the noise of a thermostat belongs to the atom, and its size to the length that atoms are measured in
     numbers, rest = eqx.partition(integrator, _is_number)
 
@@ -285,7 +282,7 @@ def transposed(
         )
         onto_v = onto_kicked + loss_v
         w = (half * onto_kicked + second * onto_v) / mass_row
-        made = transpose(force, x, tables, told, w, onto_potential, onto_virial, wanted)
+        made = pull_back(force, x, tables, told, w, onto_potential, onto_virial, wanted)
         model, numbers_bar, scale = carry.model, carry.integrator, carry.scale
         if MODEL in wanted:
             model = jax.tree.map(jnp.add, model, made.model)

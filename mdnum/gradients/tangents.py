@@ -20,11 +20,9 @@ from jaxtyping import Array, Float
 
 from mdnum.errors import InputError
 from mdnum.gradients.crossings import Crossings, Met, crossings, push_through
-from mdnum.gradients.directions import Column, Direction, columns_of, directions
-from mdnum.gradients.loops import over_rows
 from mdnum.gradients.losses import Frame
-from mdnum.gradients.parameters import quantities, with_quantities
-from mdnum.gradients.tape import Stretch, Tape, frame_of, rows_of, unsorted
+from mdnum.gradients.parameters import Column, Direction, columns_of, directions, quantities, with_quantities
+from mdnum.gradients.tape import Stretch, Tape, frame_of, over_rows, unsorted
 from mdnum.md.decide import Tables
 from mdnum.md.integrators import Integrator
 from mdnum.md.manyforce import ManyBodyForce
@@ -119,7 +117,7 @@ def tangents(
             simulation.integrator,
             jnp.asarray(simulation.masses[order]),
             simulation.tables(stretch.table),
-            rows_of(stretch),
+            stretch.columns,
             stretch.bits,
             stretch.rows,
             tape.seen(stretch),

@@ -11,8 +11,8 @@ from ase import Atoms
 from ase.md.verlet import VelocityVerlet
 from numpy import ndarray
 
-from mdnum.precision import unit_roundoff
-from mdnum.precision.policy import WIDE, carrier
+from mdnum.numerics.roles import WIDE, carrier
+from mdnum.numerics.rounding import unit_roundoff
 from mdnum.references.ase_models import Reference, evaluate, independent, reference
 from mdnum.references.independent import Edges, PairModel, edges_of, pair_forms
 from mdnum.references.oracle import rounding_bound
@@ -470,10 +470,12 @@ def check_dynamics(system: System, steps: int = 100, *, judge: Reference | None 
 
 def _without_bath(system: System) -> System:
     dynamics = system.spec.dynamics
-    if isinstance(dynamics, schema.NVE):
+    if isinstance(dynamics, schema.NVETable):
         return system
     shared = dynamics.model_dump(exclude={"kind", "friction"})
-    return replace(system, spec=system.spec.model_copy(update={"dynamics": schema.NVE(kind="nve", **shared)}))
+    return replace(
+        system, spec=system.spec.model_copy(update={"dynamics": schema.NVETable(kind="nve", **shared)})
+    )
 
 
 def _forces(system: System) -> Reference:

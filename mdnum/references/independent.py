@@ -1,7 +1,7 @@
 """Energies, forces and stress in plain numpy on ASE's neighbor list, from the formulas alone.
 
-Nothing here is shared with mdnum.md: it is the judge where ASE has no class for a potential or a cutoff, and
-the third opinion where it has one.
+Nothing here is shared with what a run evaluates (a cutoff has a `reference` of its own in numpy): it is
+the judge where ASE has no class for a potential or a cutoff, and the third opinion where it has one.
 
 A model sees directed edges (i -> j, displacement d) and returns the energy of each atom and the gradient of
 the total energy with respect to every d. Forces and stress follow from that gradient in one place:
@@ -24,6 +24,8 @@ from ase.stress import full_3x3_to_voigt_6_stress
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
+from mdnum.md.cutoffs import CUTOFFS, AtCutoff
+from mdnum.md.potentials import POTENTIALS
 from mdnum.systems import pairs
 from mdnum.systems.schema import SystemSpec
 
@@ -143,22 +145,16 @@ class PairForm:
 
     def bare(self, r: Float[ndarray, "pairs"]) -> tuple[Float[ndarray, "pairs"], Float[ndarray, "pairs"]]:
         """u(r) and u'(r) without any cutoff."""
-        return _BARE[self.kind](r, **self.constants)
+        if self.kind in _BARE:
+            return _BARE[self.kind](r, **self.constants)
+        return POTENTIALS[self.kind].reference(r, **self.constants)
 
     def __call__(self, r: Float[ndarray, "pairs"]) -> tuple[Float[ndarray, "pairs"], Float[ndarray, "pairs"]]:
         """Energy and its derivative with respect to r, cut off, for pairs that are inside."""
         u, du = self.bare(r)
         at_cut, slope_at_cut = (float(x[0]) for x in self.bare(np.array([self.r_cut])))
-        if self.cutoff == "hard":
-            return u, du
-        if self.cutoff == "shifted":
-            return u - at_cut, du
-        if self.cutoff == "force-shifted":
-            return u - at_cut - (r - self.r_cut) * slope_at_cut, du - slope_at_cut
-        s, ds = _SWITCH[self.cutoff](r, self.r_onset, self.r_cut)
-        beyond = r > self.r_onset
-        s, ds = np.where(beyond, s, 1.0), np.where(beyond, ds, 0.0)
-        return s * u, s * du + ds * u
+        at = AtCutoff(self.r_cut, self.r_onset, at_cut, slope_at_cut)
+        return CUTOFFS.parse(self.cutoff).reference(r, u, du, at)
 
 
 def pair_forms(spec: SystemSpec, species: tuple[str, ...]) -> dict[tuple[str, str], PairForm]:
@@ -206,31 +202,11 @@ def _soft_sphere(r: ndarray, sigma: float, epsilon: float, alpha: float) -> tupl
     )
 
 
-def _switched(r: ndarray, onset: float, cut: float) -> tuple[ndarray, ndarray]:
-    """HOOMD's XPLOR switch: a cubic in r², C1 at both ends."""
-    x, a, b = r * r, onset * onset, cut * cut
-    width = (b - a) ** 3
-    return (b - x) ** 2 * (b + 2.0 * x - 3.0 * a) / width, 12.0 * r * (b - x) * (a - x) / width
-
-
-def _quintic(r: ndarray, onset: float, cut: float) -> tuple[ndarray, ndarray]:
-    """1 - smootherstep in r, C2 at both ends."""
-    x = (r - onset) / (cut - onset)
-    return 1.0 - x**3 * (10.0 - 15.0 * x + 6.0 * x * x), -30.0 * x * x * (1.0 - x) ** 2 / (cut - onset)
-
-
-def _cosine(r: ndarray, onset: float, cut: float) -> tuple[ndarray, ndarray]:
-    """Half a cosine in r, C1 at both ends."""
-    phase = np.pi * (r - onset) / (cut - onset)
-    return 0.5 * (1.0 + np.cos(phase)), -0.5 * np.pi / (cut - onset) * np.sin(phase)
-
-
 _BARE: dict[str, Callable[..., tuple[ndarray, ndarray]]] = {
     "lennard-jones": _lennard_jones,
     "morse": _morse,
     "soft-sphere": _soft_sphere,
 }
-_SWITCH = {"switched": _switched, "quintic": _quintic, "cosine": _cosine}
 
 
 @dataclass(frozen=True)

@@ -178,7 +178,7 @@ def _listed(builder: str, compare: str, dtype: str) -> Callable[..., Any]:
     def search(positions: ndarray, cell: ndarray, pbc: ndarray, r_cut: float) -> Any:
         from mdnum.md.cell import Cell, displacement, wrap_positions
         from mdnum.md.decide import PairDecider
-        from mdnum.md.verlet import BUILDERS, RebuildRule, VerletList
+        from mdnum.md.neighbors import BUILDERS, RebuildRule, VerletList
 
         box = Cell.create(cell, pbc)  # type: ignore[arg-type]  (one flag or one per axis)
         wrapped, _ = wrap_positions(box, positions)

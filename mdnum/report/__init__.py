@@ -14,7 +14,6 @@ __all__ = ["judge", "write"]
 # which module judges a folder (`record`) and which writes its page (`write_report`); folders that answer
 # another question than what a run does or where two part go by that question
 _MODULES = {
-    "ball": ("mdnum.report.ball.findings", "mdnum.report.ball.html"),
     "ball-fork": ("mdnum.report.fork.ball", "mdnum.report.fork.ball"),
     "fork": ("mdnum.report.fork.findings", "mdnum.report.fork.html"),
     "along": ("mdnum.report.fork.map", "mdnum.report.fork.map"),
@@ -22,7 +21,6 @@ _MODULES = {
     "certify": ("mdnum.report.fork.certify", "mdnum.report.fork.certify"),
     "forecast": ("mdnum.report.fork.forecast", "mdnum.report.fork.forecast"),
     "audit": ("mdnum.report.audit.html", "mdnum.report.audit.html"),
-    "grad": ("mdnum.report.grad.html", "mdnum.report.grad.html"),
     "flips": ("mdnum.report.flips.html", "mdnum.report.flips.html"),
     "flips-compare": ("mdnum.report.flips.compare", "mdnum.report.flips.compare"),
 }

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,19 +14,17 @@ from jaxtyping import Float, Int
 
 from mdnum.errors import InputError
 from mdnum.md.cell import Cell, displacement
-from mdnum.md.cutoffs import BY_NAME as CUTOFFS
+from mdnum.md.cutoffs import CUTOFFS, Cutoff
 from mdnum.md.decide import PairDecider, Tables
 from mdnum.md.integrators import Integrator, Langevin, VelocityVerlet
-from mdnum.md.lattice import Lattice, LatticeDecider
+from mdnum.md.lattice import Lattice, LatticeDecider, LatticeStep, on_lattice
 from mdnum.md.latticeforce import LatticeForce
-from mdnum.md.latticestep import LatticeStep, on_lattice
-from mdnum.md.manyforce import ManyBodyForce
-from mdnum.md.pairforce import PairForce
-from mdnum.md.potentials import CutPotential, LennardJones, Morse, PairPotential, SoftSphere, pair_type
-from mdnum.md.verlet import BUILDERS, SLOTS, PairTable, RebuildRule, VerletList, check_radius
-from mdnum.precision import PrecisionPolicy, unit_roundoff
-from mdnum.precision.policy import LATTICE
-from mdnum.precision.reductions import BY_NAME as REDUCTIONS
+from mdnum.md.neighbors import BUILDERS, SLOTS, PairTable, RebuildRule, VerletList, check_radius
+from mdnum.md.pairforce import ManyBodyForce, PairForce
+from mdnum.md.potentials import POTENTIALS, CutPotential, pair_type
+from mdnum.numerics import PrecisionPolicy, unit_roundoff
+from mdnum.numerics.reductions import REDUCTIONS
+from mdnum.numerics.roles import LATTICE
 from mdnum.systems import pairs, schema
 from mdnum.systems.load import System, load
 from mdnum.units import Units
@@ -35,11 +32,8 @@ from mdnum.units import Units
 if TYPE_CHECKING:
     from mdnum.systems.evaluate import Evaluation
 
-_POTENTIALS: Mapping[str, type[PairPotential]] = {
-    "lennard-jones": LennardJones,
-    "morse": Morse,
-    "soft-sphere": SoftSphere,
-}
+if TYPE_CHECKING:
+    from mdnum.systems.evaluate import Evaluation
 
 
 @dataclass(frozen=True)
@@ -183,7 +177,7 @@ class Simulation:
     def verlet_list(self, skin: float | None = None) -> VerletList:
         """A new Verlet list for this system, with another skin where one is given."""
         rule = self.rule if skin is None else replace(self.rule, skin=skin)
-        return VerletList(BUILDERS[self.builder], rule, self.r_cut, guard=self._guard)
+        return VerletList(BUILDERS.parse(self.builder), rule, self.r_cut, guard=self._guard)
 
     @property
     def _guard(self) -> float:
@@ -203,9 +197,17 @@ class Simulation:
             types = jnp.asarray(kinds.astype(np.uint8).reshape(shape))
         return Tables(jnp.asarray(table.index.reshape(shape)), types, jnp.asarray(table.order))
 
-    def with_cutoff(self, kind: str) -> Simulation:
+    def with_cutoff(self, cutoff: str | Cutoff) -> Simulation:
         """The same system with another treatment of its cutoff (its radius and pairs stay the same)."""
-        return replace(self, model=eqx.tree_at(lambda m: m.cutoff, self.model, CUTOFFS[kind]))
+        made = CUTOFFS.parse(cutoff) if isinstance(cutoff, str) else cutoff
+        return replace(self, model=replace(self.model, cutoff=made))
+
+    @property
+    def continuous(self) -> Simulation:
+        """The same forces from an energy that does not jump at the cutoff."""
+        if not self.pairwise or self.cutoff.continuous is self.cutoff:
+            return self
+        return self.with_cutoff(self.cutoff.continuous)
 
     def with_cell(self, cell: Cell) -> Simulation:
         """The same system in another box."""
@@ -252,26 +254,26 @@ def _pair_model(system: System) -> CutPotential:
     radius, onset = pairs.cutoff_radii(spec, species)
     r_cut = jnp.asarray(_per_type(radius))
     return CutPotential(
-        _POTENTIALS[spec.potential.kind](**constants),
-        CUTOFFS[spec.cutoff.kind],
+        POTENTIALS[spec.potential.kind](**constants),
+        CUTOFFS.parse(spec.cutoff.kind),
         r_cut,
         r_cut if onset is None else jnp.asarray(_per_type(onset)),
     )
 
 
 def _many_body_model(system: System):
-    from mdnum.md import manybody
+    from mdnum.md import embedded_atom, manybody
 
     potential = system.spec.potential
     a, b, c = (bool(flag) for flag in system.atoms.pbc)
     pbc = (a, b, c)
-    if isinstance(potential, schema.EmbeddedAtom):
-        return manybody.embedded_atom(
+    if isinstance(potential, schema.EmbeddedAtomTable):
+        return embedded_atom.embedded_atom(
             system.folder / potential.file, system.atoms.get_chemical_symbols(), pbc
         )
-    if isinstance(potential, schema.Tersoff):
+    if isinstance(potential, schema.TersoffTable):
         return manybody.tersoff(potential.parameters, pbc)
-    assert isinstance(potential, schema.StillingerWeber)
+    assert isinstance(potential, schema.StillingerWeberTable)
     return manybody.stillinger_weber(potential.parameters, pbc)
 
 
@@ -323,7 +325,7 @@ def build(system: System | str, overrides: Mapping[str, Any] | None = None) -> S
     rebuild = spec.neighbors.rebuild
     builder = spec.neighbors.builder
     timestep = jnp.asarray(spec.dynamics.timestep * units.time_factor, jnp.float64)
-    if isinstance(spec.dynamics, schema.Langevin):
+    if isinstance(spec.dynamics, schema.LangevinTable):
         integrator: Integrator = Langevin(
             timestep,
             jnp.asarray(spec.dynamics.friction / units.time_factor, jnp.float64),
@@ -345,7 +347,7 @@ def build(system: System | str, overrides: Mapping[str, Any] | None = None) -> S
         # a search on the host wins on a CPU; on an accelerator the positions would have to travel
         ("host" if jax.default_backend() == "cpu" else "jax-md") if builder == "auto" else builder,
         policy,
-        REDUCTIONS[precision.reduction],
+        REDUCTIONS.parse(precision.reduction),
         integrator,
     )
     return _in_whole_numbers(simulation) if precision.state == LATTICE else simulation

@@ -11,12 +11,11 @@ import numpy as np
 from jaxtyping import Float
 
 from mdnum.ball import contacts, integrators, limits, stopping
-from mdnum.ball.losses import FinalHeight, Loss, MeanHeight, ResidualPenetration
-from mdnum.ball.problem import Problem
+from mdnum.ball.problem import FinalHeight, Loss, MeanHeight, Problem, ResidualPenetration
 from mdnum.ball.world import World
 from mdnum.errors import InputError
-from mdnum.precision import neighbor, reductions
-from mdnum.precision.policy import RolePrecision
+from mdnum.numerics import neighbor, reductions
+from mdnum.numerics.roles import RolePrecision
 from mdnum.systems import ball, ball_checks
 from mdnum.systems.ball_system import BallSystem
 from mdnum.systems.load import load
@@ -143,12 +142,8 @@ def start(spec: ball.BallSpec) -> tuple[Float[np.ndarray, "balls"], Float[np.nda
     return np.broadcast_to(height, count).copy(), np.broadcast_to(velocity, count).copy()
 
 
-def _on_the_boundary(spec: ball.BallSpec, boundary: ball.Boundary) -> Float[np.ndarray, "balls"]:
-    """One penetration an ulp short of the tolerance, and the ulp in equal parts.
-
-    Summed largest first, each part is less than half an ulp of the sum and is rounded away; their exact sum
-    is the tolerance.
-    """
+def _on_the_boundary(spec: ball.BallSpec, boundary: ball.BoundaryTable) -> Float[np.ndarray, "balls"]:
+    """One penetration an ulp short of the tolerance, and the ulp in equal parts."""
     assert spec.stop is not None and not isinstance(spec.stop, ball.FixedRule)
     tol = spec.stop.tol
     below = float(np.nextafter(np.asarray(tol, limits.DTYPES[boundary.format]), 0))
@@ -209,7 +204,7 @@ def stop_rule(spec: ball.BallSpec) -> Any:
     return rule if table.enter is None else stopping.Hysteresis(rule, table.enter)
 
 
-def _loss(table: ball.Loss) -> Loss:
+def _loss(table: ball.LossTable) -> Loss:
     if table.kind == "mean-height":
         return MeanHeight()
     if table.kind == "residual-penetration":

@@ -11,9 +11,8 @@ from jaxtyping import Float, Int
 
 from mdnum.md.cell import Cell, wrap_positions
 from mdnum.md.decide import Tables
-from mdnum.md.manyforce import ManyBodyForce
-from mdnum.md.pairforce import PairForce
-from mdnum.md.verlet import PairTable
+from mdnum.md.neighbors import PairTable
+from mdnum.md.pairforce import ManyBodyForce, PairForce
 from mdnum.systems.build import Simulation
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from mdnum.workflow.audit import AuditResult, audit
-from mdnum.workflow.ball import BallResult, bounce
+from mdnum.workflow.ball import bounce
 from mdnum.workflow.conform import conform
+from mdnum.workflow.demos import demonstrate
 from mdnum.workflow.flips import FlipsResult, flips
 from mdnum.workflow.fork import ForkResult, fork
 from mdnum.workflow.fork_certify import CertifyResult, fork_certify
@@ -12,22 +13,21 @@ from mdnum.workflow.fork_forecast import ForecastResult, fork_forecast
 from mdnum.workflow.fork_map import MapResult, fork_map
 from mdnum.workflow.fork_processes import ProcessesResult, fork_processes
 from mdnum.workflow.fork_replay import fork_folders
-from mdnum.workflow.grad import GradResult, grad
+from mdnum.workflow.grad import grad
 from mdnum.workflow.run import run
 
 __all__ = [
     "AuditResult",
-    "BallResult",
     "CertifyResult",
     "FlipsResult",
     "ForecastResult",
     "ForkResult",
-    "GradResult",
     "MapResult",
     "ProcessesResult",
     "audit",
     "bounce",
     "conform",
+    "demonstrate",
     "flips",
     "fork",
     "fork_certify",

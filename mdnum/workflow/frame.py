@@ -40,7 +40,7 @@ Progress = Callable[[int, int, dict[str, Any]], None]
 KINDS: dict[str, str] = {
     "md": "mdnum.workflow.run",
     "ball": "mdnum.workflow.ball",
-    "demos": "mdnum.workflow.ball",
+    "demos": "mdnum.workflow.demos",
     "grad": "mdnum.workflow.grad",
     "flips": "mdnum.workflow.flips",
     "flips-compare": "mdnum.workflow.flips",

@@ -263,9 +263,9 @@ def _drift(view: View, run: Record) -> Iterator[Finding]:
     # jumps do not count: what they add follows the number of pairs, up and down
     drift = view.summary.get("energy_drift_without_jumps")
     if drift is None and np.isfinite(left).all():
-        from mdnum.rollout.summary import Line
+        from mdnum.rollout.summary import LineFit
 
-        fitted = Line()
+        fitted = LineFit()
         fitted.add(time, left)
         drift = None if fitted.slope is None else fitted.slope / atoms
     if drift is not None and run.steps > 1 and np.isfinite(left).all():

@@ -10,8 +10,8 @@ from small_systems import LENNARD_JONES, crystal, make
 
 from mdnum.errors import InputError
 from mdnum.gradients import differentiable, value_and_grad
-from mdnum.gradients.base import Problem
 from mdnum.gradients.losses import Custom, MeanPotential, MeanSquaredDisplacement
+from mdnum.gradients.problem import Problem
 from mdnum.systems import build
 
 STEPS = 20
@@ -38,7 +38,7 @@ def test_the_keys_are_those_asked_for_and_values_move_the_loss(problem):
 
 def test_jax_differentiates_through_a_users_own_tree(problem):
     told = []
-    loss = differentiable(problem, ("sigma", "epsilon"), "symmetric", told=told.append)
+    loss = differentiable(problem, ("sigma", "epsilon"), "symmetric", watch=told.append)
 
     def mine(tree):
         root, (shift, width) = tree["root"], tree["rest"]

@@ -9,11 +9,9 @@ from scipy.integrate import quad
 from small_systems import LENNARD_JONES, crystal, make
 
 from mdnum.errors import InputError
-from mdnum.gradients.base import Problem
-from mdnum.gradients.boundary import Boundary
-from mdnum.gradients.frames import frames
+from mdnum.gradients.averages import Boundary, Reweighting, frames
 from mdnum.gradients.losses import MeanPotential, MeanPressure, MeanSquaredDisplacement
-from mdnum.gradients.reweighting import Reweighting, weighed
+from mdnum.gradients.problem import Problem
 from mdnum.gradients.tape import Tape
 from mdnum.systems import build
 
@@ -139,19 +137,3 @@ def test_what_is_no_average_is_refused(pair):
     ):
         with pytest.raises(InputError, match=text):
             method(problem, names)
-
-
-@pytest.mark.slow
-def test_weights_of_other_parameters_give_their_average(pair):
-    """A fifth more attraction, against the integral; the effective size says what is left of the frames."""
-    simulation = pair.simulation
-    seen = frames(Tape(simulation, pair.loss, 8000), ()).every(4)
-    changed = pair.at({"potential.epsilon": 1.2}).simulation
-    same, other = weighed(simulation, seen, simulation), weighed(simulation, seen, changed)
-    assert same.effective == pytest.approx(len(seen))
-    assert len(seen) / 2 < other.effective < len(seen)
-    inside = np.array([distances(x, 3.6)[0] for x in seen.x])
-    energy = np.where(inside < 1.5, lennard_jones(inside), 0)
-    # most of the noise is in both averages
-    ratio = 1.2 * (other.weights @ energy) / (same.weights @ energy)
-    assert ratio == pytest.approx(integral(3.6, 1.5, epsilon=1.2) / integral(3.6, 1.5), rel=0.03)

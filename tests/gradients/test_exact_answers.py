@@ -9,15 +9,14 @@ import pytest
 from ase import Atoms
 from small_systems import LENNARD_JONES, make
 
-from mdnum.gradients.base import Problem
-from mdnum.gradients.forward import Forward
 from mdnum.gradients.losses import FinalProjection
-from mdnum.gradients.symmetric import Symmetric
+from mdnum.gradients.problem import Problem
+from mdnum.gradients.recorded import Forward, Symmetric
 from mdnum.gradients.tape import Tape
-from mdnum.gradients.unrolled import Epochs, Recursive, Unrolled
+from mdnum.gradients.unrolled import Unrolled
 from mdnum.systems import build
 
-METHODS = (Symmetric(), Forward(), Unrolled(), Epochs(), Recursive())
+METHODS = (Symmetric(), Forward(), Unrolled(), Unrolled(snapshots=2))
 
 
 def in_fifty_digits(problem: Problem, changes: dict[str, mp.mpf]) -> mp.mpf:

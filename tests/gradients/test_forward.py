@@ -10,12 +10,10 @@ from small_systems import KOB_ANDERSEN, LENNARD_JONES, crystal, make, mixture
 
 from mdnum.errors import InputError
 from mdnum.gradients.adjoint import reverse
-from mdnum.gradients.base import Problem
-from mdnum.gradients.directions import gathered
-from mdnum.gradients.forward import Forward
 from mdnum.gradients.losses import FinalProjection
-from mdnum.gradients.parameters import gradient, resolve, with_values
-from mdnum.gradients.symmetric import EventAware
+from mdnum.gradients.parameters import gathered, gradient, resolve, with_values
+from mdnum.gradients.problem import Problem
+from mdnum.gradients.recorded import EventAware, Forward
 from mdnum.gradients.tangents import by_column, tangents
 from mdnum.gradients.tape import Tape
 from mdnum.rollout.engine import Engine

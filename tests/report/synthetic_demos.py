@@ -1,10 +1,10 @@
-"""Demonstrations that were not run: ordinary ones, and plots that are awkward in every way."""
+"""Plots that are awkward in every way."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from mdnum.ball.demos.base import Check, Demo, Plot, Region, Series, Table
+from mdnum.ball.demos.base import Plot, Region, Series
 
 
 def awkward() -> dict[str, Plot]:
@@ -148,51 +148,3 @@ def awkward() -> dict[str, Plot]:
             (Series("loss", x * 1e-9, x * 1e-12 - 4e-12), Series("other", x * 1e-9, x * 0)),
         ),
     }
-
-
-def make_demos() -> list[Demo]:
-    """Two demonstrations of the sixteen, and one that failed."""
-    plots = list(awkward().values())
-    table = Table(
-        "Running sum, large term first",
-        ("term", "addend", "running sum", "exact sum", "bits lost"),
-        (
-            (0, np.float16(0.000976), np.float16(0.000976), "2047/2097152", 0),
-            (1, 2.0**-23, 0.0009760856628, "16377/16777216", 2.0),
-            (2, 2.0**-23, float("nan"), "16378/16777216", None),
-        ),
-    )
-    return [
-        Demo(
-            name="sum-order",
-            title="The order of a sum decides when to stop",
-            question="Can the order of five terms decide whether a solver stops?",
-            answer="Yes: large first gives 0.0009760856628 and stops, small first 0.0009765625 and goes on.",
-            numbers={
-                "large_first": 0.0009760856628417969,
-                "small_first": np.float16(2.0**-10),
-                "stops": [True, False],
-                "nested": {"grad_k": -8.198e-8, "path": np.array([1, 0, 0, 0])},
-                "phase": 1 - 2j,
-                "none": None,
-            },
-            checks=[
-                Check("the sum of the large term first", 0.0009760856628417969, "0.0009760856628", True),
-                Check("it stops", True, "stops", True),
-            ],
-            tables=[table],
-            plots=plots[:6],
-            in_md="The order of neighbors decides the last digits of a force.",
-            data={"history": np.arange(6.0), "bad": float("inf")},
-        ),
-        Demo(
-            name="stiffness",
-            title="Where the forward run looks fine and the gradient overflows <b>",
-            question="How large may h √k be?",
-            answer="Up to 2 for semi-implicit Euler; the gradient grows from 1.4 on.",
-            numbers={"limit": 2.0},
-            checks=[Check("largest h √k that stays bounded", 1.93, "2 within 1 %", False)],
-            tables=[Table("long", ("n", "value"), tuple((n, 1.0 / (n + 1)) for n in range(75)))],
-            plots=plots[6:],
-        ),
-    ]

@@ -21,8 +21,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mdnum.gradients.adjoint import Trace
-from mdnum.gradients.diagnose.plain import Plain
-from mdnum.gradients.directions import directions
+from mdnum.gradients.parameters import directions
 from mdnum.gradients.tangents import Tangents
 from mdnum.gradients.tape import Pace, Stretch
 from mdnum.md.cell import HostCell
@@ -41,7 +40,7 @@ _NEIGHBORS = 20
 
 
 @dataclass(frozen=True)
-class Turns(Plain):
+class Turns:
     """Turning points of pairs near their cutoff; a row for each, in the order of steps.
 
     Attributes:

@@ -376,7 +376,7 @@ class MdnumVerletList:
     listed = built = pbc = None
 
     def allocate(self, positions, cell, pbc, r_cut, skin):
-        from mdnum.md.verlet import BUILDERS, RebuildRule, VerletList
+        from mdnum.md.neighbors import BUILDERS, RebuildRule, VerletList
 
         self.pbc = pbc
         self.listed = VerletList(BUILDERS["host"], RebuildRule(skin), r_cut)

@@ -6,14 +6,14 @@ import dataclasses
 
 import numpy as np
 import pytest
-
-from mdnum import ball
 from mdnum.ball.determinism import fingerprint
-from mdnum.errors import InputError
 from mdnum.forks.bounce import BallTwin, Pin, fork
 from mdnum.forks.bounce.cross import differing, overridden
 from mdnum.forks.bounce.pair import between, reordered
 from mdnum.forks.bounce.twin import as_in_a, told
+
+from mdnum import ball
+from mdnum.errors import InputError
 
 
 def adjacent(differs, low: float, high: float) -> tuple[float, float]:

@@ -9,6 +9,7 @@ import pytest
 from ball import oracles
 from hypothesis import given
 from hypothesis import strategies as st
+from mdnum.forks.exact.dyadic import Dyadic
 
 from mdnum.ball import (
     EventLocated,
@@ -26,7 +27,6 @@ from mdnum.ball import (
 )
 from mdnum.errors import InputError
 from mdnum.forks.exact.ball import ball_history, ball_horizon, certify_ball, in_dtype
-from mdnum.forks.exact.dyadic import Dyadic
 
 SCHEMES = {
     "explicit-euler": ExplicitEuler,

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from mdnum.errors import InputError
-from mdnum.gradients.base import Gradient, Problem
 from mdnum.gradients.diagnose.agreement import Scale, agreement, compare
 from mdnum.gradients.differences import FiniteDifferences
 from mdnum.gradients.losses import Custom
+from mdnum.gradients.problem import Gradient, Problem
 from mdnum.systems import build
 
 

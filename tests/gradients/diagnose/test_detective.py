@@ -12,8 +12,7 @@ from ase import Atoms
 from small_systems import LENNARD_JONES, make
 
 from mdnum.gradients import Problem
-from mdnum.gradients.diagnose.detective import detective
-from mdnum.gradients.diagnose.operations import first_not_finite
+from mdnum.gradients.diagnose.detective import detective, first_not_finite
 from mdnum.gradients.losses import Custom, VelocityAutocorrelation
 from mdnum.gradients.parameters import with_values
 from mdnum.systems import build

@@ -10,11 +10,11 @@ import pytest
 from small_systems import LENNARD_JONES, crystal, make
 
 from mdnum.gradients import Problem
-from mdnum.gradients.base import Gradient
 from mdnum.gradients.diagnose.growth import growth, growth_rate
 from mdnum.gradients.losses import FinalProjection
 from mdnum.gradients.parameters import with_values
-from mdnum.gradients.symmetric import Symmetric
+from mdnum.gradients.problem import Gradient
+from mdnum.gradients.recorded import Symmetric
 from mdnum.rollout.engine import Engine, Start
 from mdnum.systems import build
 

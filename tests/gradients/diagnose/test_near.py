@@ -15,9 +15,8 @@ from mdnum.gradients import Problem
 from mdnum.gradients.diagnose import trust
 from mdnum.gradients.diagnose.horizons import halved, spread
 from mdnum.gradients.diagnose.near import Near
-from mdnum.gradients.diagnose.passes import passed
 from mdnum.gradients.losses import EinsteinDiffusion, MeanPotential, MeanSquaredDisplacement
-from mdnum.gradients.symmetric import EventAware
+from mdnum.gradients.recorded import EventAware, passed
 from mdnum.gradients.tape import pace_of
 from mdnum.systems import build
 

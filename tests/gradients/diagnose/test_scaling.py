@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mdnum.errors import InputError
-from mdnum.gradients.diagnose.scaling import ScalingWatch
+from mdnum.gradients.diagnose.growth import ScalingWatch
 
 TYPES = {"float16": np.float16, "bfloat16": ml_dtypes.bfloat16, "float32": np.float32}
 

@@ -10,8 +10,7 @@ from small_systems import LENNARD_JONES, make
 from mdnum.errors import InputError
 from mdnum.gradients import Problem
 from mdnum.gradients.diagnose.growth import CLOCK_STEPS
-from mdnum.gradients.diagnose.jacobian import Jacobian
-from mdnum.gradients.diagnose.spectrum import spectrum
+from mdnum.gradients.diagnose.spectrum import Jacobian, spectrum
 from mdnum.gradients.losses import FinalProjection
 from mdnum.gradients.parameters import with_values
 from mdnum.gradients.tape import Tape

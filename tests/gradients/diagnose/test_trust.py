@@ -9,14 +9,14 @@ import equinox as eqx
 import jax
 import numpy as np
 import pytest
+from mdnum.gradients.diagnose.places import Flips
+from mdnum.gradients.diagnose.results import Limit
 from small_systems import LENNARD_JONES, crystal, make
 
 from mdnum.errors import InputError
 from mdnum.gradients import Problem
 from mdnum.gradients.diagnose.flips import sentence
 from mdnum.gradients.diagnose.horizons import Horizons, first_difference, horizons, spread
-from mdnum.gradients.diagnose.places import Flips
-from mdnum.gradients.diagnose.results import Limit
 from mdnum.gradients.diagnose.trust import (
     ambiguity,
     last_agreeing,
@@ -28,8 +28,8 @@ from mdnum.gradients.diagnose.trust import (
     verdict_of,
 )
 from mdnum.gradients.differences import richardson
-from mdnum.gradients.directions import Column
 from mdnum.gradients.losses import MeanPotential, MeanSquaredDisplacement
+from mdnum.gradients.parameters import Column
 from mdnum.systems import build
 
 QUINTIC = {"kind": "quintic", "radius": 2.2, "onset": 1.8}
