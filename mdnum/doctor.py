@@ -26,7 +26,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-import mdnum.precision  # noqa: F401 (turns on float64)
+import mdnum.numerics  # noqa: F401 (turns on float64)
 from mdnum.plain import plain
 from mdnum.safe_path import environment, python
 
@@ -61,7 +61,7 @@ _FCC = np.array([[0.0, 0.0, 0.0], [0.5, 0.5, 0.0], [0.5, 0.0, 0.5], [0.0, 0.5, 0
 
 
 @dataclass(frozen=True)
-class Row:
+class DoctorRow:
     """One test of the installation.
 
     Attributes:
@@ -87,7 +87,7 @@ class Diagnosis:
         seconds: how long they took.
     """
 
-    rows: tuple[Row, ...]
+    rows: tuple[DoctorRow, ...]
     seconds: float
 
     @property
@@ -137,9 +137,9 @@ def diagnose(budget: float = 18.0) -> Diagnosis:
     return Diagnosis(tuple(rows), time.perf_counter() - start)
 
 
-def _decided(name: str, right: bool, seen: str, remedy: str, wrong: str = "") -> Row:
+def _decided(name: str, right: bool, seen: str, remedy: str, wrong: str = "") -> DoctorRow:
     """ "ok", or "unsafe" with a remedy and, where given, other words for what was seen."""
-    return Row(name, "ok", seen) if right else Row(name, "unsafe", wrong or seen, remedy)
+    return DoctorRow(name, "ok", seen) if right else DoctorRow(name, "unsafe", wrong or seen, remedy)
 
 
 # --- what is installed ---
@@ -153,7 +153,7 @@ def version(package: str) -> str | None:
         return None
 
 
-def jax_version() -> Row:
+def jax_version() -> DoctorRow:
     """jax and jaxlib against the releases known to be wrong."""
     from jaxlib.version import __version__ as library
 
@@ -168,7 +168,7 @@ def jax_version() -> Row:
     return _decided("jax version", not bad, "; ".join([seen, *bad]), _GOOD_JAX)
 
 
-def flags() -> Row:
+def flags() -> DoctorRow:
     """Settings in the environment that change what XLA computes."""
     settings = {
         name: value
@@ -176,29 +176,31 @@ def flags() -> Row:
         if name == "XLA_FLAGS" or (name.startswith("JAX_") and value)
     }
     if not settings:
-        return Row("environment", "ok", "no XLA_FLAGS and no JAX_ settings")
+        return DoctorRow("environment", "ok", "no XLA_FLAGS and no JAX_ settings")
     seen = ", ".join(f"{name}={value}" for name, value in settings.items())
     if re.search(r"xla_cpu_enable_fast_math(=(true|1))?(\s|$)", settings.get("XLA_FLAGS", "")):
-        return Row("environment", "unsafe", seen, f"R{_FAST_MATH}")
-    return Row("environment", "info", seen)
+        return DoctorRow("environment", "unsafe", seen, f"R{_FAST_MATH}")
+    return DoctorRow("environment", "info", seen)
 
 
-def devices() -> Row:
+def devices() -> DoctorRow:
     """The devices that jax computes on."""
     names = ", ".join(f"{device.platform} ({device.device_kind})" for device in jax.devices())
-    return Row("devices", "info", f"{names}; {os.cpu_count()} CPU cores")
+    return DoctorRow("devices", "info", f"{names}; {os.cpu_count()} CPU cores")
 
 
-def packages() -> Row:
+def packages() -> DoctorRow:
     """Every package that mdnum needs, and the optional peers that are there."""
     found = {package: version(package) for package in (*PACKAGES, *PEERS)}
     missing = [package for package in PACKAGES if found[package] is None]
     if missing:
-        return Row("packages", "unsafe", f"missing: {', '.join(missing)}", "python3 -m pip install mdnum")
-    return Row("packages", "info", ", ".join(f"{package} {at}" for package, at in found.items() if at))
+        return DoctorRow(
+            "packages", "unsafe", f"missing: {', '.join(missing)}", "python3 -m pip install mdnum"
+        )
+    return DoctorRow("packages", "info", ", ".join(f"{package} {at}" for package, at in found.items() if at))
 
 
-def numba_works() -> Row:
+def numba_works() -> DoctorRow:
     """numba compiles, keeps float64 and does not reorder a sum."""
     start = time.perf_counter()
     try:
@@ -215,7 +217,7 @@ def numba_works() -> Row:
         got = total(values)
     except Exception as error:  # any failure of a compiler is the finding here, whatever its type
         remedy = "Neighbor lists are built with it: python3 -m pip install --upgrade numba"
-        return Row("numba", "unsafe", _short(error), remedy)
+        return DoctorRow("numba", "unsafe", _short(error), remedy)
     expected = 0.0
     for value in values.tolist():
         expected += value
@@ -239,7 +241,7 @@ def _differing(a: Any, b: Any) -> int:
     return int(np.sum(np.asarray(a) != np.asarray(b)))
 
 
-def float64() -> Row:
+def float64() -> DoctorRow:
     """Double precision is on, and a double survives the way to the device, through jit and back."""
     values = np.array([np.float64(1) / 3, np.pi, 1 + 2**-52, 8.5125, 1e300, -(2.0**-1000)])
     after = np.asarray(jax.jit(lambda x: x)(jnp.asarray(values)))
@@ -256,7 +258,7 @@ def float64() -> Row:
     )
 
 
-def elementwise() -> Row:
+def elementwise() -> DoctorRow:
     """Basic operations under jit and eagerly against numpy, bit for bit, in both precisions."""
     operations: dict[str, tuple[Callable[..., Any], Callable[..., Any]]] = {
         "add": (jnp.add, np.add),
@@ -287,7 +289,7 @@ def elementwise() -> Row:
     )
 
 
-def functions() -> Row:
+def functions() -> DoctorRow:
     """exp, log, cos and power against numpy, in units in the last place."""
     a, b = _numbers(3), _numbers(4) / 10
     pairs: dict[str, tuple[Callable[..., Any], Callable[..., Any]]] = {
@@ -309,7 +311,7 @@ def functions() -> Row:
     )
 
 
-def reassociation() -> Row:
+def reassociation() -> DoctorRow:
     """Sums keep their order: (x + c) - c is not folded and an error-free transformation is exact."""
     x, c = _numbers(5) * 1e-3, np.full(_COUNT, 1e3)
 
@@ -333,13 +335,13 @@ def reassociation() -> Row:
     )
 
 
-def contraction() -> Row:
+def contraction() -> DoctorRow:
     """Whether a*b + c is contracted to one rounding under jit."""
     a, b, c = _numbers(6), _numbers(7), -_numbers(8)
     count = _differing(jax.jit(lambda a, b, c: a * b + c)(*map(jnp.asarray, (a, b, c))), a * b + c)
     if count == 0:
-        return Row("fused multiply-add", "ok", "a*b + c is rounded twice, as written")
-    return Row(
+        return DoctorRow("fused multiply-add", "ok", "a*b + c is rounded twice, as written")
+    return DoctorRow(
         "fused multiply-add",
         "info",
         f"jit contracts a*b + c: {count} of {_COUNT} results differ from two roundings. Legitimate, and"
@@ -347,14 +349,14 @@ def contraction() -> Row:
     )
 
 
-def constant_division() -> Row:
+def constant_division() -> DoctorRow:
     """Whether x / constant becomes x * (1 / constant), and (x*c)*d becomes x*(c*d)."""
     x = _numbers(9)
     divided = _differing(jax.jit(lambda x: x / 3.0)(jnp.asarray(x)), x / 3.0)
     folded = _differing(jax.jit(lambda x: (x * 0.1) * 0.7)(jnp.asarray(x)), (x * 0.1) * 0.7)
     if divided == 0 and folded == 0:
-        return Row("division by a constant", "ok", "computed as written")
-    return Row(
+        return DoctorRow("division by a constant", "ok", "computed as written")
+    return DoctorRow(
         "division by a constant",
         "info",
         f"x / 3.0 differs from IEEE division in {divided} of {_COUNT} (a multiplication by 1/3.0),"
@@ -362,7 +364,7 @@ def constant_division() -> Row:
     )
 
 
-def subnormals() -> Row:
+def subnormals() -> DoctorRow:
     """Whether numpy and jax keep numbers below 2.2e-308, or flush them to zero.
 
     XLA flushes them on CPUs, and a library that is loaded can have the processor do so for everything. Asked
@@ -386,7 +388,7 @@ def subnormals() -> Row:
 
     jitted = jax.jit(lambda a, b: a * b)
     numpy, xla = word(np.multiply), word(lambda a, b: jitted(jnp.asarray(a), jnp.asarray(b)))
-    return Row("subnormal numbers", "info", f"{numpy} by numpy, {xla} by jax")
+    return DoctorRow("subnormal numbers", "info", f"{numpy} by numpy, {xla} by jax")
 
 
 # --- jit against eager against numpy, in the form that jax 0.10.2 gets wrong ---
@@ -436,7 +438,7 @@ def pair_energy(r2: jax.Array) -> jax.Array:
     return jnp.sum(jnp.where(inside, 4 * _EPSILON * (sixth * sixth - sixth), jnp.zeros_like(r2)))
 
 
-def crystal() -> Row:
+def crystal() -> DoctorRow:
     """Squared distances and energy of the tilted crystal under jit and eagerly, against numpy and exact sums.
 
     jax 0.10.2 computes a vmapped matrix-vector product followed by a reduction wrongly under jit on CPUs
@@ -467,7 +469,7 @@ def crystal() -> Row:
         f"{mode}: r² {r2:.1e}, energy {energy:.1e}" for mode, (r2, energy) in worst.items()
     )
     if rows <= _ROWS_THAT_MATTER:
-        return Row("tilted crystal", "unsafe", f"only {rows} slots: too few to test what must be tested")
+        return DoctorRow("tilted crystal", "unsafe", f"only {rows} slots: too few for the test")
     # written so that a NaN is unsafe
     right = all(r2 <= _R2_TOLERANCE and energy <= _CRYSTAL_TOLERANCE for r2, energy in worst.values())
     remedy = f"This jax computes wrong distances (a known cause is jax-ml/jax#39103). Install {_GOOD_JAX}"
@@ -510,14 +512,14 @@ def digest(steps: int = 50) -> str:
 # --- mdnum's own energy and forces: system file, neighbor search, decisions, potential and sums ---
 
 
-def own_forces() -> Row:
+def own_forces() -> DoctorRow:
     """mdnum's energy and forces of argon/tilted-500, neighbor search included, against plain numpy."""
     name = "mdnum's forces"
     try:
         energy, force = worst_errors()
     except Exception as error:  # whatever keeps mdnum from computing forces here is what was asked for
         remedy = "python3 -m pip install --force-reinstall mdnum, in a new environment if that does not help"
-        return Row(name, "unsafe", _short(error), remedy)
+        return DoctorRow(name, "unsafe", _short(error), remedy)
     return _decided(
         name,
         energy <= _ENERGY_TOLERANCE and force <= _FORCE_TOLERANCE,
@@ -614,26 +616,26 @@ print("jax {:.1f} s, jax_md {:.1f} s, mdnum's adaptor {:.1f} s".format(*seconds)
 DIGEST_CODE = "from mdnum.doctor import digest; print(digest())"
 
 
-def imports(child: Child, seconds: float) -> Row:
+def imports(child: Child, seconds: float) -> DoctorRow:
     """jax_md can be imported, and how long that takes."""
     answer, why = child.answer(seconds)
     if answer is not None:
-        return Row("imports", "ok", answer)
+        return DoctorRow("imports", "ok", answer)
     if why == "no answer in time":
-        return Row("imports", "info", "jax_md was still being imported when time was up")
-    return Row(
+        return DoctorRow("imports", "info", "jax_md was still being imported when time was up")
+    return DoctorRow(
         "imports", "unsafe", why, "python3 -m pip install --upgrade jax-md, or make a new environment"
     )  # fmt: skip
 
 
-def second_process(child: Child, here: str, seconds: float) -> Row:
+def second_process(child: Child, here: str, seconds: float) -> DoctorRow:
     """A jitted rollout has the same bits in another process: what resuming a run relies on."""
     answer, why = child.answer(seconds)
     if answer == here:
-        return Row("second process", "ok", f"50 jitted steps have the same bits there ({here[:12]})")
+        return DoctorRow("second process", "ok", f"50 jitted steps have the same bits there ({here[:12]})")
     if why == "no answer in time":
-        return Row("second process", "info", "it did not finish in time, so the bits were not compared")
-    return Row(
+        return DoctorRow("second process", "info", "it did not finish in time, so the bits were not compared")
+    return DoctorRow(
         "second process",
         "unsafe",
         f"50 jitted steps give {here[:12]} here and {answer[:12] if answer else why} there",

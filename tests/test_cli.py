@@ -406,7 +406,7 @@ def test_doctor_exits_by_its_verdict(capsys: pytest.CaptureFixture[str], monkeyp
     import mdnum.doctor
 
     for status, expected in (("ok", 0), ("info", 0), ("unsafe", 1)):
-        row = mdnum.doctor.Row("jax version", status, "seen", None if status == "ok" else "do this")
+        row = mdnum.doctor.DoctorRow("jax version", status, "seen", None if status == "ok" else "do this")
         monkeypatch.setattr(mdnum.doctor, "diagnose", lambda row=row: mdnum.doctor.Diagnosis((row,), 0.5))
         assert call("doctor") == expected
         out = capsys.readouterr().out

@@ -383,7 +383,7 @@ def test_an_examination_that_is_killed_is_resumed(
     assert "As far as asked (" in (tmp_path / "killed" / "report.html").read_text()
     capsys.readouterr()
     assert call("conform", "mine", "--resume", "killed") == 2
-    assert "so LIST cannot be given" in capsys.readouterr().err
+    assert "LIST is an option of a new examination" in capsys.readouterr().err
     assert call("conform", "--resume", "killed", "--no-report") == 1
     whole, resumed = RunFolder.open("whole").summary, RunFolder.open("killed").summary
     assert {**whole, "seconds": 0} == {**resumed, "seconds": 0} and whole["status"] == "complete"

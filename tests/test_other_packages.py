@@ -9,12 +9,12 @@ import sys
 
 import numpy as np
 import pytest
-from mdnum.references.check import check_energy
 from other_package import install
 
 import mdnum
 from mdnum.errors import InputError
 from mdnum.md.cutoffs import CUTOFFS
+from mdnum.references.energy_check import check_energy
 
 CUTOFF = '''
 from mdnum.md.cutoffs import Cutoff

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import typer
 
 from mdnum.cli import output
 from mdnum.cli.progress import watched
-from mdnum.errors import InputError
 
 
 def conform(
@@ -60,12 +57,14 @@ def conform(
     if pairs is None and resume is None:
         return _names(as_json)
     if resume is not None:
-        _refuse_beside_resume(
-            {
-                "LIST": pairs, "--cases": cases, "--seed": seed, "--full": full, "--precision": precision,
-                "--superset": superset, "--limits": limits, "--no-large": no_large, "--out": out,
-            }
-        )  # fmt: skip
+        from mdnum.workflow import frame
+
+        given = {
+            "LIST": pairs, "--cases": cases, "--seed": seed, "--full": full, "--precision": precision,
+            "--superset": superset, "--limits": limits, "--no-large": no_large, "--out": out,
+        }  # fmt: skip
+        asked = {name: value not in (None, False, 0) for name, value in given.items()}
+        frame.refuse(asked, "of a new examination", "Leave it out beside --resume, or begin in a new folder")
     from mdnum.workflow.conform import conform as examine
 
     words = tuple(word.strip() for one in limits or () for word in one.split(",") if word.strip())
@@ -88,16 +87,6 @@ def conform(
         )
     output.print_lines(notes)
     return output.print_outcome(outcome, as_json=as_json)
-
-
-def _refuse_beside_resume(given: Mapping[str, Any]) -> None:
-    """Raises InputError for what a folder that is gone on with has already."""
-    told = [word for word, value in given.items() if value not in (None, False, 0)]
-    if told:
-        raise InputError(
-            f"--resume goes on with the list and the options of its folder, so {told[0]} cannot be given",
-            remedy="Leave it out, or begin in a new folder",
-        )
 
 
 def _to_go_on(folder: Path | None) -> str:

@@ -11,8 +11,8 @@ from ase import Atoms
 from ase.md.verlet import VelocityVerlet
 from numpy import ndarray
 
-from mdnum.precision import unit_roundoff
-from mdnum.precision.policy import WIDE, carrier
+from mdnum.numerics.roles import WIDE, carrier
+from mdnum.numerics.rounding import unit_roundoff
 from mdnum.references.ase_models import Reference, evaluate, independent, reference
 from mdnum.references.independent import Edges, PairModel, edges_of, pair_forms
 from mdnum.references.oracle import rounding_bound

@@ -1,7 +1,7 @@
 """Energies, forces and stress in plain numpy on ASE's neighbor list, from the formulas alone.
 
-Nothing here is shared with mdnum.md: it is the judge where ASE has no class for a potential or a cutoff, and
-the third opinion where it has one.
+Nothing here is shared with what a run evaluates (a cutoff has a `reference` of its own in numpy): it is
+the judge where ASE has no class for a potential or a cutoff, and the third opinion where it has one.
 
 A model sees directed edges (i -> j, displacement d) and returns the energy of each atom and the gradient of
 the total energy with respect to every d. Forces and stress follow from that gradient in one place:

@@ -17,7 +17,7 @@ from numpy import ndarray
 from mdnum import systems
 from mdnum.references.conformance.answer import read
 from mdnum.references.conformance.case import once
-from mdnum.references.conformance.lists import Limits, PairList
+from mdnum.references.conformance.lists import ListLimits, PairList
 from mdnum.references.conformance.loading import known
 from mdnum.references.oracle import PairSet, all_pairs, completed, exactly_inside, rounding_bound
 from mdnum.systems import System
@@ -131,7 +131,7 @@ def own_searches(system: System) -> tuple[Search, ...]:
     unit = _SINGLE if "float32" in (dtype, system.spec.precision.state) else 2.0**-53
 
     def own(name: str, search: Callable[..., Any], affords: float = 1.0) -> Search:
-        limits = Limits(minimum_image=True)
+        limits = ListLimits(minimum_image=True)
         return Search(
             PairList(
                 name, lambda: search, package="mdnum", full=False, unit=unit, limits=limits, affords=affords
@@ -178,7 +178,7 @@ def _listed(builder: str, compare: str, dtype: str) -> Callable[..., Any]:
     def search(positions: ndarray, cell: ndarray, pbc: ndarray, r_cut: float) -> Any:
         from mdnum.md.cell import Cell, displacement, wrap_positions
         from mdnum.md.decide import PairDecider
-        from mdnum.md.verlet import BUILDERS, RebuildRule, VerletList
+        from mdnum.md.neighbors import BUILDERS, RebuildRule, VerletList
 
         box = Cell.create(cell, pbc)  # type: ignore[arg-type]  (one flag or one per axis)
         wrapped, _ = wrap_positions(box, positions)

@@ -18,13 +18,13 @@ from mdnum.errors import InputError
 from mdnum.references.conformance.case import AREAS
 from mdnum.references.conformance.judge import CODES, DOUBLE, SILENT, SINGLE
 from mdnum.references.conformance.lists import LIMITS, PairList
-from mdnum.references.conformance.results import Answers, Failed, Report
+from mdnum.references.conformance.results import CaseAnswers, Failed, Report
 from mdnum.report.finding import Finding, Texts, Verdict, conclude
 from mdnum.report.section import Code, Figure, Key, Page, Section, Table, pairs
 from mdnum.report.svg import BAD, FIRST, MUTED, SECOND
 from mdnum.report.words import count, listed, many, number
-from mdnum.store import RunFolder, answers, manifest
-from mdnum.store.atomic import read_text, write_text
+from mdnum.store import RunFolder, answers, files
+from mdnum.store.files import read_text, write_text
 from mdnum.workflow import frame
 from mdnum.workflow.frame import Outcome, Progress, Verb, View
 
@@ -73,7 +73,7 @@ class Options:
 
 
 @dataclass
-class Examination(Answers):
+class Examination(CaseAnswers):
     """What answers.json holds, and an examination is resumed from.
 
     Attributes:
@@ -230,13 +230,13 @@ def _write_scripts(folder: RunFolder, found: Report) -> list[str]:
         path = folder.path / scripts[-1]
         # what a link leads to is not examined
         same = path.is_file() and not path.is_symlink()
-        if not (same and manifest.digest(path) == manifest.digest_of(lines.encode())):
+        if not (same and files.digest(path) == files.digest_of(lines.encode())):
             write_text(path, lines)
-    listed = manifest.load(folder.path)
+    listed = files.load(folder.path)
     own = re.compile(rf"reproduce-\d+-({'|'.join(re.escape(_script(code)) for code in CODES)})")
     for name in listed.files if listed is not None else ():
         if own.fullmatch(name) and name not in scripts:
-            manifest.remove(folder.path / name)
+            files.remove(folder.path / name)
     return scripts
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from mdnum.references.conformance.adoption import NeighborListConformance
     from mdnum.references.conformance.case import Case, Still
-    from mdnum.references.conformance.lists import LISTS, KeptList, Limits, PairList
+    from mdnum.references.conformance.lists import LISTS, KeptList, ListLimits, PairList
     from mdnum.references.conformance.loading import from_object, installed, known, load
     from mdnum.references.conformance.questions import boxes, cases
     from mdnum.references.conformance.reproduction import script
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "adoption": ("NeighborListConformance",),
     "case": ("Case", "Still"),
-    "lists": ("LISTS", "KeptList", "Limits", "PairList"),
+    "lists": ("LISTS", "KeptList", "ListLimits", "PairList"),
     "loading": ("from_object", "installed", "known", "load"),
     "questions": ("boxes", "cases"),
     "reproduction": ("script",),
@@ -32,8 +32,8 @@ _HOMES = {
 }
 
 __all__ = [
-    "LISTS", "Case", "KeptList", "Limits", "NeighborListConformance", "PairList", "Report", "Still", "boxes",
-    "cases", "examine", "from_object", "installed", "known", "load", "script",
+    "LISTS", "Case", "KeptList", "ListLimits", "NeighborListConformance", "PairList", "Report", "Still",
+    "boxes", "cases", "examine", "from_object", "installed", "known", "load", "script",
 ]  # fmt: skip
 
 

@@ -1,11 +1,11 @@
 """The suite in a library's own tests: a class to subclass, with a test for each area.
 
-    from mdnum.references.conformance import Limits, NeighborListConformance
+    from mdnum.references.conformance import ListLimits, NeighborListConformance
     from mylibrary import neighbor_list
 
     class TestNeighborList(NeighborListConformance):
         pairs = staticmethod(neighbor_list)
-        limits = Limits(minimum_image=True)
+        limits = ListLimits(minimum_image=True)
 
 A failure prints what is wrong and a script of a few atoms that reproduces it.
 """
@@ -20,7 +20,7 @@ import pytest
 from mdnum.references.conformance import questions
 from mdnum.references.conformance.case import AREAS, Case, once
 from mdnum.references.conformance.catalog import gas
-from mdnum.references.conformance.lists import Limits, PairList
+from mdnum.references.conformance.lists import ListLimits, PairList
 from mdnum.references.conformance.loading import from_object, load
 from mdnum.references.conformance.reproduction import script
 from mdnum.references.conformance.suite import Examiner, examine
@@ -45,7 +45,7 @@ class NeighborListConformance:
     full: ClassVar[bool | None] = None
     unit: ClassVar[float | None] = None
     superset: ClassVar[bool | None] = None
-    limits: ClassVar[Limits | None] = None
+    limits: ClassVar[ListLimits | None] = None
     cases: ClassVar[int] = 200
     seed: ClassVar[int] = 0
     large: ClassVar[bool] = False

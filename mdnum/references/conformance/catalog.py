@@ -48,7 +48,7 @@ def _boxes() -> Iterator[Case]:
     for share in (2.0 - 1e-9, 2.0 + 1e-9, 3.0 - 1e-9, 3.0 + 1e-9, 3.0, 4.0 - 1e-12):
         # the number of cells along an axis changes here, and rounding may take it from one to the other
         name = f"a box a hair from {round(share)} cells"
-        yield once(name, "boxes", gas(30, [share, 4.5, 3.5], 3), np.diag([share, 4.5, 3.5]))
+        yield once(name, "boxes", gas(30, [share, 4.5, 3.5], 3), [share, 4.5, 3.5])
     for edge in (0.1, 0.3, 0.7):
         yield once("edges that no double holds", "boxes", gas(20, 3 * edge, 4), 3 * edge, r_cut=edge * 1.2)
     skewed = np.array([[4.0, 0, 0], [1.9, 4.0, 0], [-1.7, 1.5, 4.0]])
@@ -63,8 +63,8 @@ def _boxes() -> Iterator[Case]:
     yield once("left-handed", "boxes", gas(30, skewed[[1, 0, 2]], 10), skewed[[1, 0, 2]])
     yield once("vectors that point backward", "boxes", gas(30, -skewed, 11), -skewed)
     yield once("upper triangular", "boxes", gas(30, skewed.T, 12), skewed.T)
-    yield once("thin slab", "boxes", gas(40, [12.0, 12.0, 2.2], 13), np.diag([12.0, 12.0, 2.2]))
-    yield once("needle", "boxes", gas(60, [60.0, 2.3, 2.3], 14), np.diag([60.0, 2.3, 2.3]))
+    yield once("thin slab", "boxes", gas(40, [12.0, 12.0, 2.2], 13), [12.0, 12.0, 2.2])
+    yield once("needle", "boxes", gas(60, [60.0, 2.3, 2.3], 14), [60.0, 2.3, 2.3])
     clump = gas(12, 1.5, 15)
     yield once("huge", "boxes", np.vstack([clump, clump + 49.2, clump + 99.0]), 100.0)
     yield once("tiny numbers", "boxes", gas(24, 4e-9, 16), 4e-9, r_cut=1e-9)
@@ -105,16 +105,14 @@ def _axes() -> Iterator[Case]:
 
 
 def _images() -> Iterator[Case]:
-    yield once("own images along one axis", "images", [[0.1, 0.2, 0.3]], np.diag([0.7, 5.0, 5.0]))
+    yield once("own images along one axis", "images", [[0.1, 0.2, 0.3]], [0.7, 5.0, 5.0])
     yield once("own images along all axes", "images", [[0.1, 0.2, 0.3]], 0.8)
     yield once("two atoms, edges of 1.5 cutoffs", "images", [[0.1, 0.1, 0.1], [0.8, 0.9, 0.7]], 1.5)
     yield once("two atoms, edges of 0.6 cutoffs", "images", [[0.1, 0.1, 0.1], [0.3, 0.4, 0.5]], 0.6)
-    yield once("one axis below two cutoffs", "images", gas(10, [1.7, 4.0, 4.0], 30), np.diag([1.7, 4.0, 4.0]))
-    yield once(
-        "one axis just below one cutoff", "images", gas(6, [0.96, 4.0, 4.0], 31), np.diag([0.96, 4.0, 4.0])
-    )
+    yield once("one axis below two cutoffs", "images", gas(10, [1.7, 4.0, 4.0], 30), [1.7, 4.0, 4.0])
+    yield once("one axis just below one cutoff", "images", gas(6, [0.96, 4.0, 4.0], 31), [0.96, 4.0, 4.0])
     pair = [[0.0, 0, 0], [0.9, 0, 0]]
-    yield once("one cell, both neighbors the same atom", "images", pair, np.diag([1.8, 5, 5]))
+    yield once("one cell, both neighbors the same atom", "images", pair, [1.8, 5, 5])
     for edge in (0.45, 0.7, 0.95, 1.9):
         walls = np.array([[0.02, 0.03, 0.02], [0.98, 0.97, 0.96]]) * edge
         yield once(f"two atoms at opposite walls, edges of {edge} cutoffs", "images", walls, edge)
@@ -123,7 +121,7 @@ def _images() -> Iterator[Case]:
     yield once("small and skewed, slab", "images", gas(4, skewed, 33), skewed, (True, True, False))
     cubic = np.array([[0, 1, 1], [1, 0, 1], [1, 1, 0.0]])
     yield once("four shells of a primitive cell", "images", [[0.0, 0, 0]], cubic, r_cut=3.05)
-    yield once("many images along a needle", "images", gas(3, [0.3, 9.0, 9.0], 34), np.diag([0.3, 9.0, 9.0]))
+    yield once("many images along a needle", "images", gas(3, [0.3, 9.0, 9.0], 34), [0.3, 9.0, 9.0])
     yield once("many images, far outside", "images", gas(4, 1.3, 35, -9.0, 9.0), 1.3)
 
 
@@ -204,9 +202,7 @@ def _ties() -> Iterator[Case]:
     yield once(
         "30 atoms on a sphere of the cutoff", "ties", np.vstack([np.zeros((1, 3)), direction]) + 4.0, 9.0
     )
-    yield once(
-        "an image of itself at the cutoff", "ties", [[0.3, 0.3, 0.3]], np.diag([2.0, 7.0, 7.0]), r_cut=2.0
-    )
+    yield once("an image of itself at the cutoff", "ties", [[0.3, 0.3, 0.3]], [2.0, 7.0, 7.0], r_cut=2.0)
     yield once("half of the box at the cutoff", "ties", [[0.0, 0, 0], [2.0, 0, 0]], 4.0, r_cut=2.0)
 
 

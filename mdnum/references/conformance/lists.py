@@ -39,7 +39,7 @@ class KeptList(Protocol):
 
 
 @dataclass(frozen=True)
-class Limits:
+class ListLimits:
     """What a list does not claim to do; such cases are not asked, and are counted.
 
     Attributes:
@@ -131,8 +131,8 @@ class Limits:
         return None
 
 
-#: Limits that are declared by a word, such as "minimum-image".
-LIMITS = {limit.name.replace("_", "-"): limit.name for limit in fields(Limits) if limit.default is False}
+#: ListLimits that are declared by a word, such as "minimum-image".
+LIMITS = {limit.name.replace("_", "-"): limit.name for limit in fields(ListLimits) if limit.default is False}
 
 
 @dataclass(frozen=True)
@@ -163,7 +163,7 @@ class PairList:
     full: bool | None = None
     unit: float | None = None
     superset: bool | None = None
-    limits: Limits = field(default_factory=Limits)
+    limits: ListLimits = field(default_factory=ListLimits)
     source: str = ""
     call: str = "pairs"
     affords: float = 1.0

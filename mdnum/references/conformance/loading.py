@@ -83,7 +83,7 @@ def from_object(made: Any, name: str | None = None, source: str | None = None) -
     """A list from a function, from a class of lists that are kept, or from such a list.
 
     What it is declared to be is read from attributes of it, where it has them: `full` (bool), `unit`
-    (roundoff), `superset` (bool), `limits` (`Limits`).
+    (roundoff), `superset` (bool), `limits` (`ListLimits`).
 
     Raises:
         InputError: it is none of these.

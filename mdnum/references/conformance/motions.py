@@ -60,12 +60,8 @@ def _pairs() -> Iterator[Case]:
     path = [np.array([middle, middle + np.array([0.9 + 0.01 * k, 0, 0])]) for k in range(40)]
     yield sequence("two atoms part slowly", "motion", path, _L)
     at = middle + np.array([apart, 0, 0])
-    path = (
-        [np.array([middle, at])] * 3
-        + [np.array([middle, middle + np.array([0.5, 0, 0])])]
-        + [np.array([middle, at])] * 3
-    )
-    yield sequence("an atom jumps in and out", "motion", path, _L)
+    out, within = np.array([middle, at]), np.array([middle, middle + np.array([0.5, 0, 0])])
+    yield sequence("an atom jumps in and out", "motion", [out] * 3 + [within] + [out] * 3, _L)
 
 
 def _two(middle: ndarray, apart: float) -> ndarray:
@@ -83,32 +79,17 @@ def _many() -> Iterator[Case]:
     for step, steps in ((0.01, 110), (0.03, 60), (0.1, 20), (0.4, 8), (2.5, 5)):
         path = [start + k * step * speeds for k in range(steps)]
         yield sequence(f"a gas, {step} r_cut at a step", "motion", path, _L)
-    fast = []
-    for k in range(12):
-        moved = start.copy()
-        moved[0] = start[0] + 0.8 * k * np.array([1.0, 0.6, 0.3])
-        fast.append(moved)
+    fast = [np.vstack([start[0] + 0.8 * k * np.array([1.0, 0.6, 0.3]), start[1:]]) for k in range(12)]
     yield sequence("one fast atom among atoms at rest", "motion", fast, _L)
-    free = gas(30, 4.0, 83)
-    yield sequence(
-        "a free cluster flies apart and comes back",
-        "motion",
-        [free * (1 + 0.1 * abs(5 - k)) for k in range(11)],
-        np.zeros((3, 3)),
-        _R,
-        _SKIN,
-        False,
-    )
+    path = [gas(30, 4.0, 83) * (1 + 0.1 * abs(5 - k)) for k in range(11)]
+    name = "a free cluster flies apart and comes back"
+    yield sequence(name, "motion", path, np.zeros((3, 3)), pbc=False)
     order = np.random.default_rng(84).permutation(len(start))
     yield sequence("atoms change places", "motion", [start, start[order], start], _L)
     dense, sparse = 3.0 + 0.25 * gas(40, _L, 85, -1.0, 1.0), gas(40, _L, 86)
-    yield sequence(
-        "dense, sparse, dense, sparse", "motion", [sparse, dense, sparse, dense, sparse], _L, _R, _SKIN
-    )
+    yield sequence("dense, sparse, dense, sparse", "motion", [sparse, dense, sparse, dense, sparse], _L)
     jitter = np.random.default_rng(87).normal(scale=0.12, size=(60, *start.shape))
-    yield sequence(
-        "a jitter of a third of the skin", "motion", [start + noise for noise in jitter], _L, _R, _SKIN
-    )
+    yield sequence("a jitter of a third of the skin", "motion", [start + noise for noise in jitter], _L)
 
 
 def _wrapping() -> Iterator[Case]:
@@ -123,15 +104,11 @@ def _wrapping() -> Iterator[Case]:
     tossed = [start + _L * rng.integers(-2, 3, start.shape) for _ in range(6)]
     yield sequence("other images of the same atoms", "wrapping", tossed, _L)
     pair = [np.array([[0.05, 3, 3], [5.2, 3, 3]]) + np.array([k * 0.01 - 0.1, 0, 0]) for k in range(20)]
-    yield sequence(
-        "a pair goes through a face, wrapped", "wrapping", [np.mod(x, _L) for x in pair], _L, _R, _SKIN
-    )
+    yield sequence("a pair goes through a face, wrapped", "wrapping", [np.mod(x, _L) for x in pair], _L)
     meet = [
         np.array([[0.02 + 0.01 * k, 3, 3], [_L - 1.4 + 0.01 * k * (1 + k / 10), 3, 3]]) for k in range(30)
     ]
-    yield sequence(
-        "an atom follows another through a face", "wrapping", [np.mod(x, _L) for x in meet], _L, _R, _SKIN
-    )
+    yield sequence("an atom follows another through a face", "wrapping", [np.mod(x, _L) for x in meet], _L)
     skewed = np.array([[5.0, 0, 0], [2.0, 5.0, 0], [-1.5, 1.0, 5.0]])
     slanted = gas(30, skewed, 93)
     moved = [slanted + k * speeds[:30] for k in range(40)]
@@ -185,9 +162,7 @@ def _reuse() -> Iterator[Case]:
     dense = 3.0 + 0.2 * gas(40, _L, 112, -1.0, 1.0)
     yield sequence("fewer atoms each time", "reuse", [start[:n] for n in (40, 23, 9, 2, 1, 0)], _L)
     yield sequence("more atoms each time", "reuse", [start[:n] for n in (1, 2, 9, 23, 40)], _L)
-    yield sequence(
-        "an atom is removed and added", "reuse", [start, start[1:], start, start[:-1]], _L, _R, _SKIN
-    )
+    yield sequence("an atom is removed and added", "reuse", [start, start[1:], start, start[:-1]], _L)
     yield _anew(sequence("as many other atoms", "reuse", [start, other, start], _L))
     yield _anew(sequence("many neighbors, then few, then many", "reuse", [dense, start, dense, start], _L))
     boxes = [(start, np.eye(3) * _L), (start, np.eye(3) * 9.0), (start * 0.6, np.eye(3) * 3.6)]
@@ -204,11 +179,9 @@ def _other_skins() -> Case:
         path += [_two(middle, apart), _two(middle, apart - 0.6 * skin), _two(middle, apart - 1.8 * skin)]
         skins += [skin, None, None]
     case = sequence("started anew with another skin", "reuse", path, _L, _R, max(filter(None, skins)))
-    stills = [
-        replace(still, fresh=skin is not None, skin=skin)
-        for still, skin in zip(case.stills, skins, strict=True)
-    ]
-    return replace(case, stills=tuple(stills))
+    starts = zip(case.stills, skins, strict=True)
+    stills = tuple(replace(still, fresh=skin is not None, skin=skin) for still, skin in starts)
+    return replace(case, stills=stills)
 
 
 def _anew(case: Case) -> Case:

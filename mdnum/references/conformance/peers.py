@@ -12,11 +12,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 from mdnum.references.conformance.lists import LISTS as LISTS
-from mdnum.references.conformance.lists import Limits, peer
+from mdnum.references.conformance.lists import ListLimits, peer
 
 _SINGLE = 2.0**-24
 #: An edge of a box of at most FLT_EPSILON is taken for none (calc_distances.h): a library for Angstrom.
-_OF_MDANALYSIS = Limits(
+_OF_MDANALYSIS = ListLimits(
     minimum_image=True, all_axes=True, lower_triangular=True, right_handed=True, least_cutoff=1e-3
 )
 #: Measured on 512 pairs at the cutoff, release 0.2.29: in a periodic box 92 of 478 rows were one-sided, with
@@ -26,12 +26,12 @@ _JAX_MD_KNOWN = {
     "to i, and each direction is decided by itself; in free space no pair is one-sided."
 }
 # its box matrix is upper triangular, with vectors as columns
-_OF_JAX_MD = Limits(
+_OF_JAX_MD = ListLimits(
     minimum_image=True, all_axes=True, lower_triangular=True, right_handed=True, most_atoms=5_000
 )
 
 
-@peer("numpy-r2", "numpy", full=False, limits=Limits(minimum_image=True, most_atoms=5_000))
+@peer("numpy-r2", "numpy", full=False, limits=ListLimits(minimum_image=True, most_atoms=5_000))
 def numpy_r2(positions, cell, pbc, r_cut):
     """Plain numpy, one image of every pair: r² < r_cut²."""
 
@@ -48,7 +48,7 @@ def numpy_r2(positions, cell, pbc, r_cut):
     return {"i": i[inside], "j": j[inside]}
 
 
-@peer("numpy", "numpy", full=False, limits=Limits(minimum_image=True, most_atoms=5_000))
+@peer("numpy", "numpy", full=False, limits=ListLimits(minimum_image=True, most_atoms=5_000))
 def numpy_r(positions, cell, pbc, r_cut):
     """Plain numpy, one image of every pair: r < r_cut."""
 
@@ -65,7 +65,7 @@ def numpy_r(positions, cell, pbc, r_cut):
     return {"i": i[inside], "j": j[inside]}
 
 
-@peer("ase", "ase", affords=0.3, limits=Limits(least_cutoff=0.5))
+@peer("ase", "ase", affords=0.3, limits=ListLimits(least_cutoff=0.5))
 def ase_neighbor_list(positions, cell, pbc, r_cut):
     """ase.neighborlist.neighbor_list."""
 
@@ -77,7 +77,7 @@ def ase_neighbor_list(positions, cell, pbc, r_cut):
     return {"i": i, "j": j, "shift": shift, "distance": distance, "vector": vector}
 
 
-@peer("ase-primitive", "ase", affords=0.3, limits=Limits(atoms=1, most_atoms=20_000))
+@peer("ase-primitive", "ase", affords=0.3, limits=ListLimits(atoms=1, most_atoms=20_000))
 def ase_primitive_list(positions, cell, pbc, r_cut):
     """the list under ASE's LennardJones, EAM and Tersoff."""
 
@@ -123,7 +123,7 @@ def vesin_half(positions, cell, pbc, r_cut):
     return {"i": i, "j": j, "shift": shift, "distance": distance, "vector": vector}
 
 
-@peer("matscipy", "matscipy", limits=Limits(whole_cell=True))
+@peer("matscipy", "matscipy", limits=ListLimits(whole_cell=True))
 def matscipy_list(positions, cell, pbc, r_cut):
     """matscipy.neighbours.neighbour_list."""
 
@@ -135,7 +135,7 @@ def matscipy_list(positions, cell, pbc, r_cut):
     return {"i": i, "j": j, "shift": shift, "distance": distance, "vector": vector}
 
 
-@peer("pymatgen", "pymatgen", limits=Limits(least_cutoff=0.01))
+@peer("pymatgen", "pymatgen", limits=ListLimits(least_cutoff=0.01))
 def pymatgen_points(positions, cell, pbc, r_cut):
     """pymatgen's find_points_in_spheres."""
 
@@ -191,7 +191,7 @@ def mdanalysis_brute_force(positions, cell, pbc, r_cut):
     return {"i": pairs[:, 0], "j": pairs[:, 1], "distance": distance}
 
 
-@peer("scipy", "scipy", full=False, limits=Limits(minimum_image=True, along_axes=True))
+@peer("scipy", "scipy", full=False, limits=ListLimits(minimum_image=True, along_axes=True))
 def scipy_tree(positions, cell, pbc, r_cut):
     """scipy.spatial.KDTree.query_pairs."""
 
@@ -224,7 +224,7 @@ def freud_query(positions, cell, pbc, r_cut):
 
 
 # its documentation asks for wrapped positions and for periodicity along all axes or none
-@peer("torch-sim", "torch-sim-atomistic", affords=0.3, limits=Limits(wrapped=True, all_axes=True))
+@peer("torch-sim", "torch-sim-atomistic", affords=0.3, limits=ListLimits(wrapped=True, all_axes=True))
 def torch_sim_pairs(positions, cell, pbc, r_cut):
     """torch-sim's linked cells."""
 
@@ -243,7 +243,7 @@ def torch_sim_pairs(positions, cell, pbc, r_cut):
     return {"i": pairs[0].numpy(), "j": pairs[1].numpy(), "shift": shift.numpy()}
 
 
-@peer("nvalchemi-ops", "nvalchemi-toolkit-ops", affords=0.3, limits=Limits(whole_cell=True))
+@peer("nvalchemi-ops", "nvalchemi-toolkit-ops", affords=0.3, limits=ListLimits(whole_cell=True))
 def nvalchemi_pairs(positions, cell, pbc, r_cut):
     """nvalchemi-ops' cell_list."""
 
@@ -260,7 +260,7 @@ def nvalchemi_pairs(positions, cell, pbc, r_cut):
     return {"i": pairs[0].numpy(), "j": pairs[1].numpy(), "shift": shift.numpy()}
 
 
-@peer("ase-skin", "ase", affords=0.1, limits=Limits(most_atoms=20_000, roomy=1e5, least_cutoff=0.5))
+@peer("ase-skin", "ase", affords=0.1, limits=ListLimits(most_atoms=20_000, roomy=1e5, least_cutoff=0.5))
 class AseSkinList:
     """ase.neighborlist.NeighborList with a skin, which each of two atoms may use up."""
 
@@ -369,14 +369,14 @@ def jax_md_pairs(positions, cell, pbc, r_cut):
     return JaxMdList().allocate(positions, cell, pbc, r_cut, 0.0)
 
 
-@peer("mdnum-verlet", "mdnum", limits=Limits(minimum_image=True, atoms=1))
+@peer("mdnum-verlet", "mdnum", limits=ListLimits(minimum_image=True, atoms=1))
 class MdnumVerletList:
     """mdnum's own list with a skin: rebuilt before it is used up, box strain counted."""
 
     listed = built = pbc = None
 
     def allocate(self, positions, cell, pbc, r_cut, skin):
-        from mdnum.md.verlet import BUILDERS, RebuildRule, VerletList
+        from mdnum.md.neighbors import BUILDERS, RebuildRule, VerletList
 
         self.pbc = pbc
         self.listed = VerletList(BUILDERS["host"], RebuildRule(skin), r_cut)
@@ -397,7 +397,7 @@ class MdnumVerletList:
         return {"i": i, "j": rows[i, slot]}
 
 
-@peer("mdnum", "mdnum", MdnumVerletList, limits=Limits(minimum_image=True, atoms=1))
+@peer("mdnum", "mdnum", MdnumVerletList, limits=ListLimits(minimum_image=True, atoms=1))
 def mdnum_host_list(positions, cell, pbc, r_cut):
     """mdnum's own cell list."""
     return MdnumVerletList().allocate(positions, cell, pbc, r_cut, 0.0)

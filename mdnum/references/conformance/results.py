@@ -84,7 +84,7 @@ class Failed(Shrunk):
 
 
 @dataclass
-class Answers:
+class CaseAnswers:
     """Everything that a list was asked, by the number of the question, and what was shrunk of its failures.
 
     Questions are drawn again when an examination is resumed, the same for the same seed; so none is kept.
@@ -113,7 +113,7 @@ class Answers:
 
 
 @dataclass(frozen=True)
-class Refusal:
+class RefusalKind:
     """A kind of question that a list refuses.
 
     Attributes:
@@ -131,7 +131,7 @@ class Refusal:
 
 
 @dataclass
-class Tally:
+class AreaTally:
     """What became of the questions of one area.
 
     Attributes:
@@ -195,9 +195,9 @@ class Report:
     padding: float | None = None
     stated: bool = False
     shifts: bool = False
-    areas: dict[str, Tally] = field(default_factory=dict)
+    areas: dict[str, AreaTally] = field(default_factory=dict)
     aliased: str | None = None
-    refusals: list[Refusal] = field(default_factory=list)
+    refusals: list[RefusalKind] = field(default_factory=list)
     failed: list[Failed] = field(default_factory=list)
     seconds: float = 0.0
     large: tuple[int, float] | None = None
@@ -208,13 +208,13 @@ class Report:
 
     def skip(self, case: Case, why: str) -> None:
         """Counts a case that is not asked."""
-        tally = self.areas.setdefault(case.area, Tally())
+        tally = self.areas.setdefault(case.area, AreaTally())
         tally.skipped += 1
         tally.why[why] = tally.why.get(why, 0) + 1
 
     def take(self, case: Case, result: CaseResult) -> None:
         """Counts what became of a case."""
-        tally = self.areas.setdefault(case.area, Tally())
+        tally = self.areas.setdefault(case.area, AreaTally())
         tally.asked += 1
         self.ties = (self.ties[0] + result.ties[0], self.ties[1] + result.ties[1])
         if result.aliased and self.aliased is None:

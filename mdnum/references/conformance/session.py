@@ -44,7 +44,7 @@ _BORROWED = frozenset({"numpy", "scipy", "numba", "pandas", "torch", "jax", "jax
 
 
 @dataclass(frozen=True)
-class Outcome:
+class CallOutcome:
     """What became of one call.
 
     Attributes:
@@ -83,11 +83,11 @@ class Session:
         self._made: Any = None
         self._returned: list[ndarray] = []
 
-    def ask(self, case: Case) -> list[Outcome]:
+    def ask(self, case: Case) -> list[CallOutcome]:
         """The outcome at every still, as far as the list goes: it ends at the first that is no answer."""
         return list(self.outcomes(case))
 
-    def outcomes(self, case: Case) -> Iterator[Outcome]:
+    def outcomes(self, case: Case) -> Iterator[CallOutcome]:
         """The same, one after the other."""
         if self._made is None or (self.tested.kept and not self.reuse):
             try:
@@ -117,7 +117,7 @@ class Session:
 
     def _call(
         self, case: Case, positions: ndarray, cell: ndarray, pbc: ndarray, skin: float | None
-    ) -> Outcome:
+    ) -> CallOutcome:
         """One call; with a skin, a list that is kept is allocated."""
         inputs = {"positions": positions, "cell": cell, "pbc": pbc}
         before = {name: array.copy() for name, array in inputs.items()}
@@ -139,12 +139,12 @@ class Session:
                 np.asarray(part) for part in parts(given).values() if hasattr(part, "__array__")
             ]
         except Malformed as error:
-            return Outcome(malformed=str(error))
+            return CallOutcome(malformed=str(error))
         same = (
             a.shape == b.shape and a.tobytes() == b.tobytes() for a, b in zip(returned, held, strict=True)
         )
         changed = [name for name, array in inputs.items() if not np.array_equal(before[name], array)]
-        return Outcome(
+        return CallOutcome(
             answer, changed=changed[0] if changed else None, aliased=not all(same), skin=self._stated_skin()
         )
 
@@ -156,9 +156,9 @@ class Session:
         return skin if np.isfinite(skin) and skin >= 0 else None
 
 
-def _failed(error: Exception | SystemExit, case: Case, package: str | None) -> Outcome:
+def _failed(error: Exception | SystemExit, case: Case, package: str | None) -> CallOutcome:
     if isinstance(error, SystemExit):  # it would have ended the process of whoever called it
-        return Outcome(crashed=f"it ends the process: SystemExit: {error}")
+        return CallOutcome(crashed=f"it ends the process: SystemExit: {error}")
     # what follows the first lines is where it was raised, in some libraries with the frames of compiled code
     text = str(error).partition("Exception raised from ")[0].strip()
     first, frames, rest = text.partition("Traceback of ")
@@ -166,7 +166,7 @@ def _failed(error: Exception | SystemExit, case: Case, package: str | None) -> O
     text = " ".join((f"{first} {rest.splitlines()[-1]}" if frames else text).split())
     # without atoms there is nothing that could not be done
     refused = case.atoms > 0 and meant(error, package)
-    return Outcome(raised=f"{type(error).__name__}: {text[:300]}", refused=refused)
+    return CallOutcome(raised=f"{type(error).__name__}: {text[:300]}", refused=refused)
 
 
 def meant(error: Exception, package: str | None = None) -> bool:
@@ -273,9 +273,9 @@ class RemoteSession:
         self._printed: Any = tempfile.TemporaryFile()  # noqa: SIM115 (closed with the session)
         self._from = 0
 
-    def ask(self, case: Case) -> list[Outcome]:
+    def ask(self, case: Case) -> list[CallOutcome]:
         """The outcome at every still, as far as the list goes."""
-        outcomes: list[Outcome] = []
+        outcomes: list[CallOutcome] = []
         try:
             process = self._process or self._start()
             try:
@@ -289,7 +289,7 @@ class RemoteSession:
         except _Ended as ended:
             self.close()
             late = isinstance(ended, _Late)
-            return [*outcomes, Outcome(late=str(ended)) if late else Outcome(crashed=str(ended))]
+            return [*outcomes, CallOutcome(late=str(ended)) if late else CallOutcome(crashed=str(ended))]
 
     def close(self) -> None:
         """Ends the process."""
@@ -391,7 +391,7 @@ def _received(stream: BinaryIO | Any) -> Any:
 
 
 def serve(load: Any, word: str) -> None:
-    """Answers questions on stdin until there are no more: the other process of a `RemoteSession`.
+    """CaseAnswers questions on stdin until there are no more: the other process of a `RemoteSession`.
 
     Args:
         load: finds a list by a word.
@@ -425,5 +425,5 @@ def serve(load: Any, word: str) -> None:
             for outcome in session.outcomes(case):
                 _send(answers, outcome)
         except MemoryError as error:
-            _send(answers, Outcome(raised=f"MemoryError: {error}"))
+            _send(answers, CallOutcome(raised=f"MemoryError: {error}"))
         _send(answers, None)

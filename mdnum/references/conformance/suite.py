@@ -29,11 +29,20 @@ from mdnum.references.conformance.judge import (
 from mdnum.references.conformance.lists import PairList
 from mdnum.references.conformance.questions import large as large_questions
 from mdnum.references.conformance.questions import questions
-from mdnum.references.conformance.results import Answers, CaseResult, Failed, Refusal, Report, Shrunk, alike
-from mdnum.references.conformance.session import Outcome, RemoteSession, Session
+from mdnum.references.conformance.results import (
+    CaseAnswers,
+    CaseResult,
+    Failed,
+    RefusalKind,
+    Report,
+    Shrunk,
+    alike,
+)
+from mdnum.references.conformance.session import CallOutcome, RemoteSession, Session
 from mdnum.references.conformance.shrink import kind, shrunk
 
 Progress = Callable[[int, int, dict[str, Any]], None]
+Saved = Callable[[bool], None]
 
 #: Random cases by default; a list that is asked for a share of them has fewer.
 CASES = 500
@@ -71,7 +80,7 @@ class Examiner:
         )
         self.report = Report(tested)
         self.refused: dict[str, tuple[str, Case]] = {}
-        self.opening: list[tuple[Case, Outcome]] = []
+        self.opening: list[tuple[Case, CallOutcome]] = []
         self._find_conventions()
 
     def _find_conventions(self) -> None:
@@ -184,7 +193,7 @@ class Examiner:
                 self.refused[smallest] = words, case
 
     def _judge(
-        self, case: Case, step: int, outcome: Outcome, how: Conventions
+        self, case: Case, step: int, outcome: CallOutcome, how: Conventions
     ) -> tuple[list[Failure], float, tuple[int, int]]:
         """(failures, roundoff that the answer was judged by, ties counted and not)."""
         silent: tuple[tuple[Code, str | None], ...] = (
@@ -224,7 +233,7 @@ class Examiner:
         return found, unit, ties
 
 
-def _ties(outcome: Outcome, right: Truth) -> tuple[int, int]:
+def _ties(outcome: CallOutcome, right: Truth) -> tuple[int, int]:
     """Pairs at exactly the cutoff, listed and not, of a case in which no rounding can blur them."""
     numbers = np.concatenate([right.positions.ravel(), right.cell.ravel(), [right.r_cut]])
     if not ((numbers == np.rint(numbers)).all() and np.abs(numbers).max(initial=0.0) < 1e6):
@@ -271,8 +280,8 @@ def examine(
     progress: Progress | None = None,
     examiner: Examiner | None = None,
     deadline: Deadline | None = None,
-    answers: Answers | None = None,
-    saved: Callable[[bool], None] | None = None,
+    answers: CaseAnswers | None = None,
+    saved: Saved | None = None,
 ) -> Report:
     """Put a list through the suite.
 
@@ -298,7 +307,11 @@ def examine(
     began = time.perf_counter()
     examiner = examiner or Examiner(tested, reuse=True, apart=apart)
     report = examiner.report
-    deadline, answers, saved = deadline or Deadline(), answers or Answers(), saved or (lambda urgent: None)
+    deadline, answers, saved = (
+        deadline or Deadline(),
+        answers or CaseAnswers(),
+        saved or (lambda urgent: None),
+    )
     far = apart and bool(tested.word)
     every = list(questions(tested, cases, seed, report.padding, far) if asked is None else asked)
     crystals = list(large_questions()) if large and asked is None else []
@@ -338,7 +351,11 @@ def examine(
 
 
 def _shrunk(
-    examiner: Examiner, failed: Failed, deadline: Deadline, answers: Answers, saved: Callable[[bool], None]
+    examiner: Examiner,
+    failed: Failed,
+    deadline: Deadline,
+    answers: CaseAnswers,
+    saved: Callable[[bool], None],
 ) -> Failed:
     """A failure on a few atoms: as it was shrunk before, or as far as the time allows."""
     name = f"{failed.code} {failed.asked.area} {failed.asked.name}"
@@ -404,7 +421,7 @@ def _too_long(report: Report, case: Case) -> str | None:
     return f"{case.atoms:,} atoms would take more than {_PATIENCE:.0f} s" if expected > _PATIENCE else None
 
 
-def _refusals(examiner: Examiner) -> list[Refusal]:
+def _refusals(examiner: Examiner) -> list[RefusalKind]:
     """Each kind of refusal, with what is answered of the same question put in another way.
 
     A new process, or a new object, is asked each.
@@ -418,7 +435,7 @@ def _refusals(examiner: Examiner) -> list[Refusal]:
                 outcomes = examiner.session.ask(other)
                 if len(outcomes) == other.steps and outcomes[-1].answer is not None:
                     (uneven if even else answers).append(how)
-        found.append(Refusal(words, case, tuple(uneven), tuple(answers)))
+        found.append(RefusalKind(words, case, tuple(uneven), tuple(answers)))
     return found
 
 

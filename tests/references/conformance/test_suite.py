@@ -19,7 +19,7 @@ from mdnum.references.conformance import NeighborListConformance, reproduction
 from mdnum.references.conformance.case import AREAS, once, sequence
 from mdnum.references.conformance.catalog import catalog, crowds, gas, lattice
 from mdnum.references.conformance.judge import Failure
-from mdnum.references.conformance.lists import Limits
+from mdnum.references.conformance.lists import ListLimits
 from mdnum.references.conformance.loading import from_object, installed, known, load
 from mdnum.references.conformance.motions import motions, movers
 from mdnum.references.conformance.questions import PLACES, SHAPES, SIZES, drawn, questions
@@ -157,35 +157,39 @@ def _in(cell) -> object:
 @pytest.mark.parametrize(
     ("limits", "case", "why"),
     [
-        (Limits(all_axes=True), once("", "axes", gas(3, 4.0, 0), 4.0, (True, False, True)), "axis by axis"),
-        (Limits(periodic=True), _FREE, "no free atoms"),
-        (Limits(free=True), _GAS, "free atoms only"),
-        (Limits(right_handed=True), _in(np.eye(3)[[1, 0, 2]] * 4), "left-handed"),
-        (Limits(lower_triangular=True), _in(np.triu(np.ones((3, 3))) * 4), "lower"),
-        (Limits(orthorhombic=True), _in(np.tril(np.ones((3, 3)))), "right angles"),
-        (Limits(along_axes=True), _in(-4 * np.eye(3)), "along x, y and z only"),
-        (Limits(minimum_image=True), _in(1.9 * np.eye(3)), "minimum image"),
-        (Limits(wrapped=True), once("", "outside", [[-1.0, 0, 0]], 4.0), "inside the box"),
-        (Limits(whole_cell=True), _FREE, "lacks a vector"),
-        (Limits(atoms=4), _GAS, "at least 4 atoms"),
-        (Limits(most_atoms=2), _GAS, "at most 2"),
-        (Limits(least_cutoff=2.0), _GAS, "no cutoff below 2"),
-        (Limits(roomy=10.0), _GAS, "cells"),
         (
-            Limits(fixed_cell=True),
+            ListLimits(all_axes=True),
+            once("", "axes", gas(3, 4.0, 0), 4.0, (True, False, True)),
+            "axis by axis",
+        ),
+        (ListLimits(periodic=True), _FREE, "no free atoms"),
+        (ListLimits(free=True), _GAS, "free atoms only"),
+        (ListLimits(right_handed=True), _in(np.eye(3)[[1, 0, 2]] * 4), "left-handed"),
+        (ListLimits(lower_triangular=True), _in(np.triu(np.ones((3, 3))) * 4), "lower"),
+        (ListLimits(orthorhombic=True), _in(np.tril(np.ones((3, 3)))), "right angles"),
+        (ListLimits(along_axes=True), _in(-4 * np.eye(3)), "along x, y and z only"),
+        (ListLimits(minimum_image=True), _in(1.9 * np.eye(3)), "minimum image"),
+        (ListLimits(wrapped=True), once("", "outside", [[-1.0, 0, 0]], 4.0), "inside the box"),
+        (ListLimits(whole_cell=True), _FREE, "lacks a vector"),
+        (ListLimits(atoms=4), _GAS, "at least 4 atoms"),
+        (ListLimits(most_atoms=2), _GAS, "at most 2"),
+        (ListLimits(least_cutoff=2.0), _GAS, "no cutoff below 2"),
+        (ListLimits(roomy=10.0), _GAS, "cells"),
+        (
+            ListLimits(fixed_cell=True),
             sequence("", "strain", [(gas(3, 4.0, 0), edge * np.eye(3)) for edge in (4, 3.9)], 4.0),
             "box that changes",
         ),
     ],
 )
-def test_each_limit_refuses_what_it_should(limits: Limits, case, why: str):
+def test_each_limit_refuses_what_it_should(limits: ListLimits, case, why: str):
     assert why in str(limits.refusal(case))
     plain = once("", "few", gas(2, 2.0, 0) + 1.0, 4.0, r_cut=1.9 if limits.minimum_image else 2.0)
     assert limits.refusal(plain) is None or limits.free or limits.roomy or limits.atoms
 
 
 def test_what_is_beyond_a_limit_is_not_asked_and_is_counted():
-    limits = Limits(minimum_image=True, along_axes=True, wrapped=True, atoms=1)
+    limits = ListLimits(minimum_image=True, along_axes=True, wrapped=True, atoms=1)
     report = examine(replace(load("scipy"), limits=limits), asked=catalog(), shrink=False)
     assert report.conforms
     assert sum(tally.refused for tally in report.areas.values()) <= 1
@@ -331,7 +335,7 @@ def test_single_precision_is_found_out_and_ties_are_counted():
         near = np.sqrt((apart**2).sum(axis=1)) < np.float32(r_cut)
         return i[near], j[near]
 
-    limits = Limits(minimum_image=True, along_axes=True, periodic=True)
+    limits = ListLimits(minimum_image=True, along_axes=True, periodic=True)
     ties = [case for case in catalog() if case.area == "ties"]
     cases = [case for case in catalog() if "a hair inside" in case.name] + ties
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -455,7 +459,7 @@ def test_an_object_that_is_kept_is_allocated_only_where_it_should_be():
         assert not examiner.failures(case)
         assert calls == expected
     calls.clear()
-    Session(replace(from_object(Counts), limits=Limits(fixed_atoms=False))).ask(growing)
+    Session(replace(from_object(Counts), limits=ListLimits(fixed_atoms=False))).ask(growing)
     assert calls == ["allocate", "update"]  # it raises at the second, as this one does
 
 
