@@ -140,8 +140,7 @@ def fork(
         if other is not None:
             if replay:
                 return fork_questions.replay(Path(system), other, pair, as_json=as_json)
-            code = fork_ball.folders(system, other, as_json=as_json)
-            return fork_questions.folders(Path(system), other, as_json=as_json) if code is None else code
+            return fork_questions.folders(Path(system), other, as_json=as_json)
         if along is not None:
             return fork_map.along(
                 system, along, steps, most, overrides, out=out, report=not no_report, as_json=as_json
@@ -182,16 +181,15 @@ def _question(asked: Mapping[str, bool], vary: str | None, benign: bool, replay:
 
 def _choices(as_json: bool) -> int:
     """What can be varied, for somebody who did not say."""
-    from mdnum.forks.bounce import choices as of_a_ball
-    from mdnum.forks.choices import BY_NAME
+    from mdnum.forks.choices import shipped
 
-    worlds = {"choices": ("", BY_NAME), "ball_choices": (" of a ball", of_a_ball.BY_NAME)}
+    worlds = {"choices": ("", "md"), "ball_choices": (" of a ball", "ball")}
     rows = {
         key: [
-            {"name": name, "about": choice.about, "must_hold": choice.must_hold}
-            for name, choice in known.items()
+            {"name": name, "about": choice.describe(world), "must_hold": choice.must_hold}
+            for name, choice in shipped(world).items()
         ]
-        for key, (_, known) in worlds.items()
+        for key, (_, world) in worlds.items()
     }
     if as_json:
         output.print_json(rows)

@@ -72,42 +72,6 @@ def fork(
     return output.answer(result.folder, result.summary, print_rows, as_json=as_json)
 
 
-def folders(a: str, b: Path, *, as_json: bool) -> int | None:
-    """Where two finished runs of a ball part; None where they are no runs of a ball."""
-    from mdnum.forks.stored import check_runs
-    from mdnum.store import RunFolder
-
-    runs = [RunFolder.open(folder) for folder in (a, b)]
-    check_runs(*runs)
-    if not any(run.world == "ball" for run in runs):
-        return None
-    from mdnum.forks.bounce.folders import compare_folders
-
-    found = compare_folders(*runs)
-    output.print_notes(a, b)
-    if as_json:
-        output.print_json({"question": "folders", **plain(found)})
-        return output.EXIT_FINE
-    out = output.console()
-    if found.differences:
-        output.print_table("differences", ("key", "A", "B"), found.differences)
-    for number, reason in enumerate(found.reasons):
-        out.print(reason, style="bold" if number == 0 else None, markup=False)
-    dates = {"seed": found.seed, "fork": found.fork}
-    none = f"none in {found.steps:,}"
-    lines = [(name, none if step is None else f"{step:,}") for name, step in dates.items()]
-    output.print_table("", ("", "step"), lines)
-    table = [
-        (flip.run, flip.ball, "begins" if flip.entered else "ends", flip.margin, flip.bound)
-        for flip in found.decisions[:10]
-    ]
-    if table:
-        output.print_table("contacts at the fork", ("only in", "ball", "", "margin", "bound"), table)
-    if found.iterations is not None:
-        output.print_table("iterations at the fork", ("A", "B"), [found.iterations])
-    return output.EXIT_FINE
-
-
 def print_rows(summary: Mapping[str, Any]) -> None:
     """Dates, the decision at the fork and splits by run; or a ranking of choices."""
     if "ranking" in summary:

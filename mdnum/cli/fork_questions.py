@@ -17,10 +17,10 @@ def consistent(
 ) -> int:
     """Whether a choice changes anything that would be measured: an ensemble-consistency test."""
     from mdnum.forks.benign import benign
-    from mdnum.forks.choices import parse
+    from mdnum.forks.choices import parse, twin_of
     from mdnum.systems import load
 
-    twin = parse(vary).make(load(system, overrides, world="md"))
+    twin = twin_of(parse(vary), load(system, overrides, world="md"))
     with ProgressBar() as progress:
         found = benign(twin, steps=steps, progress=progress)
     if as_json:
@@ -44,27 +44,33 @@ def consistent(
 def folders(a: Path, b: Path, *, as_json: bool) -> int:
     """Where two finished runs part, by what they stored."""
     from mdnum.forks.folders import compare_folders
+    from mdnum.workflow.fork_words import folder_reasons
 
     found = compare_folders(a, b)
+    reasons = list(folder_reasons(found))
     output.print_notes(a, b)
     if as_json:
-        output.print_json({"question": "folders", **plain(found)})
+        output.print_json({"question": "folders", **plain(found), "reasons": reasons})
         return output.EXIT_FINE
     out = output.console()
     # what was different comes first: no date means anything without it
     if found.differences:
         output.print_table("differences", ("key", "A", "B"), found.differences)
-    for number, reason in enumerate(found.reasons):
+    for number, reason in enumerate(reasons):
         out.print(reason, style="bold" if number == 0 else None, markup=False)
     output.print_table(
         "", ("", "step"), [("seed", _step(found.seed, found.steps)), ("fork", _step(found.fork, found.steps))]
     )
+    verbs = ("entered", "left") if found.world == "md" else ("begins", "ends")
+    noun = "pair" if found.world == "md" else "ball"
     table = [
-        (flip.run, f"{flip.i}–{flip.j}", "entered" if flip.entered else "left", flip.margin, flip.bound)
+        (flip.run, "–".join(map(str, flip.subject)), verbs[not flip.entered], flip.margin, flip.bound)
         for flip in found.decisions[:10]
     ]
     if table:
-        output.print_table("decisions at the fork", ("only in", "pair", "", "margin", "bound"), table)
+        output.print_table("decisions at the fork", ("only in", noun, "", "margin", "bound"), table)
+    if found.iterations is not None:
+        output.print_table("iterations at the fork", ("A", "B"), [found.iterations])
     return output.EXIT_FINE
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import subprocess
 import sys
@@ -10,22 +9,14 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 from threading import Lock
 from typing import Any
 
-import numpy as np
-
-from mdnum.ball.problem import START, Problem
 from mdnum.errors import MdnumError
-from mdnum.forks.dials import dial
-from mdnum.forks.histories import history
+from mdnum.forks.worlds import program_of
 from mdnum.safe_path import environment, python
-from mdnum.systems.ball_system import BallSystem
-from mdnum.systems.build import build
-from mdnum.systems.build_ball import build_ball
-from mdnum.systems.load import System, load
+from mdnum.systems import BallSystem, System, load
 
 
 def digests_elsewhere(
@@ -107,28 +98,9 @@ def _answered(asked: dict[str, Any], values: Sequence[float], tell: Callable[[],
 
 def digests(system: System | BallSystem, key: str, steps: int, values: Sequence[float]) -> Iterator[str]:
     """The same in this process, by the program that a user runs."""
-    if isinstance(system, BallSystem):
-        problem = build_ball(system, steps=steps).problem
-        for value in values:
-            yield ball_digest(at_value(problem, key, value))
-        return
-    simulation = build(system)
-    proper = dial(simulation, key).proper
+    number = program_of(system, steps).number(key)
     for value in values:
-        yield history(proper(simulation, value), steps).digest
-
-
-def at_value(problem: Problem, name: str, value: float) -> Problem:
-    """A ball's problem at a value of a parameter; a start moves the whole batch there."""
-    if name in START:
-        return replace(problem, **{name: np.full(np.atleast_1d(np.asarray(problem.y0)).shape, value)})
-    return problem.with_values({name: value})
-
-
-def ball_digest(problem: Problem) -> str:
-    """All decisions of a ball's rollout in one word."""
-    run = problem.run(keep=False)
-    return hashlib.blake2b(run.contact.tobytes() + run.iterations.tobytes(), digest_size=16).hexdigest()
+        yield number.proper(value).history(steps).digest
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""Which decisions a perturbation will flip first, foretold by one linearized run.
+"""Which decisions a perturbation will flip first, predicted by one linearized run.
 
 Along the run each decision has a margin m and a tangent dm/da, a being the amplitude of the perturbation:
 to first order it flips at a = -m / (dm/da). The least of these at each step answers for all amplitudes at
@@ -9,7 +9,7 @@ forecast ends with it. Where the force is continuous there, a flip changes nothi
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -17,8 +17,6 @@ from jaxtyping import Float, Int
 
 from mdnum.errors import InputError
 from mdnum.forks.tangent import tangents
-from mdnum.rollout.engine import Engine
-from mdnum.rollout.flips import decided_pairs
 from mdnum.systems.build import Simulation
 
 #: Beyond this displacement, as a share of the cutoff, a forecast is not to be relied on. Measured on argon's
@@ -249,73 +247,3 @@ def direction(simulation: Simulation, seed: int) -> Float[np.ndarray, "atoms 3"]
 
 def _clock(simulation: Simulation) -> float:
     return 30 * float(simulation.integrator.timestep)
-
-
-# --- beside runs --------------------------------------------------------------------------------------
-
-Flip = tuple[int, int, int]
-
-
-@dataclass(frozen=True)
-class Case:
-    """A forecast beside the run it was about.
-
-    Attributes:
-        seed: of the direction. amplitude: of the perturbation, with its sign.
-        good: how far the forecast goes.
-        foretold: what was expected to flip up to there.
-        differing: step, i and j of every decision up to there that the perturbed run made otherwise.
-        kicks: whether nothing more was to flip.
-    """
-
-    seed: int
-    amplitude: float
-    good: Range
-    foretold: tuple[Foretold, ...]
-    differing: frozenset[Flip]
-    kicks: bool
-
-    @property
-    def contradicted(self) -> tuple[Flip, ...]:
-        """What was foretold and did not happen; where flips kick, also a step of flips not foretold."""
-        told = {(one.step, one.i, one.j) for one in self.foretold}
-        steps = {step for step, _, _ in told}
-        unforeseen = {flip for flip in self.differing if flip[0] not in steps} if self.kicks else set()
-        return tuple(sorted((told - self.differing) | unforeseen))
-
-
-def trial(
-    simulation: Simulation, steps: int, amplitudes: list[float], *, seeds: range = range(4)
-) -> tuple[Case, ...]:
-    """Make the runs that forecasts are about: one forecast for each direction, a run for each amplitude.
-
-    Args:
-        simulation: the system as objects.
-        steps: last step.
-        amplitudes: of the perturbations, with their signs.
-        seeds: of the directions.
-    """
-    plain = _decided(simulation, steps)
-    cases = []
-    for seed in seeds:
-        told = forecast(simulation, steps, seed=seed)
-        for amplitude in amplitudes:
-            moved = replace(simulation, positions=simulation.positions + amplitude * told.dx)
-            good = told.good_until(amplitude)
-            differing = set()
-            for step, (ours, theirs) in enumerate(zip(plain, _decided(moved, steps), strict=False)):
-                if step <= good.step:
-                    keys = np.setxor1d(ours, theirs, assume_unique=True).tolist()
-                    differing |= {(step, *divmod(key, simulation.atoms)) for key in keys}
-            first = told.first(amplitude, 10)
-            cases.append(Case(seed, amplitude, good, first, frozenset(differing), told.kicks))
-    return tuple(cases)
-
-
-def _decided(simulation: Simulation, steps: int) -> list[Int[np.ndarray, "inside"]]:
-    """Keys of the pairs inside at every step of a run."""
-    return [
-        decided_pairs(simulation, segment, row)
-        for segment in Engine(simulation, steps).segments()
-        for row in range(segment.rows)
-    ]

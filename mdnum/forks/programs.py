@@ -1,6 +1,6 @@
 """The programs that a system is run by: compiled or not, in a batch, inside a gradient.
 
-This file is what a process of `mdnum.forks.variants` runs: one program, told on the command line.
+This file is what a process of `mdnum.forks.variants` runs: one program, named on the command line.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from mdnum.forks.choices.base import varied
+from mdnum.forks.worlds import varied
 from mdnum.md.cell import displacement
 from mdnum.systems.load import System, load
 
-Program = Literal["scan", "rollout", "vmap", "grad", "eager"]
+ProgramName = Literal["scan", "rollout", "vmap", "grad", "eager"]
 
 #: Steps of the eager program: operation by operation, a step takes a hundred times as long.
 _EAGER_STEPS = 12
@@ -25,7 +25,7 @@ _EAGER_STEPS = 12
 _BATCH = 4
 
 
-def positions_of(system: System, steps: int, program: Program) -> Float[np.ndarray, "steps 3 atoms"]:
+def positions_of(system: System, steps: int, program: ProgramName) -> Float[np.ndarray, "steps 3 atoms"]:
     """Wrapped positions at steps 1, 2, ... in the user's order, as one program computes them in this process.
 
     Ends before an atom has moved by half the skin of the one list.
@@ -50,7 +50,7 @@ def positions_of(system: System, steps: int, program: Program) -> Float[np.ndarr
     return x[: used[0]] if len(used) else x
 
 
-def _stepped(simulation: Any, steps: int, program: Program) -> np.ndarray:
+def _stepped(simulation: Any, steps: int, program: ProgramName) -> np.ndarray:
     import jax
     import jax.numpy as jnp
     from jax import lax
@@ -100,7 +100,7 @@ def _stepped(simulation: Any, steps: int, program: Program) -> np.ndarray:
 
 
 def main() -> None:
-    """Run one variant, told by the last argument, and write its positions."""
+    """Run the variant that the last argument describes, and write its positions."""
     task: dict[str, Any] = json.loads(sys.argv[-1])
     system = load(task["system"], world="md")
     if task["reduction"]:

@@ -24,8 +24,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mdnum.errors import InputError, MdnumError
-from mdnum.forks.choices.base import is_pairwise
-from mdnum.forks.programs import Program
+from mdnum.forks.programs import ProgramName
 from mdnum.md.cell import Cell, displacement
 from mdnum.safe_path import environment, python
 from mdnum.systems.load import System
@@ -48,7 +47,7 @@ class Variant:
     """
 
     name: str
-    program: Program = "scan"
+    program: ProgramName = "scan"
     flags: tuple[str, ...] = ()
     reduction: str | None = None
 
@@ -140,7 +139,7 @@ def variants(
         InputError: a many-body potential, no steps, or no variant.
         MdnumError: none of them ran.
     """
-    if not is_pairwise(system):
+    if system.spec.cutoff is None:
         raise InputError("variants of a many-body potential are not there", where=system.name)
     if steps < 1 or not which:
         raise InputError("expected at least one step and one variant", where=f"steps = {steps}")

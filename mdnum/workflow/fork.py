@@ -13,8 +13,7 @@ from mdnum.store import RunFolder
 from mdnum.store.naming import default_folder
 
 if TYPE_CHECKING:
-    from mdnum.forks import BallFork, Fork
-    from mdnum.forks.twin import Twin
+    from mdnum.forks import Fork, Twin
     from mdnum.systems import BallSystem
     from mdnum.systems.load import System
 
@@ -36,7 +35,7 @@ class ForkResult:
     """
 
     folder: Path
-    fork: Fork | BallFork | None
+    fork: Fork | None
     summary: dict[str, Any]
 
 
@@ -123,7 +122,7 @@ def fork(
     vary, steps, split = _as_in_file(system, vary, steps, split)
     _check(steps, split, repeats)
     if pin is not None:
-        from mdnum.forks.take_back import parse_pin
+        from mdnum.forks.replays import parse_pin
 
         parse_pin(pin, len(system.atoms))
     if vary == ALL:
@@ -150,11 +149,13 @@ def _one(
     report: bool,
     progress: Progress | None,
 ) -> ForkResult:
-    from mdnum.forks.choices import parse
+    from mdnum.forks.choices import parse, twin_of
 
     choice = parse(vary)
     say(progress, 0, "compile")
-    return follow_into_folder(choice.make(system), vary, choice, options, asked, None, out, report, progress)
+    return follow_into_folder(
+        twin_of(choice, system), vary, choice, options, asked, None, out, report, progress
+    )
 
 
 def follow_into_folder(
@@ -179,14 +180,14 @@ def follow_into_folder(
         out, report, progress: as for `fork`.
     """
     from mdnum.forks import fork as follow
-    from mdnum.forks.neighborhood import neighborhood
     from mdnum.forks.pair import counterfactuals
+    from mdnum.forks.replays import neighborhood
     from mdnum.workflow import fork_answers, fork_record
 
     began = time.perf_counter()
     asked_of = {name: options[name] for name in ("counterfactual", "back", "repeats")}
     counterfactuals(twin, **asked_of)
-    folder = new_folder(twin.a.system, out)
+    folder = new_folder(twin.a.simulation.system, out)
     try:
         made = follow(twin, progress=_logged(folder, progress), **options)
         say(progress, made.steps, "the atoms at the fork")
@@ -302,7 +303,7 @@ def refuse(given: Mapping[str, bool], whose: str, remedy: str) -> None:
 
 def _check(steps: int | None, split: float | None, repeats: int | None) -> None:
     """Refuses what cannot be, before a folder is made."""
-    from mdnum.forks.words import repeats_asked
+    from mdnum.forks.pair import repeats_asked
 
     if steps is not None and steps < 1:
         raise InputError(f"steps = {steps}; expected at least 1")

@@ -10,7 +10,8 @@ import numpy as np
 from mdnum.errors import InputError
 
 if TYPE_CHECKING:
-    from mdnum.forks import Fork, Pinned
+    from mdnum.forks import Fork
+    from mdnum.forks.replays import Pinned
 
 Progress = Callable[[int, int, dict[str, Any]], None]
 
@@ -25,9 +26,9 @@ def exponent(fork: Fork) -> dict[str, Any]:
     Returns:
         "lyapunov", a table or None, and "lyapunov_reason", in words where it is None or means little.
     """
-    from mdnum.forks.lyapunov import lyapunov
+    from mdnum.forks.tangent import lyapunov
 
-    a, seen = fork.twin.a, fork.growth["B"]
+    a, seen = fork.twin.a.simulation, fork.growth["B"]
     if fork.dates.seed is None:
         return _none("no bit differs: nothing grows")
     if not a.pairwise:
@@ -72,9 +73,9 @@ def take_back(fork: Fork, pin: str) -> tuple[dict[str, Any], Pinned | None]:
     Raises:
         InputError: a pair that there is not.
     """
-    from mdnum.forks.take_back import check_pins, parse_pin, pinned
+    from mdnum.forks.replays import check_pins, parse_pin, pinned
 
-    wanted = parse_pin(pin, fork.twin.a.atoms)
+    wanted = parse_pin(pin, fork.twin.a.size)
     try:
         check_pins(fork)
     except InputError as error:
@@ -110,8 +111,7 @@ def minimal(fork: Fork, progress: Progress | None) -> dict[str, Any]:
     Args:
         progress: called with tests made and allowed.
     """
-    from mdnum.forks.minimal import minimal_cause
-    from mdnum.forks.take_back import disagreements
+    from mdnum.forks.replays import disagreements, minimal_cause
 
     def note(made: int, allowed: int) -> None:
         if progress is not None:

@@ -14,7 +14,7 @@ from mdnum.workflow.fork import ALL, ForkResult, Progress, refuse, say
 from mdnum.workflow.fork_question import Log, finish, opened
 
 if TYPE_CHECKING:
-    from mdnum.forks.bounce import BallDecision, BallFork
+    from mdnum.forks import Decision, Fork
     from mdnum.store import RunFolder
     from mdnum.systems.ball_system import BallSystem
 
@@ -62,9 +62,9 @@ def fork_ball(
         InputError: the choice is unknown, or does not apply to the system.
         FolderError: the folder cannot be used.
     """
-    from mdnum.forks.bounce import fork as follow
-    from mdnum.forks.bounce.choices import names, parse
-    from mdnum.forks.words import repeats_asked
+    from mdnum.forks import fork as follow
+    from mdnum.forks.choices import parse, shipped, twin_of
+    from mdnum.forks.pair import repeats_asked
 
     asked_split, table = split is not None, system.spec.fork
     if table is not None:
@@ -73,7 +73,7 @@ def fork_ball(
         raise InputError(
             "nothing to vary",
             where=system.name,
-            remedy=f"Add --vary CHOICE, or --vary all. There are {', '.join(names())}",
+            remedy=f"Add --vary CHOICE, or --vary all. There are {', '.join(shipped('ball'))}",
         )
     system = system if steps is None else system.for_steps(steps)
     if vary == ALL:
@@ -84,7 +84,7 @@ def fork_ball(
     repeats_asked(repeats, counterfactual)
     began = time.perf_counter()
     say(progress, 0, "compile")
-    twin = choice.make(system)
+    twin = twin_of(choice, system)
     folder = _opened(system, out)
     try:
         options: dict[str, Any] = {"split": split, "repeats": repeats, "counterfactual": counterfactual}
@@ -93,7 +93,7 @@ def fork_ball(
         folder.finalize()
         told = {
             "choice": vary,
-            "choice_about": choice.about,
+            "choice_about": choice.describe("ball"),
             "must_hold": choice.must_hold,
             "seconds": time.perf_counter() - began,
         }
@@ -108,7 +108,7 @@ def _screen(
     system: BallSystem, out: str | Path | None, report: bool, progress: Progress | None
 ) -> ForkResult:
     """Every choice that applies, ranked by when it forks."""
-    from mdnum.forks.bounce.choices import screen
+    from mdnum.forks.screen import screen
     from mdnum.workflow.fork_screen import noted, ranked
 
     began = time.perf_counter()
@@ -150,42 +150,36 @@ def _basics(system: BallSystem) -> dict[str, Any]:
     }
 
 
-def write(folder: RunFolder, fork: BallFork) -> None:
+def write(folder: RunFolder, fork: Fork) -> None:
     """Puts the series and the decisions that differ into a folder's tables."""
     series = fork.series
     rows = len(series["step"])
     columns = {name: series.get(key, np.full(rows, np.nan)) for name, key in _SERIES.items()}
-    columns |= {"step": series["step"], "time": series["step"] * fork.runs["A"].h}
+    columns |= {"step": series["step"], "time": series["step"] * fork.twin.a.timestep}
     columns |= {f"repeat_{name[2:]}": series[name] for name in series if name.startswith("B ")}
     folder.append("separation", columns)
     if fork.decision is not None:
         folder.append("around", _around(fork, fork.decision))
-    crossed = fork.crossed
-    if not len(crossed):
+    if not fork.flips:
         return
-    keep = slice(ROWS_KEPT)
-    contact = crossed.channel == "contact"
-    # the run that decided yes: in which the ball touches, or whose solver stops first
-    in_a = (crossed.a > crossed.b) == contact
-    table = {
-        "step": crossed.step,
-        "i": crossed.ball,
-        "j": np.full(len(crossed), -1),
-        "differs": np.ones(len(crossed), bool),
-        "run": np.where(in_a, "A", "B"),
-        "entered": np.ones(len(crossed), bool),
-        "margin": np.where(in_a, crossed.margin_a, crossed.margin_b),
-        "bound": np.where(in_a, crossed.bound_a, crossed.bound_b),
-        "channel": crossed.channel,
-        "ball": crossed.ball,
-        **{name: getattr(crossed, name) for name in ("a", "b", "margin_a", "margin_b", "bound_a", "bound_b")},
+    flips = fork.flips[:ROWS_KEPT]
+    names = ("step", "channel", "ball", "a", "b", "margin_a", "margin_b", "bound_a", "bound_b", "run")
+    column = {name: np.array([getattr(flip, name) for flip in flips]) for name in names}
+    in_a = column["run"] == "A"
+    more = {
+        "i": column["ball"],
+        "j": np.full(len(flips), -1),
+        "differs": np.ones(len(flips), bool),
+        "entered": np.ones(len(flips), bool),
+        "margin": np.where(in_a, column["margin_a"], column["margin_b"]),
+        "bound": np.where(in_a, column["bound_a"], column["bound_b"]),
     }
-    folder.append("cross_flips", {name: values[keep] for name, values in table.items()})
+    folder.append("cross_flips", column | more)
 
 
-def _around(fork: BallFork, made: BallDecision) -> dict[str, Any]:
+def _around(fork: Fork, made: Decision) -> dict[str, Any]:
     """The deciding ball (the first, where they decide together) in both runs around the fork."""
-    ball = max(made.ball, 0)
+    ball = made.subject[0] if made.subject else 0
     step = np.arange(max(0, made.step - _BEFORE), min(fork.steps, made.step + _AFTER) + 1)
     rows: dict[str, list[np.ndarray]] = {name: [] for name in ("step", "run", "ball", "y", "v", "contact")}
     for name in "AB":
@@ -203,11 +197,11 @@ def _around(fork: BallFork, made: BallDecision) -> dict[str, Any]:
     return {name: np.concatenate(parts) for name, parts in rows.items()}
 
 
-def summarize(system: BallSystem, fork: BallFork) -> dict[str, Any]:
+def summarize(system: BallSystem, fork: Fork) -> dict[str, Any]:
     """The content of summary.json, without choice, headline and findings."""
-    step = fork.runs["A"].h
+    step = fork.twin.a.timestep
     free, rate = fork.series["B"], fork.growth["B"]
-    total = len(fork.crossed)
+    total = fork.flips_total
     return _basics(system) | {
         "difference": fork.twin.difference,
         "changes": {key: list(values) for key, values in fork.twin.changes.items()},
@@ -231,14 +225,14 @@ def summarize(system: BallSystem, fork: BallFork) -> dict[str, Any]:
         "overridden": numbers.total(fork.series, "overridden"),
         "cross_flips": total,
         "cross_flips_kept": min(total, ROWS_KEPT),
-        "cross_contacts": int(np.count_nonzero(fork.crossed.channel == "contact")),
-        "cross_stops": int(np.count_nonzero(fork.crossed.channel == "stop")),
-        "failed": dict(fork.failed),
+        "cross_contacts": int(sum(flip.channel == "contact" for flip in fork.flips)),
+        "cross_stops": int(sum(flip.channel == "stop" for flip in fork.flips)),
+        "failed": {name: word for name, word in fork.failed.items() if word},
         "status": "failed" if fork.failed else "complete",
     }
 
 
-def _decision(made: BallDecision) -> dict[str, Any]:
+def _decision(made: Decision) -> dict[str, Any]:
     """The decision at the fork, in plain values."""
     finite = {name: numbers.plain(margin) for name, margin in made.margins.items()}
     margin, bound = finite[made.run], made.bounds[made.run]
@@ -246,7 +240,7 @@ def _decision(made: BallDecision) -> dict[str, Any]:
     return {
         "channel": made.channel,
         "step": made.step,
-        "ball": None if made.ball < 0 else made.ball,
+        "ball": made.subject[0] if made.subject else None,
         "run": made.run,
         "entered": True,
         "decided": {"A": made.a, "B": made.b},

@@ -12,11 +12,11 @@ import numpy as np
 
 from mdnum.errors import InputError
 from mdnum.store import COLUMNS, RunFolder
-from mdnum.workflow.fork_question import Log, Progress, basics, finish, is_ball, loaded, opened, steps_of
+from mdnum.workflow.fork_question import Log, Progress, basics, finish, opened, steps_of
 
 if TYPE_CHECKING:
-    from mdnum.forks.histories import Loss
-    from mdnum.forks.piecewise import Boundary, BoundaryMap
+    from mdnum.forks.boundaries import Boundary, BoundaryMap
+    from mdnum.rollout.program import Loss
     from mdnum.systems.ball_system import BallSystem
     from mdnum.systems.load import System
 
@@ -30,12 +30,12 @@ class MapResult:
 
     Attributes:
         folder: the fork folder.
-        map: intervals of one history each, and the boundaries between them; None of a ball.
+        map: intervals of one history each, and the boundaries between them.
         summary: what summary.json says, findings included.
     """
 
     folder: Path
-    map: BoundaryMap | None
+    map: BoundaryMap
     summary: dict[str, Any]
 
 
@@ -76,30 +76,28 @@ def fork_map(
         InputError: the system cannot be run, no such number, or an interval that makes no sense.
         FolderError: the folder cannot be used.
     """
-    from mdnum.forks.boundaries import MOST, boundaries
-    from mdnum.forks.dials import checked, dial, unit
-    from mdnum.forks.histories import squared_displacement
-    from mdnum.systems import build
+    from mdnum.forks.boundaries import boundaries, checked
+    from mdnum.forks.worlds import program_of
+    from mdnum.systems import BallSystem
+    from mdnum.workflow.fork import loaded_of_any
+    from mdnum.workflow.fork_words import map_words
 
     began = time.perf_counter()
-    if is_ball(system):
-        if loss is not None:
-            raise InputError("the loss of a ball is that of its system file", remedy="Leave out loss")
-        options = {"cells": cells, "most": most, "confirm": confirm}
-        return _ball(system, (key, low, high), steps, options, out, overrides, report, progress)
-    system = loaded(system, overrides)
-    last = steps_of(system, steps)
+    given: Any = loaded_of_any(system, overrides)
+    is_ball = isinstance(given, BallSystem)
+    if is_ball and loss is not None:
+        raise InputError("the loss of a ball is that of its system file", remedy="Leave out loss")
+    if is_ball:
+        given = given if steps is None else given.for_steps(steps)
+        last = given.spec.integrator.steps
+    else:
+        last = steps_of(given, steps)
     # what cannot be is refused before there is a folder
-    simulation = build(system)
-    one = dial(simulation, key)
-    checked(one, low, high)
-    for end in (low, high):
-        one.turn(simulation, end)
-    folder = opened(system, "along", out)
+    number = checked(program_of(given), key, low, high)
+    folder = opened(given, "along", out)
     try:
         found = boundaries(
-            system, one.key, low, high, last, cells=cells, most=MOST if most is None else most,
-            loss=squared_displacement if loss is None else loss, confirm=confirm,
+            given, number.key, low, high, last, cells=cells, most=most, loss=loss, confirm=confirm,
             progress=Log(folder, progress),
         )  # fmt: skip
         edges = [_row(edge) for edge in found.boundaries]
@@ -109,40 +107,81 @@ def fork_map(
             ("points", _points(found)),
         ):
             _write(folder, name, rows)
-        folder.log(found.words)
+        folder.log(map_words(found))
         folder.finalize()
-        units = system.units
-        summary = {
-            **basics(system, "along", last),
-            "key": one.key,
-            "key_unit": unit(simulation, one.key),
-            "value": one.value,
-            "loss": "mean squared displacement" if loss is None else getattr(loss, "__name__", "loss"),
-            "loss_unit": f"{units.length}²" if loss is None else "",
-            **_summary(found, edges, confirm),
-            "compiles": one.compiles,
-            "seconds": time.perf_counter() - began,
-        }
-        folder.write_summary(summary)
+        folder.write_summary(
+            {
+                **(_ball_basics(given) if is_ball else basics(given, "along", last)),
+                "key": number.key,
+                "key_unit": number.unit,
+                "value": number.value,
+                **_loss(given, loss),
+                **_summary(found, edges, confirm),
+                "says": map_words(found),
+                "compiles": number.compiles,
+                "seconds": time.perf_counter() - began,
+            }
+        )
     except BaseException:
         folder.close()
         raise
     return MapResult(folder.path, found, finish(folder, report, progress))
 
 
+def _ball_basics(system: BallSystem) -> dict[str, Any]:
+    return {
+        "world": "fork",
+        "question": "along",
+        "system": system.name,
+        "about": system.spec.about,
+        "balls": system.balls,
+        "steps": system.spec.integrator.steps,
+        "timestep": system.spec.integrator.timestep,
+        "units": "ball",
+        "findings": [],
+        "status": "complete",
+    }
+
+
+def _loss(system: Any, loss: Any) -> dict[str, str]:
+    if hasattr(system, "balls"):
+        kind = str(system.spec.loss.kind)
+        return {"loss": kind.replace("-", " "), "loss_unit": "m²" if kind == "residual-penetration" else "m"}
+    if loss is None:
+        return {"loss": "mean squared displacement", "loss_unit": f"{system.units.length}²"}
+    return {"loss": getattr(loss, "__name__", "loss"), "loss_unit": ""}
+
+
 def _row(edge: Boundary) -> dict[str, Any]:
     below, above = edge.below, edge.above
+    subject = [*edge.subject, -1, -1][:2]
+    if edge.channel == "pair":
+        who = "–".join(map(str, edge.subject))
+        says = f"pair {who} {'enters its cutoff' if above.decided else 'is left out'}"
+        way = f"in {'above' if above.decided else 'below'}"
+    elif edge.channel == "contact":
+        who = f"ball {subject[0]}"
+        says = f"{who} {'touches' if above.decided else 'misses'} the floor"
+        way = f"touches {'above' if above.decided else 'below'}"
+    else:
+        who = f"ball {subject[0]}" if edge.subject else "solver"
+        solver = f"the solver of {who}" if edge.subject else "the solver"
+        says = f"{solver} makes {above.decided} iterations instead of {below.decided}"
+        way = f"{below.decided} → {above.decided}"
+    gradients = {"gradient_below": below.gradient, "gradient_above": above.gradient}
+    if edge.channel == "pair":
+        gradients = {}
     return {
         "below": below.at,
         "above": above.at,
         "step": edge.step,
-        "i": edge.i,
-        "j": edge.j,
-        "who": f"{edge.i}–{edge.j}",
-        "says": f"pair {edge.i}–{edge.j} {'enters its cutoff' if above.inside else 'is left out'}",
-        "way": f"in {'above' if above.inside else 'below'}",
-        "channel": "pair",
-        "inside": above.inside,
+        "i": subject[0],
+        "j": subject[1],
+        "who": who,
+        "says": says,
+        "way": way,
+        "channel": edge.channel,
+        "inside": above.decided < below.decided if edge.channel == "stop" else bool(above.decided),
         "also": edge.also,
         "margin_below": below.margin,
         "margin_above": above.margin,
@@ -150,55 +189,12 @@ def _row(edge: Boundary) -> dict[str, Any]:
         "loss_below": below.loss,
         "loss_above": above.loss,
         "jump": edge.jump,
+        **gradients,
         "energy_below": below.energy,
         "energy_above": above.energy,
         "apart": edge.apart,
         "confirmed": _CONFIRMED[edge.confirmed],
     }
-
-
-def _ball(
-    system: Any, along: tuple[str, float, float], steps: int | None, options: dict[str, Any],
-    out: str | Path | None, overrides: Mapping[str, Any] | None, report: bool, progress: Progress | None,
-) -> MapResult:  # fmt: skip
-    """The map of a ball, in a folder of the same kind."""
-    from mdnum.systems import BallSystem, load
-    from mdnum.workflow.fork_map_ball import MOST, search
-
-    began = time.perf_counter()
-    if not isinstance(system, BallSystem):
-        system = load(system, overrides, world="ball")
-    system = system if steps is None else system.for_steps(steps)
-    options["most"] = MOST if options["most"] is None else options["most"]
-    say = progress if progress is not None else (lambda *_: None)
-    found, tables = search(system, *along, **options, tell=lambda phase: say(0, 0, {"phase": phase}))
-    folder = opened(system, "along", out)
-    try:
-        for name, rows in tables.items():
-            _write(folder, name, rows)
-        for edge in found["boundaries"]:
-            folder.log(f"from {edge['above']!r} on {edge['says']} in step {edge['step']}")
-        folder.finalize()
-        folder.write_summary(
-            {
-                "world": "fork",
-                "question": "along",
-                "system": system.name,
-                "about": system.spec.about,
-                "balls": system.balls,
-                "steps": system.spec.integrator.steps,
-                "timestep": system.spec.integrator.timestep,
-                "units": "ball",
-                **found,
-                "findings": [],
-                "status": "complete",
-                "seconds": time.perf_counter() - began,
-            }
-        )
-    except BaseException:
-        folder.close()
-        raise
-    return MapResult(folder.path, None, finish(folder, report, progress))
 
 
 def _write(folder: RunFolder, table: str, rows: list[dict[str, Any]]) -> None:
@@ -241,5 +237,4 @@ def _summary(found: BoundaryMap, rows: list[dict[str, Any]], confirm: bool) -> d
             {name: row[name] for name in row if name not in ("digest", "gap")} for row in _intervals(found)
         ],
         "unresolved": [list(ends) for ends in found.unresolved],
-        "says": found.words,
     }

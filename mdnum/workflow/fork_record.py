@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from mdnum.forks.certified import certified
-from mdnum.forks.neighborhood import Neighborhood
 from mdnum.forks.pair import FLIPS_KEPT, Fork
-from mdnum.forks.take_back import Pinned
+from mdnum.forks.replays import Neighborhood, Pinned
 from mdnum.rollout.flips import Ambiguous
 from mdnum.store import RunFolder
 from mdnum.systems.build import Simulation
@@ -31,7 +30,7 @@ def write(folder: RunFolder, fork: Fork, around: Neighborhood | None, pinned: Pi
     series = fork.series
     rows = len(series["step"])
     columns = {name: series.get(key, np.full(rows, np.nan)) for name, key in _SERIES.items()}
-    columns |= {"step": series["step"], "time": series["step"] * timestep(fork.twin.a)}
+    columns |= {"step": series["step"], "time": series["step"] * fork.twin.a.timestep}
     columns |= {f"repeat_{name[2:]}": series[name] for name in series if name.startswith("B ")}
     if pinned is not None:
         columns["pinned"] = pinned.separation
@@ -62,8 +61,8 @@ def summarize(
     """The content of summary.json, without headline and findings; with further answers, where there are."""
     found = (answers or {}).get("lyapunov")
     exponent = found["rate"] if found and found["chaotic"] else None
-    a = fork.twin.a
-    step = timestep(a)
+    a = fork.twin.a.simulation
+    step = fork.twin.a.timestep
     rate, free = fork.growth["B"], fork.series["B"]
     return {
         "world": "fork",
@@ -73,7 +72,7 @@ def summarize(
         "choice_about": getattr(choice, "about", ""),
         "must_hold": bool(getattr(choice, "must_hold", False)),
         "difference": fork.twin.difference,
-        "changes": changes(fork.twin.a, fork.twin.b),
+        "changes": {key: list(values) for key, values in fork.twin.changes.items()},
         "atoms": a.atoms,
         "steps": fork.steps,
         "steps_asked": fork.asked,
@@ -108,35 +107,14 @@ def summarize(
     }
 
 
-def timestep(simulation: Simulation) -> float:
-    """The time step, the user's unit of time."""
-    return float(simulation.system.spec.dynamics.timestep)
-
-
-def changes(a: Simulation, b: Simulation) -> dict[str, list[Any]]:
-    """Keys of the system file whose values differ between the runs, with both values."""
-    first, second = (dict(_flat(one.system.spec.model_dump(mode="json"))) for one in (a, b))
-    return {
-        key: [first.get(key), second.get(key)]
-        for key in dict.fromkeys((*first, *second))
-        if first.get(key) != second.get(key)
-    }
-
-
-def _flat(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in table.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{key}.")
-        else:
-            yield prefix + str(key), value
-
-
 def _decision(fork: Fork, around: Neighborhood | None) -> dict[str, Any] | None:
     made = fork.decision
     if made is None:
         return None
-    run = fork.twin.b if made.run == "B" else fork.twin.a
-    kind = _kind(fork.twin.a, made.i, made.j)
+    a, b = fork.twin.a.simulation, fork.twin.b.simulation
+    run = b if made.run == "B" else a
+    i, j = made.subject
+    kind = _kind(a, i, j)
     threshold, space = run.decider.thresholds[kind].value, run.decider.space
     quantity = threshold - made.margin
     distance = float(np.sqrt(quantity)) if space == "r2" else quantity
@@ -149,8 +127,8 @@ def _decision(fork: Fork, around: Neighborhood | None) -> dict[str, Any] | None:
         "channel": "pair",
         "step": made.step,
         "run": made.run,
-        "i": made.i,
-        "j": made.j,
+        "i": i,
+        "j": j,
         "entered": made.entered,
         "space": space,
         "margin": made.margin,
@@ -159,7 +137,7 @@ def _decision(fork: Fork, around: Neighborhood | None) -> dict[str, Any] | None:
         "margins": margins,
         "bounds": bounds,
         "ambiguous_in": [name for name, margin in margins.items() if abs(margin) <= bounds[name]],
-        "cutoffs": {"A": _cutoff(fork.twin.a, made.i, made.j), "B": _cutoff(fork.twin.b, made.i, made.j)},
+        "cutoffs": {"A": _cutoff(a, i, j), "B": _cutoff(b, i, j)},
         "distance": distance,
         "margin_length": length,
         "bound_length": made.bound / slope,

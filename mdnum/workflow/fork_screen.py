@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from mdnum.workflow.fork import ForkResult, Progress, judge, new_folder, say
 
 if TYPE_CHECKING:
-    from mdnum.forks.ranking import Screened
+    from mdnum.forks.screen import Screened
     from mdnum.store import RunFolder
     from mdnum.systems.load import System
 
@@ -34,7 +34,7 @@ def screen(
         report: write report.html.
         progress: called with choices done, how many there are, and the name of the next as the phase.
     """
-    from mdnum.forks.choices import screen as screen_choices
+    from mdnum.forks.screen import screen as screen_choices
 
     began = time.perf_counter()
     folder = new_folder(system, out)
@@ -78,9 +78,13 @@ def ranked(rows: list[Screened]) -> dict[str, Any]:
             "failed": row.failed,
         }
         for row in rows
-        if row.why_not is None
+        if row.reason_unavailable is None
     ]
-    left = [{"choice": row.choice, "why": row.why_not} for row in rows if row.why_not is not None]
+    left = [
+        {"choice": row.choice, "why": row.reason_unavailable}
+        for row in rows
+        if row.reason_unavailable is not None
+    ]
     return {"ranking": ranking, "not_applicable": left}
 
 

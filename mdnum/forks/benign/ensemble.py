@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from mdnum.forks.benign.features import Ruler, measure
-from mdnum.forks.repeats import nudged
 from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, first_state, resume_point
+from mdnum.rollout.program import MdProgram
 from mdnum.systems.build import Simulation
 
 #: Displacement of the furthest atom of a start, in float32 ulps of the largest coordinate. An atom then
@@ -29,8 +29,8 @@ def noise_size(simulation: Simulation) -> float:
 
 def starts(simulation: Simulation, count: int, seed: int, start: Start | None = None) -> list[Start]:
     """Starts of an ensemble: the simulation's own, each with other noise."""
-    begin = start or first_state(simulation)
-    return nudged(simulation, begin, noise_size(simulation), count, seed)
+    programs = MdProgram(simulation, start).nudged(noise_size(simulation), count, seed)
+    return [program.start for program in programs]
 
 
 class Member:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import equinox as eqx
 import numpy as np
 
-from mdnum.forks.choices.lists import ShuffledSimulation
+from mdnum.forks.reordered import ShuffledSimulation
 from mdnum.md.verlet import BUILDERS
 from mdnum.systems.build import Simulation
 

@@ -14,8 +14,8 @@ from mdnum.errors import InputError
 from mdnum.forks.benign import rule
 from mdnum.forks.benign.calibration import Calibration, Planted, calibrate
 from mdnum.forks.benign.ensemble import ensemble, starts
-from mdnum.forks.twin import Twin
 from mdnum.md.integrators import Langevin
+from mdnum.program import Twin
 from mdnum.systems.build import Simulation
 
 #: Features that are named, at most.
@@ -91,22 +91,23 @@ def benign(
     check(twin)
     if calibration is None:
         calibration = calibrate(
-            twin.a,
-            start=twin.start_a,
+            twin.a.simulation,
+            start=twin.a.begin,
             members=members,
             held_out=held_out,
             tries=tries,
             steps=steps,
             progress=progress,
         )
-    elif not _same_program(calibration.simulation, twin.a):
+    elif not _same_program(calibration.simulation, twin.a.simulation):
         raise InputError(
             f"the calibration is of {calibration.simulation.system.name} with other settings or positions",
             remedy="Calibrate with this comparison's own program",
         )
     window = calibration.window
-    begin = starts(twin.b, rule.RUNS, _SEED, twin.start_b)
-    rows = ensemble(twin.b, begin, [window.step], calibration.ruler)[0]
+    b = twin.b.simulation
+    begin = starts(b, rule.RUNS, _SEED, twin.b.begin)
+    rows = ensemble(b, begin, [window.step], calibration.ruler)[0]
     whole = np.isfinite(rows).all(axis=1)
     scores = np.full((len(rows), len(window.space.sigma)), np.nan)
     scores[whole] = window.space.scores(rows[whole])
@@ -135,12 +136,8 @@ def check(twin: Twin) -> None:
     Raises:
         InputError: runs of different size, or with different noise.
     """
-    a, b = twin.a, twin.b
-    if a.atoms != b.atoms:
-        raise InputError(
-            f"the runs have {a.atoms} and {b.atoms} atoms", remedy="Compare runs of one structure"
-        )
-    keys = [_key(one) for one in (a, b)]
+    twin.a.check(twin.b)
+    keys = [_key(one.simulation) for one in (twin.a, twin.b)]
     if (keys[0] is None) != (keys[1] is None) or not np.array_equal(keys[0], keys[1]):  # type: ignore[arg-type]
         raise InputError(
             "the runs have different noise, so they part at the first step whatever else they do",

@@ -83,7 +83,7 @@ def installed() -> bool:
     return find_spec("flint") is not None
 
 
-def why_not(simulation: Simulation) -> InputError | None:
+def unsupported(simulation: Simulation) -> InputError | None:
     """What keeps a system from being certified, with a remedy; None where nothing does."""
     where = "system"
     if not simulation.pairwise or not isinstance(simulation.potential, LennardJones):
@@ -138,9 +138,9 @@ class ExactProgram:
     """
 
     def __init__(self, simulation: Simulation, start: Start | None = None):
-        refused = why_not(simulation)
-        if refused is not None:
-            raise refused
+        error = unsupported(simulation)
+        if error is not None:
+            raise error
         begin = start or first_state(_wide(simulation))
         if int(begin.state.step) != 0:
             raise InputError(f"the start is at step {int(begin.state.step)}; an exact run begins at step 0")

@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Int
 
+from mdnum.program import Decision
+
 
 @dataclass(frozen=True)
 class Tape:
@@ -56,25 +58,7 @@ class Tape:
         )
 
 
-@dataclass(frozen=True)
-class Difference:
-    """The first decision in which two tapes differ.
-
-    Attributes:
-        step: of the decision.
-        i, j: the pair, i < j; where several pairs differ at this step, the first.
-        inside: decision of the first tape and of the second.
-        also: further pairs that differ at this step.
-    """
-
-    step: int
-    i: int
-    j: int
-    inside: tuple[bool, bool]
-    also: int
-
-
-def first_difference(a: Tape, b: Tape) -> Difference | None:
+def first_difference(a: Tape, b: Tape) -> Decision | None:
     """The first step at which any pair is decided differently; None where there is none in both tapes.
 
     Raises:
@@ -93,8 +77,20 @@ def first_difference(a: Tape, b: Tape) -> Difference | None:
         step = min(row[0] for row in apart)
         differing = np.unique([key for at, key, _ in apart if at == step])
     key = int(differing[0])
-    inside = tuple(bool(np.isin(key, tape.inside(step))) for tape in (a, b))
-    return Difference(step, *a.pair(key), (inside[0], inside[1]), len(differing) - 1)
+    first, second = (int(np.isin(key, tape.inside(step))) for tape in (a, b))
+    return Decision(
+        channel="pair",
+        step=step,
+        subject=a.pair(key),
+        run="A" if first else "B",
+        entered=True,
+        a=first,
+        b=second,
+        margins={},
+        bounds={},
+        separation=float("nan"),
+        also=len(differing) - 1,
+    )
 
 
 def _rows(tape: Tape) -> set[tuple[int, int, bool]]:

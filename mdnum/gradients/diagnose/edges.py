@@ -8,15 +8,11 @@ what that is worth.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from jaxtyping import Float
 
 from mdnum.errors import InputError, NumericalError
-from mdnum.forks.dials import Dial, dial
-from mdnum.forks.histories import margin
-from mdnum.forks.line import Line
+from mdnum.forks.boundaries import Line
 from mdnum.gradients import parameters
 from mdnum.gradients.base import Problem, Progress
 from mdnum.gradients.diagnose.passes import passed
@@ -26,6 +22,8 @@ from mdnum.gradients.tangents import tangents
 from mdnum.gradients.tape import Tape
 from mdnum.md.cell import HostCell
 from mdnum.precision.ulp import ordinal
+from mdnum.program import Number
+from mdnum.rollout.program import MdProgram
 from mdnum.systems.build import Simulation
 
 #: How far from the parameter a boundary is looked for, as a share of its value.
@@ -72,7 +70,8 @@ def edges(
     value = float(here)
     if value == 0 or not 0 < reach < 1:
         raise InputError(f"{full} = {value:g} and reach = {reach:g}; expected a number, and a share below 1")
-    line = Line(problem.simulation, _dial(problem.simulation, full, value), problem.steps, _no_loss)
+    program = MdProgram(problem.simulation)
+    line = Line(program, _number(program, full, value), problem.steps, _no_loss)
     ahead = _forecast(problem, full, budget, progress)
     below, above = (_edge(problem, line, full, value, sign, ahead[sign], reach, progress) for sign in (-1, 1))
     return Edges(full, value, below, above, _sentence(full, value, below, above))
@@ -82,15 +81,15 @@ def _no_loss(*_: object) -> float:
     return 0.0
 
 
-def _dial(simulation: Simulation, name: str, value: float) -> Dial:
-    """The parameter as something that can be turned without compiling anew."""
+def _number(program: MdProgram, name: str, value: float) -> Number:
+    """The parameter as a number that can be varied without compiling again."""
     if name == "cutoff.radius":
-        return dial(simulation, name)
+        return program.number(name)
 
-    def turn(one: Simulation, q: float) -> Simulation:
-        return parameters.with_values(one, {name: q})
+    def at(q: float) -> MdProgram:
+        return MdProgram(parameters.with_values(program.simulation, {name: q}))
 
-    return Dial(name, value, turn, turn, True)
+    return Number(name, value, "", at, at, True)
 
 
 def _forecast(problem: Problem, name: str, budget: int, progress: Progress | None) -> dict[int, float]:
@@ -171,8 +170,8 @@ def _edge(
             beyond = middle
     step, i, j = _first(line, inside, beyond)
     near, far = (line.value(place) for place in (inside, beyond))
-    value_near, gradient_near = _gradients(problem, line.at(inside), name)
-    value_far, gradient_far = _gradients(problem, line.at(beyond), name)
+    value_near, gradient_near = _gradients(problem, line.at(inside).simulation, name)
+    value_far, gradient_far = _gradients(problem, line.at(beyond).simulation, name)
     runs = len(line.known) - before
     return Edge(
         side,
@@ -198,21 +197,11 @@ def _nothing(side: str, runs: int) -> Edge:
 
 def _first(line: Line, inside: int, beyond: int) -> tuple[int, int, int]:
     """The first decision that differs: the pair that is nearest to its threshold on both sides."""
-    runs = [line.run(place) for place in (inside, beyond)]
-    step = runs[0].first_difference(runs[1])
-    assert step is not None
-    if any(len(run.marks) <= step for run in runs):
-        raise NumericalError(f"{line.dial.key} = {line.value(beyond)!r}: the run blew up at step {step}")
-    looks = [line.look(place, step) for place in (inside, beyond)]
-    differing: Sequence[int] = np.setxor1d(looks[0].pairs, looks[1].pairs, assume_unique=True).tolist()
-
-    def far(key: int) -> float:
-        i, j = divmod(key, line.simulation.atoms)
-        places = zip((inside, beyond), looks, strict=True)
-        return max(abs(margin(line.at(place), seen.x, i, j)) for place, seen in places)
-
-    i, j = divmod(min(differing, key=far), line.simulation.atoms)
-    return step, i, j
+    found = line.boundary(inside, beyond)
+    if found is None:
+        raise NumericalError(f"{line.number.key} = {line.value(beyond)!r}: the run blew up")
+    i, j = found.subject
+    return found.step, i, j
 
 
 def _gradients(problem: Problem, simulation: Simulation, name: str) -> tuple[float, dict[str, float]]:

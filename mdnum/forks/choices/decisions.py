@@ -2,19 +2,41 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
+from mdnum.ball.program import ImposedDecision
 from mdnum.ball.rollout import BallRun
 from mdnum.errors import InputError
-from mdnum.forks.bounce.choices.base import check, program
-from mdnum.forks.bounce.twin import BallTwin, Pin
-from mdnum.systems.ball_system import BallSystem
+from mdnum.forks.choices.base import CHOICES, Choice, no_more, number, some_ulps
+from mdnum.forks.worlds import program_of
+from mdnum.program import Twin
+from mdnum.systems import BallSystem
 
 
+def _imposed(program: Any, pin: ImposedDecision, difference: str) -> Twin:
+    return Twin(program, replace(program, pins=(pin,)), difference)
+
+
+def _run(program: Any) -> BallRun:
+    return program.run(program.steps)
+
+
+def _no_subject(system: BallSystem, step: int | None, ball: int | None) -> str | None:
+    steps = system.spec.integrator.steps
+    if step is not None and not 1 <= step <= steps:
+        return f"there is no step {step} from 1 to {steps}"
+    if ball is not None and not 0 <= ball < system.balls:
+        return f"there is no ball {ball} among {system.balls}"
+    return None
+
+
+@CHOICES.add("contact")
 @dataclass(frozen=True)
-class ContactStep:
+class ContactStep(Choice):
     """One contact of one ball begins a step earlier or later; everything else is decided as ever.
 
     Attributes:
@@ -22,6 +44,7 @@ class ContactStep:
         number: which of all contacts that begin in the run, from 1.
     """
 
+    worlds = ("ball",)
     shift: int = -1
     number: int = 1
 
@@ -30,6 +53,21 @@ class ContactStep:
             raise InputError(f"a shift of {self.shift} steps", where="contact", remedy="Give -1 or 1")
         if self.number < 1:
             raise InputError(f"contact {self.number}; they count from 1", where=self.name)
+
+    @classmethod
+    def parse(cls, argument: str, role: str, both: str | None) -> Choice:
+        """From "earlier", "later:2", or step and ball of a decision to invert, "57:0"."""
+        no_more(cls, role, both)
+        first, _, second = (argument or "earlier").partition(":")
+        if first in ("earlier", "later"):
+            return cls(-1 if first == "earlier" else 1, number(second, int, "contact") if second else 1)
+        ball = number(second, int, "contact") if second else 0
+        return Inverted(number(first, int, "contact"), ball)
+
+    @classmethod
+    def shipped(cls, world: str) -> Iterable[Choice]:
+        """The first contact."""
+        return [cls(), cls(1)]
 
     @property
     def name(self) -> str:
@@ -41,20 +79,14 @@ class ContactStep:
     def _word(self) -> str:
         return "earlier" if self.shift < 0 else "later"
 
-    @property
-    def about(self) -> str:
-        """One line."""
+    def describe(self, world: str = "ball") -> str:
+        """Which contact."""
         which = "the first contact" if self.number == 1 else f"contact {self.number}"
         return f"{which} one step {self._word}, everything else as it comes"
 
-    @property
-    def must_hold(self) -> bool:
-        """A planted flip is a fork."""
-        return False
-
-    def why_not(self, system: BallSystem) -> str | None:
+    def reason_unavailable(self, system: BallSystem) -> str | None:
         """There may be no such contact, or no step before it."""
-        found = self._find(program(system).run())
+        found = self._find(_run(program_of(system)))
         return found if isinstance(found, str) else None
 
     def _find(self, run: BallRun) -> tuple[int, int] | str:
@@ -68,21 +100,19 @@ class ContactStep:
             return f"that contact of ball {ball} begins at the first step"
         return step, ball
 
-    def make(self, system: BallSystem) -> BallTwin:
+    def make(self, system: BallSystem) -> Twin:
         """The system, and made to touch a step earlier, or not to touch a step longer."""
-        a = program(system)
-        found = self._find(a.run())
-        if isinstance(found, str):
-            check(self, system)
-            raise TypeError("a contact that is not there was not refused")
+        program = program_of(system)
+        found = self._find(_run(program))
+        assert not isinstance(found, str)
         step, ball = found
-        pin = Pin("contact", step - 1, ball, 1) if self.shift < 0 else Pin("contact", step, ball, 0)
-        words = f"the contact of ball {ball} at step {step} begins a step {self._word}"
-        return BallTwin(a, a, words, pins=(pin,))
+        earlier = self.shift < 0
+        pin = ImposedDecision("contact", step - earlier, ball, int(earlier))
+        return _imposed(program, pin, f"the contact of ball {ball} at step {step} begins a step {self._word}")
 
 
 @dataclass(frozen=True)
-class Inverted:
+class Inverted(Choice):
     """One contact decision taken the other way.
 
     Attributes:
@@ -90,6 +120,7 @@ class Inverted:
         ball: whose.
     """
 
+    worlds = ("ball",)
     step: int
     ball: int = 0
 
@@ -98,36 +129,26 @@ class Inverted:
         """Such as "contact=57:0"."""
         return f"contact={self.step}:{self.ball}"
 
-    @property
-    def about(self) -> str:
-        """One line."""
+    def describe(self, world: str = "ball") -> str:
+        """Which decision."""
         return f"the contact decision of ball {self.ball} at step {self.step} taken the other way"
 
-    @property
-    def must_hold(self) -> bool:
-        """A planted flip is a fork."""
-        return False
-
-    def why_not(self, system: BallSystem) -> str | None:
+    def reason_unavailable(self, system: BallSystem) -> str | None:
         """There may be no such step or ball."""
-        steps = system.spec.integrator.steps
-        if not 1 <= self.step <= steps:
-            return f"there is no step {self.step} from 1 to {steps}"
-        if not 0 <= self.ball < system.balls:
-            return f"there is no ball {self.ball} among {system.balls}"
-        return None
+        return _no_subject(system, self.step, self.ball)
 
-    def make(self, system: BallSystem) -> BallTwin:
+    def make(self, system: BallSystem) -> Twin:
         """The system, and with the decision inverted."""
-        check(self, system)
-        a = program(system)
-        touches = bool(a.run().contact[self.step - 1, self.ball])
-        words = f"ball {self.ball} made {'not ' if touches else ''}to touch at step {self.step}"
-        return BallTwin(a, a, words, pins=(Pin("contact", self.step, self.ball, int(not touches)),))
+        program = program_of(system)
+        touches = bool(_run(program).contact[self.step - 1, self.ball])
+        pin = ImposedDecision("contact", self.step, self.ball, int(not touches))
+        difference = f"ball {self.ball} made {'not ' if touches else ''}to touch at step {self.step}"
+        return _imposed(program, pin, difference)
 
 
+@CHOICES.add("iterations")
 @dataclass(frozen=True)
-class Iterations:
+class Iterations(Choice):
     """One solve goes on for more iterations, or for fewer, than its rule says.
 
     Attributes:
@@ -136,13 +157,13 @@ class Iterations:
         ball: whose, where each ball has a solve of its own; None for the first that iterates.
     """
 
+    worlds = ("ball",)
     more: int = 1
     step: int | None = None
     ball: int | None = None
 
     def __post_init__(self):
-        if self.more == 0:
-            raise InputError("0 iterations more change nothing", where="iterations", remedy="Write +1 or -1")
+        some_ulps(self.more, "iterations")
 
     @property
     def name(self) -> str:
@@ -150,31 +171,31 @@ class Iterations:
         parts = (f"iterations={self.more:+d}", self.step, self.ball)
         return ":".join(str(part) for part in parts if part is not None)
 
-    @property
-    def about(self) -> str:
-        """One line."""
+    @classmethod
+    def parse(cls, argument: str, role: str, both: str | None) -> Choice:
+        """From "more:step:ball"."""
+        no_more(cls, role, both)
+        parts = [number(part, int, "iterations") for part in (argument or "+1").split(":")]
+        if len(parts) > 3:
+            raise InputError(f"{argument!r} is not more:step:ball", where="iterations")
+        return cls(*parts)
+
+    def describe(self, world: str = "ball") -> str:
+        """Which solve."""
         which = "the first solve" if self.step is None else f"the solve of step {self.step}"
         noun = "iteration" if abs(self.more) == 1 else "iterations"
         return f"{which} makes {abs(self.more)} {noun} {'more' if self.more > 0 else 'fewer'}"
 
-    @property
-    def must_hold(self) -> bool:
-        """A planted flip is a fork."""
-        return False
-
-    def why_not(self, system: BallSystem) -> str | None:
+    def reason_unavailable(self, system: BallSystem) -> str | None:
         """There must be a solve that iterates."""
         if system.spec.stop is None:
             return "its steps solve nothing, so there is no iteration to add"
-        steps = system.spec.integrator.steps
-        if self.step is not None and not 1 <= self.step <= steps:
-            return f"there is no step {self.step} from 1 to {steps}"
-        if self.ball is not None and not 0 <= self.ball < system.balls:
-            return f"there is no ball {self.ball} among {system.balls}"
-        found = self._find(program(system).run())
+        if (reason := _no_subject(system, self.step, self.ball)) is not None:
+            return reason
+        found = self._find(_run(program_of(system)))
         return found if isinstance(found, str) else None
 
-    def _find(self, run: BallRun) -> Pin | str:
+    def _find(self, run: BallRun) -> ImposedDecision | str:
         """The count that the solve is made to have; why there is none."""
         counts = run.iterations
         if counts.ndim == 1 and self.ball is not None:
@@ -191,15 +212,13 @@ class Iterations:
         count = int(busy[row, ball if counts.ndim == 2 else 0]) + self.more
         if count < 0:
             return f"the solve of step {row + 1} makes {count - self.more} iterations"
-        return Pin("stop", row + 1, ball if counts.ndim == 2 else -1, count)
+        return ImposedDecision("stop", row + 1, ball if counts.ndim == 2 else -1, count)
 
-    def make(self, system: BallSystem) -> BallTwin:
+    def make(self, system: BallSystem) -> Twin:
         """The system, and made to go on, or to stop, at another iteration of one solve."""
-        check(self, system)
-        a = program(system)
-        pin = self._find(a.run())
-        assert isinstance(pin, Pin)
+        program = program_of(system)
+        pin = self._find(_run(program))
+        assert not isinstance(pin, str)
         whose = "" if pin.ball < 0 else f" of ball {pin.ball}"
         count = f"{pin.value} iterations, not {pin.value - self.more}"
-        words = f"the solve{whose} at step {pin.step} makes {count}"
-        return BallTwin(a, a, words, pins=(pin,))
+        return _imposed(program, pin, f"the solve{whose} at step {pin.step} makes {count}")

@@ -1,4 +1,4 @@
-"""The neighbor list's format as a choice: the orders in which jax-md's formats add the terms of an atom.
+"""Simulations whose lists hold the same pairs in another order: of jax-md's formats, or shuffled.
 
 A pair's force on one end is exactly minus that on the other, so a format changes nothing but an order. Dense
 and sparse lists hold a pair from both ends and add half its force for each. A sparse list adds the halves of
@@ -20,19 +20,12 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from jaxtyping import Bool, Int
 
-from mdnum.errors import InputError
-from mdnum.forks.choices.arithmetic import orderless
-from mdnum.forks.choices.base import built, check, no_sums, suffix, summing
-from mdnum.forks.twin import Twin
-from mdnum.md.verlet import PairTable, VerletList
+from mdnum.md.verlet import ListBuilder, PairTable, VerletList
 from mdnum.precision.orders import Halves, Reduction, Sequential, Twice
 from mdnum.systems.build import Simulation
-from mdnum.systems.load import System
 
 #: The sums that go with each format.
 _SUMS: Mapping[str, Reduction] = {"dense": Twice(), "sparse": Sequential(), "ordered-sparse": Halves()}
-
-FORMATS = tuple(_SUMS)
 
 
 @dataclass
@@ -113,51 +106,54 @@ class FormattedSimulation(Simulation):
 
 
 @dataclass(frozen=True)
-class Format:
-    """The neighbors of each atom in the order in which another format of the list adds them.
+class ShuffledBuilder:
+    """A neighbor search whose rows are shuffled, each atom's in its own way.
 
     Attributes:
-        word: "dense", "sparse" or "ordered-sparse", as jax-md names its formats.
-        both: reduction of both runs; None for the system's own.
+        inner: who searches.
+        seed: of the shuffle; every list of a run is shuffled with it anew.
     """
 
-    word: str = "ordered-sparse"
-    both: str | None = None
-
-    def __post_init__(self):
-        if self.word not in FORMATS:
-            raise InputError(f"no format {self.word!r}; there are {', '.join(FORMATS)}", where="format")
+    inner: ListBuilder
+    seed: int
 
     @property
     def name(self) -> str:
-        """Such as "format=sparse" or "format=ordered-sparse@exact"."""
-        return f"format={self.word}{suffix(self.both)}"
+        """The inner search's word."""
+        return self.inner.name
+
+    def build(self, positions, cell, r_list, slots):
+        """The inner search's table with the neighbors of each atom in another order, padding at the end."""
+        table, order, most = self.inner.build(positions, cell, r_list, slots)
+        atoms = table.shape[1]
+        keys = np.random.default_rng(self.seed).random(table.shape)
+        keys[table == atoms] = 2.0
+        return np.take_along_axis(table, np.argsort(keys, axis=0, kind="stable"), axis=0), order, most
+
+
+@dataclass(frozen=True)
+class ShuffledSimulation(Simulation):
+    """A simulation whose lists hold their pairs in another order.
+
+    Attributes:
+        shuffle: seed of that order.
+    """
+
+    shuffle: int = 0
+
+    @classmethod
+    def of(cls, simulation: Simulation, seed: int) -> ShuffledSimulation:
+        """A simulation with shuffled lists."""
+        same = {field.name: getattr(simulation, field.name) for field in fields(Simulation)}
+        return cls(**same, shuffle=seed)
 
     @property
-    def about(self) -> str:
-        """One line."""
-        return f"pair terms added in the order of {self.word} lists{summing(self.both)}"
+    def lists(self):
+        """Shuffled lists are other lists."""
+        return (*super().lists, self.shuffle)
 
-    @property
-    def must_hold(self) -> bool:
-        """Sums without an order cannot tell."""
-        return orderless(self.both)
-
-    def why_not(self, system: System) -> str | None:
-        """Only a loop over a list goes by the order of the list."""
-        refused = no_sums(system, self.both)
-        if refused is not None or self.both is not None:
-            return refused
-        if system.spec.cutoff is None:
-            return "a many-body potential has a format of its own"
-        word = system.spec.precision.reduction
-        if word != "sequential":
-            return f"a format is the order of a loop, and sums are {word} here"
-        return None
-
-    def make(self, system: System) -> Twin:
-        """The system, and with lists of the format."""
-        check(self, system)
-        a = built(system, self.both)
-        words = f"pair terms in the order of {self.word} lists, not of the search's{summing(self.both)}"
-        return Twin(a, FormattedSimulation.of(a, self.word), words)
+    def verlet_list(self, skin: float | None = None) -> VerletList:
+        """As the simulation's own, shuffled."""
+        made = super().verlet_list(skin)
+        made.builder = ShuffledBuilder(made.builder, self.shuffle)
+        return made
