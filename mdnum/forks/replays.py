@@ -121,7 +121,7 @@ class DecidedPairs:
         first: frozenset[int] | None = None
         for segment in Engine(simulation, last, start=program.begin).segments():
             if first is None:
-                first = frozenset(decided_pairs(simulation, segment, 0).tolist()) & changes.keys()
+                first = frozenset(changes).intersection(decided_pairs(simulation, segment, 0).tolist())
             ledger = recorder.flips(segment)
             named = ledger.subject[:, 0].astype(np.int64) * simulation.atoms + ledger.subject[:, 1]
             for step, key in zip(ledger.step.tolist(), named.tolist(), strict=True):
