@@ -15,12 +15,6 @@ __all__ = ["judge", "write"]
 # another question than what a run does or where two part go by that question
 _MODULES = {
     "ball": ("mdnum.report.ball.findings", "mdnum.report.ball.html"),
-    "ball-fork": ("mdnum.report.fork.ball", "mdnum.report.fork.ball"),
-    "fork": ("mdnum.report.fork.findings", "mdnum.report.fork.html"),
-    "along": ("mdnum.report.fork.map", "mdnum.report.fork.map"),
-    "processes": ("mdnum.report.fork.processes", "mdnum.report.fork.processes"),
-    "certify": ("mdnum.report.fork.certify", "mdnum.report.fork.certify"),
-    "forecast": ("mdnum.report.fork.forecast", "mdnum.report.fork.forecast"),
     "audit": ("mdnum.report.audit.html", "mdnum.report.audit.html"),
     "grad": ("mdnum.report.grad.html", "mdnum.report.grad.html"),
     "conform": ("mdnum.report.conform.html", "mdnum.report.conform.html"),

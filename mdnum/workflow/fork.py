@@ -100,7 +100,8 @@ def fork(
     check(asked)
     if vary == ALL:
         given = {"split": own_split is not None, "repeats": repeats is not None, "minimal": minimal,
-                 "counterfactual": not counterfactual, "back": back is not None, "pin": pin is not None}  # fmt: skip
+                 "counterfactual": not counterfactual, "back": back is not None,
+                 "pin": pin is not None}  # fmt: skip
         frame.refuse(given, "of one comparison, and all choices were asked for", "Give one choice to vary")
         return fork_screen(system, steps=steps, out=out, report=report, progress=progress)
     if isinstance(system, BallSystem):
@@ -207,6 +208,7 @@ def fork_folders(
     from mdnum.forks.folders import compare_folders, twin_of
     from mdnum.systems.load import load
 
+    began = time.perf_counter()
     frame.say(progress, "compare")
     found = compare_folders(a, b)
     system: Any = load(found.a)
@@ -214,7 +216,7 @@ def fork_folders(
         frame.refuse(dict.fromkeys(asked, True), "of a replay", "Add replay=True, or leave them out")
         with frame.new_folder("compare", f"fork-{system.name}", out, system=system) as folder:
             row = plain(found)
-            row["first_bit"] = row.pop("seed")
+            row |= {"first_bit": row.pop("seed"), "seconds": time.perf_counter() - began}
             frame.store(folder, basics(system, found.steps) | row, {})
         return frame.finish(folder, report=report, result=found, progress=progress)
     if found.world != "md":
@@ -266,12 +268,14 @@ def fork_benign(
     from mdnum.forks.benign import benign
     from mdnum.forks.choices import parse, twin_of
 
+    began = time.perf_counter()
     system = of_md(system, overrides, "benign")
     twin = twin_of(parse(vary), system)
     with frame.new_folder("benign", f"fork-{system.name}", out, system=system) as folder:
         found = benign(twin, steps=steps, progress=progress)
         summary = basics(system, found.window) | {"choice": vary, "difference": twin.difference}
-        frame.store(folder, summary | plain(found), {})
+        summary |= {**plain(found), "seconds": time.perf_counter() - began}
+        frame.store(folder, summary, {})
     return frame.finish(folder, report=report, result=found, progress=progress)
 
 
@@ -336,7 +340,7 @@ def judge_benign(view: View) -> Verdict:
 
 
 def _page(view: View, what: str, about: str, keys: list[Key], sections: list[Section]) -> Page:
-    rows = [*size(view), *([("Took", f"{number(view.summary['seconds'], 2)} s")] * ("seconds" in view.summary))]
+    rows = [*size(view), ("Took", f"{number(view.summary['seconds'], 2)} s")]
     sections = [*sections, Section("What was run", [pairs(rows)])]
     title = f"{view.name}: {what}"
     return Page(title, about, keys, sections, view.system_toml, view.folder.provenance)
@@ -367,7 +371,9 @@ def page_screen(view: View, verdict: Verdict) -> Page:
         lambda canvas: _ranking(rows, s["steps"], canvas), 0.9 + 0.24 * len(rows),
     )  # fmt: skip
     sections = [
-        Section(_RANKING, [TEXTS("ranking"), Table(columns, lines, shown=100, bad=bad), figure], terminal=True)
+        Section(
+            _RANKING, [TEXTS("ranking"), Table(columns, lines, shown=100, bad=bad), figure], terminal=True
+        )
     ]
     if left := s["not_applicable"]:
         table = Table(("choice", "reason"), [(row["choice"], row["reason"]) for row in left], shown=100)
@@ -417,7 +423,14 @@ def page_compare(view: View, verdict: Verdict) -> Page:
              flip["margin"], flip["bound"], flip["ambiguous"])
             for flip in s["decisions"]
         ]  # fmt: skip
-        columns = ("only in", "pair" if s["channel"] == "pair" else "ball", "enters", "margin", "bound", "ambiguous")
+        columns = (
+            "only in",
+            "pair" if s["channel"] == "pair" else "ball",
+            "enters",
+            "margin",
+            "bound",
+            "ambiguous",
+        )
         sections.append(Section("Decisions at the fork", [Table(columns, rows)], terminal=True))
     if s["iterations"]:
         table = Table(("in A", "in B"), [s["iterations"]])

@@ -28,7 +28,11 @@ FITS = 0.8
 #: Rows of the table of decisions that the page carries.
 TABLE_ROWS = 5_000
 #: Titles of sections that findings name.
-DECISION, TWO_BY_TWO, WHAT = "The decision at the fork", "Whose decisions, whose arithmetic", "What was compared"
+DECISION, TWO_BY_TWO, WHAT = (
+    "The decision at the fork",
+    "Whose decisions, whose arithmetic",
+    "What was compared",
+)
 SPACES = {"r2": "r²", "r": "r", "height": "minus the height", "residual": "tolerance minus residual"}
 #: A split that is expected is shown up to so many times the steps that were followed.
 _BEYOND = 2.0
@@ -71,7 +75,7 @@ def _headline(view: View) -> tuple[str, dict[str, Any]]:
     if word == "bystander" and split < fork:
         return "bystander_before", values
     if word != "open":
-        return word, values
+        return str(word), values
     by = summary.get("predicted_by")
     return "open_split" if split is not None else f"open_{by}" if by else "open", values
 
@@ -122,18 +126,17 @@ def _findings(view: View) -> Iterator[Finding]:
     if summary.get("reproduced") is False:
         stored = summary["stored"]["fork"]
         yield TEXTS.finding("NOT_REPRODUCED", stored=stored, fork=summary.get("fork"), section=WHAT)
-    for name in decision["ambiguous_in"] if decision else ():
-        margin, bound = abs(decision["margins"][name]), decision["bounds"][name]
+    if decision and decision["ambiguous_in"]:
+        margins = decision["margins"].items()
+        sizes = [TEXTS("of_bound", run=run, margin=abs(x), bound=decision["bounds"][run])
+                 for run, x in margins if run in decision["ambiguous_in"]]  # fmt: skip
         yield TEXTS.finding(
-            "AMBIGUOUS_FORK", section=DECISION, subject=subject(summary), run=name, margin=margin,
-            bound=bound,
-        )  # fmt: skip
-    values = {"steps": steps, "unit": view.units.length, "split": summary.get("predicted_split")}
+            "AMBIGUOUS_FORK", section=DECISION, subject=subject(summary), sizes=listed(sizes)
+        )
+    values: dict[str, Any] = {"steps": steps, "unit": view.units.length, "split": summary["predicted_split"]}
     values |= {"separation": summary.get("separation_end"), "tolerance": summary["tolerance"]}
-    # what differs in decisions alone, and in no bit, is no fork whose split is still to come
-    if summary.get("fork") is not None and values | summary and summary.get("split") is None and not failed:
-        if summary["effect"] not in ("same",):
-            yield TEXTS.finding("HORIZON_SHORT", *["predicted"] * bool(values["split"]), **values)
+    if summary["effect"] == "open" and summary["split"] is None and not failed:
+        yield TEXTS.finding("HORIZON_SHORT", *["predicted"] * bool(values["split"]), **values)
     until = summary.get("imposed_until")
     if until is not None and until < steps and not failed:
         word = (summary.get("failed_imposed") or {}).get("B|A")
@@ -243,10 +246,10 @@ def _separation(view: View) -> Plot | None:
     verticals, guess = _dates(s, all_of_them=True), s["predicted_split"]
     shown = guess is not None and guess <= _BEYOND * s["steps"]
     if shown:
-        verticals += ((float(guess), "split expected"),)
+        verticals += ((float(guess or 0), "split expected"),)
     fit = s["growth"]["B"]
     if fit["rate"] is not None and fit["r_squared"] >= FITS:
-        at = np.linspace(fit["first"], guess if shown else fit["last"], 60)
+        at = np.linspace(fit["first"], (guess or 0) if shown else fit["last"], 60)
         line = np.exp(fit["intercept"] + fit["rate"] * at)
         series.append(Series("growth, fitted", at, line, role="ink", dashed=True))
     ball = "balls" in s
@@ -327,7 +330,9 @@ def _around(view: View) -> Iterator[Any]:
 def _atoms(view: View, table: Mapping[str, np.ndarray], figure: Canvas) -> None:
     """A and B side by side, each with the pair in the plane and its cutoff around the first atom."""
     d = view.summary["decision"]
-    x, moved = (np.stack([table[k] for k in names], axis=1) for names in (("x", "y", "z"), ("dx", "dy", "dz")))
+    x, moved = (
+        np.stack([table[k] for k in names], axis=1) for names in (("x", "y", "z"), ("dx", "dy", "dz"))
+    )
     # along the pair, across it where the neighbors spread most, and toward the eye
     along = (x[1] - x[0]) / np.linalg.norm(x[1] - x[0])
     _, _, axes = np.linalg.svd(x - np.outer(x @ along, along), full_matrices=True)
@@ -338,7 +343,9 @@ def _atoms(view: View, table: Mapping[str, np.ndarray], figure: Canvas) -> None:
     longest = float(np.sqrt((shift[:, :2] ** 2).sum(axis=1)).max())
     factor = 10.0 ** np.floor(np.log10(_ARROW * d["cutoffs"]["A"] / longest)) if longest > 0 else 0.0
     slope = d["margin"] / d["margin_length"] if d["margin_length"] else 1.0
-    shade: Any = np.clip(1.0 - 0.8 * np.abs(flat[:, 2]) / max(float(np.abs(flat[:, 2]).max()), 1e-300), 0.15, 1)
+    shade: Any = np.clip(
+        1.0 - 0.8 * np.abs(flat[:, 2]) / max(float(np.abs(flat[:, 2]).max()), 1e-300), 0.15, 1
+    )
     for panel, name in zip(figure.subplots(1, 2), "AB", strict=True):
         inside, cutoff = bool(d["decided"][name]), float(d["cutoffs"][name])
         panel.scatter(flat[2:, 0], flat[2:, 1], s=26, c=MUTED, alpha=shade[2:], lw=0)
@@ -442,7 +449,9 @@ def _certain(view: View) -> Iterator[Any]:
         rows.append(("Protected", TEXTS(f"protected_{kind}", until=until)))
     if s.get("shadow"):
         other = "B" if s["shadow"] == "A" else "A"
-        rows.append(("Shadow horizon", TEXTS("shadow", step=s["shadow_horizon"], wide=s["shadow"], other=other)))
+        rows.append(
+            ("Shadow horizon", TEXTS("shadow", step=s["shadow_horizon"], wide=s["shadow"], other=other))
+        )
     if not rows:
         return
     yield TEXTS("certain")
@@ -489,20 +498,20 @@ def _after(view: View) -> Iterator[Plot]:
     """What differs at each step: decisions, those that were overridden, energies."""
     s, table = view.summary, view.table("separation")
     length, dates = view.units.length, _dates(s)
-    for name, title, label, role in (
-        ("cross", "Decisions that the two runs make differently", "decisions that differ", "first"),
-        ("overridden", "Decisions overridden in the run under A’s decisions", "decisions overridden", "second"),
+    for name, title, label in (
+        ("cross", "Decisions that the two runs make differently", "decisions that differ"),
+        ("overridden", "Decisions overridden in the run under A’s decisions", "decisions overridden"),
     ):
         if _has(table, name):
             values = _positive(table[name].astype(float))
             wide = np.nanmax(values) > 30
-            series = (Series(label, table["step"], values, mark="points", role=role),)
+            series = (Series(label, table["step"], values, mark="points"),)
             yield Plot(
                 name, title, "step", label, series, y_scale="log" if wide else "linear", verticals=dates,
                 caption=TEXTS(f"{name}_caption"),
             )  # fmt: skip
     if _has(table, "furthest") and "balls" not in s:
-        series = (Series("", table["step"], _positive(table["furthest"]), mark="points", role="second"),)
+        series = (Series("", table["step"], _positive(table["furthest"]), mark="points"),)
         yield Plot(
             "furthest", "Distance of overridden pairs from their cutoff", "step",
             f"furthest from its cutoff ({length})", series, y_scale="log", verticals=dates,
@@ -511,7 +520,7 @@ def _after(view: View) -> Iterator[Plot]:
     named: tuple[tuple[str, str, Role], ...] = (
         ("energy_b", "B, free", "first"), ("energy_imposed", "B under A’s decisions", "second"),
     )  # fmt: skip
-    off = [(label, role, np.abs(table[name] - table["energy_a"])) for name, label, role in named]
+    off: list[tuple[str, Role, np.ndarray]] = [(label, role, np.abs(table[name] - table["energy_a"])) for name, label, role in named]
     lines = [Series(label, table["step"], _positive(y), role=role) for label, role, y in off if np.any(y > 0)]
     if lines:
         unit = f"|energy − energy of A| ({view.units.energy})"
@@ -530,7 +539,9 @@ def _flips(view: View) -> Iterator[Any]:
     run_b = (table["run"].astype(str) == "B").astype(int)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.abs(table["margin"] / table["bound"]).astype(float)
-    columns: list[tuple[np.ndarray, int | None]] = [(table[name].astype(int), None) for name in ("step", "i", "j")]
+    columns: list[tuple[np.ndarray, int | None]] = [
+        (table[name].astype(int), None) for name in ("step", "i", "j")
+    ]
     columns.append((run_b, None))
     if ball:
         columns += [((table["channel"].astype(str) == "stop").astype(int), None)]
@@ -548,13 +559,20 @@ def _flips(view: View) -> Iterator[Any]:
             Column(4, "decision", kind="word", words=("left", "entered"), colors=("out", "in")),
             Column(5, "the runs now", kind="word", words=("agree", "differ")),
         )  # fmt: skip
-        words = {"entered": (4, 1), "in": (4, 1), "left": (4, 0), "out": (4, 0), "differ": (5, 1), "agree": (5, 0)}
+        words = {
+            "entered": (4, 1),
+            "in": (4, 1),
+            "left": (4, 0),
+            "out": (4, 0),
+            "differ": (5, 1),
+            "agree": (5, 0),
+        }
     columns += [(table["margin"].astype(float), 4), (ratio, 3)]
     rows = plain_rows(columns)
     yield TEXTS("flips_ball" if ball else "flips_md", shown=len(rows), total=total, counted=s.get("counted"))
     yield Browse(
         name="flips", row_id="flip-rows", label="Search decisions",
-        placeholder="ball 3, step:100..200, contact, ambiguous" if ball else "3-17, atom 5, step:100..200, B, ambiguous",
+        placeholder="step:100..200, ambiguous, " + ("ball 3, contact" if ball else "3-17, atom 5, B"),
         columns=(
             Column(0, "step", kind="count"), *shown, Column(7, "margin"),
             Column(8, "margin", "÷ bound", digits=2, missing="∞"),
@@ -577,12 +595,18 @@ def size(view: View) -> list[tuple[str, str]]:
 
 
 def _what(view: View, s: Mapping[str, Any]) -> Iterator[Any]:
-    rows = [*size(view), ("Choice", f"{s['choice']}: {s['choice_about']}"), ("A and B differ in", s["difference"])]
+    rows = [
+        *size(view),
+        ("Choice", f"{s['choice']}: {s['choice_about']}"),
+        ("A and B differ in", s["difference"]),
+    ]
     if "reproduced" in s:
         rows.append(("Replay", TEXTS("reproduced" if s["reproduced"] else "not_reproduced")))
     if s.get("must_hold"):
         rows.append(("Must hold", TEXTS("must_hold")))
-    split = TEXTS("split_ball" if "balls" in s else "split_md", tolerance=s["tolerance"], unit=view.units.length)
+    split = TEXTS(
+        "split_ball" if "balls" in s else "split_md", tolerance=s["tolerance"], unit=view.units.length
+    )
     rows.append(("Split", split))
     if s["imposed_until"] is None:
         rows.append(("Counterfactual", TEXTS("no_counterfactual")))

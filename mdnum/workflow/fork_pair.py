@@ -184,6 +184,7 @@ def followed(
 def _numbers(made: Fork) -> dict[str, Any]:
     """What the summary of any pair says: dates, verdict, growth, the table of two by two."""
     from mdnum.forks.pair import FLIPS_KEPT
+
     step, free, verdict = made.twin.a.timestep, made.series["B"], made.verdict
     dates = {"first_bit": made.dates.seed, "fork": made.dates.fork, "split": made.dates.split}
     count = None
@@ -385,6 +386,7 @@ def _ball_flips(made: Fork, tables: dict[str, Any]) -> dict[str, Any]:
 def _exponent(made: Fork) -> dict[str, Any]:
     """The largest Lyapunov exponent of run A beside the growth that was seen; a reason where there is none."""
     from mdnum.forks.tangent import lyapunov
+
     def none(name: str, **values: Any) -> dict[str, Any]:
         return {"lyapunov": None, "lyapunov_reason": TEXTS(f"lyapunov_{name}", **values)}
 
@@ -403,7 +405,10 @@ def _exponent(made: Fork) -> dict[str, Any]:
     # where A's largest coordinate lies: no smaller displacement of it can be written down
     ulp = float(np.spacing(np.abs(a.positions).max().astype(a.policy.dtype("state"))))
     split = found.steps_to(ulp, made.tolerance)
-    table = {name: getattr(found, name) for name in ("rate", "error", "rate_time", "error_time", "steps", "chaotic")}
+    table = {
+        name: getattr(found, name)
+        for name in ("rate", "error", "rate_time", "error_time", "steps", "chaotic")
+    }
     table |= {"ratio": plain(found.ratio(made.growth["B"])), "ulp": ulp}
     table["ulp_split"] = None if split is None else round(split)
     # log(end / first) over the steps between them, as Lyapunov.chaotic has it
@@ -444,5 +449,3 @@ def _minimal(made: Fork, progress: Progress | None) -> dict[str, Any]:
         return {"pairs": None, "proven": False, "tests": 0, "reason": error.message}
     pairs = [{"i": i, "j": j, "differs": disagreements(made, i, j)} for i, j in found.pairs or ()]
     return {**vars(found), "pairs": None if found.pairs is None else pairs}
-
-
