@@ -53,9 +53,9 @@ def force_error(simulation: Simulation, exact: np.ndarray) -> float:
 
 def study(system: System, word: str, steps: int) -> Row:
     """Compare one reduction with the system's own, and with itself in another order."""
-    exact = Order(both="exact").make(system).a.evaluate().forces
+    exact = Order(both="exact").make(system).a.simulation.evaluate().forces
     shuffled = fork(Order(both=word).make(system), min(steps, 100), counterfactual=False)
-    own = shuffled.twin.a
+    own = shuffled.twin.a.simulation
     choice = Summation(word)
     found = None
     if choice.why_not(system) is None:

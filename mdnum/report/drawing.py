@@ -12,7 +12,7 @@ from matplotlib.ticker import MaxNLocator, NullFormatter, ScalarFormatter
 from mdnum.report import thin
 from mdnum.report.section import Figure, Plot, Region, Series
 from mdnum.report.svg import BAD, FIRST, GRID, INK, MUTED, SECOND, THIRD, style
-from mdnum.report.words import many, typeset
+from mdnum.report.words import MINUS, many, typeset
 
 #: Inches; the page scales it.
 WIDTH = 7.2
@@ -98,81 +98,138 @@ def notes(plot: Figure | Plot) -> list[str]:
     x, y = (np.concatenate([np.asarray(getattr(one, name), float) for one in plot.series]) for name in "xy")
     infinite = int(np.isinf(x).sum() + np.isinf(y).sum())
     if infinite:
-        sentences.append(
-            f"{many(infinite, 'value')} {'is' if infinite == 1 else 'are'} infinite and left out."
-        )
+        sentences.append(f"Infinite and left out: {many(infinite, 'value')}.")
     for scale, values, label in ((plot.x_scale, x, plot.x_label), (plot.y_scale, y, plot.y_label)):
         values = values[np.isfinite(values)]
         lost = int((values <= 0).sum()) if scale == "log" else 0
         if lost and lost == len(values):
             sentences.append(f"No value of {label} is positive, so its axis is linear.")
         elif lost:
-            sentences.append(
-                f"{many(lost, 'value')} of {label} at or below zero cannot be shown on its axis."
-            )
+            sentences.append(f"Not shown: {many(lost, 'value')} of {label} at or below zero.")
     return sentences
 
 
 def _plot(plot: Plot, figure: Canvas) -> None:
     axes = figure.subplots()
+    bases = {name: _base(plot, name) for name in "xy"}
     for scale, name in ((plot.x_scale, "x"), (plot.y_scale, "y")):
         _scale(axes, name, scale, plot)
     if plot.region is not None:
         _region(axes, plot.region)
-    for series in plot.series:
-        _series(axes, series)
-    if not axes.lines and not axes.collections and plot.region is None:
+    for at, series in enumerate(plot.series):
+        _series(axes, series, bases, sum(_coincide(series, other) for other in plot.series[at + 1 :]))
+    if not axes.lines and not axes.collections:
         axes.text(0.5, 0.5, "no values", transform=axes.transAxes, color=MUTED, ha="center", va="center")
-    for marks, mark, transform in (
-        (plot.verticals, axes.axvline, axes.get_xaxis_transform()),
-        (plot.horizontals, axes.axhline, axes.get_yaxis_transform()),
+    for value, word in _apart(plot.verticals, bases["x"], axes.get_xlim()):
+        axes.axvline(value, color=MUTED, lw=0.9, ls=(0, (4, 3)), zorder=1.6)
+        place = {"xy": (value, 0.98), "xycoords": axes.get_xaxis_transform(), "va": "top", "rotation": 90}
+        axes.annotate(typeset(word), **place, color=MUTED, fontsize=8, ha="right")
+    for value, word in _apart(plot.horizontals, bases["y"], axes.get_ylim()):
+        axes.axhline(value, color=MUTED, lw=0.9, ls=(0, (4, 3)), zorder=1.6)
+        place = {"xy": (0.99, value), "xycoords": axes.get_yaxis_transform(), "va": "bottom"}
+        axes.annotate(typeset(word), **place, color=MUTED, fontsize=8, ha="right")
+    for setter, label, base in (
+        (axes.set_xlabel, plot.x_label, bases["x"]),
+        (axes.set_ylabel, plot.y_label, bases["y"]),
     ):
-        for value, word in marks:
-            mark(value, color=MUTED, lw=0.9, ls=(0, (4, 3)), zorder=1.6)
-            upright = marks is plot.verticals
-            place = (value, 0.98) if upright else (0.99, value)
-            axes.annotate(
-                typeset(word), place, xycoords=transform, color=MUTED, fontsize=8, ha="right",
-                va="top" if upright else "bottom", rotation=90 if upright else 0,
-            )  # fmt: skip
-    axes.set_xlabel(typeset(plot.x_label))
-    axes.set_ylabel(typeset(plot.y_label))
+        setter(f"{typeset(label)} {MINUS} {base!r}" if base else typeset(label))
     if len(plot.series) > 1 or plot.region is not None:
         legend(axes)
 
 
+def _values(plot: Plot, name: str) -> np.ndarray:
+    """All finite numbers along an axis."""
+    sources = (*plot.series, *filter(None, [plot.region]))
+    values = [np.ravel(getattr(source, name)).astype(float) for source in sources]
+    joined = np.concatenate(values or [np.zeros(0)])
+    return joined[np.abs(joined) < 1e250]
+
+
+def _base(plot: Plot, name: str) -> float:
+    """What is subtracted from values that differ in their last digits only; 0 from others."""
+    values = _values(plot, name)
+    span = np.ptp(values) if len(values) else 0.0
+    # differences of neighboring floats are exact, so none of them is lost
+    return float(np.sort(values)[len(values) // 2]) if 0 < span < 1e-7 * abs(values).max() else 0.0
+
+
+def _coincide(one: Series, other: Series) -> bool:
+    x, y = (np.asarray(getattr(one, name), float) for name in "xy")
+    return np.shape(other.y) == y.shape and np.array_equal(x, other.x, equal_nan=True) and np.allclose(
+        y, np.asarray(other.y, float), rtol=1e-3, atol=0.0, equal_nan=True
+    )  # fmt: skip
+
+
+def _apart(
+    marks: tuple[tuple[float, str], ...], base: float, limits: tuple[float, float]
+) -> list[tuple[float, str]]:
+    """Marked values with their words; one word for those too near to one another for two."""
+    kept: list[tuple[float, str]] = []
+    near = 0.025 * abs(limits[1] - limits[0])
+    for value, word in sorted((value - base, word) for value, word in marks):
+        if kept and value - kept[-1][0] < near:
+            kept[-1] = (kept[-1][0], f"{kept[-1][1]}; {word}")
+        else:
+            kept.append((value, word))
+    return kept
+
+
 def _scale(axes: Axes, name: str, scale: str, plot: Plot) -> None:
-    values = [np.asarray(getattr(one, name), float) for one in (*plot.series, *filter(None, [plot.region]))]
-    there = np.abs(np.concatenate([each[np.isfinite(each)].ravel() for each in values] or [np.zeros(0)]))
-    smallest = there[there > 0].min(initial=np.inf)
+    values = _values(plot, name)
+    largest = np.abs(values).max(initial=0.0)
     setter = axes.set_xscale if name == "x" else axes.set_yscale
-    if scale == "symlog" and np.isfinite(smallest):
+    if scale == "symlog" and largest:
         # no more than eight decades on either side of zero
-        setter("symlog", linthresh=max(smallest, there.max() * 1e-8))
-    elif scale == "log" and any(np.any(each > 0) for each in values):
+        setter("symlog", linthresh=max(np.abs(values[values != 0]).min(), largest * 1e-8))
+    elif scale == "log" and np.any(values > 0):
         setter("log", nonpositive="mask")
 
 
-def _series(axes: Axes, series: Series) -> None:
-    x, y = np.asarray(series.x, float), np.asarray(series.y, float)
-    y = np.where(np.isfinite(x) & np.isfinite(y), y, np.nan)
+def _series(axes: Axes, series: Series, bases: dict[str, float], covered: int) -> None:
+    """Draws a series; broader where later ones lie upon it, so that it is still seen."""
+    x, y = (np.asarray(getattr(series, name), float) - bases[name] for name in "xy")
+    # what is infinite, or too large for an axis to have room beyond it, leaves a gap
+    there = (np.abs(x) < 1e250) & (np.abs(y) < 1e250)
+    y = np.where(there, y, np.nan)
     color, label = COLORS[series.role], typeset(series.label)
-    look: dict[str, object] = {"ls": "--" if series.dashed else "-", "lw": 1.2}
     kept = (thin.points if series.mark == "points" else thin.line)(x, y)
+    look: dict[str, object] = {"ls": "--" if series.dashed else "-", "lw": 1.2 + 1.8 * covered}
     if series.mark == "steps":
         look["drawstyle"] = "steps-post"
     if series.mark in ("points", "line+points"):
-        look |= {"marker": _MARKERS[series.role], "ms": 4, "mew": 0}
+        look |= {"marker": _MARKERS[series.role], "ms": 4 + 2 * covered, "mew": 0}
     if series.mark == "points":
         look["ls"] = "none"
     axes.plot(x[kept], y[kept], color=color, label=label, **look)  # type: ignore[arg-type]
+    alone = there & ~np.r_[False, there[:-1]] & ~np.r_[there[1:], False]
+    if series.mark in ("line", "steps") and alone.any():
+        # a value between two gaps has no line to be seen by
+        axes.plot(x[alone], y[alone], "o", color=color, ms=3, mew=0)
 
 
 def _region(axes: Axes, region: Region) -> None:
+    x, y = (_edges(axis, log == "log") for axis, log in
+            ((region.x, axes.get_xscale()), (region.y, axes.get_yscale())))  # fmt: skip
     for at, (color, word) in enumerate(zip(_CLASSES, region.words, strict=False)):
-        # one path a class: a cell each would make a page heavy
-        axes.contourf(region.x, region.y, region.value == at, levels=[0.5, 1.5], colors=[color], alpha=0.5)
+        inside = np.pad(region.value == at, ((0, 0), (1, 1))).astype(int)
         axes.plot([], [], "s", color=color, alpha=0.5, label=word)
+        for row, steps in enumerate(np.diff(inside, axis=1)):
+            # neighbors in a row are one rectangle: a cell each would make a page heavy
+            starts, ends = np.flatnonzero(steps == 1), np.flatnonzero(steps == -1)
+            bars = list(zip(x[starts], x[ends] - x[starts], strict=True))
+            axes.broken_barh(bars, (y[row], y[row + 1] - y[row]), color=color, alpha=0.5, lw=0)
+    axes.set_xlim(x[0], x[-1])
+    axes.set_ylim(y[0], y[-1])
+
+
+def _edges(centers: np.ndarray, log: bool) -> np.ndarray:
+    """Edges of cells about centers, halfway between neighbors as the axis shows them."""
+    centers = np.log(centers) if log else np.asarray(centers, float)
+    half = np.diff(centers) / 2 if len(centers) > 1 else np.array([0.5])
+    edges = np.concatenate(
+        [centers[:1] - half[:1], (centers[1:] + centers[:-1]) / 2, centers[-1:] + half[-1:]]
+    )
+    return np.exp(edges) if log else edges
 
 
 def _engineering() -> ScalarFormatter:

@@ -28,7 +28,7 @@ HALO = "halo"
 _RIM = "paint-order: stroke; stroke: var(--paper); stroke-width: 3px; stroke-linejoin: round;"
 
 LIGHT = {
-    "ink": "#1c2430", "muted": "#66707e", "grid": "#e3e6ea", "first": "#2563a8", "second": "#c2661a",
+    "ink": "#1c2430", "muted": "#66707e", "grid": "#e3e6ea", "first": "#2563a8", "second": "#ad5712",
     "third": "#2c7a63", "bad": "#b3261e", "paper": "#ffffff",
 }  # fmt: skip
 DARK = {

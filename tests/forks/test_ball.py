@@ -443,9 +443,8 @@ def test_boundaries_of_a_ball_are_adjacent_floats_with_the_decision_between_them
     for edge in found.boundaries:
         assert edge.above.at == np.nextafter(edge.below.at, 1.0) and edge.channel in ("stop", "contact")
         assert edge.below.decided != edge.above.decided and edge.below.digest != edge.above.digest
-        runs = [ball.simulate(one.world, one.world.start(one.y0, one.v0), 50) for one in (
-            program_of(systems["batch"]).problem.with_values({"k": side.at}) for side in (edge.below, edge.above)
-        )]  # fmt: skip
+        number = program_of(systems["batch"]).number("k")
+        runs = [number.at(side.at).run(50) for side in (edge.below, edge.above)]
         first = cross_decisions(*runs)[0]
         assert (first.step, first.channel, first.a, first.b) == (
             edge.step, edge.channel, edge.below.decided, edge.above.decided,

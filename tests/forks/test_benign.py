@@ -14,11 +14,20 @@ from forks.harness import pair
 
 from mdnum.errors import InputError
 from mdnum.forks.benign import Calibration, benign, calibrate
-from mdnum.forks.benign import rule as rules
+from mdnum.forks.benign import calibration as rules
 from mdnum.forks.benign.calibration import Planted, Window, choose
-from mdnum.forks.benign.ensemble import Member, ensemble, noise_size, starts
-from mdnum.forks.benign.features import Ruler, hats, measure, pair_distances
-from mdnum.forks.benign.planted import planted, shorter
+from mdnum.forks.benign.ensemble import (
+    Member,
+    Ruler,
+    ensemble,
+    hats,
+    measure,
+    noise_size,
+    pair_distances,
+    planted,
+    shorter,
+    starts,
+)
 from mdnum.rollout.engine import first_state
 from mdnum.systems.build import Simulation, build
 

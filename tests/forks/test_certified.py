@@ -16,6 +16,7 @@ from mdnum.systems.build import Simulation
 
 STEPS = 180
 
+
 @pytest.fixture(scope="module")
 def found() -> Fork:
     """The crystal, and with decisions in float32, warm enough that a pair is decided otherwise so soon."""

@@ -269,7 +269,17 @@ def aspects(simulation: Simulation) -> dict[str, Any]:
     """Everything that a run is made of."""
     model, integrator = simulation.model, simulation.integrator
     bath = isinstance(integrator, Langevin)
-    names = ("positions", "velocities", "masses", "species", "cell", "decider", "lists", "policy", "reduction")
+    names = (
+        "positions",
+        "velocities",
+        "masses",
+        "species",
+        "cell",
+        "decider",
+        "lists",
+        "policy",
+        "reduction",
+    )
     return {
         **{name: getattr(simulation, name) for name in names},
         "potential": model.potential,

@@ -1,4 +1,4 @@
-"""Verdicts at both ends: a crystal whose flips are the cause, one without flips, a run and itself; repeats."""
+"""Verdicts at both ends: a crystal whose flips are the cause, one without flips, a run and itself."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_a_run_that_ends_before_any_decision_differs_is_a_fork_by_itself():
 
 
 def test_the_verdict_on_a_liquid_rests_on_repeats():
-    """The crystal melting splits whatever it decides; each repeat is the pair that its start would be alone."""
+    """The crystal melting splits whatever it decides; each repeat is a pair as its start would be alone."""
     hot = made("precision", crystal_system(dynamics__temperature=3.0))
     found = fork(hot, 1100, repeats=4, back=False)
     count = found.verdict.count

@@ -12,8 +12,8 @@ import pytest
 import mdnum
 from mdnum.errors import FolderError, InputError
 from mdnum.forks import Twin, choices
-from mdnum.forks.choices import Screened
-from mdnum.forks.lyapunov import Lyapunov
+from mdnum.forks.screen import Screened
+from mdnum.forks.tangent import Lyapunov
 from mdnum.rollout.engine import Engine
 from mdnum.store import RunFolder
 from mdnum.systems import build, load
@@ -283,7 +283,7 @@ def test_a_run_that_stops_leaves_the_folder_free(tmp_path, monkeypatch):
 def test_an_exponent_that_is_none_says_why(compared, monkeypatch, rate, chaotic, words):
     size = rate * np.arange(401.0)
     made = Lyapunov(400, 0.004, rate, 1e-5, size, size, 80, chaotic)
-    monkeypatch.setattr("mdnum.forks.lyapunov.lyapunov", lambda *given: made)
+    monkeypatch.setattr("mdnum.forks.tangent.lyapunov", lambda *given: made)
     found = fork_answers.exponent(compared.fork)
     reason = found["lyapunov_reason"]
     assert reason is None if words is None else reason.startswith(words)
