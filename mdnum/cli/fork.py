@@ -1,4 +1,4 @@
-"""`mdnum fork`: where two runs that differ in one choice diverge; a sub-command for each question about it."""
+"""`mdnum fork`: where two runs that differ in one choice diverge; a sub-command for each question."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _INTERVAL = re.compile(r"^\s*([^=\s]+)\s*=\s*([^:\s]+)\s*:\s*([^:\s]+)\s*$")
 
 
 class _Questions(TyperGroup):
-    """A group whose first word is a system where it is no sub-command; without a word the choices are listed."""
+    """A group whose first word is a system where it is no sub-command; without one choices are listed."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         first = args[0] if args else "--json"
@@ -69,7 +69,7 @@ _PIN = typer.Option(
 def vary(
     system: str = _SYSTEM,
     choice: str | None = typer.Option(
-        None, "--vary", metavar="CHOICE", help="What to vary: precision, reduction=exact, contact=earlier, ...; "
+        None, "--vary", metavar="CHOICE", help="What to vary: precision, reduction=exact, contact=earlier; "
         "by default what the system file has in [fork], or precision.",
     ),
     steps: int | None = _STEPS,
@@ -133,7 +133,7 @@ def screen(
     as_json: bool = output.JSON_OPTION,
 ) -> int:
     """Vary every choice, and rank them by when they fork."""
-    from mdnum.workflow.fork import fork_screen
+    from mdnum.workflow import fork_screen
 
     return _answered(fork_screen, (system,), settings, out, no_report, as_json, steps=steps)
 
@@ -253,7 +253,7 @@ def benign(
     as_json: bool = output.JSON_OPTION,
 ) -> int:
     """Find whether a choice changes anything that would be measured, with ensembles of runs."""
-    from mdnum.workflow.fork import fork_benign
+    from mdnum.workflow import fork_benign
 
     return _answered(fork_benign, (system, choice), settings, out, no_report, as_json, steps=steps)
 
