@@ -123,19 +123,24 @@ def choices(as_json: bool = output.JSON_OPTION) -> int:
     return output.EXIT_FINE
 
 
-@fork.command()
-def screen(
-    system: str = _SYSTEM,
-    steps: int | None = _STEPS,
-    settings: list[str] | None = output.SET_OPTION,
-    out: Path | None = _OUT,
-    no_report: bool = _NO_REPORT,
-    as_json: bool = output.JSON_OPTION,
-) -> int:
-    """Vary every choice, and rank them by when they fork."""
-    from mdnum.workflow import fork_screen
+def _of_a_system(question: str, text: str) -> None:
+    """Adds a question that is asked of a system alone."""
 
-    return _answered(fork_screen, (system,), settings, out, no_report, as_json, steps=steps)
+    @fork.command(question, help=text)
+    def _(
+        system: str = _SYSTEM,
+        steps: int | None = _STEPS,
+        settings: list[str] | None = output.SET_OPTION,
+        out: Path | None = _OUT,
+        no_report: bool = _NO_REPORT,
+        as_json: bool = output.JSON_OPTION,
+    ) -> int:
+        return _answered(f"fork_{question}", (system,), settings, out, no_report, as_json, steps=steps)
+
+
+_of_a_system("screen", "Vary every choice, and rank them by when they fork.")
+_of_a_system("certify", "Find when runs leave the history in exact arithmetic, by precision.")
+_of_a_system("processes", "Find which programs agree: jit, eager, vmap, grad, flags of XLA.")
 
 
 @fork.command("map")
@@ -152,10 +157,8 @@ def map_(
     as_json: bool = output.JSON_OPTION,
 ) -> int:
     """Map where the history of decisions changes along a number."""
-    from mdnum.workflow import fork_map
-
     asked = (system, *interval(along))
-    return _answered(fork_map, asked, settings, out, no_report, as_json, steps=steps, most=most)
+    return _answered("fork_map", asked, settings, out, no_report, as_json, steps=steps, most=most)
 
 
 @fork.command()
@@ -197,21 +200,6 @@ def compare(
 
 
 @fork.command()
-def certify(
-    system: str = _SYSTEM,
-    steps: int | None = _STEPS,
-    settings: list[str] | None = output.SET_OPTION,
-    out: Path | None = _OUT,
-    no_report: bool = _NO_REPORT,
-    as_json: bool = output.JSON_OPTION,
-) -> int:
-    """Find when runs leave the history in exact arithmetic, by precision."""
-    from mdnum.workflow import fork_certify
-
-    return _answered(fork_certify, (system,), settings, out, no_report, as_json, steps=steps)
-
-
-@fork.command()
 def forecast(
     system: str = _SYSTEM,
     length: float = typer.Argument(metavar="LENGTH", help="How far the furthest atom is displaced."),
@@ -222,24 +210,7 @@ def forecast(
     as_json: bool = output.JSON_OPTION,
 ) -> int:
     """Forecast which decisions a displacement of the start would flip first, from one tangent run."""
-    from mdnum.workflow import fork_forecast
-
-    return _answered(fork_forecast, (system, length), settings, out, no_report, as_json, steps=steps)
-
-
-@fork.command()
-def processes(
-    system: str = _SYSTEM,
-    steps: int | None = _STEPS,
-    settings: list[str] | None = output.SET_OPTION,
-    out: Path | None = _OUT,
-    no_report: bool = _NO_REPORT,
-    as_json: bool = output.JSON_OPTION,
-) -> int:
-    """Find which programs agree: jit, eager, vmap, grad, flags of XLA."""
-    from mdnum.workflow import fork_processes
-
-    return _answered(fork_processes, (system,), settings, out, no_report, as_json, steps=steps)
+    return _answered("fork_forecast", (system, length), settings, out, no_report, as_json, steps=steps)
 
 
 @fork.command()
@@ -253,18 +224,18 @@ def benign(
     as_json: bool = output.JSON_OPTION,
 ) -> int:
     """Find whether a choice changes anything that would be measured, with ensembles of runs."""
-    from mdnum.workflow import fork_benign
-
-    return _answered(fork_benign, (system, choice), settings, out, no_report, as_json, steps=steps)
+    return _answered("fork_benign", (system, choice), settings, out, no_report, as_json, steps=steps)
 
 
 def _answered(
-    question: Any, asked: Any, settings: Any, out: Path | None, no_report: bool, as_json: bool, **options: Any
+    name: str, asked: Any, settings: Any, out: Path | None, no_report: bool, as_json: bool, **options: Any
 ) -> int:
-    """Asks a question of a system, and prints the answer."""
+    """Asks a question of `mdnum.workflow`, and prints the answer."""
+    from mdnum import workflow
+
     overrides = output.parse_overrides(settings)
     with watched() as progress:
-        outcome = question(
+        outcome = getattr(workflow, name)(
             *asked, out=out, overrides=overrides, report=not no_report, progress=progress, **options
         )
     return output.print_outcome(outcome, as_json=as_json)

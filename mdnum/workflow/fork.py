@@ -16,13 +16,14 @@ import numpy as np
 from mdnum.errors import InputError
 from mdnum.plain import plain
 from mdnum.report.drawing import legend
-from mdnum.report.finding import Verdict, conclude
+from mdnum.report.finding import Verdict
 from mdnum.report.section import Figure, Key, Page, Section, Table, pairs
 from mdnum.report.svg import BAD, FIRST, MUTED, SECOND
 from mdnum.report.words import count, many, number
 from mdnum.workflow import frame
-from mdnum.workflow.fork_page import TEXTS, differences, judge, must_hold, page, size
+from mdnum.workflow.fork_page import differences, page, size
 from mdnum.workflow.fork_pair import Asked, basics, check, followed, of_any, of_md
+from mdnum.workflow.fork_verdict import RANKING, TEXTS, judge, judge_benign, judge_compare, judge_screen
 from mdnum.workflow.frame import Outcome, Progress, View
 
 if TYPE_CHECKING:
@@ -33,8 +34,6 @@ if TYPE_CHECKING:
 
 #: Screens every choice that there is, where one is asked for.
 ALL = "all"
-#: Title of the section that findings of a screening name.
-_RANKING = "Ranking"
 
 
 def fork(
@@ -279,63 +278,6 @@ def fork_benign(
     return frame.finish(folder, report=report, result=found, progress=progress)
 
 
-# -- judgments -----------------------------------------------------------------------------------------
-
-
-def judge_screen(view: View) -> Verdict:
-    """The verdict on all choices: which forks first, and whether what must hold did."""
-    rows, found = view.summary["ranking"], []
-    for row in rows:
-        if row["must_hold"] and row["first_bit"] is not None:
-            found.append(must_hold(row))
-        if row["failed"]:
-            found.append(TEXTS.finding("CHOICE_FAILED", section=_RANKING, **row))
-    forked = [row for row in rows if row["fork"] is not None]
-    broken = [row["choice"] for row in rows if row["must_hold"] and row["first_bit"] is not None]
-    values = {"choices": len(rows), "forked": len(forked), "steps": view.summary["steps"]}
-    if broken:
-        headline = TEXTS("screen_broken", names=", ".join(broken))
-    elif not forked:
-        headline = TEXTS("screen_none", **values)
-    else:
-        headline = TEXTS("screen_forks", first=forked[0]["choice"], step=forked[0]["fork"], **values)
-    return conclude(found, headline=headline, best="info" if forked else "good", judged=True)
-
-
-def judge_compare(view: View) -> Verdict:
-    """What two folders say about where their runs diverge, and what it may be put down to."""
-    summary = view.summary
-    causes = summary["causes"]
-    values = {name: summary[name] for name in ("steps", "first_bit", "fork")}
-    kind = "same" if summary["fork"] is None and summary["first_bit"] is None else "bits"
-    headline = TEXTS(f"folders_{'fork' if summary['fork'] is not None else kind}", **values)
-    evidence = [TEXTS(f"folders_{min(len(causes), 2)}_causes", n=len(causes), names=", ".join(causes[:6]))]
-    if "start" in causes:
-        evidence.append(TEXTS("folders_start"))
-    if summary["decisions"]:
-        flip = summary["decisions"][0]
-        which = "–".join(str(label) for label in flip["subject"])
-        yes = "entered" if flip["entered"] else "left"
-        evidence.append(TEXTS(f"folders_{summary['channel']}_{yes}", **values, which=which, **flip))
-    elif summary["iterations"]:
-        a, b = summary["iterations"]
-        evidence.append(TEXTS("folders_stop", **values, a=a, b=b))
-    if summary["fork"] is not None:
-        evidence.append(TEXTS(f"folders_further_{summary['world']}"))
-    return conclude([], evidence, headline=headline, best="good" if kind == "same" else "info")
-
-
-def judge_benign(view: View) -> Verdict:
-    """Whether B's runs belong to A's ensemble."""
-    summary = view.summary
-    values = {"difference": summary["difference"], "step": summary["window"]}
-    if summary["passed"]:
-        return conclude([], [], headline=TEXTS("benign", **values), best="good")
-    first = ", ".join(f"{name} ({z:+.3g} σ)" for name, z in summary["failing"].items())
-    finding = TEXTS.finding("NOT_BENIGN", *["blew_up"] * (not first), names=first, **values)
-    return conclude([finding], [], headline=TEXTS("not_benign", **values), judged=True)
-
-
 # -- pages ---------------------------------------------------------------------------------------------
 
 
@@ -360,10 +302,11 @@ def page_screen(view: View, verdict: Verdict) -> Page:
     ]
     lines = [
         (row["choice"], row["first_bit"], row["fork"], row["split"],
-         "" if not row["must_hold"] else "holds" if row["held"] else "broken", row["failed"] or row["difference"])
+         "" if not row["must_hold"] else "holds" if row["first_bit"] is None else "broken",
+         row["failed"] or row["difference"])
         for row in rows
     ]  # fmt: skip
-    bad = frozenset(k for k, row in enumerate(rows) if row["must_hold"] and not row["held"])
+    bad = frozenset(k for k, row in enumerate(rows) if row in held and row["first_bit"] is not None)
     columns = ("choice", "first bit", "fork", "split", "must hold", "difference")
     alt = "; ".join(f"{row['choice']}: {count(row['fork'])}" for row in rows if row["fork"] is not None)
     figure = Figure(
@@ -371,9 +314,7 @@ def page_screen(view: View, verdict: Verdict) -> Page:
         lambda canvas: _ranking(rows, s["steps"], canvas), 0.9 + 0.24 * len(rows),
     )  # fmt: skip
     sections = [
-        Section(
-            _RANKING, [TEXTS("ranking"), Table(columns, lines, shown=100, bad=bad), figure], terminal=True
-        )
+        Section(RANKING, [TEXTS("ranking"), Table(columns, lines, shown=100, bad=bad), figure], terminal=True)
     ]
     if left := s["not_applicable"]:
         table = Table(("choice", "reason"), [(row["choice"], row["reason"]) for row in left], shown=100)
@@ -415,22 +356,16 @@ def page_compare(view: View, verdict: Verdict) -> Page:
             ("fork", "Fork", "a stored decision differs"),
         )
     ]
-    sections = [Section("What was different", [differences(s) if s["differences"] else TEXTS("folders_0_causes")],
-                        terminal=True)]  # fmt: skip
+    different = differences(s) if s["differences"] else TEXTS("folders_0_causes")
+    sections = [Section("What was different", [different], terminal=True)]
     if s["decisions"]:
         rows = [
             (flip["run"], "–".join(map(str, flip["subject"])), "yes" if flip["entered"] else "no",
              flip["margin"], flip["bound"], flip["ambiguous"])
             for flip in s["decisions"]
         ]  # fmt: skip
-        columns = (
-            "only in",
-            "pair" if s["channel"] == "pair" else "ball",
-            "enters",
-            "margin",
-            "bound",
-            "ambiguous",
-        )
+        label = "pair" if s["channel"] == "pair" else "ball"
+        columns = ("only in", label, "enters", "margin", "bound", "ambiguous")
         sections.append(Section("Decisions at the fork", [Table(columns, rows)], terminal=True))
     if s["iterations"]:
         table = Table(("in A", "in B"), [s["iterations"]])

@@ -74,8 +74,11 @@ def fork_certify(
     system = of_any(system, overrides)
     if steps is not None and steps < 1:
         raise InputError(f"steps = {steps}; expected at least 1")
-    simulation = None
-    if not isinstance(system, BallSystem):
+    ball, simulation = None, None
+    # what cannot be is refused before there is a folder; a ball takes no time
+    if isinstance(system, BallSystem):
+        ball = certify(system, steps, policies, progress)
+    else:
         from mdnum.forks.exact.program import unsupported
 
         simulation = build(system)
@@ -83,7 +86,7 @@ def fork_certify(
             raise error
     with frame.new_folder("certify", f"fork-{system.name}", out, system=system) as folder:
         note = logged(folder, progress)
-        found = certify(system, steps, policies, note)
+        found = ball or certify(system, steps, policies, note)
         tables: dict[str, Any] = {}
         summary = basics(system, found.steps) | _certified(found, tables)
         if simulation is not None:
@@ -225,8 +228,9 @@ def page_certify(view: View, verdict: Verdict) -> Page:
             Key("Exact step", per, f"{number(s['seconds'], 2)} s in all"),
         ]
     ambiguous = s.get("ambiguous") or {}
-    columns = ("precision", "leaves the exact history at", "decision", "margin", "bits closer", "growth a step",
-               f"separation at the end ({unit})", *(("ambiguous", "from step") if ambiguous else ()), "")  # fmt: skip
+    counts = ("ambiguous", "from step") if ambiguous else ()
+    columns = ("precision", "leaves the exact history at", "decision", "margin", "bits closer",
+               "growth a step", f"separation at the end ({unit})", *counts, "")  # fmt: skip
     lines = []
     for row in rows:
         doubt = ambiguous.get(row["name"]) or {"total": None, "horizon": None}
@@ -245,9 +249,9 @@ def page_certify(view: View, verdict: Verdict) -> Page:
     dtypes = Table(
         ("precision", *roles), [(row["name"], *(row[role] for role in roles)) for row in rows], "Dtypes"
     )
+    kept_by = "; ".join(f"{line[0]} {line[1]}" for line in lines)
     figure = Figure(
-        "ranking", TEXTS("ranking_caption"), f"Steps that each precision keeps to the exact history, of {s['steps']}: "
-        + "; ".join(f"{line[0]} {line[1]}" for line in lines) + ".",
+        "ranking", TEXTS("ranking_caption"), f"Steps kept of {s['steps']}, by precision: {kept_by}.",
         lambda canvas: _bars(s, canvas), 0.8 + 0.34 * len(rows),
     )  # fmt: skip
     table, series = view.table("policy_separations"), []

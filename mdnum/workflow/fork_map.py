@@ -444,7 +444,8 @@ def page_forecast(view: View, verdict: Verdict) -> Page:
     keys = [
         Key("Displacement", number(s["size"], 2), f"{length}, of the furthest atom"),
         Key("First flip", f"step {count(first[0]['step'])}" if first else "–", "expected"),
-        Key("Nearest decision", number(abs(nearest[0]["amplitude"]), 2) if nearest else "–", f"{length} flip it"),
+        Key("Nearest decision", number(abs(nearest[0]["amplitude"]), 2) if nearest else "–",
+            f"{length} flip it"),
         Key("In ulps", number(nearest[0]["ulps"], 2) if nearest else "–", "of the largest start coordinate"),
         Key("Good until", f"step {count(until)}" if until >= 0 else "–",
             f"of {count(s['steps'])}; {many(s['examined'], 'decision')} of listed pairs examined"),

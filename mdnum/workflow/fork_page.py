@@ -1,165 +1,34 @@
-"""What the folder of a pair of runs says of either world: its findings, and the sections of its page."""
+"""The page of a pair of runs, of either world; from the folder alone."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.patches import Circle
 
-from mdnum.events.chance import REPEATS
 from mdnum.report.browse import Browse, Column, plain_rows
-from mdnum.report.finding import Finding, Texts, Verdict, conclude
+from mdnum.report.finding import Verdict
 from mdnum.report.section import Figure, Key, Page, Plot, Role, Section, Series, Table, pairs
 from mdnum.report.svg import BAD, FIRST, MUTED, SECOND
 from mdnum.report.words import count, listed, many, number, plain
+from mdnum.workflow.fork_verdict import DECISION, TEXTS, TWO_BY_TWO, WHAT, agreeing, sides, subject
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
     from mdnum.workflow.frame import View
 
-TEXTS = Texts(Path(__file__).with_name("fork.py"))
-
 #: r² from which a separation counts as one exponential.
 FITS = 0.8
 #: Rows of the table of decisions that the page carries.
 TABLE_ROWS = 5_000
-#: Titles of sections that findings name.
-DECISION, TWO_BY_TWO, WHAT = (
-    "The decision at the fork",
-    "Whose decisions, whose arithmetic",
-    "What was compared",
-)
 SPACES = {"r2": "r²", "r": "r", "height": "minus the height", "residual": "tolerance minus residual"}
 #: A split that is expected is shown up to so many times the steps that were followed.
 _BEYOND = 2.0
 #: The longest arrow, in cutoffs.
 _ARROW = 0.5
-
-
-def subject(s: Mapping[str, Any]) -> str:
-    """What differs at the fork: the flip of a pair, the contact of a ball, the stop of a solver."""
-    d = s.get("decision")
-    if d is None:
-        return ""
-    shared = d["channel"] == "stop" and d["ball"] is None
-    return TEXTS("subject_stop_all" if shared else f"subject_{d['channel']}", **d)
-
-
-def judge(view: View) -> Verdict:
-    """The verdict on a pair of runs."""
-    found = [*_findings(view), *view.kept(TEXTS.entries)]
-    name, values = _headline(view)
-    best = "info" if view.summary.get("fork") is not None else "good"
-    return conclude(found, _evidence(view), headline=TEXTS(name, **values), best=best, judged=True)
-
-
-def _headline(view: View) -> tuple[str, dict[str, Any]]:
-    """The sentence that answers, by name, and its values."""
-    summary = view.summary
-    failed, word, fork, split = (summary.get(name) for name in ("failed", "effect", "fork", "split"))
-    values = {name: summary.get(name) for name in ("steps", "first_bit", "fork", "split", "predicted_split")}
-    if failed:
-        values |= {"a": failed.get("A"), "b": failed.get("B"), "word": next(iter(failed.values()))}
-        values |= {"run": "A" if "A" in failed else "B", "other": "B" if "A" in failed else "A"}
-        return "ended_both" if len(failed) > 1 else "ended" if summary["decision"] else "ended_fork", values
-    values |= {"until": summary.get("imposed_until"), "subject": subject(summary)}
-    values |= {"compared": _compared(summary), "agreeing": agreeing(summary)}
-    if word == "same":
-        return "same_but_decided" if summary["decision"] else "same", values
-    if fork is None:
-        return "no_fork" if split is None else "no_fork_split", values
-    if word == "bystander" and split < fork:
-        return "bystander_before", values
-    if word != "open":
-        return str(word), values
-    by = summary.get("predicted_by")
-    return "open_split" if split is not None else f"open_{by}" if by else "open", values
-
-
-def _compared(summary: Mapping[str, Any]) -> str:
-    """When the runs split, free and under A's decisions."""
-    imposed = (summary.get("splits") or {}).get("B|A")
-    values = {"split": summary.get("split"), "imposed": imposed, "until": summary.get("imposed_until")}
-    return TEXTS("compared_not" if imposed is None else "compared", **values)
-
-
-def agreeing(summary: Mapping[str, Any]) -> str:
-    """How many of the pair and its repeats split later without the flips."""
-    count = summary.get("count")
-    return "" if not count else TEXTS("agreeing" if count["threshold"] else "agreeing_any", **count)
-
-
-def _evidence(view: View) -> Iterator[str]:
-    summary, decision = view.summary, view.summary["decision"]
-    for reason in summary.get("reasons") or ():
-        text = reason.replace("the first run's", "A’s")
-        yield TEXTS("reason", text=text[:1].upper() + text[1:])
-    if decision is None:
-        return
-    values = {**decision, "subject": subject(summary), "unit": view.units.length}
-    values |= {"runs": " and ".join(decision["ambiguous_in"])}
-    name = "at_start" if decision["run"] == "start" else decision["channel"]
-    yield TEXTS(f"decided_{name}", **values, **sides(decision), counted=summary.get("counted"))
-    yield TEXTS("rounding" if decision["ambiguous_in"] else "no_rounding", **values)
-    if decision.get("protected") is not None:
-        yield TEXTS("separated", **values)
-
-
-def sides(decision: Mapping[str, Any]) -> dict[str, Any]:
-    """Which run decided yes and which no, and what each of them decided."""
-    yes = "A" if decision["decided"]["A"] > decision["decided"]["B"] else "B"
-    return {"yes": yes, "no": "B" if yes == "A" else "A", "a": decision["decided"]["A"],
-            "b": decision["decided"]["B"]}  # fmt: skip
-
-
-def _findings(view: View) -> Iterator[Finding]:
-    summary, decision = view.summary, view.summary["decision"]
-    steps, failed = summary["steps"], summary.get("failed") or {}
-    if summary.get("must_hold") and summary.get("first_bit") is not None:
-        yield must_hold(summary)
-    for name, word in failed.items():
-        yield TEXTS.finding("RUN_FAILED", run=name, word=word, steps=steps, asked=summary["steps_asked"])
-    if summary.get("reproduced") is False:
-        stored = summary["stored"]["fork"]
-        yield TEXTS.finding("NOT_REPRODUCED", stored=stored, fork=summary.get("fork"), section=WHAT)
-    if decision and decision["ambiguous_in"]:
-        margins = decision["margins"].items()
-        sizes = [TEXTS("of_bound", run=run, margin=abs(x), bound=decision["bounds"][run])
-                 for run, x in margins if run in decision["ambiguous_in"]]  # fmt: skip
-        yield TEXTS.finding(
-            "AMBIGUOUS_FORK", section=DECISION, subject=subject(summary), sizes=listed(sizes)
-        )
-    values: dict[str, Any] = {"steps": steps, "unit": view.units.length, "split": summary["predicted_split"]}
-    values |= {"separation": summary.get("separation_end"), "tolerance": summary["tolerance"]}
-    if summary["effect"] == "open" and summary["split"] is None and not failed:
-        yield TEXTS.finding("HORIZON_SHORT", *["predicted"] * bool(values["split"]), **values)
-    until = summary.get("imposed_until")
-    if until is not None and until < steps and not failed:
-        word = (summary.get("failed_imposed") or {}).get("B|A")
-        yield TEXTS.finding("GUARD", *["failed"] * bool(word), until=until, word=word)
-    count = summary.get("count")
-    if summary["effect"] == "undecided" and count:
-        more = max(REPEATS, 2 * (count["most"] - 1))
-        needed = count["needed"] or (None, None)
-        variants = ["none"] * (count["pairs"] < 2) + ["more"] * (more > count["most"] - 1)
-        variants += ["needed"] * (count["needed"] is not None)
-        yield TEXTS.finding(
-            "UNDECIDED", *variants, section=TWO_BY_TWO, agreeing=agreeing(summary), more=more,
-            of=needed[0], need=needed[1],
-        )  # fmt: skip
-
-
-def must_hold(row: Mapping[str, Any]) -> Finding:
-    """A choice that cannot change a bit by design, and did."""
-    values = {name: row.get(name) for name in ("choice", "difference", "first_bit", "fork")}
-    return TEXTS.finding("MUST_HOLD_FORKED", *["fork"] * (row.get("fork") is not None), **values)
-
-
-# -- the page --------------------------------------------------------------------------------------------
 
 
 def page(view: View, verdict: Verdict) -> Page:
@@ -352,8 +221,8 @@ def _atoms(view: View, table: Mapping[str, np.ndarray], figure: Canvas) -> None:
         panel.add_patch(Circle(tuple(flat[0, :2]), cutoff, fill=False, ec=SECOND, lw=1.2))
         panel.plot(flat[:2, 0], flat[:2, 1], "o-" if inside else "o--", color=FIRST, lw=1.6, ms=6)
         for k, atom in enumerate(table["atom"][:2].tolist()):
-            panel.annotate(str(atom), tuple(flat[k, :2]), (-7 if k == 0 else 7, 6), textcoords="offset points",
-                           fontsize=8.5, ha="right" if k == 0 else "left")  # fmt: skip
+            side = {"xytext": (-7, 6), "ha": "right"} if k == 0 else {"xytext": (7, 6), "ha": "left"}
+            panel.annotate(str(atom), tuple(flat[k, :2]), textcoords="offset points", fontsize=8.5, **side)
         beyond = number(-d["margins"][name] / slope, 3, signed=True)
         word = "inside" if inside else "outside"
         panel.set_title(f"{name}: {word}, r − cutoff = {beyond} {view.units.length}", fontsize=9, loc="left")
@@ -520,7 +389,9 @@ def _after(view: View) -> Iterator[Plot]:
     named: tuple[tuple[str, str, Role], ...] = (
         ("energy_b", "B, free", "first"), ("energy_imposed", "B under A’s decisions", "second"),
     )  # fmt: skip
-    off: list[tuple[str, Role, np.ndarray]] = [(label, role, np.abs(table[name] - table["energy_a"])) for name, label, role in named]
+    off: list[tuple[str, Role, np.ndarray]] = [
+        (label, role, np.abs(table[name] - table["energy_a"])) for name, label, role in named
+    ]
     lines = [Series(label, table["step"], _positive(y), role=role) for label, role, y in off if np.any(y > 0)]
     if lines:
         unit = f"|energy − energy of A| ({view.units.energy})"

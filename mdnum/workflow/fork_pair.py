@@ -13,7 +13,7 @@ import numpy as np
 from mdnum.errors import InputError
 from mdnum.plain import plain
 from mdnum.workflow import frame
-from mdnum.workflow.fork_page import TEXTS
+from mdnum.workflow.fork_verdict import TEXTS
 from mdnum.workflow.frame import Outcome, Progress
 
 if TYPE_CHECKING:
@@ -335,11 +335,9 @@ def _of_md(made: Fork, asked: Asked, tables: dict[str, Any], progress: Progress 
     }
     names = ("step", "i", "j", "differs", "run", "entered", "margin", "bound")
     tables["cross_flips"] = {name: [getattr(flip, name) for flip in made.flips] for name in names}
-    doubts = [(name, one._asdict()) for name, one in made.doubts.items()]
-    tables["ambiguous_pairs"] = {
-        key: np.concatenate([np.full(len(one["step"]), name) if key == "run" else one[key] for name, one in doubts])
-        for key in ("run", "step", "i", "j", "margin", "bound")
-    } if doubts else {}  # fmt: skip
+    doubts = [{"run": np.full(len(one.step), name), **one._asdict()} for name, one in made.doubts.items()]
+    names = ("run", "step", "i", "j", "margin", "bound")
+    tables["ambiguous_pairs"] = {name: np.concatenate([one[name] for one in doubts]) for name in names}
     if around is not None:
         vectors = {name: around.positions[:, k] for k, name in enumerate("xyz")}
         vectors |= {f"d{name}": around.moved[:, k] for k, name in enumerate("xyz")}
@@ -384,7 +382,7 @@ def _ball_flips(made: Fork, tables: dict[str, Any]) -> dict[str, Any]:
 
 
 def _exponent(made: Fork) -> dict[str, Any]:
-    """The largest Lyapunov exponent of run A beside the growth that was seen; a reason where there is none."""
+    """The largest Lyapunov exponent of run A beside the growth that was seen, or why there is none."""
     from mdnum.forks.tangent import lyapunov
 
     def none(name: str, **values: Any) -> dict[str, Any]:

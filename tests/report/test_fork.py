@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import subprocess
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,7 +27,7 @@ from report.test_browser import BROWSER
 from mdnum.errors import FolderError
 from mdnum.report.section import Plot, Table
 from mdnum.store import RunFolder
-from mdnum.workflow import fork_page, frame
+from mdnum.workflow import fork_verdict, frame
 from mdnum.workflow.frame import View
 
 
@@ -40,7 +41,7 @@ def finished(path, **summary):
     return frame.finish(make_fork(path, summary=summary), report=False)
 
 
-def part(outcome, title, kind):
+def part(outcome, title, kind) -> Any:
     """The first part of a kind in a section."""
     (section,) = (one for one in outcome.page.sections if one.title == title)
     return next(one for one in section.parts if isinstance(one, kind))
@@ -135,7 +136,7 @@ NONE = {"first_bit": None, "fork": None, "split": None, "decision": None}
 def test_every_verdict_has_its_sentence(tmp_path, entries, tone, name):
     found = finished(tmp_path / "one", **entries)
     view = View(RunFolder.open(found.folder), found.summary)
-    assert fork_page._headline(view)[0] == name
+    assert fork_verdict._headline(view)[0] == name
     assert found.verdict.tone == tone and "–" not in found.verdict.headline.replace("3–4", "")
     assert not found.verdict.headline.endswith("..")
 
@@ -181,7 +182,7 @@ def test_a_decision_that_was_overridden_is_said_and_why_another_could_not_be(tmp
         pinned = PINNED | entries
         told = part(finished(tmp_path / name, pinned=pinned), "One decision overridden", str)
         values = {**pinned, "pairs": "3–4", "unit": "σ"}
-        assert told == fork_page.TEXTS(sentence, **values)
+        assert told == fork_verdict.TEXTS(sentence, **values)
 
 
 def test_bare_folders_have_pages(tmp_path):

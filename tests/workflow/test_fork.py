@@ -58,7 +58,7 @@ def use(monkeypatch, make, **looks):
     """A choice that makes a twin of its own."""
 
     class StandIn(choices.Choice):
-        name = "stand-in"
+        name = "stand-in"  # pyright: ignore
         must_hold = looks.get("must_hold", False)
 
         def make(self, system):
