@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from mdnum.errors import InputError
-from mdnum.forks.confirm import digests_elsewhere
+from mdnum.forks.child import digests_elsewhere
 from mdnum.forks.worlds import program_of
 from mdnum.precision.ulp import neighbor, ordinal
 from mdnum.program import DecisionHistory, Number, Program

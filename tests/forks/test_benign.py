@@ -113,7 +113,6 @@ def test_single_precision_is_benign(hot, calibrated):
     found = benign(pair(hot, b, "forces in float32"), calibration=calibrated)
     assert found.passed and not found.failing
     assert found.scores.shape == (3, found.components) and 2 <= found.components <= 10
-    assert "forces in float32" in found.says and "nothing you would measure does" in found.says
 
 
 def test_an_energy_that_is_not_shifted_is_named_and_nothing_else(hot, calibrated):
@@ -121,16 +120,13 @@ def test_an_energy_that_is_not_shifted_is_named_and_nothing_else(hot, calibrated
     found = benign(pair(hot, hot.with_cutoff("hard"), "cutoff not shifted"), calibration=calibrated)
     assert not found.passed
     assert list(found.failing) == ["potential energy"] and found.failing["potential energy"] < -100
-    assert "given away by potential energy (-" in found.says
 
 
 def test_another_well_is_seen_in_many_features(hot, calibrated):
     potential = eqx.tree_at(lambda one: one.epsilon, hot.potential, hot.potential.epsilon * 1.01)
     b = replace(hot, model=eqx.tree_at(lambda one: one.potential, hot.model, potential))
     found = benign(pair(hot, b, "epsilon + 1 %"), calibration=calibrated)
-    assert not found.passed and "Not benign" in found.says
-    assert all(name in found.says for name in found.failing)
-    assert 2 <= len(found.failing) <= 5
+    assert not found.passed and 2 <= len(found.failing) <= 5
     assert all(abs(z) > found.limit for z in found.failing.values())
 
 

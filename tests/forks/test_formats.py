@@ -13,7 +13,7 @@ import pytest
 import small_systems
 from forks.harness import made as twin_of
 
-from mdnum.forks.choices import Format, unavailable
+from mdnum.forks.choices import FormatChoice, unavailable
 from mdnum.forks.choices.lists import FORMATS
 from mdnum.forks.reordered import FormattedSimulation
 from mdnum.md.cell import wrap_positions
@@ -182,7 +182,7 @@ def test_a_list_in_another_format_holds_the_same_pairs(simulation):
         labels = np.append(table.order, len(table.order))[table.index]
         for half in np.split(labels, 2 if word == "ordered-sparse" else 1):
             assert (np.diff(half, axis=0) >= 0).all()
-    assert unavailable(Format(word="sparse"), replace(simulation.system, spec=_pairwise(simulation)))
+    assert unavailable(FormatChoice(word="sparse"), replace(simulation.system, spec=_pairwise(simulation)))
 
 
 def _pairwise(simulation: Simulation):

@@ -36,7 +36,7 @@ RULES = {
 
 
 @choice("precision")
-class Precision(Choice):
+class PrecisionChoice(Choice):
     """Another float in one role, or in several.
 
     Sixteen bits are for pair forces alone in molecular dynamics: in any other role they make another model

@@ -218,7 +218,7 @@ class StartUlp(Choice):
 
 
 @choice("noise")
-class Noise(Choice):
+class NoiseChoice(Choice):
     """Another key of the thermostat's noise.
 
     Attributes:

@@ -148,7 +148,7 @@ class Order(Summed):
 
 
 @choice("format")
-class Format(Summed):
+class FormatChoice(Summed):
     """The neighbors of each atom in the order in which another format of the list adds them.
 
     Attributes:
@@ -267,7 +267,7 @@ class Skin(Summed):
 
 
 @choice("rebuild")
-class Rebuild(Summed):
+class RebuildChoice(Summed):
     """Another rule for when a list is rebuilt.
 
     Attributes:

@@ -13,7 +13,7 @@ from ase import Atoms
 
 from mdnum.errors import InputError
 from mdnum.forks.exact.program import ExactProgram, _Run, unsupported
-from mdnum.forks.exact.tape import Tape, first_difference
+from mdnum.forks.exact.tape import DecisionTape, first_difference
 from mdnum.rollout.engine import first_state
 from mdnum.systems.build import Simulation, build
 
@@ -73,7 +73,7 @@ def rational_flips(simulation: Simulation, steps: int, digits: int = 400):
     return flips
 
 
-def rows(tape: Tape) -> list[tuple[int, int, int, bool]]:
+def rows(tape: DecisionTape) -> list[tuple[int, int, int, bool]]:
     return [
         (step, *tape.pair(key), entered)
         for step, key, entered in zip(
@@ -169,7 +169,7 @@ def test_a_planted_wrong_decision_is_found(seed: int):
     key = rng.choice(atoms * atoms, 80, replace=False)
     entered = rng.random(80) < 0.5
     first = np.sort(key[~entered])
-    tape = Tape(atoms, 500, first, step, key, entered)
+    tape = DecisionTape(atoms, 500, first, step, key, entered)
     row = int(rng.integers(80))
     # one decision that comes a step late, one that never comes, one that is not there
     late = replace(tape, step=np.where(np.arange(80) == row, step + 1, step))
@@ -255,7 +255,7 @@ def test_bits_follow_the_growth_of_the_balls():
 
 
 def test_only_the_first_step_that_differs_is_reported():
-    tape = Tape(
+    tape = DecisionTape(
         20, 50, np.array([9]), np.array([10, 10, 30]), np.array([45, 47, 3]), np.array([True, True, True])
     )
     bare = replace(tape, step=tape.step[:0], key=tape.key[:0], entered=tape.entered[:0])
