@@ -162,7 +162,8 @@ def test_from_the_command_line(mapped, tmp_path, monkeypatch, capsys):
 @pytest.mark.slow
 def test_a_ball_has_a_map_too(tmp_path, monkeypatch):
     """Solver iterations along the tolerance: each cuts what is left to 1 - alpha k of it."""
-    monkeypatch.setattr("mdnum.forks.confirm._answered", lambda asked, values, tell: ["other"] * len(values))
+    elsewhere = lambda system, key, steps, values, *_, **__: ["other"] * len(values)  # noqa: E731
+    monkeypatch.setattr("mdnum.forks.boundaries.digests_elsewhere", elsewhere)
     found = mdnum.fork_map("ball/batch-on-the-boundary", "stop.tol", 0.0005, 0.002, out=tmp_path / "one")
     answer, edges = found.summary, found.summary["boundaries"]
     assert answer["key"] == "tol" and answer["loss"] == "residual penetration"
