@@ -46,6 +46,9 @@ KINDS: dict[str, str] = {
     "flips-compare": "mdnum.workflow.flips_compare",
     "audit": "mdnum.workflow.audit",
     "conform": "mdnum.workflow.conform",
+    **dict.fromkeys(("fork", "screen", "compare", "benign"), "mdnum.workflow.fork"),
+    **dict.fromkeys(("map", "forecast"), "mdnum.workflow.fork_map"),
+    **dict.fromkeys(("certify", "processes"), "mdnum.workflow.fork_certify"),
 }
 
 
