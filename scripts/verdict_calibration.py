@@ -36,7 +36,6 @@ import numpy as np
 from _output import say, start
 from ase import Atoms
 from ase.build import bulk
-from mdnum.forks.repeats import perturbed, repeat
 from scipy.stats import beta
 
 from mdnum.events.chance import Delay, count

@@ -6,7 +6,6 @@ parameters (randomized); those of other contacts are in `ball_contacts`, that of
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple

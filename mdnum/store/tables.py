@@ -81,8 +81,8 @@ COLUMNS: Mapping[str, Mapping[str, pa.DataType]] = MappingProxyType(
         ),
         "points": _columns(at=_FLOAT, history=_INT, loss=_FLOAT, energy=_FLOAT),
         "variants": _columns(
-            variant=_TEXT, program=_TEXT, flags=_TEXT, reduction=_TEXT, cluster=_INT, first_bit=_INT, steps=_INT,
-            separation=_FLOAT, seconds=_FLOAT, hash=_TEXT, failed=_TEXT,
+            variant=_TEXT, program=_TEXT, flags=_TEXT, reduction=_TEXT, cluster=_INT, first_bit=_INT,
+            steps=_INT, separation=_FLOAT, seconds=_FLOAT, hash=_TEXT, failed=_TEXT,
         ),
         "variant_separations": _columns(variant=_TEXT, step=_INT, separation=_FLOAT),
         "policies": _columns(

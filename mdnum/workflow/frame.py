@@ -12,7 +12,6 @@ goes into the folder first: judge and page read the folder alone, so a page can 
 from __future__ import annotations
 
 import importlib
-import importlib.util
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -201,14 +200,6 @@ def finish(
 def verb_of(folder: RunFolder) -> Verb:
     """What judges and shows a folder."""
     return importlib.import_module(KINDS[folder.world]).VERBS[folder.world]
-
-
-def on_frame(folder: RunFolder) -> bool:
-    """Whether the verb of a folder has come onto this frame."""
-    module = KINDS.get(folder.world)
-    if module is None or importlib.util.find_spec(module) is None:
-        return False
-    return hasattr(importlib.import_module(module), "VERBS")
 
 
 def say(progress: Progress | None, phase: str, step: int = 0, steps: int = 0, **counts: Any) -> None:
