@@ -23,10 +23,10 @@ from MDAnalysis.core.universe import Universe
 from mdnum.errors import InputError
 from mdnum.trajectories.boxes import Boxes, formats_of
 from mdnum.trajectories.frame import Frame, FrameError, UnreadableFrame, check_frame, smallest_radius
-from mdnum.trajectories.ledger import Flips, Members
+from mdnum.trajectories.ledger import FlipTable, Members
 from mdnum.trajectories.mdanalysis_source import frame_of, labels_of
 from mdnum.trajectories.resolution import Resolution, infer
-from mdnum.trajectories.rules import Cutoff, Rule, SpeciesCutoffs
+from mdnum.trajectories.rules import CutoffRule, Rule, SpeciesCutoffs
 from mdnum.trajectories.tails import left_over, refuse_cut_text
 from mdnum.trajectories.topology import READING_FAILS, first_line, table_of
 from mdnum.trajectories.tracker import Tracker
@@ -49,7 +49,7 @@ class RuleResult:
     """
 
     rule: Rule
-    flips: Flips
+    flips: FlipTable
     pairs: Int[np.ndarray, "frames"]
     near: Int[np.ndarray, "frames"]
     min_margin: Float[np.ndarray, "frames"]
@@ -74,7 +74,7 @@ class RuleResult:
 
 
 @dataclass
-class _Part:
+class _ProcessPart:
     """What one process found with one rule.
 
     Attributes:
@@ -82,7 +82,7 @@ class _Part:
         rows: (pairs, near, smallest margin) of each frame of its own.
     """
 
-    flips: list[Flips] = field(default_factory=list)
+    flips: list[FlipTable] = field(default_factory=list)
     rows: list[tuple[int, int, float]] = field(default_factory=list)
     before: Members | None = None  # the pairs inside at the frame before its first; None for the first part
     initial: Members | None = None  # the pairs inside at its first frame, kept by the first part alone
@@ -119,7 +119,7 @@ class NeighborFlips(AnalysisBase):
     After `run`, `results` has for one rule all that `RuleResult` has (`flips`, `pairs`, `near`, `min_margin`,
     `initial`, `last`), and for several the same in each of `results.rules`; `results.resolution` says how
     finely the file tells where atoms are and `results.bound` what that does to a distance, per frame.
-    `frames` and `times` are those of the frames examined; `Flips.frame` counts among them.
+    `frames` and `times` are those of the frames examined; `FlipTable.frame` counts among them.
 
     When a frame cannot be read or holds what cannot be right, the results of the frames before it are kept
     and the error names it.
@@ -314,7 +314,7 @@ class NeighborFlips(AnalysisBase):
         self._trackers = [
             Tracker(rule, self._first, self._second, self._species, self._bound or 0.0) for rule in self.rules
         ]
-        self.results.parts = [[_Part() for _ in self.rules]]
+        self.results.parts = [[_ProcessPart() for _ in self.rules]]
         self.results.bounds = [[]]
         if self._at:
             # the frame before the first of this part
@@ -339,7 +339,7 @@ class NeighborFlips(AnalysisBase):
         self._done += 1
         self._reading = True
 
-    def _examined(self, ts: Any) -> tuple[float, list[Flips]]:
+    def _examined(self, ts: Any) -> tuple[float, list[FlipTable]]:
         """(how far a distance can be off, flips of each rule) at a timestep."""
         frame = self._frame(ts)
         check_frame(frame, self._seen, self._pbc, None, self._names, radius=self._radius, bits=32)
@@ -391,13 +391,13 @@ class NeighborFlips(AnalysisBase):
         return _Failure(count, f"frame {count} cannot be read ({rest})", True)
 
 
-def _joined(rule: Rule, parts: Sequence[_Part]) -> RuleResult:
+def _joined(rule: Rule, parts: Sequence[_ProcessPart]) -> RuleResult:
     """The parts one after the other, frames counted from the first of all.
 
     Raises:
         InputError: two processes found other pairs at the frame between them: the file changed meanwhile.
     """
-    flips: list[Flips] = []
+    flips: list[FlipTable] = []
     done, last = 0, None
     for part in parts:
         if last is not None and part.before is not None:
@@ -416,7 +416,7 @@ def _joined(rule: Rule, parts: Sequence[_Part]) -> RuleResult:
     rows = np.array([row for part in parts for row in part.rows], float).reshape(-1, 3)
     return RuleResult(
         rule,
-        Flips.concatenate(flips) if flips else Flips.none(),
+        FlipTable.concatenate(flips) if flips else FlipTable.none(),
         rows[:, 0].astype(np.int64),
         rows[:, 1].astype(np.int64),
         rows[:, 2],
@@ -462,7 +462,7 @@ def _rules_of(r_cut: Any, rule: Rule | Sequence[Rule] | None) -> list[Rule]:
         if not isinstance(one, Rule):
             raise InputError(
                 f"{one!r} is no membership rule",
-                remedy="Give Cutoff, SpeciesCutoffs, Nearest or Capped of mdnum.trajectories.rules",
+                remedy="Give CutoffRule, SpeciesCutoffs, Nearest or Capped of mdnum.trajectories.rules",
             )
     return rules
 
@@ -471,7 +471,7 @@ def _cutoff(value: Any) -> Rule:
     try:
         if isinstance(value, Mapping):
             return SpeciesCutoffs({pair: _length(one) for pair, one in value.items()})
-        return Cutoff(_length(value))
+        return CutoffRule(_length(value))
     except (TypeError, ValueError):
         raise InputError(
             f"r_cut = {value!r}; expected a length in Å, or lengths by pair of species",

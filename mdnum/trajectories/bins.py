@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mdnum.errors import InputError
-from mdnum.trajectories.lattice import Lattice
+from mdnum.trajectories.lattice import ReducedLattice
 
 #: repeats of a box along one direction within the cutoff
 MOST_IMAGES = 500
@@ -37,7 +37,7 @@ class Sides(NamedTuple):
     species: Int[np.ndarray, "atoms"]  # number of each atom's species
 
 
-class Limits(NamedTuple):
+class SearchLimits(NamedTuple):
     """Squared distances that a search distinguishes, by species."""
 
     kind: int  # `INSIDE`, `BAND` or `DIRECTED`
@@ -46,7 +46,7 @@ class Limits(NamedTuple):
     largest: float  # of high
 
     @classmethod
-    def of(cls, radii: Float[np.ndarray, "species species"], kind: int, band: float) -> Limits:
+    def of(cls, radii: Float[np.ndarray, "species species"], kind: int, band: float) -> SearchLimits:
         """Those of pairs within the band of their radius, or inside it."""
         low = np.where(radii >= 0, np.maximum(radii - band, 0.0) ** 2, np.inf)
         high = np.where(radii >= 0, (radii + band) ** 2, -1.0)
@@ -84,7 +84,7 @@ class Binned(NamedTuple):
         center_start, center_order: atoms that are asked, by bin; the same arrays where all are on both sides.
     """
 
-    lattice: Lattice  # of the frame
+    lattice: ReducedLattice  # of the frame
     species: Int[np.ndarray, "atoms"]
     bins: Int[np.ndarray, "3"]  # number along each axis, and how many bins away a pair can be
     reach: Int[np.ndarray, "3"]
@@ -108,7 +108,7 @@ class Binned(NamedTuple):
 
 
 def binned(
-    positions: Float[np.ndarray, "atoms 3"], lattice: Lattice, sides: Sides, reach: float, guard: float
+    positions: Float[np.ndarray, "atoms 3"], lattice: ReducedLattice, sides: Sides, reach: float, guard: float
 ) -> Binned:
     """Put atoms into bins.
 
@@ -143,7 +143,7 @@ def binned(
     )  # fmt: skip
 
 
-def grid_for(lattice: Lattice, radius: float, atoms: int, extent: Float[np.ndarray, "3"]):
+def grid_for(lattice: ReducedLattice, radius: float, atoms: int, extent: Float[np.ndarray, "3"]):
     """(bins, reach, step): bins along each axis, how many bins away a pair can be, and the width of a bin.
 
     Args:

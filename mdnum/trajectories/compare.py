@@ -16,9 +16,9 @@ from jaxtyping import Float, Int
 from mdnum.errors import InputError
 from mdnum.trajectories.frame import Box, Frame, checked, smallest_radius
 from mdnum.trajectories.lattice import lattice_of
-from mdnum.trajectories.ledger import Flips, Members
+from mdnum.trajectories.ledger import FlipTable, Members
 from mdnum.trajectories.resolution import Resolution
-from mdnum.trajectories.rules import Cutoff, Rule, SpeciesCutoffs
+from mdnum.trajectories.rules import CutoffRule, Rule, SpeciesCutoffs
 from mdnum.trajectories.search import image_distances
 from mdnum.trajectories.tracker import Tracker
 from mdnum.trajectories.trajectory import Trajectory
@@ -104,7 +104,7 @@ def separation(one: Frame, other: Frame, atoms: Int[np.ndarray, "chosen"] | None
 
 
 @dataclass
-class Difference:
+class SetDifference:
     """Pairs that are inside in one trajectory only, carried along by the flips of both.
 
     Attributes:
@@ -117,7 +117,7 @@ class Difference:
     new: list[Pair] = field(default_factory=list)
 
     @classmethod
-    def of(cls, a: Members, b: Members) -> Difference:
+    def of(cls, a: Members, b: Members) -> SetDifference:
         """At the first frame."""
         first, second = (_pairs(one.i, one.j, one.rank) for one in (a, b))
         both = first & second
@@ -128,7 +128,7 @@ class Difference:
     def __len__(self) -> int:
         return len(self.only_a) + len(self.only_b)
 
-    def step(self, a: Flips, b: Flips) -> None:
+    def step(self, a: FlipTable, b: FlipTable) -> None:
         """After the flips of the next frame in either."""
         differed: dict[Pair, bool] = {}
         for flips, mine, others in ((a, self.only_a, self.only_b), (b, self.only_b, self.only_a)):
@@ -184,7 +184,7 @@ def growth(
 
 
 @dataclass
-class Side:
+class ComparedSide:
     """One of the two trajectories."""
 
     trajectory: Trajectory
@@ -194,7 +194,7 @@ class Side:
     box_bound: float = 0.0  # the part of it that comes from the box, for a pair through one period
     bound: float = 0.0  # how far a margin can be off
 
-    def step(self, frame: Frame) -> Flips:
+    def step(self, frame: Frame) -> FlipTable:
         """The flips of the next frame."""
         self.distance_bound = self.resolution.bound(frame)
         self.box_bound = self.resolution.bound(frame, np.zeros(0, np.int64))
@@ -209,7 +209,7 @@ class Side:
 
 
 def differing_rows(
-    pairs: list[Pair], difference: Difference, sides: Sequence[Side], frames: Sequence[Frame]
+    pairs: list[Pair], difference: SetDifference, sides: Sequence[ComparedSide], frames: Sequence[Frame]
 ) -> dict[str, np.ndarray]:
     """Columns on pairs that differ: where each is inside, and by how much.
 
@@ -235,10 +235,10 @@ def differing_rows(
 
 
 def _thresholds(
-    i: np.ndarray, j: np.ndarray, inside: np.ndarray, rule: Rule, side: Side
+    i: np.ndarray, j: np.ndarray, inside: np.ndarray, rule: Rule, side: ComparedSide
 ) -> Float[np.ndarray, "pairs"]:
     """Distance under which each pair is inside, length; that of a neighbor where it is one."""
-    if isinstance(rule, Cutoff):
+    if isinstance(rule, CutoffRule):
         return np.full(len(i), rule.radius)
     if isinstance(rule, SpeciesCutoffs):
         species = side.trajectory.species.astype(str)
@@ -262,8 +262,8 @@ class NeighborSets:
     """The neighbor sets of one rule in the two trajectories."""
 
     rule: Rule
-    sides: list[Side]
-    difference: Difference = field(default_factory=Difference)
+    sides: list[ComparedSide]
+    difference: SetDifference = field(default_factory=SetDifference)
     first: dict[str, Any] | None = None  # what was seen at the first frame whose sets differ
     certain: int | None = None  # first frame at which a pair differs that no resolution could have moved
     first_pairs: list[dict[str, Any]] = field(default_factory=list)  # some of the pairs that differ there
@@ -331,7 +331,7 @@ def follow_both(sets: list[NeighborSets], atoms: np.ndarray | None, sink: Sink) 
             if at:
                 one.difference.step(*new)
             else:
-                one.difference = Difference.of(*(side.tracker.members() for side in one.sides))
+                one.difference = SetDifference.of(*(side.tracker.members() for side in one.sides))
             _sets_at(sink, place, one, at, (a, b), now, before)
         # pairs are those of the first rule
         only, tracked = sets[0].difference, [side.tracker.pairs for side in sides]
@@ -387,7 +387,7 @@ def _sets_at(
 def growth_of(frames: int, one: NeighborSets, table: Mapping[str, np.ndarray]) -> dict[str, Any]:
     """Rates at which the separation grows before the sets differ, and from then on."""
     limit = 0.1 * (
-        one.rule.radius if isinstance(one.rule, Cutoff) else float(table["furthest"].max(initial=0.0))
+        one.rule.radius if isinstance(one.rule, CutoffRule) else float(table["furthest"].max(initial=0.0))
     )
     cut = frames if one.first is None else one.first["frame"]
     # up to its bound a separation may be made of rounding

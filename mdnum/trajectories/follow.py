@@ -12,9 +12,9 @@ from jaxtyping import Int
 from mdnum.errors import InputError
 from mdnum.trajectories.compare import displacements
 from mdnum.trajectories.frame import Frame, checked, leap, smallest_radius
-from mdnum.trajectories.ledger import Flips, Members
+from mdnum.trajectories.ledger import FlipTable, Members
 from mdnum.trajectories.resolution import Resolution
-from mdnum.trajectories.rules import Capped, Cutoff, Rule, SpeciesCutoffs
+from mdnum.trajectories.rules import Capped, CutoffRule, Rule, SpeciesCutoffs
 from mdnum.trajectories.stride import crossings
 from mdnum.trajectories.tracker import Tracker
 from mdnum.trajectories.trajectory import Trajectory
@@ -36,7 +36,7 @@ def atoms_of(groups: Groups) -> Int[np.ndarray, "atoms"] | None:
     return np.unique(np.concatenate(some)) if some else None
 
 
-class Neighbors:
+class NeighborCounts:
     """How many neighbors each atom of the first group has, kept up to date by the flips.
 
     Attributes:
@@ -50,7 +50,7 @@ class Neighbors:
         self.seen = np.zeros(1, np.int64)
         self._add(members.i, members.j, np.ones(len(members)))
 
-    def step(self, flips: Flips) -> None:
+    def step(self, flips: FlipTable) -> None:
         """After the flips of a frame."""
         self._add(flips.i, flips.j, np.where(flips.entered, 1.0, -1.0))
 
@@ -81,7 +81,7 @@ class Followed:
 
     rule: Rule
     tracker: Tracker  # of it
-    neighbors: Neighbors | None = None  # known from the first frame on
+    neighbors: NeighborCounts | None = None  # known from the first frame on
     flux: list[tuple[int, float]] = field(default_factory=list)
     reach: float = float("nan")
     ranked: bool = False  # whether it is mostly the order of distances that decides there, and no radius
@@ -169,12 +169,12 @@ def follow(
 
 
 def _hand_on(
-    sink: Sink, number: int, one: Followed, flips: Flips, frame: Frame, at: int, size: tuple[int, Groups]
+    sink: Sink, number: int, one: Followed, flips: FlipTable, frame: Frame, at: int, size: tuple[int, Groups]
 ) -> None:
     """Rows of one frame and rule."""
     if one.neighbors is None:
         members = one.tracker.members()
-        one.neighbors = Neighbors(members, *size, one.rule.directed)
+        one.neighbors = NeighborCounts(members, *size, one.rule.directed)
         one.reach, one.ranked = _threshold(one.rule, members)
         sink("members", {"rule": np.full(len(members), number), **vars(members)})
     else:
@@ -197,7 +197,7 @@ def _threshold(rule: Rule, members: Members) -> tuple[float, bool]:
 
     The radius of a rule, the largest of several; of one that counts neighbors, how far the last of them is.
     """
-    if isinstance(rule, Cutoff):
+    if isinstance(rule, CutoffRule):
         return rule.radius, False
     if isinstance(rule, SpeciesCutoffs):
         return max(rule.radii.values()), False

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mdnum.errors import InputError
-from mdnum.trajectories.rules import Capped, Cutoff, Rule, SpeciesCutoffs
+from mdnum.trajectories.rules import Capped, CutoffRule, Rule, SpeciesCutoffs
 
 # Sizes of the system from its middle at which nothing is any more: unwrapped coordinates of a liquid get
 # some thousand boxes far in a second; what flies off into empty space gets further.
@@ -212,7 +212,7 @@ def smallest_radius(rules: Sequence[Rule]) -> float:
     for rule in rules:
         if isinstance(rule, SpeciesCutoffs):
             radii.extend(rule.radii.values())
-        elif isinstance(rule, Cutoff | Capped):
+        elif isinstance(rule, CutoffRule | Capped):
             radii.append(rule.radius)
     return float(min(radii))
 

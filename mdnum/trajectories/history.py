@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Int
 
-from mdnum.trajectories.ledger import Flips, Members
+from mdnum.trajectories.ledger import FlipTable, Members
 
 # a pair's three numbers are packed into one where they fit: sorting one column is ten times as fast
 _ROOM = 2**62
@@ -56,7 +56,10 @@ class History:
 
     @classmethod
     def of(
-        cls, flips: Flips | Mapping[str, np.ndarray], first: Members | Mapping[str, np.ndarray], frames: int
+        cls,
+        flips: FlipTable | Mapping[str, np.ndarray],
+        first: Members | Mapping[str, np.ndarray],
+        frames: int,
     ) -> History:
         """The histories behind a ledger.
 

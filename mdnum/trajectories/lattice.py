@@ -26,7 +26,7 @@ _UNIT_ROUNDOFF = 2.0**-53
 _FLAT = 1e-10
 
 
-class Lattice(NamedTuple):
+class ReducedLattice(NamedTuple):
     """What a search needs to know of a box; the compiled loops take it as it is.
 
     Attributes:
@@ -64,7 +64,7 @@ class Lattice(NamedTuple):
         return 16.0 * _UNIT_ROUNDOFF * size
 
 
-def lattice_of(box: Box) -> Lattice:
+def lattice_of(box: Box) -> ReducedLattice:
     """The lattice of a box.
 
     Raises:
@@ -97,10 +97,10 @@ def lattice_of(box: Box) -> Lattice:
         vectors = np.where(pbc[:, None], combination @ matrix, 0.0)
     inverse = np.linalg.inv(complete_cell(vectors))
     widths = np.where(pbc, 1.0 / np.linalg.norm(inverse, axis=0), np.inf)
-    return Lattice(vectors, pbc, inverse, widths, combination)
+    return ReducedLattice(vectors, pbc, inverse, widths, combination)
 
 
-def own_images(lattice: Lattice, radius: float) -> Float[np.ndarray, "images"]:
+def own_images(lattice: ReducedLattice, radius: float) -> Float[np.ndarray, "images"]:
     """Squared lengths of the lattice vectors no longer than radius, one of each ± pair, ascending."""
     span = [range(-int(radius / w) - 1, int(radius / w) + 2) if p else range(1)
             for w, p in zip(lattice.widths, lattice.periodic, strict=True)]  # fmt: skip

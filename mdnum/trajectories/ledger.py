@@ -44,7 +44,7 @@ class Members:
 
 
 @dataclass(frozen=True)
-class Flips:
+class FlipTable:
     """A row per decision that differs from the frame before, sorted by (frame, i, j, rank).
 
     Attributes:
@@ -77,12 +77,12 @@ class Flips:
         return len(self.frame)
 
     @classmethod
-    def concatenate(cls, parts: Sequence[Flips]) -> Flips:
+    def concatenate(cls, parts: Sequence[FlipTable]) -> FlipTable:
         """The rows of parts, one after the other; at least one part."""
         return cls(**{one.name: np.concatenate([getattr(p, one.name) for p in parts]) for one in fields(cls)})
 
     @classmethod
-    def none(cls) -> Flips:
+    def none(cls) -> FlipTable:
         """No row."""
         whole, real, yes = np.zeros(0, np.int64), np.zeros(0), np.zeros(0, bool)
         return cls(whole, whole, whole, whole, yes, real, real, real, real, real, yes)
@@ -101,7 +101,7 @@ class Thresholds(NamedTuple):
 
 
 class _Columns(NamedTuple):
-    """Those of `Flips` that differ from row to row."""
+    """Those of `FlipTable` that differ from row to row."""
 
     i: np.ndarray
     j: np.ndarray
@@ -134,7 +134,7 @@ class LedgerRows:
         distances: tuple[Float[np.ndarray, "flips"], Float[np.ndarray, "flips"]],
         thresholds: Thresholds,
         bound: float,
-    ) -> Flips:
+    ) -> FlipTable:
         """The rows of one frame.
 
         Args:
@@ -154,7 +154,7 @@ class LedgerRows:
         kinds = (np.int64,) * 3 + (np.bool_,) + (np.float64,) * 4 + (np.bool_,)
         made = _Columns(*(np.empty(count, kind) for kind in kinds))
         _sorted(start, shift, self._rows, ranks, bound, made)
-        return Flips(frame=np.full(count, frame), bound=np.full(count, bound), **made._asdict())
+        return FlipTable(frame=np.full(count, frame), bound=np.full(count, bound), **made._asdict())
 
 
 @numba.njit(cache=True, nogil=True)

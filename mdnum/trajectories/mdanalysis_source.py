@@ -13,7 +13,7 @@ import numpy as np
 from mdnum.errors import InputError
 from mdnum.trajectories.boxes import Boxes, box_of, formats_of
 from mdnum.trajectories.frame import Box, Frame
-from mdnum.trajectories.rules import Cutoff
+from mdnum.trajectories.rules import CutoffRule
 from mdnum.trajectories.tails import left_over, refuse_cut_text
 from mdnum.trajectories.topology import (
     NARROWED,
@@ -239,6 +239,6 @@ def differing_box(trajectory: Any, boxes: Boxes) -> Iterator[str]:
 
 
 def _close_pairs(ts: Any, box: Box) -> int:
-    tracker = Tracker(Cutoff(_CLOSE))
+    tracker = Tracker(CutoffRule(_CLOSE))
     tracker.step(Frame(0, 0.0, np.array(ts.positions, np.float64), box))
     return len(tracker.members())

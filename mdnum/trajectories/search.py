@@ -14,8 +14,17 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mdnum.errors import InputError
-from mdnum.trajectories.bins import DIRECTED, INSIDE, Candidates, Limits, Sides, binned, lattice_vector, meet
-from mdnum.trajectories.lattice import Lattice, image_square, near_squares, own_images, square_of
+from mdnum.trajectories.bins import (
+    DIRECTED,
+    INSIDE,
+    Candidates,
+    SearchLimits,
+    Sides,
+    binned,
+    lattice_vector,
+    meet,
+)
+from mdnum.trajectories.lattice import ReducedLattice, image_square, near_squares, own_images, square_of
 from mdnum.trajectories.rules import Capped, Nearest
 
 #: more pairs than this would take longer than anybody waits
@@ -43,7 +52,7 @@ class Found(NamedTuple):
     smallest: float  # smallest |margin| among the pairs that were decided so; inf without one
 
 
-class Rows(NamedTuple):
+class NeighborRows(NamedTuple):
     """Neighbors of each atom, one after the other."""
 
     first: Int[np.ndarray, "atoms"]  # where the row of each atom begins in `other`, and its length
@@ -60,7 +69,7 @@ class Rows(NamedTuple):
 
 def search(
     positions: Float[np.ndarray, "atoms 3"],
-    lattice: Lattice,
+    lattice: ReducedLattice,
     sides: Sides,
     radii: Float[np.ndarray, "species species"],
     kind: int,
@@ -94,7 +103,7 @@ def search(
     doubtful = max(open_room or int(1.1 * expected * share), 1024)
     while True:
         found = Candidates.room(sure, doubtful)
-        count, left = meet(atoms, Limits.of(radii, kind, band), 0, len(atoms.start) - 1, found)
+        count, left = meet(atoms, SearchLimits.of(radii, kind, band), 0, len(atoms.start) - 1, found)
         # what is open may come to be inside
         if left <= doubtful and (kind != INSIDE or count + left <= sure):
             break
@@ -142,7 +151,7 @@ def _settle(x, atoms, kind, square, radius, bound, found):
     return smallest
 
 
-def _expected(lattice: Lattice, centers: int, others: int, radius: float) -> float:
+def _expected(lattice: ReducedLattice, centers: int, others: int, radius: float) -> float:
     """About how many pairs there are, if atoms fill the box evenly; 0 where it has no end.
 
     Raises:
@@ -183,9 +192,9 @@ def _memory() -> float:
         return 32e9
 
 
-def rows_of(found: Found, atoms: int) -> Rows:
+def rows_of(found: Found, atoms: int) -> NeighborRows:
     """Pairs by their first atom, the lower one unless they are directed."""
-    rows = Rows(
+    rows = NeighborRows(
         np.zeros(atoms, np.int64), np.zeros(atoms, np.int64), np.empty(len(found.i), np.int32),
         np.empty(len(found.value)),
     )  # fmt: skip
@@ -224,7 +233,7 @@ class Chosen(NamedTuple):
         first_out: distance under which another would be one: that of the last inside, or the radius.
     """
 
-    rows: Rows  # the squares are those of the neighbors
+    rows: NeighborRows  # the squares are those of the neighbors
     close: int  # as of `Found`
     smallest: float
     last_in: Float[np.ndarray, "atoms"]
@@ -233,7 +242,7 @@ class Chosen(NamedTuple):
 
 def nearest(
     positions: Float[np.ndarray, "atoms 3"],
-    lattice: Lattice,
+    lattice: ReducedLattice,
     sides: Sides,
     rule: Nearest | Capped,
     *,
@@ -249,7 +258,9 @@ def nearest(
     if not lattice.periodic.any():
         everything = float(np.linalg.norm(np.ptp(positions, axis=0))) * (1 + 1e-9) + 1e-300 if atoms else 0.0
     radius = reach if np.isfinite(reach) else _guess(positions, lattice, sides, rule.most, everything)
-    made = Rows(np.zeros(atoms, np.int64), np.zeros(atoms, np.int64), np.zeros(0, np.int32), np.zeros(0))
+    made = NeighborRows(
+        np.zeros(atoms, np.int64), np.zeros(atoms, np.int64), np.zeros(0, np.int32), np.zeros(0)
+    )
     last_in, first_out = np.full(atoms, reach), np.full(atoms, reach)
     close, smallest, one = 0, np.inf, np.zeros(atoms, np.int64)
     while True:
@@ -337,7 +348,7 @@ def _choose(
     return written, close, smallest, short
 
 
-def _guess(positions, lattice: Lattice, sides: Sides, most: int, everything: float) -> float:
+def _guess(positions, lattice: ReducedLattice, sides: Sides, most: int, everything: float) -> float:
     """A radius in which most atoms have enough neighbors."""
     candidates = int(sides.others.sum())
     if not candidates:
@@ -361,7 +372,7 @@ class Changed(NamedTuple):
     entered: np.ndarray
 
 
-def compared(before: Rows, now: Rows, room: int) -> Changed:
+def compared(before: NeighborRows, now: NeighborRows, room: int) -> Changed:
     """Every decision that differs, pair by pair and image by image.
 
     Args:
@@ -403,8 +414,8 @@ def _compared(old, new, made):
 def exchanged(
     before: Found,
     now: Found,
-    old: tuple[Float[np.ndarray, "atoms 3"], Lattice],
-    new: tuple[Float[np.ndarray, "atoms 3"], Lattice],
+    old: tuple[Float[np.ndarray, "atoms 3"], ReducedLattice],
+    new: tuple[Float[np.ndarray, "atoms 3"], ReducedLattice],
     species: Int[np.ndarray, "atoms"],
     radii: Float[np.ndarray, "species species"],
 ) -> Changed:
@@ -449,7 +460,7 @@ def _outside(x, lattice, species, square, i, j, chosen):
 
 def image_distances(
     positions: Float[np.ndarray, "atoms 3"],
-    lattice: Lattice,
+    lattice: ReducedLattice,
     i: Int[np.ndarray, "pairs"],
     j: Int[np.ndarray, "pairs"],
     rank: Int[np.ndarray, "pairs"],

@@ -225,7 +225,7 @@ class Labels:
 
 
 @dataclass(frozen=True)
-class Tally(Sums):
+class ClassTally(Sums):
     """Flips and time inside by pair of classes.
 
     Attributes:
@@ -241,7 +241,7 @@ class Tally(Sums):
     exposure: Int[np.ndarray, "classes classes"]
 
     @classmethod
-    def of(cls, stays: Contacts, classes: Classes, frames: int, directed: bool = False) -> Tally:
+    def of(cls, stays: Contacts, classes: Classes, frames: int, directed: bool = False) -> ClassTally:
         """Counts by the classes of the two atoms.
 
         Args:
@@ -368,7 +368,7 @@ class Residues(Sums):
 
 
 @dataclass(frozen=True)
-class Again(Sums):
+class AgainSums(Sums):
     """Sums of `again` over some of the stays."""
 
     both: Int[np.ndarray, "lags"]
@@ -386,15 +386,15 @@ class Statistics(Sums):
 
     durations: Durations  # of contacts, and of contacts whose short gaps are overlooked
     intermittent: Durations
-    by_species: Tally  # None for residues where the file has none
-    by_residue_name: Tally | None
+    by_species: ClassTally  # None for residues where the file has none
+    by_residue_name: ClassTally | None
     residues: Residues | None
     chatter: Chatter
     strides: Strides
     busiest: Busiest
     pairs: int  # that flipped
     images: int  # pairs through further images of an atom
-    again: Again
+    again: AgainSums
 
     @classmethod
     def of(cls, history: History, labels: Labels, directed: bool, window: int) -> tuple[Statistics, Contacts]:
@@ -414,15 +414,15 @@ class Statistics(Sums):
         counted = cls(
             durations=Durations.of(stays, frames),
             intermittent=Durations.of(mended(stays, window), frames),
-            by_species=Tally.of(stays, labels.species, frames, directed),
-            by_residue_name=None if named is None else Tally.of(stays, named, frames, directed),
+            by_species=ClassTally.of(stays, labels.species, frames, directed),
+            by_residue_name=None if named is None else ClassTally.of(stays, named, frames, directed),
             residues=None if residues is None else Residues.of(history, residues),
             chatter=Chatter.of(history, window),
             strides=Strides.of_history(history, doublings(frames)),
             busiest=Busiest.of(history, stays),
             pairs=int(np.count_nonzero(history.flips)),
             images=int(np.count_nonzero((history.rank > 0) | (history.i == history.j))),
-            again=Again(*again(some, lags_of(frames), frames), len(some)),
+            again=AgainSums(*again(some, lags_of(frames), frames), len(some)),
         )
         return counted, stays
 

@@ -67,7 +67,7 @@ class Strides(Sums):
 
 
 @dataclass(frozen=True)
-class Between:
+class MissingFlips:
     """An estimate of what is missing between the frames, as shares of all flips that happened.
 
     Attributes:
@@ -92,7 +92,7 @@ def doublings(frames: int) -> list[int]:
     return strides
 
 
-def between_frames(found: Strides) -> Between | None:
+def between_frames(found: Strides) -> MissingFlips | None:
     """What lies between the frames, from how the flips thin out when frames are left out.
 
     Going from stride 2 to 1 brought some flips back, going from 4 to 2 some others. Where the first are fewer
@@ -118,23 +118,23 @@ def between_frames(found: Strides) -> Between | None:
     seen = (near, second, float(found.doubtful[1] / of))
     if near <= 0:
         # 3 events or fewer are not seen in one case of 20; each is two flips
-        return Between("none_lost", *seen, 0.0, 0.0, _share(2 * 6.0 / of))
+        return MissingFlips("none_lost", *seen, 0.0, 0.0, _share(2 * 6.0 / of))
     if 2 * found.doubtful[1] > found.of[1] - found.flips[1]:
-        return Between("rounding", *seen)
+        return MissingFlips("rounding", *seen)
     lost = np.diff(-found.flips[:4] * (of / found.of[:4]))
     sure = np.maximum(lost - np.diff(found.doubtful[:4] * (of / found.of[:4])), 0.0)
     if near < _FEW:
         # straight flight, and too few to see a trend in: in proportion to the stride, or to its square
         low, high = float(sure[0]) / of / 3, 2 * (near + 2 * math.sqrt(2 * near / of))
-        return Between("few", *seen, _share(near), _share(low), _share(high))
+        return MissingFlips("few", *seen, _share(near), _share(low), _share(high))
     ranges = [carried for carried in map(_carried_on, (lost, sure)) if carried is not None]
     if len(ranges) < 2:
-        return Between("brownian", *seen)
+        return MissingFlips("brownian", *seen)
     low, high = min(low for low, _ in ranges) / of, max(high for _, high in ranges) / of
     # what chance does to the counts: a flip that is left out comes with the one that reverses it
     chance = 2 * np.sqrt(2 * np.maximum(lost[:2], 2.0) / lost[:2] ** 2)
     least, most = low * max(1 - chance[0], 0.0), high * (1 + chance.sum())
-    return Between("trend", *seen, _share(math.sqrt(low * high)), _share(least), _share(most))
+    return MissingFlips("trend", *seen, _share(math.sqrt(low * high)), _share(least), _share(most))
 
 
 def _carried_on(lost: Float[np.ndarray, "doublings"]) -> tuple[float, float] | None:

@@ -23,8 +23,8 @@ import numba
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from mdnum.trajectories.bins import BAND, Candidates, Limits, Sides, binned, lattice_vector, meet
-from mdnum.trajectories.lattice import Lattice
+from mdnum.trajectories.bins import BAND, Candidates, SearchLimits, Sides, binned, lattice_vector, meet
+from mdnum.trajectories.lattice import ReducedLattice
 from mdnum.trajectories.search import exact_square
 
 #: a skin is meant to last this many frames; shorter than the least, a fresh search is as good
@@ -70,7 +70,7 @@ class Superset:
     gone: float = 0.0  # reading of the odometer, length
     last: float = 0.0  # what the last frame added to it, length
 
-    def serves(self, lattice: Lattice, radius: float, clear: float) -> bool:
+    def serves(self, lattice: ReducedLattice, radius: float, clear: float) -> bool:
         """Whether every pair within `clear` of its threshold is listed, where `radius` is the largest one."""
         # a second image within reach would have a rank, and the list knows the nearest alone
         return self.gone + clear < self.skin and lattice.narrowest >= 2.0 * (radius + self.skin)
@@ -95,9 +95,9 @@ def shift_code(n0, n1, n2):
 
 def displaced(
     before: Float[np.ndarray, "atoms 3"],
-    old: Lattice,
+    old: ReducedLattice,
     now: Float[np.ndarray, "atoms 3"],
-    new: Lattice,
+    new: ReducedLattice,
     home: Int[np.ndarray, "atoms 3"],
     radius: float,
 ) -> float:
@@ -153,7 +153,7 @@ def _displaced(before, now, strain, strained, lattice, home):
     return most, second
 
 
-def skin_for(inc: float, radius: float, clear: float, lattice: Lattice, pairs: int) -> float:
+def skin_for(inc: float, radius: float, clear: float, lattice: ReducedLattice, pairs: int) -> float:
     """A skin that lasts, length; 0 where none would last long enough to be worth it.
 
     Args:
@@ -173,7 +173,7 @@ def skin_for(inc: float, radius: float, clear: float, lattice: Lattice, pairs: i
 
 def listed(
     positions: Float[np.ndarray, "atoms 3"],
-    lattice: Lattice,
+    lattice: ReducedLattice,
     sides: Sides,
     radii: Float[np.ndarray, "species species"],
     skin: float,
@@ -191,7 +191,10 @@ def listed(
         spare: a list that is not needed any more: its memory is used again.
     """
     radius = float(radii.max(initial=0.0))
-    atoms, limits = binned(positions, lattice, sides, radius + skin, guard), Limits.of(radii, BAND, skin)
+    atoms, limits = (
+        binned(positions, lattice, sides, radius + skin, guard),
+        SearchLimits.of(radii, BAND, skin),
+    )
     # twice the inner shell: the outer one holds more
     room = int(pairs * ((1 + skin / radius) ** 3 - (1 - skin / radius) ** 3) * 1.1) + 4096
     held = Listed.room(0) if spare is None else spare.pairs
@@ -258,7 +261,7 @@ def _store(x, atoms, radius, skin, guard, found, of, held):
 def examine(
     superset: Superset,
     positions: Float[np.ndarray, "atoms 3"],
-    lattice: Lattice,
+    lattice: ReducedLattice,
     sides: Sides,
     radii: Float[np.ndarray, "species species"],
     *,
@@ -308,7 +311,7 @@ class _Frame(NamedTuple):
     square: Float[np.ndarray, "species species"]
 
     @classmethod
-    def of(cls, positions, home, lattice: Lattice, species, radii) -> _Frame:
+    def of(cls, positions, home, lattice: ReducedLattice, species, radii) -> _Frame:
         followed, shifts = np.empty_like(positions), np.empty((27, 3))
         _follow(positions, home, lattice.vectors, followed, shifts)
         square = np.where(radii >= 0, radii * radii, -1.0)

@@ -12,13 +12,13 @@ from jaxtyping import Bool, Float, Int
 from mdnum.errors import InputError
 from mdnum.trajectories.bins import INSIDE, Sides, binned
 from mdnum.trajectories.frame import Box, Frame
-from mdnum.trajectories.lattice import Lattice, lattice_of, own_images
-from mdnum.trajectories.ledger import Flips, LedgerRows, Members, Thresholds
-from mdnum.trajectories.rules import Capped, Cutoff, Nearest, Rule, SpeciesCutoffs
+from mdnum.trajectories.lattice import ReducedLattice, lattice_of, own_images
+from mdnum.trajectories.ledger import FlipTable, LedgerRows, Members, Thresholds
+from mdnum.trajectories.rules import Capped, CutoffRule, Nearest, Rule, SpeciesCutoffs
 from mdnum.trajectories.search import (
     Changed,
     Found,
-    Rows,
+    NeighborRows,
     compared,
     exchanged,
     image_distances,
@@ -62,13 +62,13 @@ class Moment:
     """
 
     positions: Float[np.ndarray, "atoms 3"]  # of the atoms that take part, length
-    lattice: Lattice  # of its box
+    lattice: ReducedLattice  # of its box
     rounding: float  # how far a distance can be off through float64, length
     own: Int[np.ndarray, "species"]  # images of an atom itself that are inside, by species
     last_in: Float[np.ndarray, "limits"]  # thresholds of each atom, where the rule is directed
     first_out: Float[np.ndarray, "limits"]
     found: Found | None = None
-    rows: Rows | None = None  # neighbors, where the rule is directed
+    rows: NeighborRows | None = None  # neighbors, where the rule is directed
 
 
 class Tracker:
@@ -125,7 +125,7 @@ class Tracker:
         self.frames = self.pairs = self.near = 0
         self.min_margin = np.inf
 
-    def step(self, frame: Frame, bound: float | None = None) -> Flips:
+    def step(self, frame: Frame, bound: float | None = None) -> FlipTable:
         """What changed since the frame before; nothing at the first.
 
         Args:
@@ -142,7 +142,7 @@ class Tracker:
         if flips is None:
             self._list = None
             now = self._decided(now)
-            flips = Flips.none() if before is None else self._flips(before, now)
+            flips = FlipTable.none() if before is None else self._flips(before, now)
         self._last = now
         self.frames += 1
         return flips
@@ -221,7 +221,7 @@ class Tracker:
             )
         return positions, largest
 
-    def _lattice_of(self, box: Box) -> Lattice:
+    def _lattice_of(self, box: Box) -> ReducedLattice:
         last = self._box
         same = (
             last is not None and np.array_equal(box.matrix, last.matrix) and np.array_equal(box.pbc, last.pbc)
@@ -257,7 +257,7 @@ class Tracker:
         self.min_margin = smallest if smallest <= HORIZON * who.radius else np.inf
         return replace(now, found=found, own=own)
 
-    def _rows(self, moment: Moment) -> Rows:
+    def _rows(self, moment: Moment) -> NeighborRows:
         """The neighbors at a moment; searched for where they are not known."""
         return moment.rows or rows_of(moment.found or self._searched(moment), len(moment.positions))
 
@@ -274,7 +274,7 @@ class Tracker:
 
     # ---- two frames
 
-    def _from_list(self, before: Moment, now: Moment) -> Flips | None:
+    def _from_list(self, before: Moment, now: Moment) -> FlipTable | None:
         """The flips that a list gives; None where none would be worth its making."""
         who, radius, bound = self._who, self._who.radius, self.bound + now.rounding
         clear = max(bound, HORIZON * radius)
@@ -316,7 +316,7 @@ class Tracker:
         rank = np.zeros(len(seen.i), np.int64)
         return self._table(before, now, Changed(seen.i, seen.j, rank, seen.entered))
 
-    def _flips(self, before: Moment, now: Moment) -> Flips:
+    def _flips(self, before: Moment, now: Moment) -> FlipTable:
         """The flips between two moments that were searched for, or can be."""
         who = self._who
         reach = who.radius + 8.0 * max(before.rounding, now.rounding)
@@ -337,7 +337,7 @@ class Tracker:
             parts.append(Changed(i, i, np.tile(np.arange(low, high), len(atoms)), entered))
         return self._table(before, now, Changed._make(map(np.concatenate, zip(*parts, strict=True))))
 
-    def _table(self, before: Moment, now: Moment, changed: Changed) -> Flips:
+    def _table(self, before: Moment, now: Moment, changed: Changed) -> FlipTable:
         """The flips as columns, from indices among the atoms that take part."""
         distances = [self._distances(one, changed.i, changed.j, changed.rank) for one in (now, before)]
         thresholds = Thresholds(
@@ -395,7 +395,7 @@ def _participants(
         kinds = kinds[labels]
     else:
         kinds = np.zeros(len(labels), np.int64)
-        radii = np.array([[float(rule.radius if isinstance(rule, Cutoff) else rule.reach)]])
+        radii = np.array([[float(rule.radius if isinstance(rule, CutoffRule) else rule.reach)]])
     both = centers & others
     own = np.bincount(kinds[both], minlength=len(radii))
     return Participants(labels, Sides(centers, others, kinds), radii, both, own)

@@ -16,7 +16,7 @@ from mdnum.errors import InputError
 from mdnum.store import RunFolder
 from mdnum.store.tables import TableStream
 from mdnum.workflow.flips_page import judge, page
-from mdnum.workflow.flips_shared import Log, about, ending, plain_box, selected, stem
+from mdnum.workflow.flips_shared import FolderLog, about, ending, plain_box, selected, stem
 from mdnum.workflow.frame import Outcome, Progress, Verb, finish, new_folder, store
 from mdnum.workflow.interrupt import asked_to_stop
 
@@ -100,12 +100,12 @@ def flips(
     groups = selected(opened, between)
     sample = opened.sample()
     resolution = infer(sample, opened.bits, opened.format)
-    rows = _Rows()
+    rows = _HeldRows()
     passes = follow(opened, asked, groups, resolution, rows.add)
     # no folder for a file whose first frame cannot be used
     found, interrupted, began = next(passes), False, time.perf_counter()
     with new_folder("flips", f"flips-{stem(opened)}", out) as folder:
-        log = Log(folder, progress)
+        log = FolderLog(folder, progress)
         with asked_to_stop() as stop:
             while True:
                 rows.checkpoint(folder, found.frames)
@@ -163,14 +163,14 @@ def rules(
     Raises:
         InputError: a word is not understood, a rule comes twice, or `most` has no cutoff to go with.
     """
-    from mdnum.trajectories.rules import Capped, Cutoff, Nearest, SpeciesCutoffs
+    from mdnum.trajectories.rules import Capped, CutoffRule, Nearest, SpeciesCutoffs
 
     if most is not None and not cutoffs:
         raise InputError(
             "--most keeps the nearest of those inside a cutoff, and there is no cutoff",
             remedy="Add --cutoff R; for the K nearest without a cutoff write --nearest K",
         )
-    found: list[Rule] = [Cutoff(radius) if most is None else Capped(radius, most) for radius in cutoffs]
+    found: list[Rule] = [CutoffRule(radius) if most is None else Capped(radius, most) for radius in cutoffs]
     found += [SpeciesCutoffs(one if isinstance(one, Mapping) else _species_cutoffs(one)) for one in pairs]
     found += [Nearest(k) for k in nearest]
     names = [one.name for one in found]
@@ -244,7 +244,7 @@ def _cut_short(error: InputError | None, trajectory: Trajectory) -> bool:
     return trajectory.in_file is not None and error.frame >= trajectory.in_file - 1
 
 
-class _Rows:
+class _HeldRows:
     """Rows of a folder's tables, appended some hundred frames at a time."""
 
     def __init__(self) -> None:
@@ -325,7 +325,7 @@ def _rule_told(
     trajectory: Trajectory,
     groups: Groups,
     window: int,
-    log: Log,
+    log: FolderLog,
 ) -> dict[str, Any]:
     """What one rule's ledger says, worked out pair by pair; its tables go into the folder."""
     from mdnum.trajectories.statistics import Labels, Statistics

@@ -15,11 +15,11 @@ from mdnum.report.browse import Browse, Column, plain_rows
 from mdnum.report.finding import Finding, Texts, Verdict, conclude
 from mdnum.report.section import Key, Page, Plot, Section, Series, Table, pairs
 from mdnum.report.words import count, many, number
-from mdnum.trajectories.compare import NeighborSets, Side, follow_both, growth_of
+from mdnum.trajectories.compare import ComparedSide, NeighborSets, follow_both, growth_of
 from mdnum.trajectories.follow import atoms_of
 from mdnum.trajectories.resolution import infer
 from mdnum.trajectories.tracker import Tracker
-from mdnum.workflow.flips_shared import Log, Written, about, ending, name_of, resolution, selected, stem
+from mdnum.workflow.flips_shared import FolderLog, Written, about, ending, name_of, resolution, selected, stem
 from mdnum.workflow.frame import Outcome, Progress, Verb, View, finish, new_folder, store
 from mdnum.workflow.interrupt import asked_to_stop
 
@@ -59,7 +59,7 @@ def compare(
     resolutions = [infer(one.sample(), one.bits, one.format) for one in (a, b)]
     sets = [
         NeighborSets(rule, [
-            Side(one, Tracker(rule, *groups, [str(word) for word in one.species]), kept)
+            ComparedSide(one, Tracker(rule, *groups, [str(word) for word in one.species]), kept)
             for one, kept in zip((a, b), resolutions, strict=True)
         ])
         for rule in asked
@@ -69,7 +69,7 @@ def compare(
     # no folder for files whose first frames cannot be used
     found, interrupted = next(passes), False
     with new_folder("flips-compare", f"flips-{stem(a)}", out) as folder:
-        log = Log(folder, progress)
+        log = FolderLog(folder, progress)
         total = min((one.count for one in (a, b) if one.count is not None), default=0)
         with asked_to_stop() as stop:
             while True:

@@ -31,7 +31,7 @@ def selected(trajectory: Trajectory, between: tuple[str, str] | None) -> Groups:
     )
 
 
-class Log:
+class FolderLog:
     """Passes progress on, and writes a line of log.txt at each new phase and now and then."""
 
     def __init__(self, folder: RunFolder, progress: Progress | None):

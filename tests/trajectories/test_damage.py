@@ -29,7 +29,7 @@ from mdnum.trajectories.frame import (
     smallest_radius,
 )
 from mdnum.trajectories.netcdf import head_of
-from mdnum.trajectories.rules import Cutoff, Nearest, SpeciesCutoffs
+from mdnum.trajectories.rules import CutoffRule, Nearest, SpeciesCutoffs
 from mdnum.trajectories.source import open_trajectory
 
 DLPOLY = Path(datafiles.PSF).parent / "dlpoly" / "HISTORY"
@@ -77,7 +77,7 @@ def test_floats_that_tell_no_distance_there_are_said_to():
     assert far_out(drifted, radius=2.5, bits=64) is None
     found = far_out(drifted, radius=2.5, bits=32)
     assert found is not None and "float32 tells distances no better than to" in found[2] and found[1] == 60
-    assert smallest_radius([Nearest(3), Cutoff(4.0), SpeciesCutoffs({("A", "B"): 2.0})]) == 2.0
+    assert smallest_radius([Nearest(3), CutoffRule(4.0), SpeciesCutoffs({("A", "B"): 2.0})]) == 2.0
     assert smallest_radius([Nearest(3)]) == np.inf
 
 

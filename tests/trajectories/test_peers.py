@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mdnum.trajectories.resolution import infer
-from mdnum.trajectories.rules import Cutoff
+from mdnum.trajectories.rules import CutoffRule
 from mdnum.trajectories.source import open_trajectory
 from mdnum.trajectories.tracker import Tracker
 
@@ -66,7 +66,7 @@ def test_lammps_counts_the_same_pairs(tmp_path):
         open_trajectory(tmp_path / f"{name}.lammpstrj", slice=":12") for name in ("exact", "plain")
     )
     assert (exact.length, exact.time, plain.time) == ("σ", "τ", "step")
-    tracker, found = Tracker(Cutoff(2.0)), []
+    tracker, found = Tracker(CutoffRule(2.0)), []
     for frame in exact.frames():
         assert frame.box.pbc.tolist() == [True, True, False] and frame.box.matrix[2, 1] != 0
         tracker.step(frame)

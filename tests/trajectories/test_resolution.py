@@ -16,7 +16,7 @@ from mdnum.errors import InputError
 from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.grid_effect import grid_effect
 from mdnum.trajectories.resolution import infer
-from mdnum.trajectories.rules import Capped, Cutoff, Nearest
+from mdnum.trajectories.rules import Capped, CutoffRule, Nearest
 from mdnum.trajectories.source import open_trajectory
 from mdnum.trajectories.tracker import Tracker
 
@@ -200,7 +200,7 @@ def test_what_the_grid_does_among_the_nearest(k, within, stride, timestep):
     assert effect.invented == pytest.approx(invented, abs=within)
 
 
-@pytest.mark.parametrize("rule", [Cutoff(CUTOFF), Nearest(4), Capped(CUTOFF, 12)])
+@pytest.mark.parametrize("rule", [CutoffRule(CUTOFF), Nearest(4), Capped(CUTOFF, 12)])
 def test_what_the_file_makes_up_is_marked_as_what_it_cannot_tell(rule):
     positions, length = liquid(20, 0.005, 4)
     true, kept = (frames_of(x, length * np.eye(3)) for x in (positions, quantized(positions, 0.01)))

@@ -19,9 +19,9 @@ from mdnum.trajectories.statistics import (
     Busiest,
     Chatter,
     Classes,
+    ClassTally,
     Durations,
     Residues,
-    Tally,
     again,
     mean_by_rate,
     residence,
@@ -192,7 +192,7 @@ def test_flips_and_time_inside_by_class(seed: int, directed: bool) -> None:
     inside, names = random_membership(seed)
     history = History.of(*ledger(inside, names), inside.shape[1])
     classes = np.random.default_rng(seed).integers(0, 3, 8)
-    found = Tally.of(contacts(history), Classes(classes, ["a", "b", "c"]), inside.shape[1], directed)
+    found = ClassTally.of(contacts(history), Classes(classes, ["a", "b", "c"]), inside.shape[1], directed)
     entered, left, time, exposed = Counter(), Counter(), Counter(), Counter()
     for (i, j, _), row in zip(names, inside.astype(int), strict=True):
         pair = (int(classes[i]), int(classes[j]))

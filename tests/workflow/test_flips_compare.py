@@ -17,7 +17,7 @@ from mdnum.errors import InputError
 from mdnum.store import RunFolder
 from mdnum.trajectories import compare
 from mdnum.trajectories.frame import Box, Frame
-from mdnum.trajectories.rules import Capped, Cutoff, Nearest, Rule
+from mdnum.trajectories.rules import Capped, CutoffRule, Nearest, Rule
 from mdnum.trajectories.tracker import Tracker
 from mdnum.workflow.flips_compare import TEXTS
 from mdnum.workflow.frame import Outcome
@@ -127,14 +127,14 @@ def test_what_is_certain_is_found_among_pairs_that_stay_different(
     assert len(RunFolder.open(found.folder).read("differing")["i"]) == 2
 
 
-@pytest.mark.parametrize("rule", [Nearest(2), Capped(4.0, 2), Cutoff(4.0)])
+@pytest.mark.parametrize("rule", [Nearest(2), Capped(4.0, 2), CutoffRule(4.0)])
 def test_thresholds_of_a_directed_rule_tell_neighbors_from_others(rule: Rule) -> None:
     rng = np.random.default_rng(3)
     box = Box(np.diag([30.0] * 3), np.ones(3, bool))
     tracker = Tracker(rule, np.arange(4, 16))
     tracker.step(Frame(0, 0.0, x := rng.uniform(0, 9, (20, 3)), box))
     stays, enters = tracker.thresholds()
-    if isinstance(rule, Cutoff):
+    if isinstance(rule, CutoffRule):
         assert np.isnan(stays).all() and np.isnan(enters).all()
         return
     assert np.isnan(stays[:4]).all() and np.isnan(enters[16:]).all()
