@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from ase import Atoms
-from mdnum.forks.dials import names
 from small_systems import LENNARD_JONES, crystal, make
 
 from mdnum.errors import InputError

@@ -5,7 +5,6 @@ from __future__ import annotations
 import jax
 import numpy as np
 import pytest
-from mdnum.forks.dials import dial, names, unit
 
 from mdnum.errors import InputError
 from mdnum.rollout.dials import dial, names, unit
