@@ -103,7 +103,7 @@ def draw(rows: list[Row], path: Path) -> None:
 def print_pairs(system: System) -> None:
     """The pair sets of every search as a table."""
     made = check_pairs(system)
-    columns = ("finder", "version", "pairs", "missing", "extra", "borderline", "stops counting", "verdict")
+    columns = ("search", "version", "pairs", "missing", "extra", "borderline", "stops counting", "verdict")
     table(
         f"\n{system.name}: {made.pairs:,} pairs with {made.compare} {made.r_cut:.6g} {system.units.length}",
         columns,

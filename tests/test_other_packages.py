@@ -14,7 +14,7 @@ from other_package import install
 import mdnum
 from mdnum.errors import InputError
 from mdnum.md.cutoffs import CUTOFFS
-from mdnum.references.check import check_energy
+from mdnum.references.energy_check import check_energy
 
 CUTOFF = '''
 from mdnum.md.cutoffs import Cutoff
