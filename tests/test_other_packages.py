@@ -69,6 +69,7 @@ class Slower(Choice):
         return twin(system, {key: table.timestep * (1 + float(self.share))}, self.name, self.name)
 '''
 METHOD = """
+import numpy as np
 from dataclasses import dataclass
 from mdnum.gradients.problem import Method
 

@@ -300,7 +300,8 @@ def test_the_1989_constants_differ_from_those_of_1988():
 
 @pytest.mark.jax_md
 @pytest.mark.parametrize(
-    "format", [*(pytest.param(one, marks=pytest.mark.nightly) for one in ("dense", "sparse")), "ordered-sparse"]
+    "format",
+    [*(pytest.param(one, marks=pytest.mark.nightly) for one in ("dense", "sparse")), "ordered-sparse"],
 )
 def test_any_jax_md_energy_function_runs_in_every_format(format):
     from ase.calculators.lj import LennardJones
