@@ -11,7 +11,7 @@ from ase.io import write
 from command_line import call, printed
 
 from mdnum.store import RunFolder
-from mdnum.store.atomic import write_text
+from mdnum.store.files import write_text
 
 EMT = "ase.calculators.emt:EMT"
 

@@ -16,8 +16,8 @@ from pydantic import TypeAdapter
 from pydantic_core import to_json
 
 from mdnum.errors import FolderError
-from mdnum.store import manifest
-from mdnum.store.atomic import read_text, write_text
+from mdnum.store import files as manifest
+from mdnum.store.files import read_text, write_text
 from mdnum.store.folder import RunFolder, restoring
 
 NAME = "answers.json"
