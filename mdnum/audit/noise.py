@@ -267,7 +267,7 @@ def direction(atoms: int, rng: np.random.Generator) -> Float[np.ndarray, "atoms 
     return drawn / np.max(np.linalg.norm(drawn, axis=1))
 
 
-def displaced(atoms: Atoms, by: Float[np.ndarray, "atoms 3"]) -> Atoms:
+def displaced(atoms: Atoms, by: Float[np.ndarray, "*atoms 3"]) -> Atoms:
     """A copy with every atom moved by Å."""
     there = atoms.copy()
     there.positions += by

@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from mdnum.audit.base import Meter, Observed, finding
 from mdnum.errors import MdnumError
-from mdnum.store.atomic import write_text
+from mdnum.store.files import write_text
 from mdnum.units import METAL, Units
 
 #: A calculator that fails is asked hundreds of times; this many structures are kept.

@@ -10,6 +10,7 @@ import numpy as np
 from ase import Atoms
 from jaxtyping import Float, Int
 
+from mdnum.audit.noise import displaced
 from mdnum.audit.pairs import molecules
 
 #: Coordinates that should be 0 and are not quite: a denormal-like displacement that was seen to cost 5 eV,
@@ -75,11 +76,11 @@ def translated(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
     if atoms.pbc.any():
         for count, words in ((1, "one lattice vector"), (-3, "three lattice vectors back")):
             by = count * atoms.cell.array[atoms.pbc].sum(axis=0)
-            yield same(f"all atoms moved by {words} along each periodic axis", _moved(atoms, by))
+            yield same(f"all atoms moved by {words} along each periodic axis", displaced(atoms, by))
         for _ in range(2):
             share = rng.uniform(0, 1, 3) * atoms.pbc
             there, what = (
-                _moved(atoms, share @ atoms.cell),
+                displaced(atoms, share @ atoms.cell),
                 "all atoms moved by fractions of the lattice vectors",
             )
             yield same(what, there)
@@ -88,7 +89,7 @@ def translated(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
     if free.any():
         axes = "the free axes" if atoms.pbc.any() else "x, y, z"
         for length in (7.3, -250.0):
-            there = _moved(atoms, length * _outward(atoms, free))
+            there = displaced(atoms, length * _outward(atoms, free))
             yield same(f"all atoms moved by {length:g} Å along {axes}", there)
 
 
@@ -100,7 +101,7 @@ def imaged(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
     yield same("atoms wrapped into the cell", _wrapped(atoms))
     for most in (1, 3, 20):
         boxes = rng.integers(-most, most + 1, (len(atoms), 3)) * atoms.pbc
-        there = _moved(atoms, boxes @ atoms.cell.array)
+        there = displaced(atoms, boxes @ atoms.cell.array)
         yield same(f"each atom moved by lattice vectors of its own, up to {most} of them", there)
 
 
@@ -111,7 +112,7 @@ def on_a_face(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
     axes, cell = np.flatnonzero(atoms.pbc), atoms.cell.array
     corner = cell[axes].sum(axis=0)
     for who in dict.fromkeys((0, int(rng.integers(len(atoms))))):
-        base = _moved(atoms, -atoms.positions[who])
+        base = displaced(atoms, -atoms.positions[who])
 
         def placed(where: str, position: object, extra: float = 0.0, base: Atoms = base, who: int = who):
             there = base.copy()
@@ -159,7 +160,7 @@ def images_by_molecule(atoms: Atoms, rng: np.random.Generator) -> Same | None:
     if size is None or not atoms.pbc.any():
         return None
     boxes = rng.integers(-2, 3, (len(atoms) // size, 3)) * atoms.pbc
-    there = _moved(atoms, np.repeat(boxes, size, axis=0) @ atoms.cell.array)
+    there = displaced(atoms, np.repeat(boxes, size, axis=0) @ atoms.cell.array)
     return _same("IMAGES", atoms, f"molecules of {size} atoms moved by lattice vectors of their own", there)
 
 
@@ -271,12 +272,6 @@ def without_periods(atoms: Atoms) -> Iterator[Same]:
     ):
         what = f"without periods, in {what}"
         yield _same("DUMMY_CELL", base, what, _in_cell(base, cell), rounding=0.0, before=base)
-
-
-def _moved(atoms: Atoms, by: np.ndarray) -> Atoms:
-    there = atoms.copy()
-    there.positions += by
-    return there
 
 
 def _wrapped(atoms: Atoms) -> Atoms:

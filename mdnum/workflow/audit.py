@@ -23,9 +23,9 @@ from mdnum.registry import unknown
 from mdnum.report.finding import Finding, Texts, Verdict, conclude
 from mdnum.report.section import Code, Key, Page, Plot, Section, Series, cell, pairs, records
 from mdnum.report.words import count, heading, many, number
-from mdnum.store import RunFolder, manifest
+from mdnum.store import RunFolder
 from mdnum.store.answers import Answers, take
-from mdnum.store.atomic import read_text, subfolder, write_text
+from mdnum.store.files import read_text, remove, subfolder, write_text
 from mdnum.workflow import frame
 from mdnum.workflow.frame import Outcome, Progress, Verb, View
 
@@ -124,7 +124,7 @@ def audit(
             folder.write_anew(_TABLES)
             for file in (folder.path / "structures").glob("failed-*.extxyz"):
                 if re.fullmatch(r"failed-\d+\.extxyz", file.name) and file.name not in state.failed:
-                    manifest.remove(file)
+                    remove(file)
             return _ask_all(folder, loaded, state, deadline, report, progress)
     if calculator is None:
         raise InputError("no calculator is named", remedy="Name one, or resume an audit")
