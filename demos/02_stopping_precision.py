@@ -8,7 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from mdnum.ball import BallRun, GlobalSum, Problem, Projection, ResidualPenetration, SemiImplicitEuler, World
+from mdnum.ball import (
+    BallProblem,
+    BallRun,
+    GlobalSum,
+    Projection,
+    ResidualPenetration,
+    SemiImplicitEuler,
+    World,
+)
 from mdnum.errors import InputError
 from mdnum.gradients.ball import ThroughIterations
 from mdnum.gradients.problem import Gradient
@@ -52,7 +60,7 @@ def boundary_batch(dtype: str, tol: float = TOL, small: int = SMALL) -> tuple[fl
     return float(limit), np.array([float(below)] + [share] * small)
 
 
-def problem(dtype: str, policy: RolePrecision, reduction: Reduction = Sequential()) -> Problem:
+def problem(dtype: str, policy: RolePrecision, reduction: Reduction = Sequential()) -> BallProblem:
     """The batch on the boundary of a dtype, four steps without gravity.
 
     Args:
@@ -63,7 +71,7 @@ def problem(dtype: str, policy: RolePrecision, reduction: Reduction = Sequential
     tol, depths = boundary_batch(dtype)
     contact = Projection(K, ALPHA, GlobalSum(tol, MAX_ITER, reduction))
     world = World.create(contact, SemiImplicitEuler(0.01), gravity=0.0, policy=policy)
-    return Problem(world, -depths, 0.0, STEPS, ResidualPenetration())
+    return BallProblem(world, -depths, 0.0, STEPS, ResidualPenetration())
 
 
 def policies(dtype: str) -> dict[str, RolePrecision]:

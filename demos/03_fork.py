@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from mdnum.ball import (
+    BallDifference,
+    BallProblem,
     BallRun,
-    Difference,
     Impact,
     Penalty,
-    Problem,
     SemiImplicitEuler,
     World,
     first_difference,
@@ -53,12 +53,12 @@ def adjacent(world: World, low: float, high: float, steps: int) -> tuple[float, 
 
 
 def run() -> Demo:
-    """Find the pair, and see what parts it: the flip, or what is done about it."""
+    """Find the pair, and see what separates it: the flip, or what is done about it."""
     reset = World.create(Impact(restitution=0.8, rest_speed=0.0), SemiImplicitEuler(H))
     spring = World.create(Penalty(STIFFNESS), SemiImplicitEuler(H))
     low, high, runs = adjacent(reset, LOW, HIGH, STEPS)
     a, b = (simulate(reset, reset.start(y0), STEPS) for y0 in (low, high))
-    told = simulate(reset, reset.start(high), STEPS, told=a.told())
+    told = simulate(reset, reset.start(high), STEPS, imposed=a.decisions())
     c, d = (simulate(spring, spring.start(y0), STEPS) for y0 in (low, high))
     parted, held, soft = first_difference(a, b), first_difference(a, told), first_difference(c, d)
     assert parted.fork is not None
@@ -67,7 +67,8 @@ def run() -> Demo:
     before = float(parted.separation[:at].max())
     after = float(parted.separation[at:].max())
     slopes = [
-        Problem(reset, y0, 0.0, STEPS).value_and_grad(["restitution"])[1]["restitution"] for y0 in (low, high)
+        BallProblem(reset, y0, 0.0, STEPS).value_and_grad(["restitution"])[1]["restitution"]
+        for y0 in (low, high)
     ]
     apart = int(ulp_distance(low, high))
     height = -parted.margins[0], -parted.margins[1]
@@ -81,7 +82,7 @@ def run() -> Demo:
             f"{height[1]:.2g} m. One velocity is reset, the other ball falls on for a step, and a separation "
             f"of {before:.1g} m becomes {after:.1g} m. Told the decisions of the first, the second stays "
             f"within {held.separation.max():.1g} m of it: the decision is the cause. On a spring the same "
-            "flip parts nothing, because the force at the boundary is 0."
+            "flip separates nothing, because the force at the boundary is 0."
         ),
         numbers={
             "first_contact": contact[:2],
@@ -109,15 +110,15 @@ def run() -> Demo:
                 f"contact, {contact[0]}",
                 parted.channel == "contact" and at == contact[0],
             ),
-            Claim("before the fork they are rounding apart", before, "below 1e-14 m", before < 1e-14),
+            Claim("before the fork they are within rounding", before, "below 1e-14 m", before < 1e-14),
             Claim(
-                "after it they are the fall of a step apart",
+                "after it they are a step's fall apart",
                 after,
                 f"at least {jump:.3g} m",
                 after >= jump * (1 - 1e-9),
             ),
             Claim(
-                "told the same decisions, they stay rounding apart",
+                "under the same decisions, they stay within rounding",
                 float(held.separation.max()),
                 "below 1e-14 m",
                 bool(held.separation.max() < 1e-14),
@@ -141,13 +142,13 @@ def run() -> Demo:
                 ),
             ),
             table(
-                "what parts them",
+                "what separates them",
                 ("contact", "second ball", "fork", "largest separation (m)"),
                 (
                     ("velocity reset", "decides for itself", at, after),
                     (
                         "velocity reset",
-                        "is told the first one's decisions",
+                        "has the first one's decisions imposed",
                         held.fork,
                         float(held.separation.max()),
                     ),
@@ -185,8 +186,8 @@ def _heights(a: BallRun, b: BallRun, at: int) -> Plot:
     )
 
 
-def _separations(a: BallRun, parted: Difference, held: Difference, soft: Difference) -> Plot:
-    def shown(found: Difference) -> np.ndarray:
+def _separations(a: BallRun, parted: BallDifference, held: BallDifference, soft: BallDifference) -> Plot:
+    def shown(found: BallDifference) -> np.ndarray:
         return np.where(found.separation > 0, found.separation, np.nan)
 
     assert parted.fork is not None
@@ -198,10 +199,10 @@ def _separations(a: BallRun, parted: Difference, held: Difference, soft: Differe
         y_scale="log",
         series=(
             Series("velocity reset", a.time, shown(parted), role="bad"),
-            Series("told the same decisions", a.time, shown(held), role="first"),
+            Series("the same decisions imposed", a.time, shown(held), role="first"),
             Series("on a spring", a.time, shown(soft), role="second"),
         ),
         caption="One flip takes the separation from rounding to the fall of a step. Where the decision is "
-        "told, or acting on it changes nothing at the boundary, it stays at rounding.",
+        "imposed, or acting on it changes nothing at the boundary, it stays at rounding.",
         verticals=((parted.fork * H, "fork"),),
     )

@@ -15,8 +15,8 @@ from jaxtyping import Array, Float, Int
 
 from mdnum.ball.contacts import Penalty
 from mdnum.ball.exact import ExactPenalty
-from mdnum.ball.integrators import ExplicitEuler, ImplicitMidpoint, SemiImplicitEuler, VelocityVerlet
-from mdnum.ball.state import Decisions
+from mdnum.ball.integrators import BallVerlet, ExplicitEuler, ImplicitMidpoint, SemiImplicitEuler
+from mdnum.ball.state import BallDecisions
 from mdnum.ball.world import World
 from mdnum.errors import InputError
 from mdnum.precision.policy import RolePrecision
@@ -25,7 +25,7 @@ from mdnum.workflow.demos import Claim, Demo, Plot, Region, Series, Table, table
 SCHEMES = {
     "explicit-euler": ExplicitEuler,
     "semi-implicit-euler": SemiImplicitEuler,
-    "velocity-verlet": VelocityVerlet,
+    "velocity-verlet": BallVerlet,
     "implicit-midpoint": ImplicitMidpoint,
 }
 
@@ -254,7 +254,7 @@ def measured_limit(
 ) -> float:
     """The largest h sqrt(k) at which a ball held in contact does not run away, found by running it.
 
-    The ball is told to be in contact in every step and starts off its equilibrium; "runs away" means that
+    Contact is imposed on the ball in every step, and it starts off its equilibrium; "runs away" means that
     it is `GROWTH` times as far off within the steps. So what is found is where the spectral radius to the
     power of the steps reaches that, a little above the limit: some 1e-6 for semi-implicit Euler without
     damping, whose eigenvalues part as a square root, some 1e-3 with damping, and sqrt(2 log(GROWTH) / steps)
@@ -290,17 +290,17 @@ def _held(world: World, k: Array, damping: Array, steps: int) -> Any:
     def one(k, damping):
         here = world.with_values({"k": k, "damping": damping})
         # one iteration solves the linear equation of the implicit midpoint
-        told = Decisions(jnp.ones(1, bool), jnp.ones((), jnp.int32))
+        imposed = BallDecisions(jnp.ones(1, bool), jnp.ones((), jnp.int32))
         # at rest it would start without any of the direction in which velocity Verlet grows
         start = here.start(-1.0 / GROWTH, -0.5 * jnp.sqrt(k) / GROWTH)
         # in contact already when it starts
         start = start._replace(a=here.contact.acceleration(
             start.y.astype(start.a.dtype), start.v.astype(start.a.dtype), jnp.zeros_like(start.a),
-            told.contact, here.rounding,
+            imposed.contact, here.rounding,
         ))  # fmt: skip
 
         def step(state, _):
-            state = here.advance(state, told=told)[0]
+            state = here.advance(state, imposed=imposed)[0]
             return state, jnp.abs(state.y[0])
 
         _, size = lax.scan(step, start, None, length=steps)

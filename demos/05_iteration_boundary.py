@@ -9,7 +9,7 @@ from functools import cache
 
 import numpy as np
 
-from mdnum.ball import GlobalSum, Problem, Projection, ResidualPenetration, SemiImplicitEuler, World
+from mdnum.ball import BallProblem, GlobalSum, Projection, ResidualPenetration, SemiImplicitEuler, World
 from mdnum.precision import neighbor, ulp_distance
 from mdnum.workflow.demos import Claim, Demo, Plot, Series, Table, table
 
@@ -58,10 +58,10 @@ class Tooth:
 
 
 @cache
-def relaxation() -> Problem:
+def relaxation() -> BallProblem:
     """One ball below the floor, one projection, the penetration that it leaves."""
     world = World.create(Projection(0.5, ALPHA, GlobalSum(TOL, 200)), SemiImplicitEuler(1.0), gravity=0.0)
-    return Problem(world, np.array([-DEPTH]), 0.0, 1, ResidualPenetration(1))
+    return BallProblem(world, np.array([-DEPTH]), 0.0, 1, ResidualPenetration(1))
 
 
 def side(k: float) -> Side:

@@ -7,7 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from mdnum.ball import BallRun, GlobalSum, Hysteresis, Penalty, Projection, SemiImplicitEuler, World, simulate
+from mdnum.ball import (
+    BallRun,
+    GlobalSum,
+    HysteresisStop,
+    Penalty,
+    Projection,
+    SemiImplicitEuler,
+    World,
+    simulate,
+)
 from mdnum.precision import RolePrecision
 from mdnum.precision.reductions import Reduction, parse
 from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
@@ -46,7 +55,7 @@ def pressed(order: Reduction, gap: float | None) -> BallRun:
     tol = float(np.float16(TOL))
     rule: Any = GlobalSum(tol, 50, order)
     if gap is not None:
-        rule = Hysteresis(rule, float(np.float16(gap * TOL)))
+        rule = HysteresisStop(rule, float(np.float16(gap * TOL)))
     narrow = RolePrecision("float32", "float32", "float16", "float16", "float32")
     world = World.create(
         Projection(0.5, 0.5, rule, restitution=0.0), SemiImplicitEuler(PRESSED_H), G, control, narrow

@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from mdnum.ball import (
+    BallProblem,
     BallRun,
-    Fixed,
+    FixedCount,
     GlobalSum,
     Maximum,
     PerInstance,
-    Problem,
     Projection,
     SemiImplicitEuler,
     World,
@@ -52,14 +52,14 @@ def rules() -> dict[str, Any]:
         "global sum": GlobalSum(TOL, CAP),
         "maximum": Maximum(TOL, CAP),
         "per instance": PerInstance(TOL, CAP),
-        "fixed count": Fixed(4),
+        "fixed count": FixedCount(4),
     }
 
 
-def batch(rule: Any, depths: tuple[float, ...]) -> Problem:
+def batch(rule: Any, depths: tuple[float, ...]) -> BallProblem:
     """Balls below the floor and one projection; the loss is of the balls of `BATCH` only."""
     world = World.create(Projection(K, ALPHA, rule), SemiImplicitEuler(1.0), gravity=0.0)
-    return Problem(world, -np.array(depths), 0.0, 1, LeftOf(len(BATCH)))
+    return BallProblem(world, -np.array(depths), 0.0, 1, LeftOf(len(BATCH)))
 
 
 def counts(run: BallRun) -> np.ndarray:

@@ -11,9 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mdnum.ball import GlobalSum, Problem, Projection, ResidualPenetration, SemiImplicitEuler, World
+from mdnum.ball import BallProblem, GlobalSum, Projection, ResidualPenetration, SemiImplicitEuler, World
 from mdnum.ball.stopping import elementwise
-from mdnum.gradients.ball import FixedPointRule, Implicit, fixed_point_tangent, scaled
+from mdnum.gradients.ball import scaled
+from mdnum.gradients.ball_contacts import FixedPointRule, Implicit, fixed_point_tangent
 from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
 
 K = ALPHA = 0.5
@@ -160,7 +161,7 @@ def _tangent(matrix, direction, tolerance, regularization):
     return fixed_point_tangent(update, direction, one, one, **options)
 
 
-def relaxation(tol: float, derivative: FixedPointRule | None = None) -> Problem:
+def relaxation(tol: float, derivative: FixedPointRule | None = None) -> BallProblem:
     """A ball below the floor and one projection: the loss is the penetration that is left.
 
     Args:
@@ -169,7 +170,7 @@ def relaxation(tol: float, derivative: FixedPointRule | None = None) -> Problem:
     """
     contact = Projection(K, ALPHA, GlobalSum(tol, 200), derivative=derivative)
     world = World.create(contact, SemiImplicitEuler(1.0), gravity=0.0)
-    return Problem(world, np.array([-DEPTH]), 0.0, 1, ResidualPenetration(1))
+    return BallProblem(world, np.array([-DEPTH]), 0.0, 1, ResidualPenetration(1))
 
 
 def run() -> Demo:

@@ -11,12 +11,12 @@ import numpy as np
 from jaxtyping import Float
 
 from mdnum.ball import (
+    BallVerlet,
     ExactPenalty,
     ExplicitEuler,
     ImplicitMidpoint,
     Penalty,
     SemiImplicitEuler,
-    VelocityVerlet,
     World,
     arrive,
     simulate,
@@ -28,7 +28,7 @@ COUNTS = (400, 800, 1600, 3200, 6400)
 SCHEMES: dict[str, Any] = {
     "explicit Euler": ExplicitEuler,
     "semi-implicit Euler": SemiImplicitEuler,
-    "velocity Verlet": VelocityVerlet,
+    "velocity Verlet": BallVerlet,
     "implicit midpoint": ImplicitMidpoint,
 }
 EULERS = tuple(SCHEMES)[:2]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 import numpy as np
 
-from mdnum.ball import ExactPenalty, Penalty, SemiImplicitEuler, VelocityVerlet, World, arrive
+from mdnum.ball import BallVerlet, ExactPenalty, Penalty, SemiImplicitEuler, World, arrive
 from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
 
 K, TIME, STEPS = 3000.0, 2.0, 200
@@ -190,7 +190,7 @@ def _order_of_bias() -> float:
     """Exponent with which the final height leaves that of the hard floor, without errors of the step."""
     starts = STARTS[::100]
     exact = np.array([float(ExactPenalty(float(y), k=K).height(TIME).value) for y in starts])
-    world = World.create(Penalty(K, eps=0.01, smooth=True), VelocityVerlet(TIME / FINE))
+    world = World.create(Penalty(K, eps=0.01, smooth=True), BallVerlet(TIME / FINE))
     off = []
     for eps in NARROW:
         y, _ = arrive(world.with_values({"eps": eps}), jnp.asarray(starts), FINE, "y0")

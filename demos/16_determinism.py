@@ -149,16 +149,19 @@ def run() -> Demo:
                 ),
             ),
             table(
-                "what equal bits tell",
+                "what equal bits show",
                 ("question", "answer"),
                 (
                     (
                         "Did anything but the inputs decide?",
                         "no: a difference between two programs is theirs",
                     ),
-                    ("Is the answer right?", "not told: a wrong program repeats itself as well"),
-                    ("Is it firm?", f"not told: one ulp at the start is {ulp:.1g} m later on"),
-                    ("On another machine?", "told only of what was tried: instruction sets, compiled or not"),
+                    ("Is the answer right?", "not shown: a wrong program repeats itself as well"),
+                    ("Is it firm?", f"not shown: one ulp at the start is {ulp:.1g} m later on"),
+                    (
+                        "On another machine?",
+                        "shown only for what was tried: instruction sets, compiled or not",
+                    ),
                 ),
             ),
         ],

@@ -42,7 +42,7 @@ from mdnum.gradients import Problem, method
 from mdnum.gradients.ensemble import Replicas, settled
 from mdnum.gradients.losses import GreenKuboDiffusion, Loss, RadialDistribution
 from mdnum.gradients.problem import Method
-from mdnum.gradients.tape import Tape
+from mdnum.gradients.tape import RunTape
 from mdnum.systems import Simulation, System, SystemSpec, build
 
 SIGMA, EPSILON, TEMPERATURE, DENSITY = 3.405, 0.0103235, 150.0, 0.5 / 3.405**3
@@ -157,7 +157,7 @@ def averages(problems: Sequence[Problem], values: dict[str, float]) -> tuple[np.
     for problem in problems:
         made = problem.at(values)
         assert isinstance(made.loss, Seen)
-        found.append(made.loss.both(Tape(made.simulation, made.loss, made.steps, budget=0).total))
+        found.append(made.loss.both(RunTape(made.simulation, made.loss, made.steps, budget=0).total))
     return np.mean([g for g, _ in found], axis=0), float(np.mean([d for _, d in found]))
 
 

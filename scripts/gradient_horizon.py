@@ -28,7 +28,7 @@ from _liquid import liquid
 from _output import COLORS, figure, parser, save, say, start, table
 
 from mdnum.gradients import Problem
-from mdnum.gradients.diagnose import Growth, Spectrum, Trust, growth, spectrum, trust
+from mdnum.gradients.diagnose import GradientGrowth, Spectrum, Trust, growth, spectrum, trust
 from mdnum.gradients.losses import MeanSquaredDisplacement
 from mdnum.systems import Simulation, build
 
@@ -43,7 +43,7 @@ BETWEEN = 29 * np.log(2)
 class Found:
     """What is drawn of one cutoff."""
 
-    growth: Growth
+    growth: GradientGrowth
     spectrum: Spectrum
     narrow: Trust
     wide: Trust

@@ -47,19 +47,63 @@ class Power(PairPotential):
         energy = self.strength * inverse * inverse * inverse * inverse
         return energy, -4 * energy / r2
 '''
+CHOICE = '''
+from dataclasses import dataclass
+from mdnum.forks.choices.base import Choice
+from mdnum.forks.worlds import twin
+
+
+@dataclass(frozen=True)
+class Slower(Choice):
+    """A time step longer by a share."""
+
+    share: str = "1e-6"
+
+    @property
+    def name(self):
+        return f"slower={self.share}"
+
+    def make(self, system):
+        key = "dynamics.timestep" if hasattr(system.spec, "dynamics") else "integrator.timestep"
+        table = system.spec.dynamics if hasattr(system.spec, "dynamics") else system.spec.integrator
+        return twin(system, {key: table.timestep * (1 + float(self.share))}, self.name, self.name)
+'''
+METHOD = """
+from dataclasses import dataclass
+from mdnum.gradients.problem import Method
+
+
+@dataclass(frozen=True)
+class OneSided(Method):
+    name = "one-sided"
+    description = "a difference to one side"
+    kind = "values"
+
+    def differentiate(self, problem, names, progress):
+        value = problem.value()
+        h, gradient = 1e-6, {}
+        for name in names:
+            (here,) = [float(x) for x in problem.simulation.model.potential.epsilon]
+            gradient[name] = np.asarray((problem.value({name: here + h}) - value) / h)
+        return self.result(value, gradient)
+"""
 GROUPS = {
     "mdnum.cutoffs": {"tilted": "strange_terms:Tilted"},
     "mdnum.potentials": {"power": "strange_terms:Power"},
+    "mdnum.choices": {"slower": "strange_choice:Slower"},
+    "mdnum.gradient_methods": {"one-sided": "strange_method:OneSided"},
 }
+MODULES = {"strange_terms": CUTOFF + POTENTIAL, "strange_choice": CHOICE, "strange_method": METHOD}
 
 
 @pytest.fixture
 def site(tmp_path, monkeypatch):
     """A folder on the search path with the package in it."""
-    folder = install(tmp_path / "site", "strange-terms", {"strange_terms": CUTOFF + POTENTIAL}, GROUPS)
+    folder = install(tmp_path / "site", "strange-terms", MODULES, GROUPS)
     monkeypatch.syspath_prepend(folder)
     yield folder
-    sys.modules.pop("strange_terms", None)
+    for name in MODULES:
+        sys.modules.pop(name, None)
 
 
 def test_a_cutoff_runs_is_compared_and_certified(site, tmp_path):
@@ -113,6 +157,27 @@ def test_a_potential_of_two_constants(site, tmp_path):
         mdnum.load("pair/at-cutoff", {**overrides, "potential.sigma": 1.0})
     with pytest.raises(InputError, match="needs a potential with a sigma; power has none"):
         mdnum.load("pair/at-cutoff", {**overrides, "cutoff.in_sigma": 2.5})
+
+
+@pytest.mark.parametrize("name", ["pair/at-cutoff", "ball/drop"])
+def test_a_choice_of_both_worlds(site, name):
+    from mdnum.forks.choices.base import parse, shipped, twin_of
+
+    system = mdnum.load(name)
+    made = twin_of(parse("slower=1e-3"), system)
+    ((before, after),) = made.changes.values()
+    assert after == pytest.approx(1.001 * before, rel=1e-12)
+    assert "slower=1e-6" in shipped("md") and "slower=1e-6" in shipped("ball")
+
+
+def test_a_gradient_method(site):
+    from mdnum.gradients import Problem, method
+    from mdnum.gradients.losses import MeanPotential
+
+    problem = Problem(mdnum.build("pair/at-cutoff", {"cutoff.kind": "quintic"}), MeanPotential(), 20)
+    own = method("one-sided")(problem, ["potential.epsilon"]).gradient["potential.epsilon"]
+    other = method("unrolled")(problem, ["potential.epsilon"]).gradient["potential.epsilon"]
+    assert float(own) == pytest.approx(float(other), rel=1e-4)
 
 
 @pytest.mark.parametrize(

@@ -12,31 +12,31 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from mdnum.ball.compare import Difference, first_difference
+    from mdnum.ball.compare import BallDifference, first_difference
     from mdnum.ball.contacts import Impact, Penalty, Projection
     from mdnum.ball.exact import ExactImpact, ExactPenalty
     from mdnum.ball.integrators import (
+        BallVerlet,
         EventLocated,
         ExplicitEuler,
         ImplicitMidpoint,
         SemiImplicitEuler,
-        VelocityVerlet,
     )
-    from mdnum.ball.problem import FinalHeight, MeanHeight, Problem, ResidualPenetration, arrive, loss_of
+    from mdnum.ball.problem import BallProblem, FinalHeight, MeanHeight, ResidualPenetration, arrive, loss_of
     from mdnum.ball.rollout import BallRun, simulate
-    from mdnum.ball.state import BallState, Decisions, Reason
-    from mdnum.ball.stopping import Fixed, GlobalSum, Hysteresis, Maximum, PerInstance, Relative
+    from mdnum.ball.state import BallDecisions, BallState, Reason
+    from mdnum.ball.stopping import FixedCount, GlobalSum, HysteresisStop, Maximum, PerInstance, Relative
     from mdnum.ball.world import World
 
 _NAMES = {
     "contacts": "Impact Penalty Projection",
     "exact": "ExactImpact ExactPenalty",
-    "integrators": "EventLocated ExplicitEuler ImplicitMidpoint SemiImplicitEuler VelocityVerlet",
-    "problem": "FinalHeight MeanHeight Problem ResidualPenetration arrive loss_of",
-    "compare": "Difference first_difference",
+    "integrators": "EventLocated ExplicitEuler ImplicitMidpoint SemiImplicitEuler BallVerlet",
+    "problem": "FinalHeight MeanHeight BallProblem ResidualPenetration arrive loss_of",
+    "compare": "BallDifference first_difference",
     "rollout": "BallRun simulate",
-    "state": "BallState Decisions Reason",
-    "stopping": "Fixed GlobalSum Hysteresis Maximum PerInstance Relative",
+    "state": "BallState BallDecisions Reason",
+    "stopping": "FixedCount GlobalSum HysteresisStop Maximum PerInstance Relative",
     "world": "World",
 }
 _HOMES = {name: home for home, names in _NAMES.items() for name in names.split()}

@@ -44,7 +44,7 @@ class CrossDecision(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Difference:
+class BallDifference:
     """Where two rollouts of the same length diverge.
 
     Attributes:
@@ -70,7 +70,7 @@ class Difference:
     separation: Float[np.ndarray, "times"]
 
 
-def first_difference(a: BallRun, b: BallRun) -> Difference:
+def first_difference(a: BallRun, b: BallRun) -> BallDifference:
     """Where two rollouts diverge.
 
     Raises:
@@ -90,9 +90,9 @@ def first_difference(a: BallRun, b: BallRun) -> Difference:
     contact, stops = a.contact != b.contact, _unequal_counts(a, b, a.steps)
     steps = np.flatnonzero(contact.any(axis=1) | stops.any(axis=1))
     if not len(steps):
-        return Difference(seed, None, "", -1, (np.nan, np.nan), 0, 0, separation)
+        return BallDifference(seed, None, "", -1, (np.nan, np.nan), 0, 0, separation)
     first = cross_decisions(a, b, int(steps[0]) + 1)[0]
-    return Difference(
+    return BallDifference(
         seed, first.step, first.channel, first.ball, (first.margin_a, first.margin_b),
         int(stops.any(axis=1).sum()), int(contact.sum()), separation,
     )  # fmt: skip

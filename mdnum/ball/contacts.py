@@ -11,8 +11,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Int
 
-from mdnum.ball.integrators import Balls, EventLocated, Integrator, Push, Rounding
-from mdnum.ball.state import Reason, Record, Solve
+from mdnum.ball.integrators import Balls, EventLocated, Push, Rounding, Scheme
+from mdnum.ball.state import BallRecord, Reason, Solve
 from mdnum.ball.stopping import StopRule, elementwise, iterate, no_solve
 from mdnum.precision.policy import RolePrecision
 
@@ -24,8 +24,8 @@ class Motion(NamedTuple):
         y, v, carried: height, velocity and the acceleration that velocity Verlet carries, in the dtype of
             arithmetic.
         free: acceleration without contact (control minus gravity), shape (balls,).
-        judge: the contact decision at a height: the world's own, or what the step was told.
-        told: iterations the step was told to make, or None.
+        judge: the contact decision at a height: the world's own, or what was imposed.
+        imposed: iterations that are imposed, or None.
         integrator, policy, rounding: of the world.
         history: whether solvers keep the residual of every decision.
     """
@@ -35,8 +35,8 @@ class Motion(NamedTuple):
     carried: Balls
     free: Balls
     judge: Callable[[Balls], Bool[Array, "balls"]]
-    told: Int[Array, "..."] | None
-    integrator: Integrator
+    imposed: Int[Array, "..."] | None
+    integrator: Scheme
     policy: RolePrecision
     rounding: Rounding
     history: bool
@@ -48,7 +48,7 @@ class Moved(NamedTuple):
     y: Balls
     v: Balls
     a: Balls
-    record: Record
+    record: BallRecord
 
 
 class Contact(Protocol):
@@ -68,8 +68,8 @@ class Contact(Protocol):
 class Penalty(eqx.Module):
     """Force k p - damping v on a ball in contact, with p = -y; k p with a softplus p when smooth.
 
-    A step that is told of a contact pushes with -k y whatever the sign of y: the branch goes on smoothly
-    beyond its threshold, as a pair force beyond its cutoff does when it is told to.
+    A step on which a contact is imposed pushes with -k y whatever the sign of y: the branch continues
+    smoothly beyond its threshold, as a pair force beyond its cutoff does when it is imposed.
 
     Attributes:
         k: stiffness per mass, 1/s².
@@ -104,10 +104,10 @@ class Penalty(eqx.Module):
         def pull(y, v, contact):
             return self.acceleration(y, v, motion.free, contact, r)
 
-        push = Push(motion.judge, pull, motion.policy, motion.told, motion.history)
+        push = Push(motion.judge, pull, motion.policy, motion.imposed, motion.history)
         made = motion.integrator.push(push, motion.y, motion.v, motion.carried, r)
         left = self.depth(made.y, made.y < 0)
-        record = Record(made.height, made.contact, left, made.solve)
+        record = BallRecord(made.height, made.contact, left, made.solve)
         return Moved(made.y, made.v, made.a, record)
 
 
@@ -146,7 +146,7 @@ class Projection(eqx.Module):
 
         def run(inputs, rest):
             y, gain = inputs
-            touching, rule, told, rounding = rest
+            touching, rule, imposed, rounding = rest
 
             def depth(y):
                 return jnp.where(touching & (y < 0), -y, jnp.zeros_like(y))
@@ -158,19 +158,19 @@ class Projection(eqx.Module):
                 depth,
                 policy,
                 rounding.zero,
-                told=told,
+                imposed=imposed,
                 history=history,
             )
             return (y,), solve
 
         gain = jnp.broadcast_to(r(self.alpha * self.k), height.shape)
-        (y,), solve = elementwise(run)((height, gain), (contact, self.stop, motion.told, r))
+        (y,), solve = elementwise(run)((height, gain), (contact, self.stop, motion.imposed, r))
         if self.derivative is not None:
             y = self.derivative.attach(y, gain, contact)
         left = jnp.where(contact & (y < 0), -y, jnp.zeros_like(y))
         y = jnp.where(contact & (y < 0), jnp.zeros_like(y), y)
         v = jnp.where(contact, r(-self.restitution * jnp.where(v < 0, v, jnp.zeros_like(v))), v)
-        return Moved(y, v, motion.free, Record(height, contact, left, solve))
+        return Moved(y, v, motion.free, BallRecord(height, contact, left, solve))
 
 
 class Impact(eqx.Module):
@@ -207,7 +207,7 @@ class Impact(eqx.Module):
         v = jnp.where(contact, jnp.where(rests, zero, rebound), v)
         solve = no_solve(motion.policy.dtype("decision"))
         reason = jnp.where(jnp.any(rests), Reason.REST.value, Reason.NONE.value).astype(jnp.int8)
-        record = Record(height, contact, zero, solve._replace(reason=reason))
+        record = BallRecord(height, contact, zero, solve._replace(reason=reason))
         return Moved(y, v, motion.free, record)
 
     def _located(self, motion: Motion, scheme: EventLocated) -> Moved:
@@ -218,14 +218,14 @@ class Impact(eqx.Module):
 
         def run(inputs, rest):
             y, v, a, left, restitution = inputs
-            touching, rest_speed, told, rounding = rest
+            touching, rest_speed, imposed, rounding = rest
             count = jnp.zeros(y.shape, jnp.int32)
             still = jnp.zeros(y.shape, bool)
 
             def ahead(y, v, left, count, still):
                 below = jnp.where(count == 0, touching, lowest(y, v, a, left, rounding) < 0)
                 own = below & ~still & (count < scheme.max_impacts)
-                return own if told is None else jnp.where(told < 0, own, (count < told) & ~still)
+                return own if imposed is None else jnp.where(imposed < 0, own, (count < imposed) & ~still)
 
             def body(carry):
                 y, v, left, count, still, hits = carry
@@ -257,12 +257,12 @@ class Impact(eqx.Module):
         restitution = jnp.broadcast_to(jnp.asarray(self.restitution, motion.y.dtype), h.shape)
         (y, v), (count, reason) = elementwise(run)(
             (motion.y, motion.v, motion.free, h, restitution),
-            (contact, self.rest_speed, motion.told, r),
+            (contact, self.rest_speed, motion.imposed, r),
         )
         nothing = jnp.full(y.shape, jnp.nan, motion.policy.dtype("decision"))
         empty = jnp.zeros(0, nothing.dtype)
         solve = Solve(count, reason, nothing, nothing, nothing, empty)
-        return Moved(y, v, motion.free, Record(height, contact, jnp.zeros_like(y), solve))
+        return Moved(y, v, motion.free, BallRecord(height, contact, jnp.zeros_like(y), solve))
 
 
 def lowest(y, v, a, time, r):

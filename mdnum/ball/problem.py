@@ -13,17 +13,17 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from mdnum.ball.rollout import BallRun, simulate
-from mdnum.ball.state import BallState, Decisions, Record
+from mdnum.ball.state import BallDecisions, BallRecord, BallState
 from mdnum.ball.world import World
 
 #: Parameters of the start rather than of the world; a value moves the whole batch.
 START = ("y0", "v0")
 
 
-class Loss(Protocol):
+class BallLoss(Protocol):
     """A sum over steps and a term of the end; both shape (), in the dtype they are given."""
 
-    def step(self, state: BallState, record: Record, dtype: Any) -> Float[Array, ""]:
+    def step(self, state: BallState, record: BallRecord, dtype: Any) -> Float[Array, ""]:
         """What the step that made this state adds."""
         ...
 
@@ -81,7 +81,7 @@ class ResidualPenetration(eqx.Module):
 
 
 @dataclass(frozen=True)
-class Problem:
+class BallProblem:
     """A world, a start, a number of steps and a loss.
 
     Attributes:
@@ -96,9 +96,9 @@ class Problem:
     y0: Any
     v0: Any = 0.0
     steps: int = 100
-    loss: Loss = field(default_factory=FinalHeight)
+    loss: BallLoss = field(default_factory=FinalHeight)
 
-    def with_values(self, values: Mapping[str, Any]) -> Problem:
+    def with_values(self, values: Mapping[str, Any]) -> BallProblem:
         """The same problem with other values of named parameters, start values included."""
         start = {name: values[name] for name in START if name in values}
         rest = {name: value for name, value in values.items() if name not in START}
@@ -120,26 +120,26 @@ class Problem:
         return float(_loss(self._bare(), self.world, *self._start(), dict(overrides or {}), None))
 
     def value_and_grad(
-        self, names: Sequence[str], told: Decisions | None = None
+        self, names: Sequence[str], imposed: BallDecisions | None = None
     ) -> tuple[float, dict[str, float]]:
         """Loss and derivative along each named parameter, through the iterations that ran.
 
         Args:
             names: a batch moves as a whole along y0 and v0.
-            told: decisions of every step to act on instead of its own, leading axis steps.
+            imposed: decisions of every step to act on instead of its own, leading axis steps.
 
         Error: rounding of the reverse pass in the dtypes of the policy.
         """
         values = {name: jnp.zeros((), jnp.float64) for name in names if name in START}
         values |= {name: jnp.asarray(self.world.value(name)) for name in names if name not in START}
-        loss, slopes = _value_and_grad(self._bare(), values, self.world, *self._start(), told)
+        loss, slopes = _value_and_grad(self._bare(), values, self.world, *self._start(), imposed)
         return float(loss), {name: float(slope) for name, slope in slopes.items()}
 
     def run(self, **options: Any) -> BallRun:
         """Simulate it; see `simulate`."""
         return simulate(self.world, self.world.start(self.y0, self.v0), self.steps, **options)
 
-    def _bare(self) -> tuple[int, Loss]:
+    def _bare(self) -> tuple[int, BallLoss]:
         return self.steps, self.loss
 
     def _start(self) -> tuple[Array, Array]:
@@ -153,13 +153,13 @@ def loss_of(
     y0: Float[Array, "balls"],
     v0: Float[Array, "..."],
     steps: int,
-    loss: Loss,
-    told: Decisions | None = None,
+    loss: BallLoss,
+    imposed: BallDecisions | None = None,
 ) -> Float[Array, ""]:
     """The loss of a rollout, traceable; every argument but steps and loss may be differentiated.
 
     Args:
-        told: decisions of every step, leading axis steps; its own when None.
+        imposed: decisions of every step, leading axis steps; its own when None.
 
     Returns:
         the loss in the dtype of its role.
@@ -168,15 +168,15 @@ def loss_of(
 
     def step(carry, given):
         state, total = carry
-        state, record = world.advance(state, told=given)
+        state, record = world.advance(state, imposed=given)
         return (state, total + loss.step(state, record, dtype)), None
 
     start = (world.start(y0, v0), jnp.zeros((), dtype))
-    (state, total), _ = lax.scan(step, start, told, length=steps)
+    (state, total), _ = lax.scan(step, start, imposed, length=steps)
     return loss.end(state, steps, total)
 
 
-def _apply(bare, world, y0, v0, values, told, shifts=False):
+def _apply(bare, world, y0, v0, values, imposed, shifts=False):
     steps, loss = bare
     rest = {name: value for name, value in values.items() if name not in START}
     world = world.with_values(rest)
@@ -186,17 +186,17 @@ def _apply(bare, world, y0, v0, values, told, shifts=False):
             old = y0 if name == "y0" else v0
             new = old + value.astype(old.dtype) if shifts else value.astype(old.dtype)
             y0, v0 = (new, v0) if name == "y0" else (y0, new)
-    return loss_of(world, jnp.atleast_1d(y0), v0, steps, loss, told)
+    return loss_of(world, jnp.atleast_1d(y0), v0, steps, loss, imposed)
 
 
 @eqx.filter_jit
-def _loss(bare, world, y0, v0, values, told):
-    return _apply(bare, world, y0, v0, values, told)
+def _loss(bare, world, y0, v0, values, imposed):
+    return _apply(bare, world, y0, v0, values, imposed)
 
 
 @eqx.filter_jit
-def _value_and_grad(bare, values, world, y0, v0, told):
-    return jax.value_and_grad(lambda given: _apply(bare, world, y0, v0, given, told, shifts=True))(values)
+def _value_and_grad(bare, values, world, y0, v0, imposed):
+    return jax.value_and_grad(lambda given: _apply(bare, world, y0, v0, given, imposed, shifts=True))(values)
 
 
 def arrive(world: World, y0: Float[Array, "balls"], steps: int, name: str) -> tuple[Array, Array]:

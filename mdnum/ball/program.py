@@ -15,9 +15,9 @@ from jaxtyping import Float, Int
 from mdnum.ball.compare import CrossDecision, cross_decisions, overridden
 from mdnum.ball.contacts import Projection
 from mdnum.ball.limits import spacing
-from mdnum.ball.problem import START, Problem
+from mdnum.ball.problem import START, BallProblem
 from mdnum.ball.rollout import BallRun, simulate
-from mdnum.ball.state import Decisions
+from mdnum.ball.state import BallDecisions
 from mdnum.errors import InputError
 from mdnum.events.ledger import Ledger
 from mdnum.program import Decision, DecisionHistory, Differing, Number, PairRows
@@ -56,7 +56,7 @@ class BallProgram:
         pins: decisions that are imposed on it.
     """
 
-    problem: Problem
+    problem: BallProblem
     name: str = "ball"
     order: tuple[int, ...] | None = None
     pins: tuple[ImposedDecision, ...] = ()
@@ -119,7 +119,7 @@ class BallProgram:
                 f"{self.size} balls and {other.size}", remedy="Compare programs of the same number of balls"
             )
 
-    def run(self, steps: int, decisions: Decisions | None = None) -> BallRun:
+    def run(self, steps: int, decisions: BallDecisions | None = None) -> BallRun:
         """A rollout, its balls in the order of the other program.
 
         Args:
@@ -136,14 +136,14 @@ class BallProgram:
         else:
             counts = decisions.iterations
             counts = counts[:, index] if counts.ndim == 2 else counts
-            imposed = Decisions(decisions.contact[:, index], counts)
-        run = simulate(problem.world, problem.world.start(problem.y0, problem.v0), steps, told=imposed)
+            imposed = BallDecisions(decisions.contact[:, index], counts)
+        run = simulate(problem.world, problem.world.start(problem.y0, problem.v0), steps, imposed=imposed)
         run = run if index is None else _reordered(run, np.asarray(index))
         if decisions is None:
             self._runs[steps] = run
         return run
 
-    def _pinned(self, steps: int) -> Decisions | None:
+    def _pinned(self, steps: int) -> BallDecisions | None:
         """The pins, -1 wherever the program decides by itself; None where there are none."""
         if not self.pins:
             return None
@@ -162,7 +162,7 @@ class BallProgram:
                 iterations[pin.step - 1] = pin.value
             else:
                 iterations[pin.step - 1, pin.ball] = pin.value
-        return Decisions(contact, iterations)  # type: ignore[arg-type]
+        return BallDecisions(contact, iterations)  # type: ignore[arg-type]
 
     def lockstep(
         self, other: BallProgram, last: int, *, forward: bool, back: bool, guard: float | None
@@ -178,13 +178,13 @@ class BallProgram:
         overridden_count: dict[str, np.ndarray] = {}
         furthest: dict[str, np.ndarray] = {}
         if forward:
-            runs["B|A"] = other.run(asked, a.told())
+            runs["B|A"] = other.run(asked, a.decisions())
             overridden_count["B|A"], furthest["B|A"] = overridden(runs["B|A"], last)
             separation["B|A"] = _guarded(_apart(a, runs["B|A"], last), furthest["B|A"], guard)
             from_b = _apart(b, runs["B|A"], last)
             separation["B|A from B"] = np.where(np.isnan(separation["B|A"]), np.nan, from_b)
         if back:
-            runs["A|B"] = self.run(asked, b.told())
+            runs["A|B"] = self.run(asked, b.decisions())
             separation["A|B"] = _apart(b, runs["A|B"], last)
             separation["A|B from A"] = _apart(a, runs["A|B"], last)
         steps = np.array([flip.step for flip in flips], np.int64)
@@ -214,7 +214,7 @@ class BallProgram:
         a = self.run(steps)
         found = []
         for other in others:
-            under = other.run(steps, a.told())
+            under = other.run(steps, a.decisions())
             separation = _guarded(_apart(a, under, last), overridden(under, last)[1], guard)
             found.append((_apart(a, other.run(steps), last), separation))
         return found
@@ -286,7 +286,7 @@ class BallProgram:
             for touches, count in zip(contact, counts, strict=True)
         ]
         digest = hashlib.blake2b(contact.tobytes() + run.iterations.tobytes(), digest_size=16).hexdigest()
-        value, _ = problem.value_and_grad([], jax.tree.map(jnp.asarray, run.told()))
+        value, _ = problem.value_and_grad([], jax.tree.map(jnp.asarray, run.decisions()))
         x = run.y[-1].astype(np.float64)
         every = np.frombuffer(b"".join(marks), np.uint64)
         return DecisionHistory(every, digest, x, value, float("nan"), "", first=1)
@@ -305,7 +305,7 @@ class BallProgram:
             flips[0] = first._replace(margin_a=margins[0], margin_b=margins[1])
         name = self.number(key).key
         gradients = tuple(
-            problem.value_and_grad([name], jax.tree.map(jnp.asarray, run.told()))[1][name]
+            problem.value_and_grad([name], jax.tree.map(jnp.asarray, run.decisions()))[1][name]
             for problem, run in zip(problems, runs, strict=True)
         )
         return Differing(self.decision(other, flips, float("nan")), gradients)

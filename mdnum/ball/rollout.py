@@ -14,7 +14,7 @@ from jax import lax
 from jaxtyping import Bool, Float, Int
 
 from mdnum.ball.contacts import Penalty
-from mdnum.ball.state import BallState, Decisions, Reason
+from mdnum.ball.state import BallDecisions, BallState, Reason
 from mdnum.ball.world import World
 from mdnum.errors import InputError
 from mdnum.events import Ledger, changes_in_time
@@ -94,9 +94,9 @@ class BallRun:
         codes, counts = np.unique(self.reason, return_counts=True)
         return {Reason(code).word: int(n) for code, n in zip(codes, counts, strict=True)}
 
-    def told(self) -> Decisions:
-        """The decisions of all steps, to be told to another rollout."""
-        return Decisions(self.contact, self.iterations)  # type: ignore[arg-type]
+    def decisions(self) -> BallDecisions:
+        """The decisions of all steps, to be imposed on another rollout."""
+        return BallDecisions(self.contact, self.iterations)  # type: ignore[arg-type]
 
 
 def energy(world: World, y: np.ndarray, v: np.ndarray) -> Float[np.ndarray, "..."]:
@@ -118,7 +118,7 @@ def simulate(
     *,
     history: bool = False,
     keep: bool = True,
-    told: Decisions | None = None,
+    imposed: BallDecisions | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> BallRun:
     """Advance a batch of balls and record every decision.
@@ -129,7 +129,7 @@ def simulate(
         steps: steps to make.
         history: keep the residual of every stop decision too.
         keep: keep every state; otherwise the first and the last, and the flips.
-        told: decisions of every step to act on instead of the world's own, leading axis steps.
+        imposed: decisions of every step to act on instead of the world's own, leading axis steps.
         progress: called with the steps made and asked for.
 
     Returns:
@@ -147,7 +147,7 @@ def simulate(
     state, made, before = start, 0, np.asarray(start.touching)
     while made < steps:
         length = min(chunk, steps - made)
-        given = None if told is None else jax.tree.map(lambda x: x[made : made + length], told)  # noqa: B023
+        given = None if imposed is None else jax.tree.map(lambda x: x[made : made + length], imposed)  # noqa: B023
         state, out = _chunk(world, state, given, length, history)
         rows = {name: np.asarray(value) for name, value in out.items()}
         ledgers.append(_flips(world, made, before, parts[-1]["y"][-1], parts[-1]["v"][-1], rows))
@@ -170,9 +170,9 @@ def simulate(
 
 
 @eqx.filter_jit
-def _chunk(world: World, state: BallState, told: Any, length: int, history: bool) -> Any:
+def _chunk(world: World, state: BallState, imposed: Any, length: int, history: bool) -> Any:
     def step(state, given):
-        after, record = world.advance(state, told=given, history=history)
+        after, record = world.advance(state, imposed=given, history=history)
         solve = record.solve
         row = {
             "y": after.y,
@@ -187,7 +187,7 @@ def _chunk(world: World, state: BallState, told: Any, length: int, history: bool
         }
         return after, row | ({"history": solve.history} if history else {})
 
-    return lax.scan(step, state, told, length=length)
+    return lax.scan(step, state, imposed, length=length)
 
 
 def _flips(

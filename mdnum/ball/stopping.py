@@ -105,7 +105,7 @@ class Relative(GlobalSum):
         return jnp.where(first == 0, jnp.asarray(least, first.dtype), scaled)
 
 
-class Hysteresis(eqx.Module):
+class HysteresisStop(eqx.Module):
     """A rule with a gap: the solver starts only above one threshold, and then runs to below another.
 
     Attributes:
@@ -131,7 +131,7 @@ class Hysteresis(eqx.Module):
         return jnp.where(iteration == 0, enter, self.rule.threshold(first, iteration))
 
 
-class Fixed(eqx.Module):
+class FixedCount(eqx.Module):
     """A fixed number of iterations, whatever the residual: no decision, and none that could flip.
 
     Attributes:
@@ -163,7 +163,7 @@ def iterate(
     policy: RolePrecision,
     zero: Int[Array, ""],
     *,
-    told: Int[Array, "..."] | None = None,
+    imposed: Int[Array, "..."] | None = None,
     history: bool = False,
 ) -> tuple[Any, Solve]:
     """Update until the rule stops it, its cap ends it, or the imposed number of iterations is reached.
@@ -175,7 +175,7 @@ def iterate(
         terms: of the residual, one per ball.
         policy: dtypes of sums and decisions.
         zero: runtime zero for fenced sums.
-        told: iterations to make instead of the rule's own; a negative number leaves it to the rule.
+        imposed: iterations to make instead of the rule's own; a negative number leaves it to the rule.
         history: whether to keep the residual of every decision.
 
     Returns:
@@ -188,7 +188,7 @@ def iterate(
 
     def goes_on(stopped, iterations):
         own = ~stopped & (iterations < rule.max_iter)
-        return own if told is None else jnp.where(told < 0, own, iterations < told)
+        return own if imposed is None else jnp.where(imposed < 0, own, iterations < imposed)
 
     def note(kept, iterations, residual):
         if not history:
@@ -197,9 +197,9 @@ def iterate(
         return kept.at[jnp.max(iterations)].set(jnp.max(residual))
 
     first = measure(start)
-    if told is not None:
+    if imposed is not None:
         # one rule for the batch may be given a count for each ball
-        first = jnp.broadcast_to(first, jnp.broadcast_shapes(first.shape, told.shape))
+        first = jnp.broadcast_to(first, jnp.broadcast_shapes(first.shape, imposed.shape))
     none = jnp.zeros(first.shape, jnp.int32)
     threshold = rule.threshold(first, none)
     kept = jnp.full(rule.max_iter + 1 if history else 0, jnp.nan, decision)
@@ -226,7 +226,7 @@ def iterate(
     x, iterations, residual, margin, before, stopped, kept = lax.while_loop(
         lambda carry: jnp.any(goes_on(carry[5], carry[1])), body, carry
     )
-    met = Reason.FIXED if isinstance(rule, Fixed) else Reason.TOLERANCE
+    met = Reason.FIXED if isinstance(rule, FixedCount) else Reason.TOLERANCE
     reason = jnp.where(stopped, met.value, Reason.CAP.value)
     reason = jnp.where(jnp.isfinite(residual), reason, Reason.NOT_FINITE.value).astype(jnp.int8)
     return x, Solve(iterations, reason, residual, margin, before, kept)

@@ -14,8 +14,8 @@ from jaxtyping import Array, Bool, Int
 
 from mdnum.ball import limits, stopping
 from mdnum.ball.contacts import Contact, Impact, Motion, Penalty, Projection
-from mdnum.ball.integrators import Balls, EventLocated, Integrator, Rounding
-from mdnum.ball.state import BallState, Decisions, Record
+from mdnum.ball.integrators import Balls, EventLocated, Rounding, Scheme
+from mdnum.ball.state import BallDecisions, BallRecord, BallState
 from mdnum.errors import InputError
 from mdnum.events import Hysteresis, Threshold
 from mdnum.precision.exact import zero_bits
@@ -59,7 +59,7 @@ class World(eqx.Module):
     """
 
     contact: Contact
-    integrator: Integrator
+    integrator: Scheme
     gravity: Any
     control: Any
     lift: Any
@@ -70,7 +70,7 @@ class World(eqx.Module):
     def create(
         cls,
         contact: Contact,
-        integrator: Integrator,
+        integrator: Scheme,
         gravity: float = 9.81,
         control: Any = None,
         policy: RolePrecision | None = None,
@@ -179,13 +179,13 @@ class World(eqx.Module):
         return BallState(step, y, v, a, touching)
 
     def advance(
-        self, state: BallState, *, told: Decisions | None = None, history: bool = False
-    ) -> tuple[BallState, Record]:
+        self, state: BallState, *, imposed: BallDecisions | None = None, history: bool = False
+    ) -> tuple[BallState, BallRecord]:
         """Decide and act.
 
         Args:
             state: at this step.
-            told: decisions to act on instead of its own, or instead of some of them (see `Decisions`).
+            imposed: decisions to act on instead of its own, or instead of some of them (see `BallDecisions`).
             history: whether a solver keeps the residual of every decision.
 
         Returns:
@@ -198,8 +198,8 @@ class World(eqx.Module):
                 v=state.v.astype(arithmetic),
                 carried=state.a.astype(arithmetic),
                 free=self._free(state.step, state.y.shape),
-                judge=self._judge(state, told),
-                told=None if told is None else told.iterations,
+                judge=self._judge(state, imposed),
+                imposed=None if imposed is None else imposed.iterations,
                 integrator=self.integrator,
                 policy=self.policy,
                 rounding=self.rounding,
@@ -211,10 +211,12 @@ class World(eqx.Module):
         record = jax.tree.map(jax.lax.stop_gradient, moved.record)._replace(left=moved.record.left)
         return BallState(step, y, v, moved.a, moved.record.contact), record
 
-    def _judge(self, state: BallState, told: Decisions | None) -> Callable[[Balls], Bool[Array, "balls"]]:
-        if told is None:
+    def _judge(
+        self, state: BallState, imposed: BallDecisions | None
+    ) -> Callable[[Balls], Bool[Array, "balls"]]:
+        if imposed is None:
             return lambda height: self.touches(height, state.touching)
-        contact = told.contact
+        contact = imposed.contact
         if contact.dtype == bool:
             return lambda _: contact
         return lambda height: jnp.where(contact < 0, self.touches(height, state.touching), contact > 0)
@@ -285,9 +287,9 @@ def _check(
 def _check_stop(rule: Any, policy: RolePrecision, gain: float) -> None:
     """Refuse a stopping rule out of range, or with a tolerance that the dtypes can never meet."""
     _count("max_iter", rule.max_iter)
-    if isinstance(rule, stopping.Fixed):
+    if isinstance(rule, stopping.FixedCount):
         return
-    if isinstance(rule, stopping.Hysteresis):
+    if isinstance(rule, stopping.HysteresisStop):
         _check_stop(rule.rule, policy, gain)
         if not float(rule.enter) >= float(rule.rule.tol):
             raise InputError(

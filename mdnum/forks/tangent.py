@@ -37,7 +37,7 @@ KEPT = 3
 
 
 @dataclass(frozen=True)
-class Tangents:
+class StepTangents:
     """The tangent along some steps of one list.
 
     Attributes:
@@ -71,7 +71,7 @@ def tangents(
     clock: float,
     reach: bool = True,
     start: Start | None = None,
-) -> Iterator[Tangents]:
+) -> Iterator[StepTangents]:
     """Carry a perturbation of the start along a run.
 
     Args:
@@ -116,7 +116,7 @@ def tangents(
         with np.errstate(divide="ignore"):
             size = np.log(length.astype(np.float64)) + shift - np.log(first)
             furthest = np.log(most.astype(np.float64)) + shift
-        yield Tangents(
+        yield StepTangents(
             segment,
             size,
             furthest,

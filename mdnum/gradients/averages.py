@@ -24,7 +24,7 @@ from mdnum.gradients.forces import MODEL, SCALE, pull_back
 from mdnum.gradients.parameters import Cotangents
 from mdnum.gradients.problem import Gradient, Method, Problem, Progress, in_phase, pairs_only
 from mdnum.gradients.recorded import tape_of
-from mdnum.gradients.tape import KEPT, Tape, frame_of
+from mdnum.gradients.tape import KEPT, RunTape, frame_of
 from mdnum.md.cell import displacement
 from mdnum.md.cutoffs import Hard
 from mdnum.md.integrators import Langevin
@@ -80,7 +80,7 @@ def energy_of_forces(simulation: Simulation) -> Simulation:
     return simulation.with_cutoff("shifted") if isinstance(simulation.cutoff, Hard) else simulation
 
 
-def frames(tape: Tape, names: Sequence[str], progress: Callable[[int, int], None] | None = None) -> Frames:
+def frames(tape: RunTape, names: Sequence[str], progress: Callable[[int, int], None] | None = None) -> Frames:
     """The frames of a tape's loss.
 
     Args:
@@ -302,7 +302,7 @@ def density(
 
 
 @dataclass(frozen=True)
-class Boundary(Method):
+class BoundaryTerm(Method):
     """The derivative of an average over given states: of what is inside, and of which pairs are.
 
     Attributes:
@@ -378,7 +378,7 @@ class Boundary(Method):
 class Reweighting(Method):
     """Differentiable trajectory reweighting: explicit derivative and response of the weights.
 
-    The explicit part is that of `Boundary`; the response is minus the covariance of the loss's terms with
+    The explicit part is that of `BoundaryTerm`; the response is minus the covariance of the loss's terms with
     the derivative of the energy, over kT.
 
     Attributes:
@@ -390,7 +390,7 @@ class Reweighting(Method):
     Source: S. Thaler, J. Zavadlav, Nature Communications 12, 6884 (2021).
     """
 
-    at_states: Boundary = field(default_factory=Boundary)
+    at_states: BoundaryTerm = field(default_factory=BoundaryTerm)
     budget: int = KEPT
 
     name = "reweighting"

@@ -12,8 +12,8 @@ import numpy as np
 
 from mdnum.ball.contacts import Penalty, Projection
 from mdnum.ball.integrators import EventLocated
-from mdnum.ball.problem import START, Problem
-from mdnum.ball.state import BallState, Decisions, Record
+from mdnum.ball.problem import START, BallProblem
+from mdnum.ball.state import BallDecisions, BallRecord, BallState
 from mdnum.ball.world import World
 from mdnum.errors import NumericalError
 from mdnum.events.saltation import carry, grazing
@@ -47,7 +47,7 @@ class ThroughContacts(BallMethod):
     kind = "flow"
     description = "the derivative of the motion, the times of its contacts moving along (saltation at each)"
 
-    def __call__(self, problem: Problem, names: Sequence[str]) -> Gradient:
+    def __call__(self, problem: BallProblem, names: Sequence[str]) -> Gradient:
         """The derivative, by tangents that are carried with the rollout.
 
         Raises:
@@ -156,19 +156,19 @@ def _tangents(values, world, y0, v0, steps, loss):
     return ends(state.y, state.v, total), slopes, events, flagged
 
 
-def _advance(world: World, rest: dict, state: BallState, told: Decisions):
+def _advance(world: World, rest: dict, state: BallState, told: BallDecisions):
     """One told step as a function of what carries derivatives."""
 
     def run(values, y, v, a):
         given = world.with_values({name: values[name] for name in rest})
-        after, record = given.advance(state._replace(y=y, v=v, a=a), told=told)
+        after, record = given.advance(state._replace(y=y, v=v, a=a), imposed=told)
         return after.y, after.v, after.a, record.left, record.height
 
     return run
 
 
-def _flight(world: World, state: BallState, record: Record) -> Decisions:
-    return Decisions(jnp.zeros_like(record.contact), jnp.zeros_like(record.solve.iterations))
+def _flight(world: World, state: BallState, record: BallRecord) -> BallDecisions:
+    return BallDecisions(jnp.zeros_like(record.contact), jnp.zeros_like(record.solve.iterations))
 
 
 def _carry(world, rest, values, seed, state, after, record, tangent):

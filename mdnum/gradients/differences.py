@@ -35,7 +35,7 @@ _WIDENINGS, _POINTS = 4, 7
 
 
 @dataclass(frozen=True)
-class Difference:
+class Differentiated:
     """A derivative from values.
 
     Attributes:
@@ -51,7 +51,7 @@ class Difference:
     table: tuple[tuple[float, float], ...]
 
 
-def richardson(f: Callable[[float], float], x: float, step: float, levels: int = 6) -> Difference:
+def richardson(f: Callable[[float], float], x: float, step: float, levels: int = 6) -> Differentiated:
     """The derivative of f at x by Richardson's extrapolation of central differences (Ridders 1982).
 
     Steps shrink by 1.4 and the extrapolation with the least estimated error wins, so that neither a step
@@ -79,7 +79,7 @@ def richardson(f: Callable[[float], float], x: float, step: float, levels: int =
         if k and abs(table[k, k] - table[k - 1, k - 1]) >= 2 * error:
             break
         h /= shrink
-    return Difference(best, error, chosen, tuple(rows))
+    return Differentiated(best, error, chosen, tuple(rows))
 
 
 def noise_of(values: Float[np.ndarray, "points"]) -> float:

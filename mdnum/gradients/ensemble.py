@@ -3,7 +3,7 @@
 A replica is the same system with other velocities, and with another noise where there is a thermostat. Each
 is a run with lists of its own, so replicas are made one after another, on the devices that there are.
 
-Between two crossings that change the step at which they happen, a loss with a force jump follows the
+StepEnds two crossings that change the step at which they happen, a loss with a force jump follows the
 derivative of its steps; at each of them it jumps. What the event-aware gradient predicts is the slope over
 many such jumps, so a difference that shall be compared with it must reach across many of them.
 """
@@ -26,7 +26,7 @@ from mdnum.gradients import parameters
 from mdnum.gradients.differences import nonzero
 from mdnum.gradients.problem import Gradient, Method, Problem, Progress, scalars_only
 from mdnum.gradients.recorded import EventAware
-from mdnum.gradients.tape import Stretch, Tape
+from mdnum.gradients.tape import RunTape, TapeStretch
 from mdnum.md.integrators import Langevin
 from mdnum.rollout.engine import FAILURES, Engine, unwrapped
 from mdnum.systems.build import Simulation
@@ -284,7 +284,7 @@ def _values(starts: Sequence[Problem], values: dict[str, float], flips: bool, co
     for start in starts:
         made = start.at(values)
         met: set[tuple[int, ...]] = set()
-        tape = Tape(
+        tape = RunTape(
             made.simulation, made.loss, made.steps, flips=flips, budget=0,
             each=lambda stretch, met=met: met.update(_crossings(stretch)),
         )  # fmt: skip
@@ -293,7 +293,7 @@ def _values(starts: Sequence[Problem], values: dict[str, float], flips: bool, co
     return found
 
 
-def _crossings(stretch: Stretch) -> Iterator[tuple[int, ...]]:
+def _crossings(stretch: TapeStretch) -> Iterator[tuple[int, ...]]:
     """Step and pair of every flip of a stretch; none where they were not asked for."""
     if stretch.ledger is not None:
         yield from zip(stretch.ledger.step.tolist(), *stretch.ledger.subject.T.tolist(), strict=True)

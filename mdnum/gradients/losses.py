@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from mdnum.systems.build import Simulation
 
 
-class Frame(NamedTuple):
+class LossFrame(NamedTuple):
     """One step as a loss sees it, atoms in the user's order.
 
     Attributes:
@@ -42,7 +42,7 @@ class Frame(NamedTuple):
     virial: Float[Array, ""]
 
 
-class Surroundings(NamedTuple):
+class LossContext(NamedTuple):
     """What does not change along a run.
 
     Attributes:
@@ -93,14 +93,14 @@ class Loss(eqx.Module):
         return (steps >= self.first) & ((steps - self.first) % self.every == 0)
 
     @abstractmethod
-    def observe(self, frame: Frame, origin: Frame, around: Surroundings) -> Any:
+    def observe(self, frame: LossFrame, origin: LossFrame, around: LossContext) -> Any:
         """What one frame adds: a pytree of arrays, differentiable in both frames; `origin` is step 0."""
 
     def value(self, total: Any, frames: Int[Array, ""] | int) -> Float[Array, ""]:
         """The number, from the sum of what was observed and the number of frames: the mean."""
         return total / frames
 
-    def reason_unavailable(self, around: Surroundings) -> str | None:
+    def reason_unavailable(self, around: LossContext) -> str | None:
         """Why it has no meaning in these surroundings; None where it has."""
         return None
 
@@ -137,7 +137,7 @@ class Custom(Loss):
     """
 
     name = "custom"
-    see: Callable[[Frame, Frame, Surroundings], Any] = eqx.field(static=True, kw_only=True)
+    see: Callable[[LossFrame, LossFrame, LossContext], Any] = eqx.field(static=True, kw_only=True)
     conclude: Callable[[Any, Any], Any] = eqx.field(
         static=True, kw_only=True, default=lambda total, frames: total / frames
     )
@@ -220,7 +220,7 @@ class MeanPressure(_OfFrames):
     def observe(self, frame, origin, around):
         return (2 * _kinetic(frame, around) + frame.virial) / (3 * around.volume)
 
-    def reason_unavailable(self, around: Surroundings) -> str | None:
+    def reason_unavailable(self, around: LossContext) -> str | None:
         return None if float(around.volume) > 0 else "the box has no volume: it is not periodic everywhere"
 
 
@@ -360,7 +360,7 @@ class RadialDistribution(_OfFrames):
         """Of the bins, length."""
         return (jnp.arange(self.bins, dtype=jnp.float64) + 0.5) * self.width
 
-    def reason_unavailable(self, around: Surroundings) -> str | None:
+    def reason_unavailable(self, around: LossContext) -> str | None:
         """Distances are those of nearest images."""
         if not float(around.volume) > 0:
             return "the box has no volume: it is not periodic everywhere"
@@ -373,7 +373,7 @@ class RadialDistribution(_OfFrames):
             )
         return None
 
-    def observe(self, frame: Frame, origin: Frame, around: Surroundings):
+    def observe(self, frame: LossFrame, origin: LossFrame, around: LossContext):
         x = frame.x.astype(jnp.float64)
         atoms = x.shape[1]
         inverse = jnp.linalg.inv(around.matrix)
@@ -425,11 +425,11 @@ def _shared(r: Float[Array, "pairs"], near, width: float, bins: int) -> Float[Ar
     return counts[2 : bins + 2]
 
 
-def _correlation(frame: Frame, origin: Frame):
+def _correlation(frame: LossFrame, origin: LossFrame):
     return jnp.mean(jnp.sum(frame.v.astype(jnp.float64) * origin.v.astype(jnp.float64), axis=0))
 
 
-def _kinetic(frame: Frame, around: Surroundings) -> Float[Array, ""]:
+def _kinetic(frame: LossFrame, around: LossContext) -> Float[Array, ""]:
     speed2 = jnp.sum(jnp.square(frame.v.astype(jnp.float64)), axis=0)
     return 0.5 * jnp.sum(around.masses * speed2)
 

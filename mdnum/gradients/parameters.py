@@ -429,7 +429,7 @@ def unit(simulation: Simulation, name: str) -> str:
 
 
 @dataclass(frozen=True)
-class Column:
+class ParameterEntry:
     """One number among the parameters.
 
     Attributes:
@@ -444,10 +444,10 @@ class Column:
         return f"{self.name}[{', '.join(map(str, self.index))}]" if self.index else self.name
 
 
-def columns_of(simulation: Simulation, names: Sequence[str]) -> tuple[Column, ...]:
+def columns_of(simulation: Simulation, names: Sequence[str]) -> tuple[ParameterEntry, ...]:
     """The numbers that some parameters consist of, in order."""
     return tuple(
-        Column(name, tuple(int(k) for k in index))
+        ParameterEntry(name, tuple(int(k) for k in index))
         for name in names
         for index in np.ndindex(value(simulation, name).shape)
     )
@@ -463,7 +463,7 @@ def gathered(
     return {name: part.reshape(shapes[name]) for name, part in zip(names, parts, strict=True)}
 
 
-def directions(simulation: Simulation, columns: Sequence[Column]) -> Direction:
+def directions(simulation: Simulation, columns: Sequence[ParameterEntry]) -> Direction:
     """What each column moves, stacked along a first axis; per unit of the parameter's own value."""
     nothing = jnp.zeros((3, simulation.atoms), simulation.policy.dtype("state"))
     still = Direction(

@@ -12,8 +12,8 @@ from jaxtyping import Float
 
 from mdnum.errors import InputError
 from mdnum.gradients import parameters
-from mdnum.gradients.losses import Frame, Loss
-from mdnum.gradients.tape import Tape, surroundings
+from mdnum.gradients.losses import Loss, LossFrame
+from mdnum.gradients.tape import RunTape, surroundings
 from mdnum.md.pairforce import PairForce
 from mdnum.registry import Registry
 from mdnum.systems.build import Simulation
@@ -57,7 +57,7 @@ class Problem:
         number = jax.ShapeDtypeStruct((), np.float64)
         shapes: tuple[Any, ...] = (jax.ShapeDtypeStruct((), np.int64), vector, vector, number, number)
         made = jax.eval_shape(
-            lambda frame: self.loss.value(self.loss.observe(frame, frame, around), 1), Frame(*shapes)
+            lambda frame: self.loss.value(self.loss.observe(frame, frame, around), 1), LossFrame(*shapes)
         )
         if jax.tree.structure(made) != jax.tree.structure(0.0) or made.shape != ():
             seen = getattr(made, "shape", None) or jax.tree.structure(made)
@@ -75,7 +75,7 @@ class Problem:
     def value(self, values: Mapping[str, Any] | None = None) -> float:
         """The loss, of the run that the rollout makes."""
         made = self.at(values or {})
-        return Tape(made.simulation, made.loss, made.steps, budget=0).value
+        return RunTape(made.simulation, made.loss, made.steps, budget=0).value
 
     @property
     def jumps(self) -> bool:
@@ -161,7 +161,8 @@ for _name, _class in {
     "finite-differences": "differences:FiniteDifferences",
     "shadow-differences": "differences:ShadowDifferences",
     "smoothed-differences": "ensemble:SmoothedDifferences", "surrogate": "recorded:Surrogate",
-    "ensemble": "ensemble:Ensemble", "reweighting": "averages:Reweighting", "boundary": "averages:Boundary",
+    "ensemble": "ensemble:Ensemble", "reweighting": "averages:Reweighting",
+    "boundary": "averages:BoundaryTerm",
 }.items():  # fmt: skip
     METHODS.add(_name, f"mdnum.gradients.{_class}")
 #: Names of what reverse mode keeps of its forward pass, which its method decides by the memory there is.

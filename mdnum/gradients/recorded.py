@@ -30,7 +30,7 @@ from mdnum.gradients.problem import (
     rounded,
 )
 from mdnum.gradients.tangents import by_column, tangents
-from mdnum.gradients.tape import KEPT, ReversibleTape, Stretch, Tape
+from mdnum.gradients.tape import KEPT, ReversibleTape, RunTape, TapeStretch
 from mdnum.md.latticestep import forgotten_bits
 from mdnum.systems.build import Simulation
 from mdnum.systems.schema import ONSET_FRACTION
@@ -46,11 +46,11 @@ _SINGLE_FRAMES = (
 #: Crossings of the largest weight that are named in the details.
 _NAMED = 10
 #: Called with every stretch of the reverse pass, last first, and what was carried at its steps.
-Watch = Callable[[Stretch, Trace], None]
+Watch = Callable[[TapeStretch, Trace], None]
 
 
 @dataclass(frozen=True)
-class Pass:
+class ReversePass:
     """A reverse pass that has been made.
 
     Attributes:
@@ -60,7 +60,7 @@ class Pass:
         guard: radial speed below which a crossing was left out, length per internal time.
     """
 
-    tape: Tape
+    tape: RunTape
     parts: Cotangents
     gradient: dict[str, Float[np.ndarray, "..."]]
     crossings: list[Crossings]
@@ -75,9 +75,9 @@ def passed(
     guard: float = GUARD,
     budget: int = KEPT,
     watches: Sequence[Watch] = (),
-    tape: Tape | None = None,
+    tape: RunTape | None = None,
     progress: Progress | None = None,
-) -> Pass:
+) -> ReversePass:
     """Run a problem and its reverse pass, which several instruments may watch.
 
     Args:
@@ -93,7 +93,7 @@ def passed(
         InputError: saltation without a pair potential. NumericalError: the run blew up.
     """
 
-    def watch(stretch: Stretch, trace: Trace) -> None:
+    def watch(stretch: TapeStretch, trace: Trace) -> None:
         for one in watches:
             one(stretch, trace)
 
@@ -109,12 +109,12 @@ def passed(
         watch=watch if watches else None,
     )
     gradient = {name: parameters.gradient(problem.simulation, parts, name) for name in names}
-    return Pass(tape, parts, gradient, crossings, speed)
+    return ReversePass(tape, parts, gradient, crossings, speed)
 
 
-def tape_of(problem: Problem, flips: bool, budget: int = KEPT, progress: Progress | None = None) -> Tape:
+def tape_of(problem: Problem, flips: bool, budget: int = KEPT, progress: Progress | None = None) -> RunTape:
     """The run of a problem."""
-    return Tape(
+    return RunTape(
         problem.simulation, problem.loss, problem.steps, flips=flips, budget=budget,
         progress=in_phase(progress, "run"),
     )  # fmt: skip
@@ -141,7 +141,7 @@ class Symmetric(Method):
         made = passed(problem, names, saltation=False, budget=self.budget, progress=progress)
         return self.of(problem, made)
 
-    def of(self, problem: Problem, made: Pass) -> Gradient:
+    def of(self, problem: Problem, made: ReversePass) -> Gradient:
         """The gradient, of a pass that was made."""
         tape = made.tape
         details = {"stretches": len(tape), "run again": tape.replayed, "bytes kept": tape.held}
@@ -173,7 +173,7 @@ class EventAware(Method):
         made = passed(problem, names, guard=self.guard, budget=self.budget, progress=progress)
         return self.of(problem, made)
 
-    def of(self, problem: Problem, made: Pass) -> Gradient:
+    def of(self, problem: Problem, made: ReversePass) -> Gradient:
         """The gradient, of a pass that was made."""
         notes = independent(problem, made.gradient, saltation=True)
         unseen = bool(np.any(problem.simulation.jumps())) and made.tape.jumps_unseen

@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mdnum.errors import NumericalError
 from mdnum.events import Ledger
-from mdnum.gradients.losses import Frame, Loss, Surroundings
+from mdnum.gradients.losses import Loss, LossContext, LossFrame
 from mdnum.md.latticestep import LatticeLangevin
 from mdnum.md.verlet import PairTable
 from mdnum.rollout.backward import BackwardRun, Stretched
@@ -38,7 +38,7 @@ _FINGERPRINTS = 256
 
 
 @dataclass(frozen=True)
-class Stretch:
+class TapeStretch:
     """Some steps of one list, in the order of its atoms.
 
     Attributes:
@@ -81,7 +81,7 @@ class Stretch:
         return (self.steps, self.x, self.v, self.images, self.potential, self.virial)
 
 
-def stretch_of(segment: Segment, start: Start, ledger: Ledger | None = None) -> Stretch:
+def stretch_of(segment: Segment, start: Start, ledger: Ledger | None = None) -> TapeStretch:
     """A copy of what a segment recorded from a start; the segment's own record is used again."""
     record, order = segment.record, segment.table.order
     assert segment.before is not None
@@ -94,7 +94,7 @@ def stretch_of(segment: Segment, start: Start, ledger: Ledger | None = None) -> 
         copy[: segment.rows] = whole[: segment.rows]
         return copy
 
-    return Stretch(
+    return TapeStretch(
         segment.first,
         segment.rows,
         kept("x"),
@@ -137,7 +137,7 @@ def pace_of(loss: Loss, steps: int) -> Pace:
     return Pace(jnp.asarray(between), jnp.asarray(int(seen[0]) if len(seen) else 0))
 
 
-class Tape:
+class RunTape:
     """A run that has been made, and its loss.
 
     Args:
@@ -161,7 +161,7 @@ class Tape:
         *,
         flips: bool = False,
         budget: int = KEPT,
-        each: Callable[[Stretch], None] | None = None,
+        each: Callable[[TapeStretch], None] | None = None,
         progress: Callable[[int, int], None] | None = None,
     ):
         self.simulation, self.loss, self.steps, self.flips = simulation, loss, steps, flips
@@ -175,7 +175,7 @@ class Tape:
         self._recorder = PairRecorder(simulation) if flips else None
         self._starts: list[Start] = []
         self._ledgers: list[Ledger | None] = []
-        self._kept: dict[int, Stretch] = {}
+        self._kept: dict[int, TapeStretch] = {}
         self._engine = Engine(simulation, steps, start=self.start)
         self._begin()
         for segment in self._engine.segments():
@@ -233,26 +233,26 @@ class Tape:
     def __len__(self) -> int:
         return len(self._starts)
 
-    def __getitem__(self, k: int) -> Stretch:
+    def __getitem__(self, k: int) -> TapeStretch:
         if k in self._kept:
             return self._kept[k]
         start = self._starts[k]
         return stretch_of(self._engine.again(start), start, self._ledgers[k])
 
-    def backward(self) -> Iterator[Stretch]:
+    def backward(self) -> Iterator[TapeStretch]:
         """The stretches, last first."""
         return (self[k] for k in reversed(range(len(self._starts))))
 
-    def forward(self) -> Iterator[Stretch]:
+    def forward(self) -> Iterator[TapeStretch]:
         """The stretches, first one first."""
         return (self[k] for k in range(len(self._starts)))
 
-    def seen(self, stretch: Stretch) -> Bool[np.ndarray, "room"]:
+    def seen(self, stretch: TapeStretch) -> Bool[np.ndarray, "room"]:
         """Rows that the loss looks at."""
         steps = stretch.steps
         return self.loss.looks_at(steps, self.steps) & (np.arange(len(steps)) < stretch.rows)
 
-    def _observe(self, stretch: Stretch) -> None:
+    def _observe(self, stretch: TapeStretch) -> None:
         seen = self.seen(stretch)
         self.frames += int(seen.sum())
         if self.total is None:
@@ -265,7 +265,7 @@ class Tape:
             )  # fmt: skip
 
 
-class ReversibleTape(Tape):
+class ReversibleTape(RunTape):
     """A run with a fixed-point integer state that has been made and is not kept, and its loss.
 
     `backward` reverses the steps, with lists that it builds itself, and raises NumericalError where what
@@ -306,11 +306,11 @@ class ReversibleTape(Tape):
         """Memory that grows with the run: what friction forgot."""
         return sum(bath.nbytes for bath in self.baths.values())
 
-    def forward(self) -> Iterator[Stretch]:
+    def forward(self) -> Iterator[TapeStretch]:
         """A run that is not kept is run again."""
-        return Tape(self.simulation, self.loss, self.steps, flips=self.flips).forward()
+        return RunTape(self.simulation, self.loss, self.steps, flips=self.flips).forward()
 
-    def backward(self) -> Iterator[Stretch]:
+    def backward(self) -> Iterator[TapeStretch]:
         # the initial bath is empty
         baths = {**self.baths, 0: np.zeros((3, self.simulation.atoms), np.int64)}
         way = BackwardRun(self.simulation, self._end, baths)
@@ -343,13 +343,13 @@ class ReversibleTape(Tape):
             where=self.simulation.system.name,
         )
 
-    def _stretch(self, made: Stretched) -> Stretch:
+    def _stretch(self, made: Stretched) -> TapeStretch:
         record = made.record
         x, v, images, bits, potential, virial = (
             np.asarray(getattr(record, name)) for name in ("x", "v", "images", "bits", "potential", "virial")
         )
         before = np.zeros_like(bits[0])
-        return Stretch(
+        return TapeStretch(
             made.first, made.rows, x, v, images, bits, before, made.x_before, potential, virial, made.table
         )
 
@@ -394,11 +394,11 @@ def unsorted(a: Float[Any, "*rest atoms"], order: Int[Any, "atoms"]) -> Float[Ar
     return jnp.zeros_like(a).at[..., order].set(a)
 
 
-def frame_of(row, order: Int[Array, "atoms"], matrix: Float[Array, "3 3"]) -> Frame:
+def frame_of(row, order: Int[Array, "atoms"], matrix: Float[Array, "3 3"]) -> LossFrame:
     """A row in the user's order, without the faces of the box."""
     step, x, v, images, potential, virial = row
     whole = x + (matrix.T @ images.astype(matrix.dtype)).astype(x.dtype)
-    return Frame(step, unsorted(whole, order), unsorted(v, order), potential, virial)
+    return LossFrame(step, unsorted(whole, order), unsorted(v, order), potential, virial)
 
 
 @jax.jit
@@ -415,7 +415,7 @@ def _summed(loss, total, rows, used, seen, origin, around, order):
     return over_rows(step, total, (rows, seen), used)[0]
 
 
-def surroundings(simulation: Simulation) -> Surroundings:
+def surroundings(simulation: Simulation) -> LossContext:
     """Masses and box of a simulation."""
     cell = simulation.cell
     volume = cell.volume if all(simulation.pbc) else 0.0
@@ -423,13 +423,13 @@ def surroundings(simulation: Simulation) -> Surroundings:
         simulation.masses, np.asarray(cell.matrix), volume, simulation.units.k_B,
         simulation.integrator.timestep, simulation.units.time_factor,
     )  # fmt: skip
-    return Surroundings(*(jnp.asarray(part, jnp.float64) for part in parts))
+    return LossContext(*(jnp.asarray(part, jnp.float64) for part in parts))
 
 
-def frame_of_start(start: Start, simulation: Simulation) -> Frame:
+def frame_of_start(start: Start, simulation: Simulation) -> LossFrame:
     """The frame of step 0; its energies are not known yet, and a loss has no use for them there."""
     state = start.state
     matrix = jnp.asarray(np.asarray(simulation.cell.matrix), jnp.float64)
     whole = state.x + (matrix.T @ state.images.astype(matrix.dtype)).astype(state.x.dtype)
     nan = jnp.full((), jnp.nan, jnp.float64)
-    return Frame(state.step, whole, state.v, nan, nan)
+    return LossFrame(state.step, whole, state.v, nan, nan)

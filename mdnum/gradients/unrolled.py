@@ -29,10 +29,10 @@ from jaxtyping import Array, Bool, Float, Int, UInt8, UInt64
 
 from mdnum.errors import NumericalError
 from mdnum.gradients import parameters
-from mdnum.gradients.losses import Frame, Surroundings
+from mdnum.gradients.losses import LossContext, LossFrame
 from mdnum.gradients.parameters import Cotangents, quantities, with_quantities
 from mdnum.gradients.problem import Method, Problem, Progress, independent, rounded
-from mdnum.gradients.tape import Tape, surroundings
+from mdnum.gradients.tape import RunTape, surroundings
 from mdnum.md.decide import Tables
 from mdnum.md.verlet import PairTable
 from mdnum.rollout.engine import first_state
@@ -63,7 +63,7 @@ class Inputs(NamedTuple):
     scale: Float[Array, ""]
 
 
-class Between(NamedTuple):
+class StepEnds(NamedTuple):
     """What one step hands to the next and a derivative goes through, user's order.
 
     Attributes:
@@ -75,7 +75,7 @@ class Between(NamedTuple):
     total: Any
 
 
-class Fixed(NamedTuple):
+class RunConstants(NamedTuple):
     """What does not change along a run and is not differentiated.
 
     Attributes:
@@ -89,7 +89,7 @@ class Fixed(NamedTuple):
     masses: Float[Array, "atoms"]
     half_skin: Float[Array, ""]
     loss: Any
-    around: Surroundings
+    around: LossContext
     images: Int[Array, "3 atoms"]
 
 
@@ -131,8 +131,13 @@ class ChunkRecord(NamedTuple):
 
 @partial(jax.jit, static_argnames=("rule",))
 def chunk(
-    inputs: Inputs, between: Between, fixed: Fixed, place: Place, tables: Tables, rule: tuple[int, int, bool]
-) -> tuple[Between, ChunkRecord]:
+    inputs: Inputs,
+    between: StepEnds,
+    fixed: RunConstants,
+    place: Place,
+    tables: Tables,
+    rule: tuple[int, int, bool],
+) -> tuple[StepEnds, ChunkRecord]:
     """Some steps with one list; differentiable by its first two arguments.
 
     Args:
@@ -156,7 +161,7 @@ def chunk(
         volume=fixed.around.volume * scale**3,
         timestep=integrator.timestep,
     )
-    origin = Frame(
+    origin = LossFrame(
         jnp.zeros((), jnp.int64),
         inputs.x * scale.astype(dtype) + (matrix.T @ fixed.images.astype(matrix.dtype)).astype(dtype),
         inputs.v,
@@ -176,7 +181,7 @@ def chunk(
 
     def observe(total, step, x, v, images, potential, virial):
         whole = x + (matrix.T @ images.astype(matrix.dtype)).astype(dtype)
-        frame = Frame(step, unsorted(whole), unsorted(v), potential, virial)
+        frame = LossFrame(step, unsorted(whole), unsorted(v), potential, virial)
         return jax.tree.map(jnp.add, total, fixed.loss.observe(frame, origin, around))
 
     def act(carry, see):
@@ -221,7 +226,7 @@ def chunk(
     )
     (_, x, v, images, total, due, finite, rows), (xs, vs, bits) = lax.scan(one, start, place.seen)
     record = ChunkRecord(rows, due, finite, unsorted(images), xs, vs, bits)
-    return Between(unsorted(x), unsorted(v), total), lax.stop_gradient(record)
+    return StepEnds(unsorted(x), unsorted(v), total), lax.stop_gradient(record)
 
 
 @partial(jax.jit, static_argnames=("rule",))
@@ -236,7 +241,7 @@ def keep(inputs, between, fixed, place, tables, rule):
 
 
 @jax.jit
-def pull(back, onto_between: Between, onto_inputs: Inputs) -> tuple[Between, Inputs]:
+def pull(back, onto_between: StepEnds, onto_inputs: Inputs) -> tuple[StepEnds, Inputs]:
     """Cotangents through the reverse function of a chunk; those of the inputs are added up."""
     by_inputs, by_between = back(onto_between)
     return by_between, jax.tree.map(jnp.add, onto_inputs, by_inputs)
@@ -252,7 +257,7 @@ class Snapshot(NamedTuple):
         slots: capacity of the list; 0 lets the density decide.
     """
 
-    between: Between
+    between: StepEnds
     step: int
     built: int
     images: Int[Array, "3 atoms"]
@@ -260,7 +265,7 @@ class Snapshot(NamedTuple):
     slots: int
 
 
-class Program:
+class ChunkedProgram:
     """The program of a problem, chunk by chunk.
 
     Args:
@@ -274,7 +279,7 @@ class Program:
         state = first_state(simulation).state
         rule = simulation.rule
         self.rule = (rule.every, rule.delay, rule.check)
-        self.fixed = Fixed(
+        self.fixed = RunConstants(
             simulation.force,
             simulation.integrator,
             jnp.asarray(simulation.masses),
@@ -285,11 +290,11 @@ class Program:
         )
         numbers = eqx.filter(simulation.integrator, eqx.is_inexact_array)
         self.inputs = Inputs(quantities(simulation.force), numbers, state.x, state.v, jnp.ones(()))
-        origin = Frame(state.step, state.x, state.v, jnp.zeros(()), jnp.zeros(()))
+        origin = LossFrame(state.step, state.x, state.v, jnp.zeros(()), jnp.zeros(()))
         shapes = jax.eval_shape(problem.loss.observe, origin, origin, self.fixed.around)
         total = jax.tree.map(lambda one: jnp.zeros(one.shape, one.dtype), shapes)
         # the sums are kept as numbers; what the loss makes of them comes last
-        between = Between(state.x * self.inputs.scale.astype(state.x.dtype), state.v, total)
+        between = StepEnds(state.x * self.inputs.scale.astype(state.x.dtype), state.v, total)
         self.start = Snapshot(between, 0, 0, state.images, between.x, 0)
         self._verlet = simulation.verlet_list()
         # snapshots of one list share the array of the positions at which it was built
@@ -326,7 +331,7 @@ class Program:
         """The loss, from its sums."""
         return self.problem.loss.value(total, self.frames)
 
-    def cotangents(self, start: Between, inputs: Inputs) -> Cotangents:
+    def cotangents(self, start: StepEnds, inputs: Inputs) -> Cotangents:
         """Derivatives by what a rollout is made of, from those of the inputs and of the first positions."""
         x = np.asarray(inputs.x + start.x, np.float64)
         v = np.asarray(inputs.v + start.v, np.float64)
@@ -349,7 +354,7 @@ class Program:
         )
         return self.inputs, at.between, self.fixed, place, tables
 
-    def _after(self, at: Snapshot, between: Between, record: ChunkRecord) -> Snapshot:
+    def _after(self, at: Snapshot, between: StepEnds, record: ChunkRecord) -> Snapshot:
         step, slots = at.step + int(record.rows), self.list_of(at)[0].slots
         if not bool(record.finite):
             raise NumericalError(
@@ -384,7 +389,7 @@ class Unrolled(Method):
 
     def differentiate(self, problem: Problem, names: tuple[str, ...], progress: Progress | None):
         simulation, last = problem.simulation, problem.steps
-        program = Program(problem, self.chunk)
+        program = ChunkedProgram(problem, self.chunk)
         size = sum(leaf.nbytes for leaf in jax.tree.leaves(program.start[:1] + program.start[3:5]))
         room = max(1, free() // size) if self.snapshots is None else self.snapshots
         at, ends, kept = program.start, [0], [program.start]
@@ -402,7 +407,7 @@ class Unrolled(Method):
         stack = [(k, state) for k, state in enumerate(kept[:count])]
         value, by_total = jax.value_and_grad(program.value)(at.between.total)
         nothing = jnp.zeros_like(at.between.x)
-        onto, inputs = Between(nothing, nothing, by_total), jax.tree.map(jnp.zeros_like, program.inputs)
+        onto, inputs = StepEnds(nothing, nothing, by_total), jax.tree.map(jnp.zeros_like, program.inputs)
         own = Fingerprints(last)
         for k in reversed(range(count)):
             while stack[-1][0] < k:
@@ -427,7 +432,7 @@ class Unrolled(Method):
         notes = independent(problem, gradient, saltation=False)
         if self.compare:
             run = Fingerprints(last)
-            tape = Tape(
+            tape = RunTape(
                 simulation, problem.loss, last, budget=0,
                 each=lambda one: run.add(
                     one.first, one.rows, one.x, one.v, one.bits, simulation.tables(one.table)

@@ -473,9 +473,8 @@ def _without_bath(system: System) -> System:
     if isinstance(dynamics, schema.NVETable):
         return system
     shared = dynamics.model_dump(exclude={"kind", "friction"})
-    return replace(
-        system, spec=system.spec.model_copy(update={"dynamics": schema.NVETable(kind="nve", **shared)})
-    )
+    nve = schema.NVETable(kind="nve", **shared)
+    return replace(system, spec=system.spec.model_copy(update={"dynamics": nve}))
 
 
 def _forces(system: System) -> Reference:

@@ -314,15 +314,3 @@ class _GivenSimulation(Simulation):
         plain = PairForce.create(self.model, cell, self.compiled, policy, self.reduction)
         values = jnp.asarray(np.asarray([t.value for t in self.decider.thresholds], policy.dtype("decision")))
         return _GivenForce(**_parts(plain), values=values)
-
-
-def checked(one: Dial, low: float, high: float) -> None:
-    """Refuse an interval that is none, or whose values make no sense.
-
-    Raises:
-        InputError: what is wrong with it.
-    """
-    if not (np.isfinite(low) and np.isfinite(high) and low < high):
-        raise InputError(f"there is nothing between {low!r} and {high!r}", remedy="Give LOW < HIGH")
-    if one.positive and low <= 0:
-        raise InputError(f"{one.key} = {low!r}; expected a value above 0")

@@ -23,13 +23,13 @@ from mdnum.store.folder import RunFolder, restoring
 NAME = "answers.json"
 
 
-class State(Protocol):
+class Timed(Protocol):
     """A dataclass of numbers, text, lists, tuples, dictionaries and further dataclasses."""
 
     seconds: float
 
 
-T = TypeVar("T", bound=State)
+T = TypeVar("T", bound=Timed)
 
 
 class Answers(Generic[T]):

@@ -197,7 +197,7 @@ _CHUNK = 1 << 20
 # listed from their first write on; scripts and structures among them, which a page or a person goes by
 _FROM_THE_FIRST = re.compile(r"answers\.json|summary\.json|reproduce[\w.-]*\.py|structures/[^/]+\.extxyz")
 # what a command goes on from, by the world of the folder
-_STATE = {"md": "checkpoint.npz", "audit": "checkpoint.npz", "conform": "answers.json"}
+_STATE = {"md": "checkpoint.npz", "audit": "answers.json", "conform": "answers.json"}
 _INSIDE = re.compile(rf"(({'|'.join(SUBFOLDERS)})/)?(?!\.{{1,2}}$)[^/\0]+")
 
 

@@ -154,7 +154,7 @@ class RunFolder:
 
         def share(world: str) -> float:
             there = [(folder.path / f"{name}.parquet").exists() for name in TABLES[world]]
-            return sum(there) / len(there)
+            return sum(there) / max(1, len(there))
 
         # from before there were manifests: some tables are those of two worlds, and some came later
         likeliest = max(TABLES, key=share)

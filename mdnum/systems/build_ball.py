@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mdnum.ball import contacts, integrators, limits, stopping
-from mdnum.ball.problem import FinalHeight, Loss, MeanHeight, Problem, ResidualPenetration
+from mdnum.ball.problem import BallLoss, BallProblem, FinalHeight, MeanHeight, ResidualPenetration
 from mdnum.ball.world import World
 from mdnum.errors import InputError
 from mdnum.numerics import neighbor, reductions
@@ -23,7 +23,7 @@ from mdnum.systems.load import load
 _INTEGRATORS: Mapping[str, Any] = {
     "explicit-euler": integrators.ExplicitEuler,
     "semi-implicit-euler": integrators.SemiImplicitEuler,
-    "velocity-verlet": integrators.VelocityVerlet,
+    "velocity-verlet": integrators.BallVerlet,
     "event-located": integrators.EventLocated,
 }
 _RULES: Mapping[str, Any] = {
@@ -46,7 +46,7 @@ class BallVariant:
 
     name: str
     changes: Mapping[str, Any]
-    problem: Problem
+    problem: BallProblem
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class BallSimulation:
     """
 
     system: BallSystem
-    problem: Problem
+    problem: BallProblem
     variants: tuple[BallVariant, ...]
 
 
@@ -88,7 +88,7 @@ def build_ball(
     return BallSimulation(system, problem(system.spec, steps, system.name), variants)
 
 
-def problem(spec: ball.BallSpec, steps: int | None = None, where: str = "system") -> Problem:
+def problem(spec: ball.BallSpec, steps: int | None = None, where: str = "system") -> BallProblem:
     """World, start, steps and loss of the tables of a file.
 
     Args:
@@ -122,7 +122,7 @@ def problem(spec: ball.BallSpec, steps: int | None = None, where: str = "system"
     except InputError as error:
         raise InputError(error.message, remedy=error.remedy, where=error.where or where) from None
     y0, v0 = start(spec)
-    return Problem(world, y0, v0, steps, _loss(spec.loss))
+    return BallProblem(world, y0, v0, steps, _loss(spec.loss))
 
 
 def start(spec: ball.BallSpec) -> tuple[Float[np.ndarray, "balls"], Float[np.ndarray, "balls"]]:
@@ -196,15 +196,15 @@ def stop_rule(spec: ball.BallSpec) -> Any:
     table = spec.stop
     assert table is not None
     if isinstance(table, ball.FixedRule):
-        return stopping.Fixed(table.count)
+        return stopping.FixedCount(table.count)
     options = {}
     if table.rule in ("sum", "relative"):
         options["reduction"] = reductions.parse(spec.precision.reduction)
     rule = _RULES[table.rule](table.tol, table.max_iter, **options)
-    return rule if table.enter is None else stopping.Hysteresis(rule, table.enter)
+    return rule if table.enter is None else stopping.HysteresisStop(rule, table.enter)
 
 
-def _loss(table: ball.LossTable) -> Loss:
+def _loss(table: ball.LossTable) -> BallLoss:
     if table.kind == "mean-height":
         return MeanHeight()
     if table.kind == "residual-penetration":

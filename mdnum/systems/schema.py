@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import fields
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args
 
-from pydantic import BeforeValidator, ConfigDict, Discriminator, Field, Tag, model_validator
+from pydantic import BeforeValidator, ConfigDict, Discriminator, Field, Tag, create_model, model_validator
 
 from mdnum import units as unit_systems
 from mdnum.systems.grammar import Named, NonNegative, TomlTable
@@ -47,14 +47,14 @@ def _check_pairs(pairs: Mapping[str, Any] | None) -> None:
 class LennardJonesPair(TomlTable):
     """Constants of one pair of species, Lennard-Jones."""
 
-    sigma: Length
-    epsilon: Energy
+    sigma: Length = Field(description="distance of zero energy (Å or σ)")
+    epsilon: Energy = Field(description="well depth (eV or ε)")
 
 
 class MorsePair(TomlTable):
     """Constants of one pair of species, Morse."""
 
-    depth: Energy = Field(description="well depth (eV or ε)")
+    depth: Energy = Field(description="well depth D (eV or ε)")
     alpha: float = Field(gt=0, description="stiffness (1/length)")
     r0: Length = Field(description="distance of the minimum (Å or σ)")
 
@@ -62,9 +62,9 @@ class MorsePair(TomlTable):
 class SoftSpherePair(TomlTable):
     """Constants of one pair of species, soft sphere."""
 
-    sigma: Length
-    epsilon: Energy
-    alpha: float = Field(default=2.0, gt=1, description="exponent")
+    sigma: Length = Field(description="diameter (Å or σ)")
+    epsilon: Energy = Field(description="energy scale (eV or ε)")
+    alpha: float = Field(default=2.0, gt=1, description="exponent; 2 is harmonic, 2.5 Hertzian")
 
 
 class PairPotentialTable(TomlTable):
@@ -90,41 +90,25 @@ class PairPotentialTable(TomlTable):
         return tuple(key for key in type(self).model_fields if key not in ("kind", "pairs"))
 
 
-class LennardJonesTable(PairPotentialTable):
-    """4 ε [(σ/r)^12 - (σ/r)^6]."""
-
-    kind: Literal["lennard-jones"]
-    sigma: Length | None = Field(default=None, description="distance of zero energy (Å or σ)")
-    epsilon: Energy | None = Field(default=None, description="well depth (eV or ε)")
-    pairs: dict[str, LennardJonesPair] | None = Field(
-        default=None, description='constants of each pair of species, such as "Ni-P"'
-    )
-
-
-class MorseTable(PairPotentialTable):
-    """D [(1 - exp(-α (r - r0)))^2 - 1]."""
-
-    kind: Literal["morse"]
-    depth: Energy | None = Field(default=None, description="well depth D (eV or ε)")
-    alpha: Annotated[float, Field(gt=0)] | None = Field(default=None, description="stiffness (1/length)")
-    r0: Length | None = Field(default=None, description="distance of the minimum (Å or σ)")
-    pairs: dict[str, MorsePair] | None = Field(
-        default=None, description='constants of each pair of species, such as "Ni-P"'
-    )
+def _pair_table(name: str, kind: str, row: type[TomlTable], description: str) -> Any:
+    """The table of a potential whose constants are given once, or as a row for each pair of species."""
+    columns: dict[str, Any] = {"kind": (Literal[kind], ...)}
+    for key, field in row.model_fields.items():
+        value: Any = Annotated[field.annotation, *field.metadata]
+        given = Field(default=None, description=field.description)
+        columns[key] = (value | None, given) if field.is_required() else (field.annotation, field)
+    rows = Field(default=None, description='constants of each pair of species, such as "Ni-P"')
+    columns["pairs"] = (dict[str, row] | None, rows)
+    return create_model(name, __base__=PairPotentialTable, __doc__=description, **columns)
 
 
-class SoftSphereTable(PairPotentialTable):
-    """(ε/α) (1 - r/σ)^α inside σ, nothing outside."""
-
-    kind: Literal["soft-sphere"]
-    sigma: Length | None = Field(default=None, description="diameter (Å or σ)")
-    epsilon: Energy | None = Field(default=None, description="energy scale (eV or ε)")
-    alpha: Annotated[float, Field(gt=1)] = Field(
-        default=2.0, description="exponent; 2 is harmonic, 2.5 Hertzian"
-    )
-    pairs: dict[str, SoftSpherePair] | None = Field(
-        default=None, description='constants of each pair of species, such as "Ni-P"'
-    )
+LennardJonesTable = _pair_table(
+    "LennardJonesTable", "lennard-jones", LennardJonesPair, "4 ε [(σ/r)^12 - (σ/r)^6]."
+)
+MorseTable = _pair_table("MorseTable", "morse", MorsePair, "D [(1 - exp(-α (r - r0)))^2 - 1].")
+SoftSphereTable = _pair_table(
+    "SoftSphereTable", "soft-sphere", SoftSpherePair, "(ε/α) (1 - r/σ)^α inside σ, nothing outside."
+)
 
 
 class ManyBodyTable(TomlTable):

@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -268,7 +268,7 @@ def _check_width(atoms: Atoms, r_cut: float, skin: float, length: str) -> None:
 
 
 def _smallest_distance(spec: schema.SystemSpec) -> float:
-    potential = spec.potential
+    potential: Any = spec.potential
     if isinstance(potential, schema.SoftSphereTable):
         # soft spheres may overlap; only coinciding centers, where the force has no direction, are wrong
         return 1e-9

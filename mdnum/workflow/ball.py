@@ -28,7 +28,7 @@ from mdnum.workflow.ball_page import (
 from mdnum.workflow.frame import Outcome, Progress, Verb, View
 
 if TYPE_CHECKING:
-    from mdnum.ball.problem import Problem
+    from mdnum.ball.problem import BallProblem
     from mdnum.ball.rollout import BallRun
     from mdnum.systems.ball_system import BallSystem
     from mdnum.systems.build_ball import BallSimulation
@@ -115,7 +115,7 @@ def _changes(text: str) -> dict[str, str]:
     return {key.strip(): value.strip()}
 
 
-def _simulate(problem: Problem, progress: Progress | None) -> tuple[BallRun, float | None]:
+def _simulate(problem: BallProblem, progress: Progress | None) -> tuple[BallRun, float | None]:
     """The run, and steps per second after the part that holds the compilation (None for a short one)."""
     marks: list[tuple[float, int]] = []
 
@@ -172,7 +172,7 @@ def _differentiated(
     return made, rows
 
 
-def gradients(problem: Problem, asked: Any, first: bool = False) -> list[dict[str, Any]]:
+def gradients(problem: BallProblem, asked: Any, first: bool = False) -> list[dict[str, Any]]:
     """Each derivative that was asked for, as a plain mapping.
 
     Args:
@@ -206,7 +206,7 @@ def gradients(problem: Problem, asked: Any, first: bool = False) -> list[dict[st
     return found
 
 
-def loss(problem: Problem, gradient: Sequence[Mapping[str, Any]]) -> float:
+def loss(problem: BallProblem, gradient: Sequence[Mapping[str, Any]]) -> float:
     """The loss, taken from a derivative of the program itself where there is one: it is compiled already."""
     same = ("unrolled", "frozen", "event-aware")
     known = [made["value"] for made in gradient if made["method"] in same and not made["refused"]]
@@ -312,7 +312,8 @@ def _independent(view: View) -> Iterator[Finding]:
         for place, names in places.items():
             groups.setdefault(names, []).append(place)
         told = "; ".join(f"along {listed(names)} {listed(where)}" for names, where in groups.items())
-        variants = ["implicit"] * ("by implicit" in places)
+        implicit = "by implicit" in places
+        variants = ["only_implicit" if len(places) == 1 else "implicit"] if implicit else []
         variants += ["variant"] * (not any(own.get(place) for place in own))
         names = listed(list(dict.fromkeys(name for names in places.values() for name in names)))
         finding = TEXTS.finding(

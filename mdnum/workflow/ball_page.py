@@ -87,6 +87,7 @@ def page(view: View, verdict: Verdict) -> Page:
 def _keys(view: View) -> Iterator[Key]:
     summary, first = view.summary, view.summary["first_contact"]
     when = "none begins" if first is None else f"first at step {count(first)}"
+    when = when if summary["flips_entered"] or first is None else "in contact at the start"
     yield Key("Contacts", count(summary["flips_entered"]), when)
     total = count(summary["iterations_total"])
     if located(view):
@@ -123,12 +124,17 @@ def _heights(view: View) -> Plot | None:
     roles: tuple[Role, ...] = ("first", "second", "third")
     few = len(balls) <= len(roles)
     lines = []
-    for n, ball in enumerate(balls):
-        mine = rows["ball"] == ball
-        label = f"ball {ball}" if few else "balls" if n == 0 else ""
-        lines.append(
-            Series(label, time_of(view, rows["step"][mine]), rows["y"][mine], "line", roles[n * few])
-        )
+    if few:
+        for n, ball in enumerate(balls):
+            mine = rows["ball"] == ball
+            at = time_of(view, rows["step"][mine])
+            lines.append(Series(f"ball {ball}", at, rows["y"][mine], "line", roles[n]))
+    else:
+        # one line with a gap after each ball
+        order = np.argsort(rows["ball"], kind="stable")
+        ends = np.cumsum(np.bincount(rows["ball"].astype(int)))
+        x, y = (np.insert(values[order], ends, np.nan) for values in (time_of(view, rows["step"]), rows["y"]))
+        lines.append(Series("balls", x, y))
     if not balls:
         if not np.isfinite(series["mean_height"]).any():
             return None

@@ -8,12 +8,12 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from mdnum.ball.compare import Difference
+from mdnum.ball.compare import BallDifference
 from mdnum.ball.contacts import Penalty, Projection
 from mdnum.ball.exact import ExactImpact, ExactPenalty
 from mdnum.ball.rollout import BallRun, residual_bound
 from mdnum.ball.state import Reason
-from mdnum.ball.stopping import Fixed
+from mdnum.ball.stopping import FixedCount
 from mdnum.systems import ball
 from mdnum.systems.ball_system import BallSystem
 from mdnum.systems.build_ball import BallSimulation, BallVariant
@@ -145,7 +145,7 @@ def heights(run: BallRun) -> dict[str, np.ndarray]:
     }
 
 
-def separations(name: str, found: Difference) -> dict[str, np.ndarray]:
+def separations(name: str, found: BallDifference) -> dict[str, np.ndarray]:
     """A row per step: how far the heights of a variant are from those of the run."""
     size = len(found.separation)
     return {"variant": np.full(size, name), "step": np.arange(size), "separation": found.separation}
@@ -195,7 +195,7 @@ def summarize(simulation: BallSimulation, run: BallRun) -> dict[str, Any]:
 
 def compared(
     variant: BallVariant,
-    found: Difference,
+    found: BallDifference,
     other: BallRun,
     gradient: Sequence[Mapping[str, Any]],
     theirs: Sequence[Mapping[str, Any]],
@@ -320,7 +320,7 @@ def ambiguous_flips(run: BallRun) -> np.ndarray:
 def ambiguous_stops(run: BallRun) -> np.ndarray:
     """Stop decisions of each step that another order of the residual's sum could have made otherwise."""
     rule = rule_of(run)
-    if rule is None or isinstance(rule, Fixed):
+    if rule is None or isinstance(rule, FixedCount):
         return np.zeros(run.steps, np.int64)
     share = residual_bound(run.world, 1.0, 1 if run.iterations.ndim == 2 else run.balls)
     busy = solved(run)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import ast
 import importlib.util
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -251,7 +251,10 @@ def page(view: View, verdict: Verdict) -> Page:
         rows = [("ok" if one["ok"] else "failed", one["what"], shown(one["seen"]), one["expected"])
                 for one in demo["checks"]]  # fmt: skip
         bad = frozenset(row for row, one in enumerate(demo["checks"]) if not one["ok"])
-        numbers = pairs([(key.replace("_", " "), shown(value)) for key, value in demo["numbers"].items()])
+        digits = _digits(demo["numbers"].values(), 10)
+        numbers = pairs(
+            [(key.replace("_", " "), shown(value, digits)) for key, value in demo["numbers"].items()]
+        )
         checks = Table(("", "check", "seen", "expected"), rows, shown=1000, bad=bad)
         told = [demo["question"], typeset(demo["answer"]), numbers, checks]
         sections.append(Section(demo["title"], told, terminal=True))
@@ -271,21 +274,27 @@ def _table(stored: Mapping[str, Any]) -> Table:
     """A table whose numbers have the fewest digits, five at least, that tell those of a column apart."""
     columns = []
     for values in zip(*stored["rows"], strict=True):
-        floats = {value for value in values if isinstance(value, float)}
-        apart = (digits for digits in range(5, 17) if len({f"{x:.{digits}g}" for x in floats}) == len(floats))
-        digits = next(apart, 17)
+        digits = _digits(values, 5)
         columns.append(
             [shown(value, digits) if isinstance(value, float | list) else value for value in values]
         )
     return Table(tuple(stored["columns"]), list(zip(*columns, strict=True)), stored["title"])
 
 
+def _digits(values: Iterable[Any], least: int) -> int:
+    """The fewest significant digits that tell numbers apart."""
+    floats = {value for value in values if isinstance(value, float)}
+    apart = (n for n in range(least, 17) if len({f"{x:.{n}g}" for x in floats}) == len(floats))
+    return next(apart, 17)
+
+
 def shown(value: Any, digits: int = 10) -> str:
-    """A plain value as people read it: numbers to so many significant digits, lists in brackets."""
+    """A plain value as people read it: numbers to a number of significant digits, lists in brackets."""
     if isinstance(value, Mapping):
         return ", ".join(f"{str(key).replace('_', ' ')} {shown(item, digits)}" for key, item in value.items())
     if isinstance(value, list):
-        texts = [shown(item, min(digits, 5) if len(value) > 3 else digits) for item in value]
+        digits = _digits(value, min(digits, 5) if len(value) > 3 else digits)
+        texts = [shown(item, digits) for item in value]
         if len(texts) > _LISTED:
             return f"[{', '.join(texts[:6])}, …, {texts[-1]}] ({len(texts)} values)"
         return f"[{', '.join(texts)}]"

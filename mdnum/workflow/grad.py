@@ -34,11 +34,13 @@ ALL = "all"
 _QUICK, AFFORDABLE = ("event-aware", "symmetric", "finite-differences"), 6_000_000
 #: Parts of a diagnosis that are always there, and those that are asked for.
 _PARTS, EDGES = ("agreement", "growth", "flips", "trust"), "edges"
+_BRIEF = ("growth", "flips", "spectrum", "scaling", "detective")
 ALSO = ("spectrum", EDGES, "scaling")
 #: Entries of a derivative that summary.json has one by one; the file with those that have more.
 _FEW, ARRAYS = 6, "gradients.npz"
 _BALL_UNITS = {
-    "k": "1/s²", "damping": "1/s", "eps": "m", "tol": "m", "gravity": "m/s²", "h": "s", "y0": "m", "v0": "m/s",
+    "k": "1/s²", "damping": "1/s", "eps": "m", "tol": "m", "gravity": "m/s²", "h": "s", "y0": "m",
+    "v0": "m/s",
 }  # fmt: skip
 #: Share of a derivative above which single flips decide it, and how many of them count as single.
 _HEAVY, _SINGLE = 0.2, 3
@@ -310,11 +312,11 @@ def _summary(problem: Problem, names: Sequence[str], found: GradientDiagnosis) -
         "reference": agreement.reference,
         "methods": [_method(one.found) | {"seconds": one.seconds} for one in made if one.found],
         "comparisons": plain(agreement.comparisons),
-        **{name: _brief(getattr(found, name)) for name in ("growth", "flips", "spectrum", "scaling", "detective")},
+        **{name: _brief(getattr(found, name)) for name in _BRIEF},
         "trust": trust,
         "edges": plain(found.edges),
         "failed": dict(found.failed),
-        "refused": [{"method": one.method, "why": one.missing} for one in agreement.opinions if not one.found],
+        "refused": [{"method": one.method, "why": one.missing} for one in agreement.opinions if one.missing],
         "status": "complete",
     }  # fmt: skip
 

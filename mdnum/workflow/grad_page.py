@@ -275,8 +275,8 @@ def _horizons(view: View) -> Iterator[Any]:
     if series:
         label = f"|parameter × derivative| ({unit})" if unit else "|parameter × derivative|"
         yield Plot(
-            "growth", f"The gradient of {summary['loss']['word']} against the horizon", "horizon (steps)", label,
-            tuple(series), y_scale="log", caption=TEXTS("caption_growth"), verticals=verticals,
+            "growth", f"The gradient of {summary['loss']['word']} against the horizon", "horizon (steps)",
+            label, tuple(series), y_scale="log", caption=TEXTS("caption_growth"), verticals=verticals,
         )  # fmt: skip
     size, horizon, rate = table["size"], table["horizon"], summary["growth"]["rate"]
     if np.any(size > 0):
@@ -401,8 +401,9 @@ def _flips(view: View) -> Iterator[Any]:
             tuple(running), caption=TEXTS("caption_running"), horizontals=((0.0, ""),),
         )  # fmt: skip
         yield Plot(
-            "ranked", "Contributions of single flips, the largest first", "rank", "|contribution| / |derivative|",
-            tuple(ranked), x_scale="log", y_scale="log", caption=TEXTS("caption_ranked"),
+            "ranked", "Contributions of single flips, the largest first", "rank",
+            "|contribution| / |derivative|", tuple(ranked), x_scale="log", y_scale="log",
+            caption=TEXTS("caption_ranked"),
         )  # fmt: skip
     yield TEXTS("by_weight", shown=min(found["flips"], TABLE_ROWS), flips=found["flips"])
     yield _browse({name: values[:TABLE_ROWS] for name, values in table.items()})

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from mdnum.ball import (
+    BallVerlet,
     EventLocated,
     ExactImpact,
     ExactPenalty,
@@ -19,7 +20,6 @@ from mdnum.ball import (
     PerInstance,
     Projection,
     SemiImplicitEuler,
-    VelocityVerlet,
     World,
     simulate,
 )
@@ -70,7 +70,7 @@ def test_located_impacts_have_the_exact_derivatives(name):
     assert np.all(found.largest > 0.1)
 
 
-@pytest.mark.parametrize("scheme", [ExplicitEuler, SemiImplicitEuler, VelocityVerlet])
+@pytest.mark.parametrize("scheme", [ExplicitEuler, SemiImplicitEuler, BallVerlet])
 def test_impacts_at_the_end_of_a_step_are_of_order_one_and_their_derivative_is_zero(scheme):
     """The derivative by y0 is exactly 0.0 at every step size: an error that does not shrink."""
     found = converge(World.create(Impact(), scheme(0.01)), ExactImpact, STARTS, TIME, COUNTS)
@@ -103,7 +103,7 @@ def test_saltation_restores_the_derivative_to_order_one(scheme):
     [
         (ExplicitEuler, 1),
         (SemiImplicitEuler, 1),
-        (VelocityVerlet, 2),
+        (BallVerlet, 2),
         (ImplicitMidpoint, 2),
     ],
 )

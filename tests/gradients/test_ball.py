@@ -8,8 +8,8 @@ from scipy.optimize import brentq
 
 from mdnum.ball.contacts import Impact, Penalty, Projection
 from mdnum.ball.exact import ExactImpact
-from mdnum.ball.integrators import EventLocated, SemiImplicitEuler, VelocityVerlet
-from mdnum.ball.problem import MeanHeight, Problem, ResidualPenetration
+from mdnum.ball.integrators import BallVerlet, EventLocated, SemiImplicitEuler
+from mdnum.ball.problem import BallProblem, MeanHeight, ResidualPenetration
 from mdnum.ball.stopping import GlobalSum, PerInstance
 from mdnum.ball.world import World
 from mdnum.errors import InputError, NumericalError
@@ -22,16 +22,16 @@ def method(name: str, **options):
     return BALL_METHODS[name](**options)
 
 
-def relaxation(tol: float, p0=(0.45,), rule=GlobalSum) -> Problem:
+def relaxation(tol: float, p0=(0.45,), rule=GlobalSum) -> BallProblem:
     """One step without gravity from below the floor: the projection and nothing else."""
     contact = Projection(0.5, 0.5, rule(tol, 200))
     world = World.create(contact, SemiImplicitEuler(1.0), gravity=0.0)
-    return Problem(world, -np.array(p0), 0.0, 1, ResidualPenetration(1))
+    return BallProblem(world, -np.array(p0), 0.0, 1, ResidualPenetration(1))
 
 
-def bouncing(scheme, end: float = 2.0, steps: int | None = None, y0=1.0, **contact) -> Problem:
+def bouncing(scheme, end: float = 2.0, steps: int | None = None, y0=1.0, **contact) -> BallProblem:
     world = World.create(Impact(**contact), scheme)
-    return Problem(world, y0, 0.0, steps or round(end / float(scheme.h)))
+    return BallProblem(world, y0, 0.0, steps or round(end / float(scheme.h)))
 
 
 def height(y0, v0, e, g, end):
@@ -92,7 +92,7 @@ def test_frozen_is_the_derivative_of_the_pinned_program() -> None:
     control = 3.0 * np.sin(np.arange(60.0))[:, None] * np.array([1.0, 0.5])
     contact = Projection(0.5, 0.5, GlobalSum(1e-3, 60))
     world = World.create(contact, SemiImplicitEuler(1e-2), control=control)
-    problem = Problem(world, np.array([0.05, 0.2]), 0.0, 60, MeanHeight())
+    problem = BallProblem(world, np.array([0.05, 0.2]), 0.0, 60, MeanHeight())
     names = ["k", "alpha", "restitution", "gravity", "y0", "v0"]
     frozen = method("frozen")(problem, names)
     unrolled = method("unrolled")(problem, names)
@@ -106,7 +106,7 @@ def test_frozen_is_the_derivative_of_the_pinned_program() -> None:
 
 def test_a_fixed_point_too_ill_conditioned_to_differentiate_is_refused() -> None:
     world = World.create(Projection(1e-13, 0.5, GlobalSum(1e-2, 3)), SemiImplicitEuler(1.0), gravity=0.0)
-    problem = Problem(world, np.array([-0.45]), 0.0, 1, ResidualPenetration(1))
+    problem = BallProblem(world, np.array([-0.45]), 0.0, 1, ResidualPenetration(1))
     with pytest.raises(InputError, match="condition number 2e\\+13"):
         method("implicit")(problem, ["k"])
     helped = method("implicit", regularization=1e-3)(problem, ["k"])
@@ -116,7 +116,7 @@ def test_a_fixed_point_too_ill_conditioned_to_differentiate_is_refused() -> None
 
 def test_six_located_bounces_to_ten_digits() -> None:
     world = World.create(Impact(0.8), EventLocated(1e-2))
-    found = method("event-aware")(Problem(world, 1.0, 0.5, 300), ["y0", "v0", "restitution", "gravity"])
+    found = method("event-aware")(BallProblem(world, 1.0, 0.5, 300), ["y0", "v0", "restitution", "gravity"])
     assert found.details["events"] == 6
     exact = ExactImpact(1.0, 0.5, gravity=9.81, restitution=0.8).height(3.0)
     np.testing.assert_allclose(found.value, exact.value, rtol=1e-11)
@@ -127,7 +127,7 @@ def test_six_located_bounces_to_ten_digits() -> None:
 def test_located_impacts_have_the_derivative_of_the_exact_motion() -> None:
     at = {"y0": 1.0, "v0": 0.5, "e": 0.8, "g": 9.81}
     world = World.create(Impact(0.8), EventLocated(1e-2))
-    found = method("event-aware")(Problem(world, 1.0, 0.5, 200), ["y0", "v0", "restitution", "gravity"])
+    found = method("event-aware")(BallProblem(world, 1.0, 0.5, 200), ["y0", "v0", "restitution", "gravity"])
     assert found.details == {"events": 3, "located": True}
     exact = slopes(lambda **p: height(p["y0"], p["v0"], p["e"], p["g"], 2.0), at, 1e-4)
     got = dict(zip(at, found.gradient.values(), strict=True))
@@ -189,14 +189,14 @@ def damped(y0, k, damping, g=9.81, end=1.0):
     return depth(out)[1] * left - g * left * left / 2
 
 
-@pytest.mark.parametrize("scheme", [SemiImplicitEuler, VelocityVerlet])
+@pytest.mark.parametrize("scheme", [SemiImplicitEuler, BallVerlet])
 def test_a_damper_that_sets_in_with_a_jump_needs_the_saltation_too(scheme) -> None:
     names = ["y0", "k", "damping"]
     exact = slopes(lambda **p: damped(**p), {"y0": 1.0, "k": 1e4, "damping": 20.0}, 1e-5)
     naive_error, aware_error = [], []
     for h in (2e-5, 1e-5):
         world = World.create(Penalty(1e4, damping=20.0), scheme(h))
-        problem = Problem(world, 1.0, 0.0, round(1.0 / h))
+        problem = BallProblem(world, 1.0, 0.0, round(1.0 / h))
         np.testing.assert_allclose(problem.value(), damped(1.0, 1e4, 20.0), atol=30 * h)
         naive = method("unrolled")(problem, names).gradient
         aware = method("event-aware")(problem, names).gradient
@@ -211,7 +211,7 @@ def test_a_damper_that_sets_in_with_a_jump_needs_the_saltation_too(scheme) -> No
 def test_a_graze_is_refused() -> None:
     # a ball that sinks through the floor at 1e-9 m/s: the time of its contact is nowhere near differentiable
     world = World.create(Impact(0.8, rest_speed=0.0), SemiImplicitEuler(0.125))
-    hover = Problem(world, 1e-10, 9.81 * 0.125 - 1e-9, 1)
+    hover = BallProblem(world, 1e-10, 9.81 * 0.125 - 1e-9, 1)
     with pytest.raises(NumericalError, match="graze"):
         method("event-aware")(hover, ["y0"])
 
@@ -259,7 +259,7 @@ def test_loss_scaling_brings_back_what_float16_loses() -> None:
     top, tiny = float(np.nextafter(np.float16(1e-3), np.float16(0))), 2.0**-23
     contact = Projection(0.5, 0.5, GlobalSum(float(np.float16(1e-3)), 25))
     world = World.create(contact, SemiImplicitEuler(1e-2), gravity=0.0, policy=policy)
-    problem = Problem(world, -np.array([top] + [tiny] * 8), 0.0, 4, ResidualPenetration())
+    problem = BallProblem(world, -np.array([top] + [tiny] * 8), 0.0, 4, ResidualPenetration())
     plain = method("unrolled")(problem, ["k"])
     scaled = method("unrolled", loss_scale=2.0**16)(problem, ["k"])
     # 2 p1 dp1/dk / 9 in real arithmetic
@@ -286,7 +286,7 @@ def test_a_comparison_runs_what_applies_and_says_why_the_rest_does_not() -> None
 )
 def test_a_spring_has_no_saltation(damping: float, word: str) -> None:
     world = World.create(Penalty(900.0, damping), SemiImplicitEuler(0.01))
-    problem = Problem(world, 1.0, 0.0, 120)
+    problem = BallProblem(world, 1.0, 0.0, 120)
     aware, plain = (method(name)(problem, ["y0"]) for name in ("event-aware", "unrolled"))
     assert word in aware.description
     same = aware.gradient["y0"] == pytest.approx(plain.gradient["y0"], rel=1e-12)

@@ -70,7 +70,7 @@ def test_the_horizon_of_noise_is_where_the_error_passes_the_mean(hard):
         Ensemble()(problem, ("v0",))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_wide_differences_of_a_melt_agree_with_the_flow_and_not_with_the_steps():
     """How hot a crystal has become while it melts: replica by replica, what the flips add is some standard
     errors of the difference, and with it nothing is missing. By the radius, plain is exactly 0."""

@@ -145,7 +145,7 @@ def test_floats_cannot_be_taken_back():
         Reversible()(Problem(simulation, FinalProjection(), 10), ("sigma",))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("bath", (False, True))
 def test_a_hundred_thousand_steps_back_to_the_start(bath):
     """Lists of the way back are built independently; `backward` raises where a bit of the start is wrong."""
@@ -196,7 +196,7 @@ print(digest.hexdigest())
 """
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_instruction_sets_and_optimization_do_not_matter():
     """The same bits of states, decisions and energies from programs that a compiler makes differently."""
     seen = {}

@@ -16,7 +16,7 @@ from mdnum.gradients.differences import FiniteDifferences, richardson
 from mdnum.gradients.losses import Custom, FinalProjection
 from mdnum.gradients.problem import Problem
 from mdnum.gradients.recorded import Symmetric
-from mdnum.gradients.tape import Tape
+from mdnum.gradients.tape import RunTape
 from mdnum.systems import build
 
 STEPS = 40
@@ -89,7 +89,7 @@ def test_the_tape_is_the_run_of_the_rollout(switched):
     """States and decisions that the reverse pass linearizes at, against the run without any gradient."""
     from mdnum.rollout.engine import Engine
 
-    tape = Tape(switched.simulation, switched.loss, STEPS, budget=0)
+    tape = RunTape(switched.simulation, switched.loss, STEPS, budget=0)
     steps = {}
     for segment in Engine(switched.simulation, STEPS).segments():
         for row in range(segment.rows):

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from mdnum.forks.choices.arithmetic import Precision, Stopping, Summation
+from mdnum.forks.choices.arithmetic import PrecisionChoice, Stopping, Summation
 from mdnum.forks.choices.base import CHOICES, Choice, parse, shipped, twin_of, unavailable, world_of
 from mdnum.forks.choices.decisions import ContactStep, Inverted, Iterations
 from mdnum.forks.choices.frames import Images, Relabel, Rotate, Translate
-from mdnum.forks.choices.inputs import Cap, EnergyShift, Noise, StartUlp, Ulps
-from mdnum.forks.choices.lists import Builder, Format, Order, Rebuild, Skin
+from mdnum.forks.choices.inputs import Cap, EnergyShift, NoiseChoice, StartUlp, Ulps
+from mdnum.forks.choices.lists import Builder, FormatChoice, Order, RebuildChoice, Skin
 
 __all__ = [
     "CHOICES",
@@ -16,14 +16,14 @@ __all__ = [
     "Choice",
     "ContactStep",
     "EnergyShift",
-    "Format",
+    "FormatChoice",
     "Images",
     "Inverted",
     "Iterations",
-    "Noise",
+    "NoiseChoice",
     "Order",
-    "Precision",
-    "Rebuild",
+    "PrecisionChoice",
+    "RebuildChoice",
     "Relabel",
     "Rotate",
     "Skin",

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Any
 
 from mdnum.errors import InputError
 from mdnum.forks.choices.base import (
-    CHOICES,
     Choice,
     built,
+    choice,
     is_pairwise,
-    no_more,
     simulations,
     summed,
     world_of,
@@ -37,9 +35,8 @@ RULES = {
 }
 
 
-@CHOICES.add("precision")
-@dataclass(frozen=True)
-class Precision(Choice):
+@choice("precision")
+class PrecisionChoice(Choice):
     """Another float in one role, or in several.
 
     Sixteen bits are for pair forces alone in molecular dynamics: in any other role they make another model
@@ -68,18 +65,15 @@ class Precision(Choice):
     @property
     def name(self) -> str:
         """Such as "precision" or "precision.force=float64"."""
-        base = "precision" if self.role is None else f"precision.{self.role}"
+        base = self.family if self.role is None else f"{self.family}.{self.role}"
         return base if self.dtype == "float32" else f"{base}={self.dtype}"
 
     @classmethod
     def parse(cls, argument: str, role: str, both: str | None) -> Choice:
-        """From "precision.role=dtype"."""
-        no_more(cls, "", both)
         return cls(role or None, argument or "float32")
 
     @classmethod
     def shipped(cls, world: str) -> Iterable[Choice]:
-        """Each role in single precision, pair forces in half; of a ball every role in every format."""
         roles = (None, *ROLES[world])
         if world == "ball":
             return [cls(role, dtype) for role in roles for dtype in ALL]
@@ -91,11 +85,9 @@ class Precision(Choice):
         return ("force",) if world == "md" and self.dtype not in WIDE else _DEFAULT[world]
 
     def describe(self, world: str = "md") -> str:
-        """Roles and dtype."""
         return f"{', '.join(self._roles(world))} in {self.dtype}"
 
     def reason_unavailable(self, system: Any) -> str | None:
-        """A role may be missing, have that float already, have nothing to do, or not be able to have it."""
         world = world_of(system)
         roles = self._roles(world)
         if missing := [role for role in roles if role not in ROLES[world]]:
@@ -119,7 +111,6 @@ class Precision(Choice):
         return {f"precision.{role}": self.dtype for role in self._roles(world)}
 
     def make(self, system: Any) -> Twin:
-        """The system, and with the other float."""
         world = world_of(system)
         roles = self._roles(world)
         before = ", ".join(sorted({getattr(system.spec.precision, role) for role in roles}))
@@ -127,8 +118,7 @@ class Precision(Choice):
         return twin(system, self._keys(world), self.name, difference)
 
 
-@CHOICES.add("reduction")
-@dataclass(frozen=True)
+@choice("reduction")
 class Summation(Choice):
     """Another order of a sum: of the forces on an atom, of the residuals that stop a solver.
 
@@ -136,27 +126,20 @@ class Summation(Choice):
         word: as `mdnum.precision.reductions.parse` reads it: "exact", "permuted:3", "blocked:8".
     """
 
+    shown = True
     word: str = "exact"
 
     def __post_init__(self):
         reductions.parse(self.word)
 
-    @property
-    def name(self) -> str:
-        """Such as "reduction=exact"."""
-        return f"reduction={self.word}"
-
     @classmethod
     def shipped(cls, world: str) -> Iterable[Choice]:
-        """Every reduction."""
         return [cls(word) for word in reductions.BY_NAME]
 
     def describe(self, world: str = "md") -> str:
-        """What is summed, and how."""
         return f"{'force sums' if world == 'md' else 'the residuals of all balls summed'} {self.word}"
 
     def reason_unavailable(self, system: Any) -> str | None:
-        """There must be a sum that can have another order."""
         if world_of(system) == "ball":
             if (reason := nothing_summed(system)) is not None:
                 return reason
@@ -169,7 +152,6 @@ class Summation(Choice):
         return None
 
     def make(self, system: Any) -> Twin:
-        """The system, and with the other sums."""
         before = system.spec.precision.reduction
         if world_of(system) == "ball":
             values = {"precision.reduction": self.word}
@@ -178,8 +160,7 @@ class Summation(Choice):
         return simulations(a, summed(a, self.word), f"force sums {self.word}, not {before}")
 
 
-@CHOICES.add("stop")
-@dataclass(frozen=True)
+@choice("stop")
 class Stopping(Choice):
     """Another rule that stops the solver, with the same tolerance.
 
@@ -188,28 +169,21 @@ class Stopping(Choice):
     """
 
     worlds = ("ball",)
+    shown = True
     rule: str = "per-instance"
 
     def __post_init__(self):
         if self.rule not in RULES:
             raise InputError(f"no rule {self.rule!r}; there are {', '.join(RULES)}", where="stop")
 
-    @property
-    def name(self) -> str:
-        """Such as "stop=per-instance"."""
-        return f"stop={self.rule}"
-
     @classmethod
     def shipped(cls, world: str) -> Iterable[Choice]:
-        """Every rule."""
         return [cls(rule) for rule in RULES]
 
     def describe(self, world: str = "ball") -> str:
-        """What stops it."""
         return f"the solver is stopped by {RULES[self.rule]}"
 
     def reason_unavailable(self, system: Any) -> str | None:
-        """There must be a tolerance, of the same kind."""
         stop = system.spec.stop
         if stop is None:
             return "its steps solve nothing, so nothing stops a solver"
@@ -222,7 +196,6 @@ class Stopping(Choice):
         return not_possible(system, {"stop.rule": self.rule}, self.name)
 
     def make(self, system: Any) -> Twin:
-        """The system, and under the other rule."""
         difference = f"stopped by the rule {self.rule}, not {system.spec.stop.rule}"
         return twin(system, {"stop.rule": self.rule}, self.name, difference)
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar
+
+from typing_extensions import dataclass_transform
 
 from mdnum.errors import InputError
 from mdnum.forks.worlds import changes, program_of, varied
@@ -16,43 +18,69 @@ from mdnum.systems import BallSystem, System
 
 #: Reductions whose result does not depend on the order of their terms.
 ORDERLESS = ("exact", "fixed-point")
-#: What `--processes` varies, and people may look for here.
+#: What `mdnum fork processes` varies, and people may look for here.
 _PROGRAMS = ("jit", "eager", "vmap", "grad", "xla")
 _WORLDS = {"md": "of molecular dynamics", "ball": "of a ball"}
 
 
 class Choice:
-    """One numerical choice that can be made otherwise: a frozen dataclass of its arguments.
+    """One numerical choice that can be made otherwise: its arguments, as a frozen dataclass.
 
-    To add one, write a subclass and register it in `CHOICES` under its family, the word before "="; a package
-    outside does so by an entry point of the group "mdnum.choices".
+    To add one, write a subclass and decorate it with `choice("family")`, the word before "=". A package
+    outside gives its own a `family`, decorates it with `choice(None)` and names it by an entry point of the
+    group "mdnum.choices". Its first field but `both` is what is written after "=", and `both`, where there is
+    one, what is written after "@".
 
     Attributes:
+        family: the word before "=".
         worlds: "md" and "ball", or one of them.
         must_hold: whether it cannot change a bit of the trajectory by design, so that a fork is a finding.
+        shown: whether its argument is a part of its name where it is the default.
     """
 
+    family: ClassVar[str] = ""
     worlds: ClassVar[tuple[str, ...]] = ("md", "ball")
     must_hold: bool = False
+    shown: ClassVar[bool] = False
+
+    @classmethod
+    def _field(cls) -> Any:
+        return next((one for one in fields(cls) if one.name != "both"), None)  # type: ignore[arg-type]
+
+    @property
+    def argument(self) -> str:
+        """What is written after "="."""
+        field = self._field()
+        value = None if field is None else getattr(self, field.name)
+        if value is None or (field and value == field.default and not self.shown):
+            return ""
+        return f"{value:g}" if isinstance(value, float) else str(value)
 
     @property
     def name(self) -> str:
         """The word that `parse` makes it from."""
-        raise NotImplementedError
+        both = getattr(self, "both", None)
+        return self.family + (f"={self.argument}" if self.argument else "") + (f"@{both}" if both else "")
 
     def describe(self, world: str = "md") -> str:
-        """One line."""
+        """One line, for a system of a world."""
         return (self.__doc__ or self.name).partition("\n")[0].rstrip(".")
 
     @classmethod
     def parse(cls, argument: str, role: str, both: str | None) -> Choice:
-        """From "family.role=argument@both"; empty where there is none.
+        """From "family.role=argument@both"; empty where there is none. It has those that it has fields for.
 
         Raises:
             InputError: an argument that it cannot have.
         """
-        no_more(cls, role, both)
-        return cls(argument) if argument else cls()  # type: ignore[call-arg]
+        field = cls._field()
+        if argument and field is None:
+            raise InputError(f"{cls.family} has no argument", where=f"{cls.family}={argument}")
+        values = {"both": both} if both else {}
+        if argument:
+            kind = {"int": int, "float": float}.get(str(field.type).partition(" ")[0])
+            values[field.name] = number(argument, kind, cls.family) if kind else argument
+        return cls(**values)
 
     @classmethod
     def shipped(cls, world: str) -> Iterable[Choice]:
@@ -69,6 +97,20 @@ class Choice:
 
 
 CHOICES: Registry[Any] = Registry("choice", "mdnum.choices", Choice)
+
+
+@dataclass_transform(frozen_default=True)
+def choice(family: str | None):
+    """Make a subclass of `Choice` a frozen dataclass, and register it under its family where it has one."""
+
+    def add(cls: type[Any]) -> type[Any]:
+        made = dataclass(frozen=True)(cls)
+        if family is not None:
+            made.family = family
+            CHOICES.add(family, made)
+        return made
+
+    return add
 
 
 def world_of(system: Any) -> str:
@@ -129,10 +171,13 @@ def parse(text: str) -> Choice:
     if family in _PROGRAMS:
         raise InputError(
             f"{text} is another program of one run, and no choice of two",
-            remedy="Ask `mdnum fork SYSTEM --processes`",
+            remedy="Ask `mdnum fork processes SYSTEM`",
         )
     if head in CHOICES and (argument or not equals) and (both or not at):
-        return CHOICES[head].parse(argument, role, both or None)
+        kind: type[Choice] = CHOICES[head]
+        takes = {one.name for one in fields(kind)}  # type: ignore[arg-type]
+        if (not role or "role" in takes) and (not both or "both" in takes):
+            return kind.parse(argument, role, both or None)
     close = difflib.get_close_matches(text, [*CHOICES, *shipped("md"), *shipped("ball")], n=3)
     near = f"Did you mean {' or '.join(close)}? " if close else ""
     raise InputError(
@@ -141,17 +186,6 @@ def parse(text: str) -> Choice:
 
 
 # --- for the choices ----------------------------------------------------------------------------------
-
-
-def no_more(family: type, role: str, both: str | None) -> None:
-    """Refuse a role or a reduction of both runs, which most families do not have.
-
-    Raises:
-        InputError: there is one.
-    """
-    if role or both:
-        extra = f".{role}" if role else f"@{both}"
-        raise InputError(f"no choice with {extra} here", where=family.__name__.lower())
 
 
 def number(text: str, kind: type, where: str) -> Any:
@@ -194,13 +228,8 @@ def no_sums(system: System, both: str | None) -> str | None:
     return "the sums of a many-body potential have one order"
 
 
-def suffix(both: str | None) -> str:
-    """The end of a choice's name that says how both runs sum."""
-    return "" if both is None else f"@{both}"
-
-
 def summing(both: str | None) -> str:
-    """The same as the end of a sentence."""
+    """The end of a sentence that says how both runs sum."""
     return "" if both is None else f" (both with {both} sums)"
 
 

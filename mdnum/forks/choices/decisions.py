@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from mdnum.ball.program import ImposedDecision
 from mdnum.ball.rollout import BallRun
 from mdnum.errors import InputError
-from mdnum.forks.choices.base import CHOICES, Choice, no_more, number, some_ulps
+from mdnum.forks.choices.base import Choice, choice, number, some_ulps
 from mdnum.forks.worlds import program_of
 from mdnum.program import Twin
 from mdnum.systems import BallSystem
@@ -34,8 +34,7 @@ def _no_subject(system: BallSystem, step: int | None, ball: int | None) -> str |
     return None
 
 
-@CHOICES.add("contact")
-@dataclass(frozen=True)
+@choice("contact")
 class ContactStep(Choice):
     """One contact of one ball begins a step earlier or later; everything else is decided as ever.
 
@@ -56,8 +55,6 @@ class ContactStep(Choice):
 
     @classmethod
     def parse(cls, argument: str, role: str, both: str | None) -> Choice:
-        """From "earlier", "later:2", or step and ball of a decision to invert, "57:0"."""
-        no_more(cls, role, both)
         first, _, second = (argument or "earlier").partition(":")
         if first in ("earlier", "later"):
             return cls(-1 if first == "earlier" else 1, number(second, int, "contact") if second else 1)
@@ -66,26 +63,21 @@ class ContactStep(Choice):
 
     @classmethod
     def shipped(cls, world: str) -> Iterable[Choice]:
-        """The first contact."""
         return [cls(), cls(1)]
 
     @property
-    def name(self) -> str:
-        """Such as "contact=earlier" or "contact=later:2"."""
-        base = f"contact={self._word}"
-        return base if self.number == 1 else f"{base}:{self.number}"
+    def argument(self) -> str:
+        return self._word if self.number == 1 else f"{self._word}:{self.number}"
 
     @property
     def _word(self) -> str:
         return "earlier" if self.shift < 0 else "later"
 
     def describe(self, world: str = "ball") -> str:
-        """Which contact."""
         which = "the first contact" if self.number == 1 else f"contact {self.number}"
         return f"{which} one step {self._word}, everything else as it comes"
 
     def reason_unavailable(self, system: BallSystem) -> str | None:
-        """There may be no such contact, or no step before it."""
         found = self._find(_run(program_of(system)))
         return found if isinstance(found, str) else None
 
@@ -101,7 +93,6 @@ class ContactStep(Choice):
         return step, ball
 
     def make(self, system: BallSystem) -> Twin:
-        """The system, and made to touch a step earlier, or not to touch a step longer."""
         program = program_of(system)
         found = self._find(_run(program))
         assert not isinstance(found, str)
@@ -111,7 +102,7 @@ class ContactStep(Choice):
         return _imposed(program, pin, f"the contact of ball {ball} at step {step} begins a step {self._word}")
 
 
-@dataclass(frozen=True)
+@choice(None)
 class Inverted(Choice):
     """One contact decision taken the other way.
 
@@ -120,25 +111,22 @@ class Inverted(Choice):
         ball: whose.
     """
 
+    family = "contact"
     worlds = ("ball",)
     step: int
     ball: int = 0
 
     @property
-    def name(self) -> str:
-        """Such as "contact=57:0"."""
-        return f"contact={self.step}:{self.ball}"
+    def argument(self) -> str:
+        return f"{self.step}:{self.ball}"
 
     def describe(self, world: str = "ball") -> str:
-        """Which decision."""
         return f"the contact decision of ball {self.ball} at step {self.step} taken the other way"
 
     def reason_unavailable(self, system: BallSystem) -> str | None:
-        """There may be no such step or ball."""
         return _no_subject(system, self.step, self.ball)
 
     def make(self, system: BallSystem) -> Twin:
-        """The system, and with the decision inverted."""
         program = program_of(system)
         touches = bool(_run(program).contact[self.step - 1, self.ball])
         pin = ImposedDecision("contact", self.step, self.ball, int(not touches))
@@ -146,8 +134,7 @@ class Inverted(Choice):
         return _imposed(program, pin, difference)
 
 
-@CHOICES.add("iterations")
-@dataclass(frozen=True)
+@choice("iterations")
 class Iterations(Choice):
     """One solve goes on for more iterations, or for fewer, than its rule says.
 
@@ -166,28 +153,23 @@ class Iterations(Choice):
         some_ulps(self.more, "iterations")
 
     @property
-    def name(self) -> str:
-        """Such as "iterations=+1" or "iterations=-1:57"."""
-        parts = (f"iterations={self.more:+d}", self.step, self.ball)
+    def argument(self) -> str:
+        parts = (f"{self.more:+d}", self.step, self.ball)
         return ":".join(str(part) for part in parts if part is not None)
 
     @classmethod
     def parse(cls, argument: str, role: str, both: str | None) -> Choice:
-        """From "more:step:ball"."""
-        no_more(cls, role, both)
         parts = [number(part, int, "iterations") for part in (argument or "+1").split(":")]
         if len(parts) > 3:
             raise InputError(f"{argument!r} is not more:step:ball", where="iterations")
         return cls(*parts)
 
     def describe(self, world: str = "ball") -> str:
-        """Which solve."""
         which = "the first solve" if self.step is None else f"the solve of step {self.step}"
         noun = "iteration" if abs(self.more) == 1 else "iterations"
         return f"{which} makes {abs(self.more)} {noun} {'more' if self.more > 0 else 'fewer'}"
 
     def reason_unavailable(self, system: BallSystem) -> str | None:
-        """There must be a solve that iterates."""
         if system.spec.stop is None:
             return "its steps solve nothing, so there is no iteration to add"
         if (reason := _no_subject(system, self.step, self.ball)) is not None:
@@ -215,7 +197,6 @@ class Iterations(Choice):
         return ImposedDecision("stop", row + 1, ball if counts.ndim == 2 else -1, count)
 
     def make(self, system: BallSystem) -> Twin:
-        """The system, and made to go on, or to stop, at another iteration of one solve."""
         program = program_of(system)
         pin = self._find(_run(program))
         assert not isinstance(pin, str)

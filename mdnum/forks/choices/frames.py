@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,15 +12,13 @@ from jaxtyping import Float, Int
 
 from mdnum.errors import InputError
 from mdnum.forks.choices.base import (
-    CHOICES,
     Choice,
     built,
+    choice,
     is_langevin,
-    no_more,
     no_sums,
     number,
     simulations,
-    suffix,
     summing,
 )
 from mdnum.forks.choices.lists import Summed
@@ -38,8 +36,7 @@ def _frame(simulation: Any, **parts: Any) -> Any:
     return replace(Frame.same(simulation.atoms), **parts)
 
 
-@CHOICES.add("relabel")
-@dataclass(frozen=True)
+@choice("relabel")
 class Relabel(Summed):
     """The atoms in another order of the file.
 
@@ -50,29 +47,15 @@ class Relabel(Summed):
 
     seed: int = 1
 
-    @property
-    def name(self) -> str:
-        """Such as "relabel" or "relabel=3@exact"."""
-        return ("relabel" if self.seed == 1 else f"relabel={self.seed}") + suffix(self.both)
-
-    @classmethod
-    def parse(cls, argument: str, role: str, both: str | None) -> Choice:
-        """From "seed@both"."""
-        no_more(cls, role, None)
-        return cls(both, number(argument, int, "relabel") if argument else 1)
-
     def describe(self, world: str = "md") -> str:
-        """What is in another order."""
         return "atoms in another order" + summing(self.both)
 
     def reason_unavailable(self, system: System) -> str | None:
-        """A thermostat's noise goes by label."""
         if is_langevin(system):
             return "the thermostat's noise belongs to labels: other atoms would get it"
         return no_sums(system, self.both)
 
     def make(self, system: System) -> Twin:
-        """The system, and with its atoms permuted."""
         a = built(system, self.both)
         labels = np.random.default_rng(self.seed).permutation(a.atoms)
         b = built(replace(system, atoms=system.atoms[labels]), self.both)
@@ -82,8 +65,7 @@ class Relabel(Summed):
         return simulations(a, b, difference, _frame(a, labels=labels))
 
 
-@CHOICES.add("rotate")
-@dataclass(frozen=True)
+@choice("rotate")
 class Rotate(Summed):
     """The axes of the box exchanged or turned around.
 
@@ -108,19 +90,7 @@ class Rotate(Summed):
                 where="rotate",
             )
 
-    @property
-    def name(self) -> str:
-        """Such as "rotate" or "rotate=yzx"."""
-        return ("rotate" if self.axes is None else f"rotate={self.axes}") + suffix(self.both)
-
-    @classmethod
-    def parse(cls, argument: str, role: str, both: str | None) -> Choice:
-        """From "axes@both"."""
-        no_more(cls, role, None)
-        return cls(both, argument or None)
-
     def describe(self, world: str = "md") -> str:
-        """What is exchanged."""
         return "axes of the box exchanged or turned around" + summing(self.both)
 
     def _symmetry(self, system: System) -> str | None:
@@ -136,7 +106,6 @@ class Rotate(Summed):
         return None
 
     def reason_unavailable(self, system: System) -> str | None:
-        """The box may have no such symmetry, and a thermostat's noise goes by axis."""
         if is_langevin(system):
             return "the thermostat's noise belongs to axes: others would get it"
         if self._symmetry(system) is None:
@@ -144,7 +113,6 @@ class Rotate(Summed):
         return no_sums(system, self.both)
 
     def make(self, system: System) -> Twin:
-        """The system, and turned."""
         word = self._symmetry(system)
         assert word is not None
         a = built(system, self.both)
@@ -161,8 +129,7 @@ def _read(word: str) -> tuple[list[int], list[float]]:
     return ["xyz".index(part[-1]) for part in parts], [-1.0 if part[0] == "-" else 1.0 for part in parts]
 
 
-@CHOICES.add("translate")
-@dataclass(frozen=True)
+@choice("translate")
 class Translate(Summed):
     """Everything moved by a share of the lattice vectors: coordinates of another size are rounded otherwise.
 
@@ -172,6 +139,7 @@ class Translate(Summed):
     """
 
     must_hold = False  # type: ignore[assignment]
+    shown = True
     share: float = 0.25
 
     def __post_init__(self):
@@ -179,44 +147,32 @@ class Translate(Summed):
         if not np.isfinite(self.share) or self.share == 0:
             raise InputError(f"a share of {self.share:g}; expected a number other than 0", where="translate")
 
-    @property
-    def name(self) -> str:
-        """Such as "translate=0.25"."""
-        return f"translate={self.share:g}{suffix(self.both)}"
-
     @classmethod
     def parse(cls, argument: str, role: str, both: str | None) -> Choice:
-        """From "share@both", or "lattice"."""
-        no_more(cls, role, None)
         if argument == "lattice" and both is None:
             return Images()
         return cls(both, number(argument, float, "translate") if argument else 0.25)
 
     @classmethod
     def shipped(cls, world: str) -> Iterable[Choice]:
-        """By a quarter, and by whole lattice vectors."""
         return [cls(), Images()]
 
     def describe(self, world: str = "md") -> str:
-        """By how much."""
         return f"moved by {self.share:g} of each lattice vector{summing(self.both)}"
 
     def reason_unavailable(self, system: System) -> str | None:
-        """A cluster has no lattice vectors."""
         if not any(system.atoms.pbc):
             return "no axis is periodic"
         return no_sums(system, self.both)
 
     def make(self, system: System) -> Twin:
-        """The system, and elsewhere."""
         a = built(system, self.both)
         shift = self.share * np.asarray(a.cell.matrix)[list(a.cell.pbc)].sum(axis=0)
         b = replace(a, positions=a.positions + shift)
         return simulations(a, b, self.describe(), _frame(a, shift=shift))
 
 
-@CHOICES.add("unwrapped")
-@dataclass(frozen=True)
+@choice("unwrapped")
 class Images(Choice):
     """Atoms started in other images of the box.
 
@@ -238,27 +194,22 @@ class Images(Choice):
         """ "translate=lattice", "unwrapped" or "unwrapped=3"."""
         if self.seed is None:
             return "translate=lattice"
-        return "unwrapped" if self.seed == 1 else f"unwrapped={self.seed}"
+        return self.family if self.seed == 1 else f"{self.family}={self.seed}"
 
     @classmethod
     def parse(cls, argument: str, role: str, both: str | None) -> Choice:
-        """From a seed."""
-        no_more(cls, role, both)
         return cls(number(argument, int, "unwrapped") if argument else 1)
 
     @classmethod
     def shipped(cls, world: str) -> Iterable[Choice]:
-        """Random images."""
         return [cls(1)]
 
     def describe(self, world: str = "md") -> str:
-        """Which images."""
         if self.seed is None:
             return "moved by every lattice vector, exactly"
         return "started from unwrapped positions, exactly"
 
     def reason_unavailable(self, system: System) -> str | None:
-        """A cluster has no images; in a tilted box a sum of lattice vectors may not be exact."""
         if not any(system.atoms.pbc):
             return "no axis is periodic"
         _, _, lost = self._starts(built(system))
@@ -274,7 +225,6 @@ class Images(Choice):
         return exact_images(a.cell, a.positions, images * np.array(a.cell.pbc))
 
     def make(self, system: System) -> Twin:
-        """Both from positions whose images are exact: wrapped, and not."""
         a = built(system)
         wrapped, elsewhere, _ = self._starts(a)
         return simulations(replace(a, positions=wrapped), replace(a, positions=elsewhere), self.describe())

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from mdnum.errors import InputError
 from mdnum.forks.choices.base import (
-    CHOICES,
     Choice,
     built,
+    choice,
     is_langevin,
-    no_more,
     number,
     simulations,
     some_ulps,
@@ -42,8 +41,7 @@ OFTEN = {
 _NEAR = 1e-6
 
 
-@CHOICES.add("ulps")
-@dataclass(frozen=True)
+@choice("ulps")
 class Ulps(Choice):
     """A number of the system file, moved to a float near it in the format that it is used in.
 
@@ -61,14 +59,11 @@ class Ulps(Choice):
         some_ulps(self.ulps, self.name)
 
     @property
-    def name(self) -> str:
-        """Such as "ulps=cutoff.radius:+1"."""
-        return f"ulps={self.key}:{self.ulps:+d}"
+    def argument(self) -> str:
+        return f"{self.key}:{self.ulps:+d}"
 
     @classmethod
     def parse(cls, argument: str, role: str, both: str | None) -> Choice:
-        """From "key:ulps"."""
-        no_more(cls, role, both)
         if not argument:
             raise InputError("no number is named", where="ulps", remedy="Write such as ulps=cutoff.radius:+1")
         key, _, count = argument.partition(":")
@@ -76,15 +71,12 @@ class Ulps(Choice):
 
     @classmethod
     def shipped(cls, world: str) -> Iterable[Choice]:
-        """The numbers that systems often have."""
         return [cls(key) for key in OFTEN[world]]
 
     def describe(self, world: str = "md") -> str:
-        """Key and ulps."""
         return f"{self.key} by {self.ulps:+d} ulp{'s' if abs(self.ulps) > 1 else ''}"
 
     def reason_unavailable(self, system: Any) -> str | None:
-        """The file may have no such number, or must not have its neighbor."""
         numbers = floats(system)
         if self.key not in numbers:
             # one that somebody wrote may be a slip of the pen
@@ -102,7 +94,6 @@ class Ulps(Choice):
         return before, float(neighbor(before, self.ulps, np.dtype(dtype)))
 
     def make(self, system: Any) -> Twin:
-        """The system, and with the number's neighbor."""
         before, after = self._moved(system)
         difference = f"{self.key} = {after!r}, not {before!r}"
         if self.key == "dynamics.temperature" and not is_langevin(system) and system.velocities is not None:
@@ -119,8 +110,7 @@ def _drawn(system: System) -> System:
     return replace(system, spec=system.spec.model_copy(update={"structure": structure}), atoms=atoms)
 
 
-@CHOICES.add("start")
-@dataclass(frozen=True)
+@choice("start")
 class StartUlp(Choice):
     """One coordinate of the start, moved to a float near it.
 
@@ -143,17 +133,12 @@ class StartUlp(Choice):
         some_ulps(self.ulps, "start")
 
     @property
-    def name(self) -> str:
-        """Such as "start", "start=17:0:+1", "start=velocity:+1" or "start=3:height:-1"."""
-        if self == StartUlp():
-            return "start"
-        parts = [part for part in (self.which, self.what) if part is not None]
-        return "start=" + ":".join([*(str(part) for part in parts), f"{self.ulps:+d}"])
+    def argument(self) -> str:
+        parts = [str(part) for part in (self.which, self.what) if part is not None]
+        return "" if self == StartUlp() else ":".join([*parts, f"{self.ulps:+d}"])
 
     @classmethod
     def parse(cls, argument: str, role: str, both: str | None) -> Choice:
-        """From "which:what:ulps", of which the first may be left out for a ball."""
-        no_more(cls, role, both)
         if not argument:
             return cls()
         parts = argument.split(":")
@@ -168,18 +153,15 @@ class StartUlp(Choice):
 
     @classmethod
     def shipped(cls, world: str) -> Iterable[Choice]:
-        """The largest coordinate."""
         return [cls()] if world == "md" else [cls(), cls(what="velocity")]
 
     def describe(self, world: str = "md") -> str:
-        """What is moved."""
         if world == "md":
             return f"one coordinate of the start by {self.ulps:+d} ulp"
         which = "one ball" if self.which is None else f"ball {self.which}"
         return f"{self.what or 'height'} of {which} at the start by {self.ulps:+d} ulp"
 
     def reason_unavailable(self, system: Any) -> str | None:
-        """There may be no such atom, ball or coordinate, or it starts at 0."""
         world = world_of(system)
         count = len(system.atoms) if world == "md" else system.balls
         if self.which is not None and not 0 <= self.which < count:
@@ -194,7 +176,6 @@ class StartUlp(Choice):
         return None
 
     def make(self, system: Any) -> Twin:
-        """The system, and with the other coordinate."""
         return self._make_md(system) if world_of(system) == "md" else self._make_ball(system)
 
     def _make_md(self, system: System) -> Twin:
@@ -236,9 +217,8 @@ class StartUlp(Choice):
         return Twin(a, replace(a, problem=replace(a.problem, **start)), difference)
 
 
-@CHOICES.add("noise")
-@dataclass(frozen=True)
-class Noise(Choice):
+@choice("noise")
+class NoiseChoice(Choice):
     """Another key of the thermostat's noise.
 
     Attributes:
@@ -252,19 +232,7 @@ class Noise(Choice):
         if self.seed is not None and self.seed < 0:
             raise InputError(f"seed {self.seed} is negative", where="noise")
 
-    @property
-    def name(self) -> str:
-        """Such as "noise" or "noise=7"."""
-        return "noise" if self.seed is None else f"noise={self.seed}"
-
-    @classmethod
-    def parse(cls, argument: str, role: str, both: str | None) -> Choice:
-        """From a seed."""
-        no_more(cls, role, both)
-        return cls(number(argument, int, "noise") if argument else None)
-
     def reason_unavailable(self, system: System) -> str | None:
-        """Without a thermostat there is no noise."""
         if not is_langevin(system):
             return "there is no noise at constant energy (dynamics.kind is nve)"
         if self.seed == system.spec.dynamics.seed:
@@ -272,7 +240,6 @@ class Noise(Choice):
         return None
 
     def make(self, system: System) -> Twin:
-        """The system, and with the other noise: the start is the same."""
         import equinox as eqx
         import jax
 
@@ -283,8 +250,7 @@ class Noise(Choice):
         return simulations(a, replace(a, integrator=integrator), f"noise of seed {seed}, not {own}")
 
 
-@CHOICES.add("max_iter")
-@dataclass(frozen=True)
+@choice("max_iter")
 class Cap(Choice):
     """More iterations before the solver gives up, or of a fixed number of them.
 
@@ -299,18 +265,10 @@ class Cap(Choice):
         some_ulps(self.more, self.name)
 
     @property
-    def name(self) -> str:
-        """Such as "max_iter=+1"."""
-        return f"max_iter={self.more:+d}"
-
-    @classmethod
-    def parse(cls, argument: str, role: str, both: str | None) -> Choice:
-        """From a number of iterations."""
-        no_more(cls, role, both)
-        return cls(number(argument, int, "max_iter") if argument else 1)
+    def argument(self) -> str:
+        return f"{self.more:+d}"
 
     def describe(self, world: str = "ball") -> str:
-        """How many."""
         return f"{self.more:+d} iteration{'s' if abs(self.more) > 1 else ''} at most, or of a fixed number"
 
     def _key(self, system: Any) -> tuple[str, int]:
@@ -320,20 +278,17 @@ class Cap(Choice):
         return "stop.max_iter", stop.max_iter
 
     def reason_unavailable(self, system: Any) -> str | None:
-        """There must be a solver."""
         if system.spec.stop is None:
             return "its steps solve nothing, so there is no iteration to add"
         key, value = self._key(system)
         return not_possible(system, {key: value + self.more}, self.name)
 
     def make(self, system: Any) -> Twin:
-        """The system, and with the other cap."""
         key, value = self._key(system)
         return twin(system, {key: value + self.more}, self.name, f"{key} = {value + self.more}, not {value}")
 
 
-@CHOICES.add("energy-shift")
-@dataclass(frozen=True)
+@choice("energy-shift")
 class EnergyShift(Choice):
     """Pair energies shifted to zero at the cutoff, or not.
 
@@ -343,19 +298,7 @@ class EnergyShift(Choice):
     worlds = ("md",)
     must_hold = True
 
-    @property
-    def name(self) -> str:
-        """The only one."""
-        return "energy-shift"
-
-    @classmethod
-    def parse(cls, argument: str, role: str, both: str | None) -> Choice:
-        """It has no argument."""
-        no_more(cls, role, both or argument)
-        return cls()
-
     def reason_unavailable(self, system: System) -> str | None:
-        """Other cutoffs change the force too."""
         cutoff = system.spec.cutoff
         if cutoff is None:
             return "the potential carries its own cutoff"
@@ -364,7 +307,6 @@ class EnergyShift(Choice):
         return None
 
     def make(self, system: System) -> Twin:
-        """The system, and with its cutoff hard instead of shifted or the other way round."""
         assert system.spec.cutoff is not None
         kind = system.spec.cutoff.kind
         other = "shifted" if kind == "hard" else "hard"

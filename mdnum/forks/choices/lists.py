@@ -7,7 +7,7 @@ change the order in which forces are summed. With sums that have no order they m
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,16 +15,14 @@ import numpy as np
 from mdnum.errors import InputError
 from mdnum.forks.choices.arithmetic import nothing_summed
 from mdnum.forks.choices.base import (
-    CHOICES,
     ORDERLESS,
     Choice,
     built,
+    choice,
     is_pairwise,
-    no_more,
     no_sums,
     number,
     simulations,
-    suffix,
     summing,
     world_of,
 )
@@ -38,7 +36,7 @@ from mdnum.systems.ball import MaximumRule, RelativeRule, SumRule
 FORMATS = ("dense", "sparse", "ordered-sparse")
 
 
-@dataclass(frozen=True)
+@choice(None)
 class Summed(Choice):
     """A choice whose two runs may both be given a reduction: with one that has no order, it must hold.
 
@@ -60,16 +58,13 @@ class Summed(Choice):
 
     @classmethod
     def shipped(cls, world: str) -> Iterable[Choice]:
-        """As the system sums, and both with exact sums."""
         return [cls(), cls(both="exact")]
 
     def reason_unavailable(self, system: Any) -> str | None:
-        """Only pair potentials sum in an order that can be chosen."""
         return no_sums(system, self.both)
 
 
-@CHOICES.add("order")
-@dataclass(frozen=True)
+@choice("order")
 class Order(Summed):
     """The neighbors of each atom, or the balls of the batch, in another order.
 
@@ -89,28 +84,15 @@ class Order(Summed):
             raise InputError(f"seed {self.seed} is negative", where="order")
 
     @property
-    def name(self) -> str:
-        """Such as "order", "order=3@exact" or "order@alone"."""
-        return ("order" if self.seed == 1 else f"order={self.seed}") + suffix(self.both)
-
-    @property
     def must_hold(self) -> bool:  # type: ignore[override]
         """Sums without an order, and balls that hear nothing of each other, cannot tell."""
         return self.both in (*ORDERLESS, "alone")
 
     @classmethod
-    def parse(cls, argument: str, role: str, both: str | None) -> Choice:
-        """From "seed@both"."""
-        no_more(cls, role, None)
-        return cls(both, number(argument, int, "order") if argument else 1)
-
-    @classmethod
     def shipped(cls, world: str) -> Iterable[Choice]:
-        """As the system sums, and where the order must hold."""
         return [cls(), *(cls(both) for both in (ORDERLESS if world == "md" else ("exact", "alone")))]
 
     def describe(self, world: str = "md") -> str:
-        """What is in another order."""
         if world == "md":
             return "neighbors of each atom shuffled" + summing(self.both)
         both = {
@@ -121,7 +103,6 @@ class Order(Summed):
         return f"the balls of the batch in another order{both.get(self.both, '')}"
 
     def reason_unavailable(self, system: Any) -> str | None:
-        """One ball has one order; without a sum the order must hold, and with one it need not."""
         if world_of(system) == "md":
             return "@alone is for balls" if self.both == "alone" else no_sums(system, self.both)
         if self.both not in (None, "exact", "alone"):
@@ -140,7 +121,6 @@ class Order(Summed):
         return None
 
     def make(self, system: Any) -> Twin:
-        """The system, and in another order."""
         if world_of(system) == "md":
             from mdnum.forks.reordered import ShuffledSimulation
 
@@ -167,9 +147,8 @@ class Order(Summed):
         return Twin(a, b, difference)
 
 
-@CHOICES.add("format")
-@dataclass(frozen=True)
-class Format(Summed):
+@choice("format")
+class FormatChoice(Summed):
     """The neighbors of each atom in the order in which another format of the list adds them.
 
     Attributes:
@@ -177,6 +156,7 @@ class Format(Summed):
         word: "dense", "sparse" or "ordered-sparse", as jax-md names its formats.
     """
 
+    shown = True
     word: str = "ordered-sparse"
 
     def __post_init__(self):
@@ -184,28 +164,14 @@ class Format(Summed):
         if self.word not in FORMATS:
             raise InputError(f"no format {self.word!r}; there are {', '.join(FORMATS)}", where="format")
 
-    @property
-    def name(self) -> str:
-        """Such as "format=sparse" or "format=ordered-sparse@exact"."""
-        return f"format={self.word}{suffix(self.both)}"
-
-    @classmethod
-    def parse(cls, argument: str, role: str, both: str | None) -> Choice:
-        """From "format@both"."""
-        no_more(cls, role, None)
-        return cls(both, argument or "ordered-sparse")
-
     @classmethod
     def shipped(cls, world: str) -> Iterable[Choice]:
-        """Every format."""
         return [*(cls(word=word) for word in FORMATS), cls("exact")]
 
     def describe(self, world: str = "md") -> str:
-        """Whose order."""
         return f"pair terms added in the order of {self.word} lists{summing(self.both)}"
 
     def reason_unavailable(self, system: System) -> str | None:
-        """Only a loop over a list goes by the order of the list."""
         reason = no_sums(system, self.both)
         if reason is not None or self.both is not None:
             return reason
@@ -217,7 +183,6 @@ class Format(Summed):
         return None
 
     def make(self, system: System) -> Twin:
-        """The system, and with lists of the format."""
         from mdnum.forks.reordered import FormattedSimulation
 
         a = built(system, self.both)
@@ -225,8 +190,7 @@ class Format(Summed):
         return simulations(a, FormattedSimulation.of(a, self.word), difference)
 
 
-@CHOICES.add("builder")
-@dataclass(frozen=True)
+@choice("builder")
 class Builder(Summed):
     """Another search for neighbors.
 
@@ -246,29 +210,15 @@ class Builder(Summed):
                 f"no list builder {self.word!r}; there are {', '.join(BUILDERS)}", where="builder"
             )
 
-    @property
-    def name(self) -> str:
-        """Such as "builder" or "builder=jax-md"."""
-        return ("builder" if self.word is None else f"builder={self.word}") + suffix(self.both)
-
-    @classmethod
-    def parse(cls, argument: str, role: str, both: str | None) -> Choice:
-        """From "builder@both"."""
-        no_more(cls, role, None)
-        return cls(both, argument or None)
-
     def describe(self, world: str = "md") -> str:
-        """Both searches find the pairs that interact; only their order differs."""
         return "lists by another search" + summing(self.both)
 
     def reason_unavailable(self, system: System) -> str | None:
-        """The system may have that builder already."""
         if self.word is not None and built(system).builder == self.word:
             return f"the lists are {self.word}'s already"
         return no_sums(system, self.both)
 
     def make(self, system: System) -> Twin:
-        """The system, and with the other search."""
         from mdnum.md.verlet import BUILDERS
 
         a = built(system, self.both)
@@ -277,8 +227,7 @@ class Builder(Summed):
         return simulations(a, b, f"lists by {word}, not {a.builder}{summing(self.both)}")
 
 
-@CHOICES.add("skin")
-@dataclass(frozen=True)
+@choice("skin")
 class Skin(Summed):
     """Another skin: more or fewer pairs that do not interact, found at other times.
 
@@ -294,19 +243,7 @@ class Skin(Summed):
         if self.length is not None and not self.length >= 0:
             raise InputError(f"skin = {self.length:g}; expected a length of 0 or more", where="skin")
 
-    @property
-    def name(self) -> str:
-        """Such as "skin" or "skin=0.5@exact"."""
-        return ("skin" if self.length is None else f"skin={self.length:g}") + suffix(self.both)
-
-    @classmethod
-    def parse(cls, argument: str, role: str, both: str | None) -> Choice:
-        """From "length@both"."""
-        no_more(cls, role, None)
-        return cls(both, number(argument, float, "skin") if argument else None)
-
     def describe(self, world: str = "md") -> str:
-        """Whose skin."""
         return "another skin of the lists" + summing(self.both)
 
     def _length(self, system: System) -> float:
@@ -318,22 +255,19 @@ class Skin(Summed):
         return 1.5 * own if 1.5 * own <= room else 0.75 * own
 
     def reason_unavailable(self, system: System) -> str | None:
-        """The system may have that skin already."""
         if self._length(system) == system.spec.skin:
             return f"the skin is {system.spec.skin:g} already"
         return no_sums(system, self.both)
 
     def make(self, system: System) -> Twin:
-        """The system, and with the other skin."""
         length = self._length(system)
         b = built(varied(system, {"neighbors.skin": length}), self.both)
         difference = f"skin {length:g}, not {system.spec.skin:g}{summing(self.both)}"
         return simulations(built(system, self.both), b, difference)
 
 
-@CHOICES.add("rebuild")
-@dataclass(frozen=True)
-class Rebuild(Summed):
+@choice("rebuild")
+class RebuildChoice(Summed):
     """Another rule for when a list is rebuilt.
 
     Attributes:
@@ -349,10 +283,8 @@ class Rebuild(Summed):
             raise InputError(f"every {self.every} steps; expected at least 1", where="rebuild")
 
     @property
-    def name(self) -> str:
-        """Such as "rebuild=every:1" or "rebuild=half-skin"."""
-        word = "half-skin" if self.every is None else f"every:{self.every}"
-        return f"rebuild={word}{suffix(self.both)}"
+    def argument(self) -> str:
+        return "half-skin" if self.every is None else f"every:{self.every}"
 
     @property
     def must_hold(self) -> bool:  # type: ignore[override]
@@ -361,8 +293,6 @@ class Rebuild(Summed):
 
     @classmethod
     def parse(cls, argument: str, role: str, both: str | None) -> Choice:
-        """From "every:10@both" or "half-skin@both"."""
-        no_more(cls, role, None)
         if argument in ("", "half-skin"):
             return cls(both, None if argument else 1)
         rule, _, count = argument.partition(":")
@@ -372,11 +302,9 @@ class Rebuild(Summed):
 
     @classmethod
     def shipped(cls, world: str) -> Iterable[Choice]:
-        """At every step, blindly, in time."""
         return [*(cls(every=every) for every in (1, 10, None)), cls("exact")]
 
     def describe(self, world: str = "md") -> str:
-        """When."""
         return f"lists rebuilt {self._words}{summing(self.both)}"
 
     @property
@@ -386,7 +314,6 @@ class Rebuild(Summed):
         return "at every step" if self.every == 1 else f"blindly every {self.every} steps"
 
     def reason_unavailable(self, system: System) -> str | None:
-        """The system may have that rule already."""
         rule = system.spec.neighbors.rebuild
         # where nothing is checked, a delay holds back a rebuild like an interval does
         same = rule.check if self.every is None else not rule.check and rule.delay <= self.every
@@ -395,7 +322,6 @@ class Rebuild(Summed):
         return no_sums(system, self.both)
 
     def make(self, system: System) -> Twin:
-        """The system, and with the other rule."""
         rule = {"every": self.every or 1, "delay": 0, "check": self.every is None}
         other = varied(system, {f"neighbors.rebuild.{key}": value for key, value in rule.items()})
         return simulations(built(system, self.both), built(other, self.both), self.describe())

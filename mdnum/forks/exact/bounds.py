@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mdnum.errors import InputError
-from mdnum.forks.exact.tape import Tape
+from mdnum.forks.exact.tape import DecisionTape
 from mdnum.md.cell import Cell, HostCell
 from mdnum.md.decide import PairDecider
 from mdnum.rollout.engine import FAILURES, Engine, Segment, Start
@@ -87,7 +87,7 @@ class Taped:
         failed: "blow-up", "runaway", or "".
     """
 
-    tape: Tape
+    tape: DecisionTape
     x: Float[np.ndarray, "rows 3 atoms"]
     failed: str
 
@@ -110,7 +110,7 @@ def taped(simulation: Simulation, steps: int, start: Start | None = None) -> Tap
         last = segment.last
     step, key, now = np.concatenate(at).astype(np.int64), np.concatenate(keys), np.concatenate(entered)
     order = np.lexsort((key, step))
-    tape = Tape(simulation.atoms, last, first, step[order], key[order], now[order])
+    tape = DecisionTape(simulation.atoms, last, first, step[order], key[order], now[order])
     return Taped(tape, np.concatenate(rows), failed)
 
 

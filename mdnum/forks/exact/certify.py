@@ -91,7 +91,7 @@ class Certificate:
     Attributes:
         steps: last step.
         timestep: in the user's units of time.
-        exact: the history, a `program.Exact` or a `ball.BallHistory`.
+        exact: the history, a `program.ExactHistory` or a `ball.BallHistory`.
         ranking: precisions, longest horizon first; those that cannot run come last.
         steps_per_bit: by how many steps one more bit puts a horizon off: ln 2 over the growth rate of the
             separation from the exact run; NaN where no growth was seen.

@@ -11,7 +11,7 @@ from mdnum.program import Decision
 
 
 @dataclass(frozen=True)
-class Tape:
+class DecisionTape:
     """Every pair decision of a run from step 0 on: the pairs inside at the start, and what changed later.
 
     Attributes:
@@ -46,7 +46,7 @@ class Tape:
             (members.add if entered else members.discard)(key)
         return np.array(sorted(members), np.int64)
 
-    def until(self, last: int) -> Tape:
+    def until(self, last: int) -> DecisionTape:
         """The same tape up to a step."""
         kept = self.step <= last
         return replace(
@@ -58,7 +58,7 @@ class Tape:
         )
 
 
-def first_difference(a: Tape, b: Tape) -> Decision | None:
+def first_difference(a: DecisionTape, b: DecisionTape) -> Decision | None:
     """The first step at which any pair is decided differently; None where there is none in both tapes.
 
     Raises:
@@ -93,5 +93,5 @@ def first_difference(a: Tape, b: Tape) -> Decision | None:
     )
 
 
-def _rows(tape: Tape) -> set[tuple[int, int, bool]]:
+def _rows(tape: DecisionTape) -> set[tuple[int, int, bool]]:
     return set(zip(tape.step.tolist(), tape.key.tolist(), tape.entered.tolist(), strict=True))

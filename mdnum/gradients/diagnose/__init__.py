@@ -5,12 +5,12 @@ from mdnum.gradients.diagnose.detective import detective
 from mdnum.gradients.diagnose.diagnose import PARTS, GradientDiagnosis, diagnose
 from mdnum.gradients.diagnose.edges import edges
 from mdnum.gradients.diagnose.flips import flips
-from mdnum.gradients.diagnose.growth import Growth, growth
+from mdnum.gradients.diagnose.growth import GradientGrowth, growth
 from mdnum.gradients.diagnose.horizons import horizons
 from mdnum.gradients.diagnose.spectrum import Spectrum, spectrum
 from mdnum.gradients.diagnose.trust import Trust, trust
 
 __all__ = [
-    "PARTS", "GradientDiagnosis", "Growth", "Spectrum", "Trust", "agreement", "detective", "diagnose",
-    "edges", "flips", "growth", "horizons", "spectrum", "trust",
+    "PARTS", "GradientDiagnosis", "GradientGrowth", "Spectrum", "Trust", "agreement", "detective",
+    "diagnose", "edges", "flips", "growth", "horizons", "spectrum", "trust",
 ]  # fmt: skip

@@ -91,7 +91,7 @@ class Agreement:
 
 
 @dataclass(frozen=True)
-class Scale:
+class RoundingScale:
     """What rounding can do to a gradient.
 
     Attributes:
@@ -130,7 +130,7 @@ def agreement(
             others.
         methods: names or methods; default all there are. One that does not apply is listed with the reason.
         known: gradients that have been worked out already, by name of the method.
-        growth: how much the gradient by the state grew over the run (`Growth.gain`).
+        growth: how much the gradient by the state grew over the run (`GradientGrowth.gain`).
         progress: called with the steps done, all steps, and the name of the phase.
 
     Raises:
@@ -155,7 +155,7 @@ def agreement(
     there = {one.method: one for one in given}
     reference = next((word for word in (*order, "unrolled", "forward") if word in there), given[0].method)
     roundings = [unit_roundoff(problem.simulation.policy.dtype(role)) for role in ("state", "force")]
-    scale = Scale(max(roundings), growth)
+    scale = RoundingScale(max(roundings), growth)
     rows = [
         compare(name, one, there[reference], scale, jumps=problem.jumps)
         for one in given
@@ -185,7 +185,7 @@ def _asked(method: Method, problem: Problem, names: Sequence[str], progress: Pro
 
 
 def compare(
-    name: str, one: Gradient, reference: Gradient, scale: Scale, *, jumps: bool
+    name: str, one: Gradient, reference: Gradient, scale: RoundingScale, *, jumps: bool
 ) -> GradientDifference:
     """Two derivatives by one parameter.
 
@@ -206,7 +206,13 @@ def compare(
 
 
 def _meaning(
-    name: str, one: Gradient, reference: Gradient, size: float, relative: float, scale: Scale, jumps: bool
+    name: str,
+    one: Gradient,
+    reference: Gradient,
+    size: float,
+    relative: float,
+    scale: RoundingScale,
+    jumps: bool,
 ) -> tuple[str, dict[str, Any]]:
     kinds = {one.kind: one, reference.kind: reference}
     by_rounding = {"grown": scale.growth, "explained": scale.primal}

@@ -20,10 +20,10 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from mdnum.gradients import parameters
-from mdnum.gradients.adjoint import Backward, Trace, transposed
+from mdnum.gradients.adjoint import StretchReversal, Trace, transposed
 from mdnum.gradients.problem import Problem, Progress
 from mdnum.gradients.recorded import GUARD, radial_speed, tape_of, wanted
-from mdnum.gradients.tape import Stretch, Tape, frame_of
+from mdnum.gradients.tape import RunTape, TapeStretch, frame_of
 from mdnum.md.cell import HostCell
 from mdnum.md.decide import GROUP
 
@@ -281,7 +281,7 @@ def detective(
     names: Sequence[str],
     *,
     saltation: bool = True,
-    tape: Tape | None = None,
+    tape: RunTape | None = None,
     progress: Progress | None = None,
 ) -> NotFinite:
     """The first step and operation of the reverse pass that is not finite, and the pair at fault.
@@ -302,7 +302,7 @@ def detective(
         tape = tape_of(problem, saltation, progress=progress)
     if not np.isfinite(tape.value):
         return _in_forward(tape)
-    back = Backward(tape, wanted(full), GUARD * radial_speed(simulation) if saltation else None)
+    back = StretchReversal(tape, wanted(full), GUARD * radial_speed(simulation) if saltation else None)
     if not _all_finite(back.onto_total):
         made = first_not_finite(jax.grad(lambda total: tape.loss.value(total, tape.frames)), tape.total)
         return _blamed(tape.steps, "loss", made)
@@ -337,7 +337,7 @@ def _last_bad(trace: Trace, rows: int) -> int | None:
     return int(np.flatnonzero(bad)[-1]) if bad.any() else None
 
 
-def _in_forward(tape: Tape) -> NotFinite:
+def _in_forward(tape: RunTape) -> NotFinite:
     """The run is finite, the loss is not: the first frame at which it is not."""
     for stretch in tape.forward():
         seen = tape.seen(stretch)
@@ -351,7 +351,7 @@ def _in_forward(tape: Tape) -> NotFinite:
     return replace(_blamed(tape.steps, "loss", made), forward=False)
 
 
-def _looked_into(back: Backward, stretch: Stretch, row: int) -> NotFinite:
+def _looked_into(back: StretchReversal, stretch: TapeStretch, row: int) -> NotFinite:
     """The step of a row, operation by operation."""
     whole = back.arguments(stretch, traced=True)
     loss, origin, *rest = whole[8]
@@ -388,7 +388,7 @@ def _rows(arguments: tuple[Any, ...], first: int, end: int) -> tuple[Any, ...]:
 
 
 def _pair(
-    back: Backward, stretch: Stretch, row: int, made: Operation | None, part: str
+    back: StretchReversal, stretch: TapeStretch, row: int, made: Operation | None, part: str
 ) -> tuple[int, int, float]:
     """Labels of the pair whose number it is, and its distance."""
     if made is None or not made.index:

@@ -12,13 +12,13 @@ from mdnum.gradients.diagnose.agreement import Agreement, agreement
 from mdnum.gradients.diagnose.detective import NotFinite, detective
 from mdnum.gradients.diagnose.edges import DecisionEdges, edges
 from mdnum.gradients.diagnose.flips import FlipTerms, flips
-from mdnum.gradients.diagnose.growth import Growth, GrowthWatch, Scaling, ScalingWatch
+from mdnum.gradients.diagnose.growth import GradientGrowth, GrowthWatch, Scaling, ScalingWatch
 from mdnum.gradients.diagnose.near import Near
 from mdnum.gradients.diagnose.spectrum import Spectrum, spectrum
 from mdnum.gradients.diagnose.trust import TOLERANCE, Trust, trust
 from mdnum.gradients.problem import METHODS, Gradient, Method, Problem, Progress
 from mdnum.gradients.problem import method as by_name
-from mdnum.gradients.recorded import EventAware, Pass, Symmetric, passed
+from mdnum.gradients.recorded import EventAware, ReversePass, Symmetric, passed
 from mdnum.gradients.tape import pace_of
 
 #: Parts of a diagnosis by their words; `edges` takes some dozens of runs and is asked for by name.
@@ -43,7 +43,7 @@ class GradientDiagnosis:
     names: tuple[str, ...]
     value: float
     agreement: Agreement | None = None
-    growth: Growth | None = None
+    growth: GradientGrowth | None = None
     spectrum: Spectrum | None = None
     trust: Trust | None = None
     flips: FlipTerms | None = None
@@ -97,11 +97,11 @@ def diagnose(
         by_name(one) if isinstance(one, str) else one for one in (METHODS if methods is None else methods)
     ]
     base, why = _base(problem, full, chosen)
-    made: Pass | None = None
+    made: ReversePass | None = None
     found: dict[str, Any] = {}
     failed: dict[str, str] = {}
     known: dict[str, Gradient] = {}
-    growing: Growth | None = None
+    growing: GradientGrowth | None = None
     near: Near | None = None
     saltation = isinstance(base, EventAware)
     if base is None:

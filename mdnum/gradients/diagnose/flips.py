@@ -19,7 +19,7 @@ from mdnum.errors import InputError
 from mdnum.gradients import parameters
 from mdnum.gradients.parameters import columns_of
 from mdnum.gradients.problem import Problem, Progress, in_phase
-from mdnum.gradients.recorded import GUARD, MOST, Pass, passed
+from mdnum.gradients.recorded import GUARD, MOST, ReversePass, passed
 from mdnum.gradients.tangents import by_column, tangents
 
 SMOOTH, ENTERS, LEAVES = "smooth", "pair enters", "pair leaves"
@@ -64,7 +64,7 @@ def flips(
     names: Sequence[str],
     *,
     guard: float = GUARD,
-    made: Pass | None = None,
+    made: ReversePass | None = None,
     progress: Progress | None = None,
 ) -> FlipTerms:
     """Contributions of all flips, heaviest first.

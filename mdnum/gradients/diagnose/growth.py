@@ -23,7 +23,7 @@ from mdnum.gradients.adjoint import Trace
 from mdnum.gradients.parameters import Cotangents
 from mdnum.gradients.problem import Problem, Progress
 from mdnum.gradients.recorded import passed
-from mdnum.gradients.tape import Stretch
+from mdnum.gradients.tape import TapeStretch
 from mdnum.precision import formats
 from mdnum.systems.build import Simulation
 
@@ -42,7 +42,7 @@ LOST = 0.01
 
 
 @dataclass(frozen=True)
-class Growth:
+class GradientGrowth:
     """How the gradient grows with the horizon, from one reverse pass.
 
     Attributes:
@@ -89,7 +89,7 @@ class GrowthWatch:
         # by the start itself a derivative has the entries of the start: its norm is shown for it
         self._scalars = [name for name in self.names if not name.startswith("initial.")]
 
-    def __call__(self, stretch: Stretch, trace: Trace) -> None:
+    def __call__(self, stretch: TapeStretch, trace: Trace) -> None:
         """One stretch of the reverse pass."""
         rows, first = stretch.rows, stretch.first
         onto_x, onto_v = (np.asarray(part, np.float64)[:rows] for part in (trace.x, trace.v))
@@ -116,7 +116,7 @@ class GrowthWatch:
                     self.gradient[name] = np.full((self.steps + 1, *value.shape), np.nan)
                 self.gradient[name][first + row] = value
 
-    def result(self, whole: dict[str, Float[np.ndarray, "..."]]) -> Growth:
+    def result(self, whole: dict[str, Float[np.ndarray, "..."]]) -> GradientGrowth:
         """The growth.
 
         Args:
@@ -151,7 +151,7 @@ class GrowthWatch:
         there = size[np.isfinite(size) & (size > 0)]
         gain = float(there.max() / there[0]) if len(there) else 1.0
         step = timestep / units.time_factor
-        return Growth(table, clock, step, rate, error, step / rate if rate else np.inf, gain, word)
+        return GradientGrowth(table, clock, step, rate, error, step / rate if rate else np.inf, gain, word)
 
 
 def growth_rate(size: Float[np.ndarray, "rows"]) -> tuple[float, float, bool]:
@@ -189,7 +189,7 @@ def forward_bounded(speed: Float[np.ndarray, "rows"]) -> bool:
 
 def growth(
     problem: Problem, names: Sequence[str], *, saltation: bool = True, progress: Progress | None = None
-) -> Growth:
+) -> GradientGrowth:
     """The gradient against the horizon, from one reverse pass.
 
     Args:
@@ -253,7 +253,7 @@ class ScalingWatch:
         # how many numbers of each step have each binary exponent
         self.exponents = np.zeros((steps + 1, _HIGHEST - _LOWEST + 1), np.int32)
 
-    def __call__(self, stretch: Stretch, trace: Trace) -> None:
+    def __call__(self, stretch: TapeStretch, trace: Trace) -> None:
         """One stretch of the reverse pass."""
         for row in range(stretch.rows):
             both = (np.asarray(part[row], np.float64).ravel() for part in (trace.x, trace.v))

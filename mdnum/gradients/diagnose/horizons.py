@@ -16,11 +16,11 @@ from mdnum.errors import InputError
 from mdnum.events import Ledger
 from mdnum.gradients import parameters
 from mdnum.gradients.losses import Loss
-from mdnum.gradients.parameters import Column, columns_of
+from mdnum.gradients.parameters import ParameterEntry, columns_of
 from mdnum.gradients.problem import Problem, Progress, in_phase
 from mdnum.gradients.recorded import GUARD, radial_speed
-from mdnum.gradients.tangents import Tangents, tangents
-from mdnum.gradients.tape import Stretch, Tape
+from mdnum.gradients.tangents import StretchTangents, tangents
+from mdnum.gradients.tape import RunTape, TapeStretch
 
 #: The parameter by which derivatives at half the time step are twice as large.
 TIMESTEP = "dynamics.timestep"
@@ -102,7 +102,7 @@ class Horizons:
     """
 
     at: Int[np.ndarray, "points"]
-    columns: tuple[Column, ...]
+    columns: tuple[ParameterEntry, ...]
     value: Float[np.ndarray, "points"]
     gradient: Float[np.ndarray, "points columns"]
     ledgers: tuple[Ledger, ...]
@@ -137,8 +137,8 @@ def horizons(
     *,
     saltation: bool = True,
     guard: float = GUARD,
-    each: Callable[[Stretch], None] | None = None,
-    watch: Callable[[Tangents], None] | None = None,
+    each: Callable[[TapeStretch], None] | None = None,
+    watch: Callable[[StretchTangents], None] | None = None,
     progress: Progress | None = None,
 ) -> Horizons:
     """The gradient of the loss of every shorter run from the same start.
@@ -162,7 +162,7 @@ def horizons(
     rows = np.arange(last + 1)
     table = np.stack([problem.loss.looks_at(rows, int(h)) & (rows <= h) for h in at], axis=1)
     loss = Shorter(inner=problem.loss, table=jnp.asarray(table))
-    tape = Tape(simulation, loss, last, flips=True, each=each, progress=in_phase(progress, "run"))
+    tape = RunTape(simulation, loss, last, flips=True, each=each, progress=in_phase(progress, "run"))
     total: Any = None
     ledgers = []
     for part in tangents(

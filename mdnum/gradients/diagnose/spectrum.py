@@ -22,7 +22,7 @@ from mdnum.gradients.diagnose.growth import CLOCK_STEPS, WORDS, forward_bounded,
 from mdnum.gradients.forces import pull_back
 from mdnum.gradients.problem import Problem, Progress
 from mdnum.gradients.recorded import tape_of
-from mdnum.gradients.tape import Stretch, Tape, over_rows
+from mdnum.gradients.tape import RunTape, TapeStretch, over_rows
 from mdnum.md.decide import Tables
 from mdnum.md.integrators import Integrator
 from mdnum.md.pairforce import PairForce
@@ -95,7 +95,7 @@ class Jacobian:
         InputError: a many-body potential.
     """
 
-    def __init__(self, tape: Tape, clock: float):
+    def __init__(self, tape: RunTape, clock: float):
         if not isinstance(tape.simulation.force, PairForce):
             raise InputError(
                 "the Jacobian of a step is one of pair potentials", where=tape.simulation.system.name
@@ -132,7 +132,7 @@ class Jacobian:
                 curve.append(curve[-1] + np.log(np.abs(np.diag(r))))
         return TangentImage(block, mixing, log_scale, np.array(noted), np.array(curve))
 
-    def _through(self, stretch: Stretch, used: int, block, backward: bool):
+    def _through(self, stretch: TapeStretch, used: int, block, backward: bool):
         simulation, order = self.tape.simulation, stretch.table.order
         x, v = self._parts(block, backward)
         x, v = _carried(
@@ -216,7 +216,7 @@ def spectrum(
     extra: int = 4,
     rounds: int = 4,
     seed: int = 0,
-    tape: Tape | None = None,
+    tape: RunTape | None = None,
     progress: Progress | None = None,
 ) -> Spectrum:
     """Singular values and finite-time Lyapunov exponents of the product of all step Jacobians.
@@ -311,7 +311,7 @@ def _residual(jacobian: Jacobian, left, right, log_s) -> np.ndarray:
     return np.linalg.norm(image - right, axis=0)
 
 
-def _speeds(tape: Tape) -> np.ndarray:
+def _speeds(tape: RunTape) -> np.ndarray:
     """Rms speed at every step."""
     parts = [
         np.sqrt(np.mean(np.sum(stretch.v[: stretch.rows].astype(np.float64) ** 2, axis=1), axis=1))

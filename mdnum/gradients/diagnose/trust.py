@@ -20,7 +20,7 @@ from jaxtyping import Float, Int
 
 from mdnum.errors import InputError
 from mdnum.gradients import parameters
-from mdnum.gradients.diagnose.growth import CLOCK_STEPS, WORDS, Growth, GrowthWatch
+from mdnum.gradients.diagnose.growth import CLOCK_STEPS, WORDS, GradientGrowth, GrowthWatch
 from mdnum.gradients.diagnose.horizons import (
     TIMESTEP,
     Horizons,
@@ -33,7 +33,7 @@ from mdnum.gradients.diagnose.near import Near, Turns
 from mdnum.gradients.differences import in_float64
 from mdnum.gradients.ensemble import replica
 from mdnum.gradients.problem import Problem, Progress
-from mdnum.gradients.recorded import MOST, Pass, passed
+from mdnum.gradients.recorded import MOST, ReversePass, passed
 from mdnum.gradients.tape import pace_of
 from mdnum.md.integrators import Langevin
 from mdnum.precision import PrecisionPolicy
@@ -150,9 +150,9 @@ def trust(
     replicas: int = 0,
     half_step: bool = True,
     points: int = POINTS,
-    made: Pass | None = None,
+    made: ReversePass | None = None,
     near: Near | None = None,
-    growth: Growth | None = None,
+    growth: GradientGrowth | None = None,
     progress: Progress | None = None,
 ) -> Trust:
     """The horizon up to which a gradient means something, and what limits it.
@@ -301,7 +301,7 @@ def _compared(what: str, agreed: tuple[int, bool], differing, tolerance: float, 
 
 
 def _missed(
-    problem: Problem, own: Horizons, turns: Turns | None, unseen, made: Pass, tolerance: float,
+    problem: Problem, own: Horizons, turns: Turns | None, unseen, made: ReversePass, tolerance: float,
     saltation: bool,
 ) -> Limit:  # fmt: skip
     """Where a turning point within reach of the cutoff has a term that weighs."""
@@ -326,7 +326,8 @@ def _missed(
     with np.errstate(divide="ignore", invalid="ignore"):
         # a term that is not known weighs
         share = np.where(turns.term == 0, 0.0, np.nan_to_num(turns.term / size, nan=np.inf))
-    weighs = np.sqrt(np.cumsum(np.square(share), axis=0))
+    with np.errstate(over="ignore"):
+        weighs = np.sqrt(np.cumsum(np.square(share), axis=0))
     over = np.flatnonzero(~(weighs <= tolerance).all(axis=1))
     k, column = np.unravel_index(int(np.argmax(share)), share.shape)
     values = {
@@ -340,7 +341,7 @@ def _missed(
     return Limit(NEAR, max(int(turns.step[over[0]]) - 1, 0), True, code, values)
 
 
-def _left_out(made: Pass) -> Limit | None:
+def _left_out(made: ReversePass) -> Limit | None:
     """Flips slower than the guard, where they would have weighed."""
     slow = [one for one in made.crossings if one.grazing.any()]
     left = sum(float(np.nansum(np.abs(one.weight[one.grazing]))) for one in slow)
