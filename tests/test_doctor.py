@@ -82,7 +82,7 @@ def _asked(expression: str, **environment: str) -> str:
 def test_fast_math_is_unsafe(value: str, flag: str, sums: str):
     """The flag is read, and what it does is seen without reading it."""
     flags = f"--xla_cpu_enable_fast_math={value}"
-    assert _asked("d.flags().status, d.reassociation().status", XLA_FLAGS=flags) == str((flag, sums))
+    assert _asked("d.flags().status, d.reassociation().status", XLA_FLAGS=flags) == f"{flag} {sums}"
 
 
 def test_contraction_is_computed_and_not_assumed():
