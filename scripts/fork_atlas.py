@@ -41,8 +41,8 @@ from matplotlib.colors import LogNorm
 from mdnum.errors import InputError, MdnumError
 from mdnum.events.chance import REPEATS
 from mdnum.forks import fork
-from mdnum.forks.choices import BY_NAME, Choice, parse
-from mdnum.forks.choices.base import varied
+from mdnum.forks.choices import Choice, parse, shipped, unavailable
+from mdnum.forks.worlds import varied
 from mdnum.md.cutoffs import BY_NAME as CUTOFFS
 from mdnum.systems import System, load
 
@@ -154,7 +154,7 @@ def cell_of(system: System, word: str, kind: str, choice: Choice, steps: int, re
         )
 
     try:
-        reason = choice.why_not(system)
+        reason = unavailable(choice, system)
         if reason is not None:
             return ended("does not apply", reason)
         found = fork(choice.make(system), steps, repeats=repeats)
@@ -285,7 +285,7 @@ def main() -> None:
     quick = chosen.quick
     words = chosen.systems or (SYSTEMS[:1] if quick else SYSTEMS)
     kinds = chosen.kinds or (("hard", "switched") if quick else KINDS)
-    choices = [parse(word) for word in chosen.choices or (QUICK if quick else BY_NAME)]
+    choices = [parse(word) for word in chosen.choices or (QUICK if quick else shipped("md"))]
     steps = chosen.steps or (300 if quick else 4000)
     repeats = chosen.repeats if chosen.repeats is not None else (0 if quick else REPEATS)
     systems = {word: system_of(word) for word in words}

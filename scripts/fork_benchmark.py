@@ -91,12 +91,11 @@ def single(system: System) -> Callable[[int], None]:
 def triple(system: System) -> Callable[[int], None]:
     """Two runs and the counterfactual, compared step by step."""
     from mdnum.forks.choices import StartUlp
-    from mdnum.rollout.lockstep import lockstep
 
     twin = StartUlp().make(system)
 
     def run(steps: int) -> None:
-        for _ in lockstep(twin.a, twin.b, steps, start_a=twin.start_a, start_b=twin.start_b):
+        for _ in twin.a.lockstep(twin.b, steps, forward=True, back=False, guard=None):
             pass
 
     return run

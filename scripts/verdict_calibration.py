@@ -42,8 +42,7 @@ from mdnum.events.chance import Delay, count
 from mdnum.events.forks import Dates, Verdict, growth, judge
 from mdnum.forks import fork
 from mdnum.forks.choices import parse
-from mdnum.forks.pair import SPLIT
-from mdnum.forks.repeats import perturbed, repeat
+from mdnum.forks.pair import SPLIT, perturbation
 from mdnum.rollout.engine import Engine
 from mdnum.systems import System, SystemSpec, build, load
 
@@ -122,13 +121,13 @@ def gather(made: System, share: float, unseen: int, *, always: bool = False) -> 
         always: whether to run those where the verdict is not clear or asked for none, too.
     """
     twin = parse("precision").make(made)
-    found = fork(twin, STEPS, split=share * twin.a.r_cut, back=False)
+    found = fork(twin, STEPS, split=share * twin.a.scale, back=False)
     truth: list[Delay] = []
     clear = found.verdict.word in ("accelerated", "bystander")
     if unseen and found.dates.split is not None and (clear or always):
-        starts = perturbed(found.twin, found.tolerance, unseen, seed=1)
-        runs = repeat(found.twin, starts, found.steps, found.tolerance, 3 * found.tolerance)
-        truth = [Delay.of(*run, found.tolerance) for run in runs]
+        programs = twin.b.nudged(perturbation(found), unseen, seed=1)
+        runs = twin.a.repeats(programs, found.steps, found.tolerance, 3 * found.tolerance)
+        truth = [Delay.of(free, under, found.tolerance) for free, under in runs]
     # the separations are stored in full: a verdict must be the same from the file
     kept = {name: found.series[name] for name in ("B", "B|A")}
     delays = {"seen": _rows(found.repeats), "unseen": _rows(truth)}

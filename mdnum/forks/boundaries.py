@@ -1,37 +1,239 @@
 """Where along a number of a system the decisions of a run change, to the last bit.
 
-Between two boundaries a run is one smooth function of the number. At a boundary a pair is decided otherwise
-between two adjacent floats, and everything after it may jump.
+Between two boundaries a run is one smooth function of the number. At a boundary something is decided
+otherwise between two adjacent floats, and everything after it may jump.
 """
 
 from __future__ import annotations
 
 import heapq
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mdnum.errors import InputError
-from mdnum.forks.confirm import digests_elsewhere
-from mdnum.forks.dials import checked, dial
-from mdnum.forks.histories import Loss, margin, squared_displacement
-from mdnum.forks.line import Line
-from mdnum.forks.piecewise import Boundary, BoundaryMap, Interval, Side
-from mdnum.precision.ulp import ordinal
-from mdnum.systems.build import build
-from mdnum.systems.load import System, load
+from mdnum.forks.child import digests_elsewhere
+from mdnum.forks.worlds import program_of
+from mdnum.precision.ulp import neighbor, ordinal
+from mdnum.program import DecisionHistory, Number, Program
+from mdnum.systems import BallSystem, System, load
 
 Progress = Callable[[int, int, dict[str, Any]], None]
 
-#: Boundaries that are searched for, unless more are asked for: as many as a figure can name.
-MOST = 24
+#: Boundaries that are searched for, unless more are asked for: as many as a figure can name, and more of a
+#: ball, whose runs take no time.
+MOST, MOST_BALL = 24, 64
+
+
+@dataclass(frozen=True)
+class Side:
+    """A run on one side of a boundary.
+
+    Attributes:
+        at: the number, as the float next to the boundary.
+        digest: of its decisions.
+        loss, energy: at its last step; a ball's energy is not kept.
+        gradient: of the loss along the number, decisions held; NaN of molecular dynamics.
+        margin: of the decision that changes, in the quantity's space.
+        decided: that decision: 0 or 1, or a number of iterations.
+    """
+
+    at: float
+    digest: str
+    loss: float
+    energy: float
+    gradient: float
+    margin: float
+    decided: int
+
+
+@dataclass(frozen=True)
+class Boundary:
+    """Two adjacent floats with different histories, and the decision that makes the difference.
+
+    Attributes:
+        below, above: the two sides; above.at is the float after below.at.
+        channel: of the first decision that differs: "pair", "contact" or "stop".
+        step: of it.
+        subject: labels of its pair, or of its ball; empty where one decision is the whole batch's.
+        bound: on the rounding error of its margin.
+        also: further decisions that differ first at this step.
+        apart: largest distance between the two final states, length.
+        confirmed: whether a fresh process found the same history on either side; None where none was asked.
+    """
+
+    below: Side
+    above: Side
+    channel: str
+    step: int
+    subject: tuple[int, ...]
+    bound: float
+    also: int
+    apart: float
+    confirmed: bool | None = None
+
+    @property
+    def jump(self) -> float:
+        """Loss above minus loss below."""
+        return self.above.loss - self.below.loss
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A stretch of the number on which every run made had one history.
+
+    Attributes:
+        low, high: its ends; both were run.
+        history: a number for each distinct history of a map, in order of appearance.
+        digest: of it.
+        loss_low, loss_high: at the ends.
+        runs: how many were made here.
+        gap: the longest stretch between two of them: two boundaries closer than this may hide there. One ulp
+            where every float was run.
+    """
+
+    low: float
+    high: float
+    history: int
+    digest: str
+    loss_low: float
+    loss_high: float
+    runs: int
+    gap: float
+
+
+@dataclass(frozen=True)
+class BoundaryMap:
+    """A run as a piecewise function of a number.
+
+    Attributes:
+        number: that was varied.
+        steps: last step of every run.
+        low, high: the interval that was searched.
+        intervals: with one history each, in order.
+        boundaries: between them, in order.
+        unresolved: stretches whose ends have different histories but were not searched to the last bit, and
+            adjacent floats where a run fails on one side before anything is decided otherwise.
+        complete: whether every float of the interval was run, so that nothing can hide.
+        resolution: the longest stretch between two runs of one history; a pair of boundaries within it that
+            cancel each other may be missed.
+        evaluations: runs made to find them.
+        at, loss, energy: of every run made, in order; at its last step.
+        failed: runs among them that ended in a blow-up or a runaway.
+    """
+
+    number: Number
+    steps: int
+    low: float
+    high: float
+    intervals: tuple[Interval, ...]
+    boundaries: tuple[Boundary, ...]
+    unresolved: tuple[tuple[float, float], ...]
+    complete: bool
+    resolution: float
+    evaluations: int
+    at: np.ndarray
+    loss: np.ndarray
+    energy: np.ndarray
+    failed: int
+
+    @property
+    def histories(self) -> int:
+        """How many distinct histories were seen."""
+        return len({interval.digest for interval in self.intervals})
+
+
+class NumberLine:
+    """Runs of one program along one number, addressed by the ordinal of a float.
+
+    Args:
+        program: with the system's own value.
+        number: that is varied.
+        steps: last step of each run.
+        loss: of the final state, as the world's `history` takes it.
+    """
+
+    def __init__(
+        self, program: Program, number: Number, steps: int, loss: Callable[..., float] | None = None
+    ):
+        self.program, self.number, self.steps, self.loss = program, number, steps, loss
+        #: What is kept of each run: everything but its marks and its last state.
+        self.known: dict[int, DecisionHistory] = {}
+
+    def value(self, place: int) -> float:
+        """The float of an ordinal."""
+        return float(neighbor(np.zeros((), self.number.dtype), place, self.number.dtype))
+
+    def places(self, values: Any) -> list[int]:
+        """The ordinals of some floats, ascending, each once."""
+        return sorted({int(place) for place in ordinal(np.asarray(values, self.number.dtype))})
+
+    def at(self, place: int) -> Any:
+        """The program at a float."""
+        return self.number.at(self.value(place))
+
+    def run(self, place: int) -> DecisionHistory:
+        """The run at a float."""
+        history = self.at(place).history(self.steps, self.loss)
+        self.known[place] = replace(history, marks=history.marks[:0], x=history.x[:0])
+        return history
+
+    def digest(self, place: int) -> str:
+        """What the run at a float decided."""
+        if place not in self.known:
+            self.run(place)
+        return self.known[place].digest
+
+    def bisect(self, a: int, b: int, pending: list[tuple[int, int]]) -> tuple[int, int]:
+        """Adjacent ordinals between two whose histories differ; the halves not followed go to `pending`."""
+        while b - a > 1:
+            middle = (a + b) // 2
+            here = self.digest(middle)
+            if here == self.digest(a):
+                a = middle
+                continue
+            if here != self.digest(b):
+                heapq.heappush(pending, (middle, b))
+            b = middle
+        return a, b
+
+    def boundary(self, below: int, above: int) -> Boundary | None:
+        """What differs between two ordinals with different histories; None where a run fails first."""
+        places = (below, above)
+        runs = [self.run(place) for place in places]
+        step = runs[0].first_difference(runs[1])
+        assert step is not None  # their digests differ
+        if any(len(run.marks) <= step - run.first for run in runs):
+            return None
+        found = self.at(below).differing(self.at(above), self.steps, step, self.number.key)
+        decision = found.decision
+        gradients = found.gradients or (float("nan"),) * 2
+        sides = [
+            Side(self.value(place), run.digest, run.loss, run.energy, gradient, margin, decided)
+            for place, run, gradient, margin, decided in zip(
+                places, runs, gradients, decision.margins.values(), (decision.a, decision.b), strict=True
+            )
+        ]
+        moved = (runs[1].x - runs[0].x).reshape(len(runs[0].x), -1)
+        apart = float(np.sqrt(np.max(np.sum(moved**2, axis=1))))
+        return Boundary(
+            sides[0],
+            sides[1],
+            decision.channel,
+            step,
+            decision.subject,
+            decision.bounds["A"],
+            decision.also,
+            apart,
+        )
 
 
 def boundaries(
-    system: System | str,
+    system: System | BallSystem | str | Path,
     key: str,
     low: float,
     high: float,
@@ -39,8 +241,8 @@ def boundaries(
     *,
     overrides: Mapping[str, Any] | None = None,
     cells: int = 64,
-    most: int = MOST,
-    loss: Loss = squared_displacement,
+    most: int | None = None,
+    loss: Callable[..., float] | None = None,
     confirm: bool = True,
     progress: Progress | None = None,
 ) -> BoundaryMap:
@@ -49,18 +251,19 @@ def boundaries(
     The interval is run on a grid. A cell whose ends differ is bisected until its ends are adjacent floats; a
     half that differs too is searched as well, from the lowest float on: where there are more than asked for,
     those left lie above all that were found. All runs are by the program that a user runs (for the cutoff
-    radius: by its twin that is given the radius), and both sides of every boundary are run again by a fresh
-    process.
+    radius: by one that is given the radius as an argument), and both sides of every boundary are run again by
+    a fresh process.
 
     Args:
-        system: a loaded system, or a name or path to load.
-        key: the number (see dials.dial).
+        system: a loaded system of either world, or a name or path to load.
+        key: the number, such as "potential.sigma" or "position.17.x"; of a ball "k", "tol", "y0".
         low, high: the interval, in the units of the system's file; both belong to it.
         steps: last step; default the system's own.
         overrides: as for `load`, where a name or path is given.
         cells: of the grid. With at least as many as there are floats, all are run.
-        most: stop after this many boundaries; what is left is told as unresolved.
-        loss: of the final state, called with the simulation, unwrapped positions and velocities.
+        most: stop after this many boundaries; default 24, of a ball 64. What is left is unresolved.
+        loss: of the final state of molecular dynamics, called with the simulation, unwrapped positions and
+            velocities; default the mean squared displacement. That of a ball is its file's.
         confirm: whether to run both sides of every boundary in a fresh process.
         progress: called with what is done of what there is to do, and figures: the phase, what is counted.
 
@@ -69,54 +272,80 @@ def boundaries(
 
     Error: none in a boundary: its sides are adjacent floats, and their runs decided differently.
     """
-    if not isinstance(system, System):
-        system = load(system, overrides, world="md")
+    if not isinstance(system, System | BallSystem):
+        system = load(system, overrides)
+    assert isinstance(system, System | BallSystem)
+    is_ball = isinstance(system, BallSystem)
+    most = (MOST_BALL if is_ball else MOST) if most is None else most
     if cells < 1 or most < 1:
         raise InputError(f"cells = {cells} and most = {most}; expected at least 1")
-    simulation = build(system)
-    last = system.spec.dynamics.steps if steps is None else steps
+    if is_ball and loss is not None:
+        raise InputError("the loss of a ball is that of its system file", remedy="Leave out loss")
+    program = program_of(system, steps)
+    last = program.steps if steps is None else steps
     if last < 1:
         raise InputError(f"steps = {last}; expected at least 1")
-    one = dial(simulation, key)
-    checked(one, low, high)
-    for end in (low, high):
-        one.turn(simulation, end)
-    line = Line(simulation, one, last, loss)
-    places = _grid(low, high, cells)
-    pending: list[tuple[int, int]] = []
+    number = checked(program, key, low, high)
+    line = NumberLine(program, number, last, loss)
+    places = _grid(line, low, high, cells)
+    note = progress or (lambda done, total, info: None)
     for k, place in enumerate(places):
-        _tell(progress, k, len(places), "running a grid", "runs")
+        note(k, len(places), {"phase": "running a grid", "unit": "runs"})
         line.digest(place)
-    for a, b in pairwise(places):
-        if line.digest(a) != line.digest(b):
-            heapq.heappush(pending, (a, b))
+    pending = [(a, b) for a, b in pairwise(places) if line.digest(a) != line.digest(b)]
+    heapq.heapify(pending)
     found: list[tuple[int, int]] = []
     while pending and len(found) < most:
-        _tell(progress, len(found), min(most, len(found) + len(pending)), "bisecting", "boundaries")
-        a, b = heapq.heappop(pending)
-        found.append(_bisect(line, a, b, pending))
-    found.sort()
+        total = min(most, len(found) + len(pending))
+        note(len(found), total, {"phase": "bisecting", "unit": "boundaries"})
+        found.append(line.bisect(*heapq.heappop(pending), pending))
     annotated = []
-    for k, pair in enumerate(found):
-        _tell(progress, k, len(found), "looking at both sides", "boundaries")
-        annotated.append(_annotated(line, pair))
-    bounds = [boundary for boundary in annotated if boundary is not None]
-    return _mapped(line, _confirmed(system, line, bounds, progress) if confirm and bounds else bounds)
+    for k, edge in enumerate(sorted(found)):
+        note(k, len(found), {"phase": "comparing both sides", "unit": "boundaries"})
+        annotated.append(line.boundary(*edge))
+    edges = [edge for edge in annotated if edge is not None]
+    if confirm and edges:
+        edges = _confirmed(system, line, edges, note)
+    return _mapped(line, edges)
 
 
-def _confirmed(
-    system: System, line: Line, found: list[Boundary], progress: Progress | None
-) -> list[Boundary]:
+def checked(program: Program, key: str, low: float, high: float) -> Number:
+    """The number of a key, an interval of which makes sense for this program.
+
+    Raises:
+        InputError: no such number, or what is wrong with the interval.
+    """
+    number = program.number(key)
+    if not (np.isfinite(low) and np.isfinite(high) and low < high):
+        raise InputError(f"there is nothing between {low!r} and {high!r}", remedy="Give LOW < HIGH")
+    if number.positive and (low < 0 if number.zero else low <= 0):
+        raise InputError(
+            f"{number.key} = {low!r}; expected a value {'of at least' if number.zero else 'above'} 0"
+        )
+    for end in (low, high):
+        number.at(end)
+    return number
+
+
+def _grid(line: NumberLine, low: float, high: float, cells: int) -> list[int]:
+    """Ordinals of the grid's floats: evenly spread, or all of them."""
+    first, final = line.places([low, high])[0], line.places([low, high])[-1]
+    if final - first <= cells:
+        return list(range(first, final + 1))
+    return line.places(np.linspace(low, high, cells + 1))
+
+
+def _confirmed(system: Any, line: NumberLine, found: list[Boundary], note: Progress) -> list[Boundary]:
     """The same boundaries, compared with what a fresh process finds on either side."""
     sides = [side for boundary in found for side in (boundary.below, boundary.above)]
     digests = digests_elsewhere(
         system,
-        line.dial.key,
+        line.number.key,
         line.steps,
         [side.at for side in sides],
-        lambda done: _tell(progress, done, len(sides), "confirming in a fresh process", "runs"),
+        lambda done: note(done, len(sides), {"phase": "confirming in a fresh process", "unit": "runs"}),
         # each side is another compiled program then, and compiling is what takes the time
-        processes=2 if line.dial.compiles else 1,
+        processes=2 if line.number.compiles else 1,
     )
     same = [side.digest == digest for side, digest in zip(sides, digests, strict=True)]
     return [
@@ -125,70 +354,7 @@ def _confirmed(
     ]
 
 
-def _tell(progress: Progress | None, done: int, total: int, phase: str, unit: str) -> None:
-    if progress is not None:
-        progress(done, total, {"phase": phase, "unit": unit})
-
-
-def _grid(low: float, high: float, cells: int) -> list[int]:
-    """Ordinals of the grid's floats: evenly spread, or all of them."""
-    first, final = (int(place) for place in ordinal(np.array([low, high])))
-    if final - first <= cells:
-        return list(range(first, final + 1))
-    return sorted({int(place) for place in ordinal(np.linspace(low, high, cells + 1))})
-
-
-def _bisect(line: Line, a: int, b: int, pending: list[tuple[int, int]]) -> tuple[int, int]:
-    """Adjacent ordinals between two whose histories differ; the halves not followed go to `pending`."""
-    while b - a > 1:
-        middle = (a + b) // 2
-        here = line.digest(middle)
-        if here == line.digest(a):
-            a = middle
-            continue
-        if here != line.digest(b):
-            heapq.heappush(pending, (middle, b))
-        b = middle
-    return a, b
-
-
-def _annotated(line: Line, pair: tuple[int, int]) -> Boundary | None:
-    """What differs between two adjacent floats; None where it is a run that fails, not a decision."""
-    runs = [line.run(place) for place in pair]
-    step = runs[0].first_difference(runs[1])
-    assert step is not None  # their digests differ
-    if any(len(run.marks) <= step for run in runs):
-        return None
-    looks = [line.look(place, step) for place in pair]
-    simulations = [line.at(place) for place in pair]
-    atoms = line.simulation.atoms
-    differing = np.setxor1d(looks[0].pairs, looks[1].pairs, assume_unique=True)
-    pairs = [divmod(int(key), atoms) for key in differing]
-    margins = [
-        [margin(simulation, seen.x, i, j) for simulation, seen in zip(simulations, looks, strict=True)]
-        for i, j in pairs
-    ]
-    nearest = min(range(len(pairs)), key=lambda k: max(abs(m) for m in margins[k]))
-    i, j = pairs[nearest]
-    sides = [
-        Side(
-            line.value(place),
-            run.digest,
-            line.known[place].loss,
-            run.energy,
-            margins[nearest][k],
-            bool(np.isin(differing[nearest], looks[k].pairs)),
-        )
-        for k, (place, run) in enumerate(zip(pair, runs, strict=True))
-    ]
-    kind = int(line.simulation.type_of(np.array([i]), np.array([j]))[0])
-    apart = float(np.sqrt(np.max(np.sum((runs[1].x - runs[0].x) ** 2, axis=1))))
-    below, above = sides
-    bound = float(simulations[0].decider.bounds_at(looks[0].x.T[None])[0, kind])
-    return Boundary(below, above, step, i, j, bound, len(pairs) - 1, apart, None)
-
-
-def _mapped(line: Line, found: list[Boundary]) -> BoundaryMap:
+def _mapped(line: NumberLine, found: list[Boundary]) -> BoundaryMap:
     """Everything that was run, put in order."""
     places = sorted(line.known)
     values = [line.value(place) for place in places]
@@ -199,29 +365,19 @@ def _mapped(line: Line, found: list[Boundary]) -> BoundaryMap:
     for first, end in zip([0, *edges], [*edges, len(places)], strict=True):
         digest = points[first].digest
         inner = np.diff(values[first:end])
-        gap = float(inner.max()) if len(inner) else float(np.spacing(values[first]))
-        intervals.append(
-            Interval(
-                values[first],
-                values[end - 1],
-                numbers.setdefault(digest, len(numbers)),
-                digest,
-                points[first].loss,
-                points[end - 1].loss,
-                end - first,
-                gap,
-            )
-        )
+        gap = float(inner.max()) if len(inner) else line.value(places[first] + 1) - values[first]
+        number = numbers.setdefault(digest, len(numbers))
+        ends = values[first], values[end - 1], number, digest, points[first].loss, points[end - 1].loss
+        intervals.append(Interval(*ends, end - first, gap))
     known = {boundary.below.at for boundary in found}
-    unresolved = tuple((values[k - 1], values[k]) for k in edges if values[k - 1] not in known)
     return BoundaryMap(
-        line.dial.key,
+        line.number,
         line.steps,
         values[0],
         values[-1],
         tuple(intervals),
         tuple(found),
-        unresolved,
+        tuple((values[k - 1], values[k]) for k in edges if values[k - 1] not in known),
         len(places) == places[-1] - places[0] + 1,
         max(interval.gap for interval in intervals),
         len(line.known),

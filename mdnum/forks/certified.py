@@ -11,18 +11,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from mdnum.forks.twin import Twin
+from mdnum.forks.pair import Fork
 from mdnum.md.decide import PairDecider
 from mdnum.precision.ulp import unit_roundoff
+from mdnum.program import Twin
 from mdnum.systems.build import Simulation
-
-if TYPE_CHECKING:
-    from mdnum.forks.pair import Fork
 
 ROLES = ("state", "force", "decision", "accumulate")
 
@@ -69,9 +67,9 @@ def certified(fork: Fork) -> Certified:
     """The dates of a pair that was followed."""
     twin = fork.twin
     last = fork.steps
-    if not (twin.a.pairwise and twin.b.pairwise):
+    if twin.a.imposable or twin.b.imposable:
         return Certified({}, None, None, None)
-    runs = (("A", twin.a), ("B", twin.b))
+    runs = (("A", twin.a.simulation), ("B", twin.b.simulation))
     horizon = {name: _horizon(run, fork.series[f"ambiguous {name}"]) for name, run in runs}
     away, needed = protection(fork)
     bare = np.flatnonzero(~(away > needed))
@@ -95,7 +93,7 @@ def protection(fork: Fork) -> tuple[Float[np.ndarray, "steps"], Float[np.ndarray
     Two atoms may each be off by the separation, so their distance by twice that. Margins are those of the run
     whose own rounding is smaller, which is allowed for.
     """
-    deciders = {"A": fork.twin.a.decider, "B": fork.twin.b.decider}
+    deciders = {"A": fork.twin.a.simulation.decider, "B": fork.twin.b.simulation.decider}
     a, b = deciders.values()
     cutoffs = float(np.max(np.abs(_cutoffs(a) - _cutoffs(b)))) if len(a.r_cut) == len(b.r_cut) else np.inf
     finer = min(deciders, key=lambda name: np.nanmax(fork.series[f"bound {name}"]))
@@ -114,8 +112,8 @@ def wider(twin: Twin) -> str | None:
 
     Only of programs that are otherwise the same: what another time step decides differently is no rounding.
     """
-    a, b = twin.a, twin.b
-    if twin.start_a is not None or twin.start_b is not None or _but_for_roles(a) != _but_for_roles(b):
+    a, b = twin.a.simulation, twin.b.simulation
+    if twin.a.begin is not None or twin.b.begin is not None or _but_for_roles(a) != _but_for_roles(b):
         return None
     if not (np.array_equal(a.positions, b.positions) and np.array_equal(a.velocities, b.velocities)):
         return None

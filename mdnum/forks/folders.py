@@ -1,223 +1,324 @@
-"""Two finished runs: where they part, from what they stored, and what was different about them.
+"""Two finished runs of one world: where they part, from what they stored, and what was different about them.
 
-Nothing is run. Seed and fork are read from the tables of both folders; when the positions are wanted, the
-runs are in the folders too (`twin`), and `mdnum.forks.fork` follows them again.
+Nothing is run. The first differing bit and the fork are read from the tables of both folders; when the
+positions are wanted, the runs are in the folders too (`twin_of`), and `mdnum.forks.fork` follows them again.
+
+Two runs are of different systems where no step or subject of one corresponds to one of the other: other
+atoms, another box, another potential or contact. Every number and every choice of a program is a difference
+and may be large.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from mdnum.errors import InputError
-from mdnum.forks import folder_differences
-from mdnum.forks.folder_differences import Difference
-from mdnum.forks.stored import check_runs
-from mdnum.forks.twin import Twin
+from mdnum.forks.worlds import flat, program_of
+from mdnum.program import Twin
 from mdnum.store import RunFolder
-from mdnum.systems.build import build
 from mdnum.systems.load import load
 
+Difference = tuple[str, Any, Any]
+
+#: Of a system file by world, what does not decide what is computed, and what makes it another system.
+_ELSEWHERE = {
+    "md": ("about", "name", "record.save_every", "dynamics.steps", "fork", "gradient", "variants"),
+    "ball": ("about", "name", "loss", "fork", "gradient", "variants"),
+}
+_SYSTEM = {"md": ("units", "potential.kind"), "ball": ("contact.kind", "integrator.kind")}
 #: Stored at every step; that one of them differs in a bit means that the state does.
 _NUMBERS = ("potential", "kinetic", "displacement", "min_margin")
+#: Of the provenance, what bits depend on; its fingerprint is a hash of these and of the dtypes.
+_ARITHMETIC = ("versions", "cpu", "devices", "jax_settings", "environment")
+#: Dtypes by role are one choice: `--vary precision`.
+_ROLES = ("state", "force", "decision", "accumulate")
+#: What drawn velocities come from.
+_DRAWN = ("dynamics.temperature", "dynamics.seed", "dynamics.remove_drift", "structure.velocities")
+#: Boxes and masses are those of one system up to this part; they may differ in their last digits.
+_SAME = 1e-6
 
 
 @dataclass(frozen=True)
 class StoredFlip:
-    """A row of flips.parquet at which two runs differ.
+    """A stored flip that one of two runs has and the other has not.
 
     Attributes:
-        run: "A" or "B": which run has the row; the other has not.
-        step, i, j, entered, distance, margin, bound, ambiguous: as stored.
+        run: "A" or "B": which run has it.
+        step: of it.
+        subject: labels of the atoms of a pair, or of the ball.
+        entered: whether the pair enters its cutoff, or the contact begins.
+        margin, bound: as stored: of the decision, and on its rounding error.
+        distance: of the pair, length; NaN of a ball.
+        ambiguous: whether rounding alone could have decided otherwise.
     """
 
     run: str
     step: int
-    i: int
-    j: int
+    subject: tuple[int, ...]
     entered: bool
-    distance: float
     margin: float
     bound: float
+    distance: float
     ambiguous: bool
 
 
 @dataclass(frozen=True)
 class FolderFork:
-    """What two run folders say about one another.
+    """What two run folders hold about where their runs part.
 
     Attributes:
+        world: "md" or "ball".
         a, b: the folders.
         differences: what was different about the runs, as (key, in A, in B): system first, then the starts,
             then what bits depend on.
+        causes: what a fork may be put down to: keys of the system file, "start", "arithmetic".
         steps: steps that both have.
         seed: first step at which a stored number differs; None where none does.
         fork: first step at which a stored decision differs; None where none does.
-        decisions: the rows that differ at the fork.
+        channel: of the decision at the fork; "" without one.
+        iterations: of both solvers of a ball at the fork, where they differ.
+        decisions: the flips that differ at the fork, the nearest to its threshold first.
         same_structure: whether both began from the same atoms, bit for bit.
-        reasons: what can be concluded, and what cannot, in words.
     """
 
+    world: str
     a: Path
     b: Path
     differences: tuple[Difference, ...]
+    causes: tuple[str, ...]
     steps: int
     seed: int | None
     fork: int | None
+    channel: str
+    iterations: tuple[int, int] | None
     decisions: tuple[StoredFlip, ...]
     same_structure: bool
-    reasons: tuple[str, ...]
 
 
 def compare_folders(a: RunFolder | str | Path, b: RunFolder | str | Path) -> FolderFork:
     """Where two finished runs part.
 
     Args:
-        a, b: run folders of molecular dynamics, finished or not.
+        a, b: run folders of one world, finished or not.
 
     Raises:
-        InputError: the runs are of different systems, so that no step of theirs corresponds; names what is
-            different. Or a folder is that of a fork.
+        InputError: the runs are of different worlds or systems, so that no step of theirs corresponds; names
+            what is different. Or a folder is that of a fork.
         FolderError: a folder holds no run.
     """
-    first, second = (folder if isinstance(folder, RunFolder) else RunFolder.open(folder) for folder in (a, b))
-    check_runs(first, second)
+    first = a if isinstance(a, RunFolder) else RunFolder.open(a)
+    second = b if isinstance(b, RunFolder) else RunFolder.open(b)
+    for folder in (first, second):
+        folder.check_start()
+        if folder.summary.get("world") == "fork" or folder.world not in _ELSEWHERE:
+            raise InputError(
+                "this is a fork folder, the answer of `mdnum fork`, and no run",
+                where=str(folder.path),
+                remedy="Give two folders of `mdnum run` or of `mdnum ball`; `mdnum report DIR` shows a fork",
+            )
+    where = f"{first.path} and {second.path}"
+    if first.world != second.world:
+        raise InputError("one of these is no run of a ball", where=where, remedy="Compare runs of one world")
     with first.explained(), second.explained():
-        return _compared(first, second)
+        return _compared(first, second, where)
 
 
-def _compared(first: RunFolder, second: RunFolder) -> FolderFork:
-    programs = folder_differences.of_programs(first, second)
-    folder_differences.refuse_other_systems(first, second, programs)
-    starts = folder_differences.of_starts(first, second, programs)
-    arithmetic = folder_differences.of_arithmetic(first, second)
+def twin_of(found: FolderFork) -> Twin:
+    """The runs of two folders of molecular dynamics, to be followed again.
+
+    A replay has the bits of the stored run where versions and processor are the same.
+    """
+    difference = "; ".join(f"{key}: {one} and {other}" for key, one, other in found.differences[:3])
+    a, b = (program_of(load(path, world="md")) for path in (found.a, found.b))
+    return Twin(a, b, difference or "nothing known")
+
+
+def _compared(first: RunFolder, second: RunFolder, where: str) -> FolderFork:
+    world = first.world
+    elsewhere = _ELSEWHERE[world]
+    keys = _different(flat(first.system), flat(second.system))
+    programs = [row for row in keys if row[0] not in elsewhere and row[0].split(".")[0] not in elsewhere]
+    noun = "atoms" if world == "md" else "balls"
+    counts = [folder.summary.get(noun) for folder in (first, second)]
+    # a run that was killed has no summary; its structure is compared with the other's
+    if None not in counts and counts[0] != counts[1]:
+        raise InputError(
+            f"the runs have {counts[0]} and {counts[1]} {noun}",
+            where=where,
+            remedy="Compare runs of one system",
+        )
+    for key, one, other in programs:
+        if key in _SYSTEM[world]:
+            raise InputError(
+                f"the runs are of different systems: {key} is {one} in the first and {other} in the second",
+                where=where,
+                remedy="Compare runs of one system, which differ in numbers or in choices of the program",
+            )
+    iterations = None
+    if world == "md":
+        starts = _starts(first, second, programs, where)
+        steps, seed, fork, channel, flips = _md_dates(first, second)
+        # other starts need not show in a stored number at once
+        seed = 0 if starts else seed
+    else:
+        starts = []
+        steps, seed, fork, channel, flips, iterations = _ball_dates(first, second)
+    tables = (
+        flat({key: folder.provenance[key] for key in _ARITHMETIC if key in folder.provenance})
+        for folder in (first, second)
+    )
+    arithmetic = _different(*tables)
+    causes = [*choices(programs), *(["start"] if starts else []), *(["arithmetic"] if arithmetic else [])]
+    return FolderFork(
+        world,
+        first.path,
+        second.path,
+        (*programs, *starts, *arithmetic),
+        tuple(causes),
+        steps,
+        seed,
+        fork,
+        channel,
+        iterations,
+        tuple(sorted(flips, key=lambda flip: abs(flip.margin))),
+        not starts,
+    )
+
+
+def choices(programs: list[Difference]) -> list[str]:
+    """The choices that differing keys amount to: dtypes by role are one, so are a cutoff and its numbers."""
+    keys = [key for key, _, _ in programs]
+    out: dict[str, None] = {}
+    for key, one, other in programs:
+        table, _, name = key.partition(".")
+        if table == "precision" and name in _ROLES:
+            out["precision"] = None
+        elif not (table == "cutoff" and "cutoff.kind" in keys and None in (one, other)):
+            out[key] = None
+    return list(out)
+
+
+def _different(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[Difference]:
+    keys = dict.fromkeys([*one, *other])
+    return [(key, one.get(key), other.get(key)) for key in keys if one.get(key) != other.get(key)]
+
+
+def _alone(
+    first: RunFolder, second: RunFolder, table: str, labels: tuple[str, ...], steps: int
+) -> tuple[int | None, list[StoredFlip]]:
+    """The first step at which a flip is in one table alone, and those flips."""
+    names = ("step", *labels, "entered")
+    further = ("distance", "ambiguous") if table == "flips" else ()
+    tables = [folder.read(table, [*names, "margin", "bound", *further]) for folder in (first, second)]
+    rows = [
+        {row: k for k, row in enumerate(zip(*(data[name].tolist() for name in names), strict=True))}
+        for data in tables
+    ]
+    alone = {row for row in rows[0].keys() ^ rows[1].keys() if row[0] <= steps}
+    if not alone:
+        return None, []
+    step = int(min(row[0] for row in alone))
+    flips = []
+    for run, known, data in zip("AB", rows, tables, strict=True):
+        for row in sorted(known.keys() & {row for row in alone if row[0] == step}):
+            k = known[row]
+            margin, bound = float(data["margin"][k]), float(data["bound"][k])
+            distance = float(data["distance"][k]) if "distance" in data else float("nan")
+            ambiguous = bool(data["ambiguous"][k]) if "ambiguous" in data else abs(margin) <= bound
+            subject = tuple(int(label) for label in row[1:-1])
+            flips.append(StoredFlip(run, step, subject, bool(row[-1]), margin, bound, distance, ambiguous))
+    return step, flips
+
+
+def _md_dates(first: RunFolder, second: RunFolder):
     series = [folder.read("series", ["step", "pairs", *_NUMBERS]) for folder in (first, second)]
     steps = min(len(table["step"]) for table in series) - 1
     if steps < 0:
         raise InputError("a run has no step to compare", remedy="Resume it, or run again")
-    # other starts need not show in a stored number at once
-    seed = 0 if starts else _first_difference(series, steps)
-    fork, decisions = _fork(first, second, series, steps)
-    return FolderFork(
-        first.path,
-        second.path,
-        (*programs, *starts, *arithmetic),
-        steps,
-        seed,
-        fork,
-        decisions,
-        not starts,
-        (
-            *_attributed(folder_differences.choices(programs), starts, arithmetic),
-            *_dated(steps, seed, fork, decisions),
-        ),
-    )
-
-
-def twin(a: str | Path, b: str | Path) -> Twin:
-    """The runs of two folders, to be followed again.
-
-    A replay has the bits of the stored run where versions and processor are the same.
-    """
-    return twin_of(compare_folders(a, b))
-
-
-def twin_of(found: FolderFork) -> Twin:
-    """The runs of two folders that have been compared, to be followed again."""
-    words = "; ".join(f"{key}: {one} and {other}" for key, one, other in found.differences[:3])
-    return Twin(build(load(found.a, world="md")), build(load(found.b, world="md")), words or "nothing known")
-
-
-def _first_difference(series: list[dict[str, np.ndarray]], steps: int) -> int | None:
     differ = np.zeros(steps + 1, bool)
     for name in _NUMBERS:
         one, other = (table[name][: steps + 1] for table in series)
         differ |= ~((one == other) | (np.isnan(one) & np.isnan(other)))
-    return int(differ.argmax()) if differ.any() else None
+    seed = int(differ.argmax()) if differ.any() else None
+    if series[0]["pairs"][0] != series[1]["pairs"][0]:
+        return steps, seed, 0, "pair", []
+    fork, flips = _alone(first, second, "flips", ("i", "j"), steps)
+    return steps, seed, fork, "" if fork is None else "pair", flips
 
 
-def _fork(
-    first: RunFolder, second: RunFolder, series: list[dict[str, np.ndarray]], steps: int
-) -> tuple[int | None, tuple[StoredFlip, ...]]:
-    columns = ["step", "i", "j", "entered", "distance", "margin", "bound", "ambiguous"]
-    tables = [folder.read("flips", columns) for folder in (first, second)]
-    rows = [
-        {
-            (int(step), int(i), int(j), bool(entered)): k
-            for k, (step, i, j, entered) in enumerate(
-                zip(*(table[name].tolist() for name in columns[:4]), strict=True)
+def _ball_dates(first: RunFolder, second: RunFolder):
+    tables = [folder.read("steps") for folder in (first, second)]
+    steps = min(int(table["step"][-1]) for table in tables)
+    heights = [folder.read("heights") for folder in (first, second)]
+    kept = [{name: values[table["step"] <= steps] for name, values in table.items()} for table in heights]
+    seed = None
+    if len(kept[0]["step"]) == len(kept[1]["step"]):
+        apart = (kept[0]["y"] != kept[1]["y"]) | (kept[0]["v"] != kept[1]["v"])
+        seed = int(kept[0]["step"][apart].min()) if apart.any() else None
+    contact, flips = _alone(first, second, "contacts", ("ball",), steps)
+    counts = [table["iterations"][: steps + 1] for table in tables]
+    off = np.flatnonzero(counts[0] != counts[1])
+    stop = int(off[0]) if len(off) else None
+    fork = min((step for step in (contact, stop) if step is not None), default=None)
+    channel = "" if fork is None else "contact" if fork == contact else "stop"
+    iterations = (int(counts[0][fork]), int(counts[1][fork])) if fork is not None and fork == stop else None
+    return steps, seed, fork, channel, flips if channel == "contact" else [], iterations
+
+
+def _starts(first: RunFolder, second: RunFolder, programs: list[Difference], where: str) -> list[Difference]:
+    """What differs about the atoms at step 0.
+
+    Raises:
+        InputError: the atoms or the box are those of different systems.
+    """
+    from ase import Atoms
+    from ase.io import read
+
+    paths = [folder.path / "structure.extxyz" for folder in (first, second)]
+    if not all(path.exists() for path in paths):
+        return []
+    # a single frame each, which ase types as if it were several
+    atoms = [each for each in map(read, paths) if isinstance(each, Atoms)]
+    one, other = atoms
+    for what, is_same, seen in _same_system(one, other):
+        if not is_same:
+            raise InputError(
+                f"the runs are of different systems: {what} differ{seen}",
+                where=where,
+                remedy="Compare runs of one system",
             )
-            if step <= steps
-        }
-        for table in tables
-    ]
-    only = [set(rows[0]) - set(rows[1]), set(rows[1]) - set(rows[0])]
-    found = [row[0] for missing in only for row in missing]
-    counts = series[0]["pairs"][: steps + 1] != series[1]["pairs"][: steps + 1]
-    if counts[0]:
-        return 0, ()
-    if not found:
-        return None, ()
-    step = min(found)
-    flips = [
-        StoredFlip(
-            run,
-            *row,
-            *(table[name][known[row]].item() for name in ("distance", "margin", "bound", "ambiguous")),
-        )
-        for run, missing, known, table in zip("AB", only, rows, tables, strict=True)
-        for row in sorted(missing)
-        if row[0] == step
-    ]
-    return step, tuple(sorted(flips, key=lambda flip: abs(flip.margin)))
+    rows: list[Difference] = []
+    if not np.array_equal(one.cell.array, other.cell.array):
+        rows.append(("start: box", "", "other last digits"))
+    if not np.array_equal(one.get_masses(), other.get_masses()):
+        rows.append(("start: masses", "", "other last digits"))
+    if not np.array_equal(one.positions, other.positions):
+        moved = other.positions - one.positions
+        images = np.round(moved @ np.linalg.pinv(one.cell.array)) * one.pbc
+        moved -= images @ one.cell.array
+        rows.append(("start: positions", "", f"up to {np.linalg.norm(moved, axis=1).max():.3g} away"))
+    momenta = [each.arrays.get("momenta") for each in atoms]
+    switched = any(key == "structure.velocities" for key, _, _ in programs)
+    if switched or any(each is None for each in momenta):
+        # they are drawn when the run begins, from what the file says
+        if any(key in _DRAWN for key, _, _ in programs) or any(each is not None for each in momenta):
+            rows.append(("start: velocities", "", "drawn otherwise"))
+    elif not np.array_equal(one.arrays["momenta"], other.arrays["momenta"]):
+        rows.append(("start: velocities", "", "other"))
+    return rows
 
 
-def _attributed(choices: list[str], starts: list[Difference], arithmetic: list[Difference]) -> Iterator[str]:
-    """What parting may be put down to."""
-    things = [*choices]
-    if starts:
-        things.append("the start")
-    if arithmetic:
-        things.append("versions, flags or machine")
-    if len(things) > 1:
-        listed = ", ".join(things[:6]) + (", ..." if len(things) > 6 else "")
-        yield f"the runs differ in {len(things)} things ({listed}): a fork cannot be put down to one choice"
-    elif choices:
-        yield f"the runs differ in one choice, {choices[0]}"
-    elif starts:
-        yield "the programs are the same and the starts are not"
-    elif arithmetic:
-        yield f"the system is the same; what bits depend on differs in {len(arithmetic)} points"
-    else:
-        yield "nothing on record differs: runs like these should agree bit for bit"
-    if starts:
-        what = " and ".join(key.removeprefix("start: ") for key, _, _ in starts)
-        yield f"they begin otherwise ({what}), so the seed is step 0"
-
-
-def _dated(
-    steps: int, seed: int | None, fork: int | None, decisions: tuple[StoredFlip, ...]
-) -> Iterator[str]:
-    """Where they part."""
-    if seed is None:
-        yield f"no stored number differs in {steps} steps"
-    else:
-        yield f"the first stored number that differs is that of step {seed}"
-    if fork is None:
-        yield f"no decision differs in {steps} steps"
-    elif not decisions:
-        yield "the pairs inside differ at the start already"
-    else:
-        flip = decisions[0]
-        verb = "entered" if flip.entered else "left"
-        yield (
-            f"at step {fork} pair {flip.i}-{flip.j} {verb} in {flip.run} only, "
-            f"{abs(flip.margin):.2g} from the threshold (rounding bound {flip.bound:.1g})"
-        )
-        yield (
-            "when they split, and whether this was the cause, is told by following both again: "
-            "`mdnum fork RUN_A RUN_B --replay`"
-        )
+def _same_system(one: Any, other: Any) -> Iterator[tuple[str, bool, str]]:
+    """(what, whether it is the same, what was seen)."""
+    yield "numbers of atoms", len(one) == len(other), f", {len(one)} and {len(other)}"
+    species = [each.get_chemical_symbols() for each in (one, other)]
+    yield "species", species[0] == species[1], " or their order"
+    yield "masses", np.allclose(one.get_masses(), other.get_masses(), rtol=_SAME), ""
+    yield "periodic directions", bool((one.pbc == other.pbc).all()), ""
+    size = float(np.abs(one.cell.array).max())
+    yield "boxes", bool(np.allclose(one.cell.array, other.cell.array, atol=_SAME * size, rtol=0)), ""

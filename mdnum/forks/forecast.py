@@ -1,4 +1,4 @@
-"""Which decisions a perturbation will flip first, foretold by one linearized run.
+"""Which decisions a perturbation will flip first, predicted by one linearized run.
 
 Along the run each decision has a margin m and a tangent dm/da, a being the amplitude of the perturbation:
 to first order it flips at a = -m / (dm/da). The least of these at each step answers for all amplitudes at
@@ -9,7 +9,7 @@ forecast ends with it. Where the force is continuous there, a flip changes nothi
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -17,12 +17,10 @@ from jaxtyping import Float, Int
 
 from mdnum.errors import InputError
 from mdnum.forks.tangent import tangents
-from mdnum.rollout.engine import Engine
-from mdnum.rollout.flips import decided_pairs
 from mdnum.systems.build import Simulation
 
 #: Beyond this displacement, as a share of the cutoff, a forecast is not to be relied on. Measured on argon's
-#: crystal: every first flip was foretold up to 0.006, one of two at 0.02, none of six late ones at 0.04.
+#: crystal: every first flip was predicted up to 0.006, one of two at 0.02, none of six late ones at 0.04.
 LINEAR = 5e-3
 #: How far off the amplitude of a flip may be, as a share of it, for each cutoff of displacement. Measured on
 #: a crystal, cold, warm and with a continuous force, and a liquid: 196 at most in 304 decisions, 15 in seven
@@ -33,7 +31,7 @@ _ULPS = 8.0
 
 
 @dataclass(frozen=True)
-class Foretold:
+class PredictedFlip:
     """A decision that a perturbation is expected to flip.
 
     Attributes:
@@ -51,14 +49,14 @@ class Foretold:
     ulps: float
 
 
-class Range(NamedTuple):
+class ForecastRange(NamedTuple):
     """How far a forecast is good for one amplitude.
 
     Attributes:
         step: the last one; -1 for none.
         ends: why there: "end" of the run; "flip", the first one kicks its atoms; "close", whether a decision
             of the next step flips is within the error; "size", the displacement is too large from then on;
-            "list", a pair that was not looked at could come inside.
+            "list", a pair that was not examined could come inside.
     """
 
     step: int
@@ -77,12 +75,12 @@ class Forecast:
         pairs: of those decisions, shape (2, steps + 1, KEPT, 2); margins: theirs, as `reach`.
         furthest: displacement of the furthest atom per amplitude at each step, shape (steps + 1,).
         ulp: spacing of the floats at the largest start coordinate, length.
-        listed: pairs that were looked at, those of the list, at each step, shape (steps + 1,).
-        room: how much nearer to the cutoff than in the run a pair would have to be that was not looked at,
+        listed: pairs that were examined, those of the list, at each step, shape (steps + 1,).
+        room: how much nearer to the cutoff than in the run a pair would have to be that was not examined,
             length, shape (steps + 1,).
 
     Error: second order in the displacement, and some ulps; a decision that may flip or not within it is not
-        foretold. `good_until` says how far a forecast goes.
+        predicted. `good_until` says how far a forecast goes.
     """
 
     simulation: Simulation
@@ -102,21 +100,21 @@ class Forecast:
         """Whether a flip changes the force by a jump, and with it all that follows."""
         return self.simulation.cutoff.smoothness < 1
 
-    def good_until(self, amplitude: float) -> Range:
-        """Up to which step what is foretold of a perturbation holds, and why not beyond."""
-        last = Range(self.steps, "end")
+    def good_until(self, amplitude: float) -> ForecastRange:
+        """Up to which step what is predicted of a perturbation holds, and why not beyond."""
+        last = ForecastRange(self.steps, "end")
         for step, ends in ((self.linear_until(amplitude), "size"), (self._listed_until(amplitude), "list")):
-            last = min(last, Range(step, ends), key=lambda one: one.step)
+            last = min(last, ForecastRange(step, ends), key=lambda one: one.step)
         if self.kicks:
             nearest, error = self._nearest(amplitude), self._error(amplitude)
             near = np.flatnonzero(nearest[: last.step + 1] <= abs(amplitude) * (1 + error[: last.step + 1]))
             if len(near):
                 step = int(near[0])
                 sure = nearest[step] <= abs(amplitude) * (1 - error[step])
-                return Range(step, "flip") if sure else Range(step - 1, "close")
+                return ForecastRange(step, "flip") if sure else ForecastRange(step - 1, "close")
         return last
 
-    def first(self, amplitude: float, count: int = 3) -> tuple[Foretold, ...]:
+    def first(self, amplitude: float, count: int = 3) -> tuple[PredictedFlip, ...]:
         """The decisions that a perturbation flips first, by step, each pair once; no further than it is good.
 
         At most `KEPT` of a step; where there are as many, there may be more.
@@ -128,28 +126,28 @@ class Forecast:
         sign = 0 if amplitude >= 0 else 1
         sure = self.reach[sign] <= abs(amplitude) * (1 - self._error(amplitude))[:, None]
         rows, places = np.nonzero(sure[: self.good_until(amplitude).step + 1])
-        found: list[Foretold] = []
+        found: list[PredictedFlip] = []
         seen = set()
         for row, place in zip(rows.tolist(), places.tolist(), strict=True):
             pair = tuple(self.pairs[sign, row, place].tolist())
             if pair not in seen:
                 seen.add(pair)
-                found.append(self._foretold(sign, row, place))
+                found.append(self._flip(sign, row, place))
             if len(found) == count:
                 break
         return tuple(found)
 
-    def nearest(self, count: int = 10) -> tuple[Foretold, ...]:
+    def nearest(self, count: int = 10) -> tuple[PredictedFlip, ...]:
         """The decisions that the smallest amplitudes of either sign flip, each pair once.
 
         Each at an amplitude at which its forecast is good until then: where flips kick, one that comes after
-        another one is foretold for no amplitude.
+        another one is predicted for no amplitude.
         """
         # where flips kick, only what flips sooner or at less than all before it can be the first
         least = np.minimum.accumulate(self.reach.min(axis=2), axis=1)
         first = self.reach <= least[:, :, None] if self.kicks else np.isfinite(self.reach)
         flats = np.flatnonzero(first & np.isfinite(self.reach))
-        found: list[Foretold] = []
+        found: list[PredictedFlip] = []
         seen = set()
         for flat in flats[np.argsort(self.reach.reshape(-1)[flats], kind="stable")]:
             if len(found) == count:
@@ -160,7 +158,7 @@ class Forecast:
             # its own flip is within the error of its own amplitude, and ends the range a step before
             if pair not in seen and self.good_until(amplitude).step >= row - 1:
                 seen.add(pair)
-                found.append(self._foretold(sign, row, place))
+                found.append(self._flip(sign, row, place))
         return tuple(found)
 
     def linear_until(self, amplitude: float) -> int:
@@ -181,12 +179,12 @@ class Forecast:
         with np.errstate(divide="ignore", over="ignore"):
             return _SECOND_ORDER * size * self.furthest / self.simulation.r_cut + _ULPS * self.ulp / size
 
-    def _foretold(self, sign: int, row: int, place: int) -> Foretold:
+    def _flip(self, sign: int, row: int, place: int) -> PredictedFlip:
         i, j = (int(end) for end in self.pairs[sign, row, place])
         amplitude = float(self.reach[sign, row, place]) * (1 if sign == 0 else -1)
         largest = float(np.sqrt((self.dx**2).sum(axis=1)).max()) or 1.0
         margins = float(self.margins[sign, row, place])
-        return Foretold(row, i, j, amplitude, margins, abs(amplitude) * largest / self.ulp)
+        return PredictedFlip(row, i, j, amplitude, margins, abs(amplitude) * largest / self.ulp)
 
 
 def forecast(
@@ -249,73 +247,3 @@ def direction(simulation: Simulation, seed: int) -> Float[np.ndarray, "atoms 3"]
 
 def _clock(simulation: Simulation) -> float:
     return 30 * float(simulation.integrator.timestep)
-
-
-# --- beside runs --------------------------------------------------------------------------------------
-
-Flip = tuple[int, int, int]
-
-
-@dataclass(frozen=True)
-class Case:
-    """A forecast beside the run it was about.
-
-    Attributes:
-        seed: of the direction. amplitude: of the perturbation, with its sign.
-        good: how far the forecast goes.
-        foretold: what was expected to flip up to there.
-        differing: step, i and j of every decision up to there that the perturbed run made otherwise.
-        kicks: whether nothing more was to flip.
-    """
-
-    seed: int
-    amplitude: float
-    good: Range
-    foretold: tuple[Foretold, ...]
-    differing: frozenset[Flip]
-    kicks: bool
-
-    @property
-    def contradicted(self) -> tuple[Flip, ...]:
-        """What was foretold and did not happen; where flips kick, also a step of flips not foretold."""
-        told = {(one.step, one.i, one.j) for one in self.foretold}
-        steps = {step for step, _, _ in told}
-        unforeseen = {flip for flip in self.differing if flip[0] not in steps} if self.kicks else set()
-        return tuple(sorted((told - self.differing) | unforeseen))
-
-
-def trial(
-    simulation: Simulation, steps: int, amplitudes: list[float], *, seeds: range = range(4)
-) -> tuple[Case, ...]:
-    """Make the runs that forecasts are about: one forecast for each direction, a run for each amplitude.
-
-    Args:
-        simulation: the system as objects.
-        steps: last step.
-        amplitudes: of the perturbations, with their signs.
-        seeds: of the directions.
-    """
-    plain = _decided(simulation, steps)
-    cases = []
-    for seed in seeds:
-        told = forecast(simulation, steps, seed=seed)
-        for amplitude in amplitudes:
-            moved = replace(simulation, positions=simulation.positions + amplitude * told.dx)
-            good = told.good_until(amplitude)
-            differing = set()
-            for step, (ours, theirs) in enumerate(zip(plain, _decided(moved, steps), strict=False)):
-                if step <= good.step:
-                    keys = np.setxor1d(ours, theirs, assume_unique=True).tolist()
-                    differing |= {(step, *divmod(key, simulation.atoms)) for key in keys}
-            first = told.first(amplitude, 10)
-            cases.append(Case(seed, amplitude, good, first, frozenset(differing), told.kicks))
-    return tuple(cases)
-
-
-def _decided(simulation: Simulation, steps: int) -> list[Int[np.ndarray, "inside"]]:
-    """Keys of the pairs inside at every step of a run."""
-    return [
-        decided_pairs(simulation, segment, row)
-        for segment in Engine(simulation, steps).segments()
-        for row in range(segment.rows)
-    ]

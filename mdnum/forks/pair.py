@@ -1,4 +1,4 @@
-"""A pair of runs, followed until they split: dates, the decision at the fork, and a tested verdict."""
+"""A pair of runs of either world, followed until they split: dates, the decision at the fork, the verdict."""
 
 from __future__ import annotations
 
@@ -10,53 +10,26 @@ import numpy as np
 from jaxtyping import Shaped
 
 from mdnum.errors import InputError
-from mdnum.events.chance import Delay
+from mdnum.events.chance import FEWEST, REPEATS, Delay
 from mdnum.events.forks import PATIENCE, Dates, Growth, Verdict, growth, judge, split_of
 from mdnum.events.shares import Cell, Share, shares, table
-from mdnum.forks.repeats import perturbed, repeat
-from mdnum.forks.twin import Twin
-from mdnum.forks.words import repeats_asked
-from mdnum.md.cell import HostCell
-from mdnum.rollout.engine import Start, first_state
-from mdnum.rollout.flips import Ambiguous
-from mdnum.rollout.lockstep import CrossFlip, Stretch, lockstep
+from mdnum.program import Decision, PairRows, Twin
 
-#: The split tolerance as a share of the longest cutoff. Flips that part a crystal do so slowly, and its atoms
-#: have no room to be much further apart; docs/verdict-calibration.md has the verdicts by tolerance.
+#: The split tolerance as a share of the longest cutoff, or of the largest start height. Flips that part a
+#: crystal do so slowly, and its atoms have no room to be much further apart; docs/verdict-calibration.md has
+#: the verdicts by tolerance.
 SPLIT = 0.01
 #: A run is followed for so many times the steps to its split, so that "did not split" means something.
 _BEYOND = 2.0
-#: A counterfactual ends when a decision it is told is so many tolerances from its cutoff.
+#: A counterfactual ends when an imposed decision is so many tolerances from its threshold.
 _GUARD = 3.0
+#: Repeats are perturbed by what a choice does within so many steps, and by so many tolerances at most: a
+#: choice that changes everything at once still leaves room.
+_SOON, _LARGEST = 100, 1e-3
 #: Cross-run flips that are kept; the counts cover all of them.
 FLIPS_KEPT = 100_000
 
-
-@dataclass(frozen=True)
-class Decision:
-    """The decision at the fork.
-
-    Attributes:
-        step: of the fork.
-        i, j: the pair, labels of A.
-        run: which run flipped there, "A" or "B"; "start" where they differ from the start on.
-        entered: whether the pair entered its cutoff in that run.
-        margin, bound: of that decision, and the bound on its rounding error, in the quantity's space.
-        ambiguous: whether rounding alone could have decided otherwise.
-        separation: largest distance between the runs at the step before, length.
-        also: further pairs that fork at the same step.
-    """
-
-    step: int
-    i: int
-    j: int
-    run: str
-    entered: bool
-    margin: float
-    bound: float
-    ambiguous: bool
-    separation: float
-    also: int
+Progress = Callable[[int, int, dict[str, Any]], None]
 
 
 @dataclass(frozen=True)
@@ -68,14 +41,14 @@ class Fork:
         steps: steps that were followed.
         asked: steps that were asked for.
         tolerance: of the split, length.
-        dates: seed, fork and split.
+        dates: first differing bit, fork and split.
         decision: at the fork; None without one.
         series: arrays by step: "step"; separations from A "B", "B|A", "A|B from A", "B 1", ... (repeats,
             NaN once all have split), from B "A|B" and "B|A from B" (length);
-            "cross", pairs that differ; "overridden" and "furthest" of B|A;
-            energies "energy A", "energy B", "energy B|A"; "nearest A", "nearest B", the distance of the pair
-            next to its cutoff from it (length); "bound A", "bound B", how far rounding can move a distance
-            that is compared (length); "ambiguous A", "ambiguous B", ambiguous decisions.
+            "cross", decisions that differ; "overridden" and "furthest" of B|A; "energy A", "energy B",
+            "energy B|A"; of molecular dynamics also "nearest A", the distance of the pair next to its cutoff
+            from it (length), "bound A", how far rounding can move a distance that is compared (length), and
+            "ambiguous A", ambiguous decisions, and the same of B.
         flips: cross-run flips, the first `FLIPS_KEPT`.
         flips_total: of all.
         doubts: ambiguous decisions of A and of B, the first `FLIPS_KEPT` of each.
@@ -87,6 +60,7 @@ class Fork:
         repeats: when each repeat splits, free and under A's decisions.
         failed: runs that ended in "blow-up" or "runaway". Where a free run does, the comparison ends with it;
             where only one of them does, that is the fork at the latest.
+        runs: A, B and the counterfactuals by name, of a world that keeps them whole.
     """
 
     twin: Twin
@@ -96,9 +70,9 @@ class Fork:
     dates: Dates
     decision: Decision | None
     series: dict[str, Shaped[np.ndarray, "steps"]]
-    flips: tuple[CrossFlip, ...]
+    flips: tuple[Any, ...]
     flips_total: int
-    doubts: dict[str, Ambiguous]
+    doubts: dict[str, Any]
     growth: dict[str, Growth]
     splits: dict[str, int | None]
     table: tuple[Cell, ...]
@@ -106,6 +80,7 @@ class Fork:
     verdict: Verdict
     repeats: tuple[Delay, ...]
     failed: dict[str, str]
+    runs: dict[str, Any]
 
 
 def fork(
@@ -117,74 +92,64 @@ def fork(
     back: bool | None = None,
     repeats: int | None = None,
     seed: int = 0,
-    progress: Callable[[int, int, dict[str, Any]], None] | None = None,
+    progress: Progress | None = None,
 ) -> Fork:
     """Follow two runs until they have split, and judge what the flips had to do with it.
 
     Args:
         twin: the pair.
-        steps: last step; default the system's own. Followed to twice the split at most; a fifth further where
-            the split comes too late to tell a cause from a delay.
-        split: separation that counts as split, length; default 0.01 of the longest cutoff.
+        steps: last step; default the system's own. Molecular dynamics is followed to twice the split at most;
+            a fifth further where the split comes too late to tell a cause from a delay.
+        split: separation that counts as split, length; default 0.01 of the longest cutoff or start height.
         counterfactual: whether to run B under A's decisions; many-body potentials cannot.
         back: whether to run A under B's decisions too, for the full table of two by two; it costs as much
             as the run of B under A's. Default where that is run.
-        repeats: runs of B at most of which all atoms are displaced at random by as much as the choice
-            separates the runs in their first 100 steps (an ulp at least), each free and under A's decisions;
-            default 15. They are run where the runs split either way, until the verdict is clear.
+        repeats: runs of B at most whose start is displaced at random by as much as the choice separates the
+            runs at first (an ulp at least), each free and under A's decisions; default 15. They are run where
+            the runs split either way, until the verdict is clear.
         seed: of the perturbations.
         progress: called with the step reached, the last step, and figures.
 
     Raises:
-        InputError: steps below 1, runs of different size, or counterfactuals asked for that are not run.
+        InputError: steps below 1, programs that cannot be compared, or counterfactuals that are not run.
     """
     a, b = twin.a, twin.b
     counterfactual, back, most = counterfactuals(twin, counterfactual, back, repeats)
-    if a.atoms != b.atoms:
-        raise InputError(
-            f"the runs have {a.atoms} and {b.atoms} atoms", remedy="Compare runs of one structure"
-        )
-    last = a.system.spec.dynamics.steps if steps is None else steps
-    if last < 1:
-        raise InputError(f"steps = {last}; expected at least 1")
-    tolerance = SPLIT * a.r_cut if split is None else split
-    if not tolerance > 0:
+    a.check(b)
+    asked = a.steps if steps is None else steps
+    if asked < 1:
+        raise InputError(f"steps = {asked}; expected at least 1")
+    tolerance = SPLIT * a.scale if split is None else split
+    if not 0 < tolerance < np.inf:
         raise InputError(f"split = {tolerance:g}; expected a length above 0")
-    gathered: list[Stretch] = []
-    flips: list[CrossFlip] = []
-    doubts = {name: Ambiguous.joined([]) for name in ("A", "B")}
-    total = 0
-    asked, end = last, None
-    for stretch in lockstep(
-        a,
-        b,
-        _beyond(last),
-        start_a=twin.start_a,
-        start_b=twin.start_b,
-        frame=twin.frame,
-        handed=counterfactual,
-        back=back,
-        guard=_GUARD * tolerance,
-    ):
-        apart = split_of(stretch.separation["B"], tolerance)
-        if end is None and apart is not None and stretch.first + apart <= asked:
-            end = int(_BEYOND * (stretch.first + apart)) + 100
-            last = min(end, max(asked, _beyond(stretch.first + apart)))
-        # the stretches are the program's own: the last one may end beyond the last step
-        stretch = stretch.until(last)
-        gathered.append(replace(stretch, flips=(), doubts={}))
-        total += len(stretch.flips)
-        flips += stretch.flips[: max(0, FLIPS_KEPT - len(flips))]
-        for name, more in stretch.doubts.items():
-            room = max(0, FLIPS_KEPT - len(doubts[name].step))
-            doubts[name] = Ambiguous.joined([doubts[name], more.where(slice(room))])
-        reached = stretch.first + stretch.rows - 1
+    guard = _GUARD * tolerance
+    gathered: list[PairRows] = []
+    flips: list[Any] = []
+    doubts: dict[str, Any] = {}
+    total, last, end = 0, asked, None
+    horizon = _beyond(asked) if a.streams else asked
+    for rows in a.lockstep(b, horizon, forward=counterfactual, back=back, guard=guard):
+        apart = split_of(rows.separation["B"], tolerance)
+        if a.streams and end is None and apart is not None and rows.first + apart <= asked:
+            end = int(_BEYOND * (rows.first + apart)) + 100
+            last = min(end, max(asked, _beyond(rows.first + apart)))
+        # how many rows come at once is the program's own affair: the last may lie beyond the last step
+        rows = rows.until(last)
+        gathered.append(replace(rows, flips=(), doubts={}))
+        total += len(rows.flips)
+        flips += rows.flips[: max(0, FLIPS_KEPT - len(flips))]
+        for name, more in rows.doubts.items():
+            held = doubts.get(name)
+            room = FLIPS_KEPT - (0 if held is None else len(held.step))
+            more = more.where(slice(max(0, room)))
+            doubts[name] = more if held is None else type(more).joined([held, more])
+        reached = rows.first + rows.rows - 1
         if progress is not None:
-            shown = {"phase": "run", "separation": float(np.nanmax(stretch.separation["B"], initial=0.0))}
+            shown = {"phase": "run", "separation": float(np.nanmax(rows.separation["B"], initial=0.0))}
             progress(min(reached, last), last, shown)
         if reached >= last:
             break
-    found = _judged(twin, asked, tolerance, gathered, tuple(flips), total, doubts, most)
+    found = _judged(twin, asked, tolerance, gathered, flips, total, doubts, most)
     return _repeated(found, most, seed, progress)
 
 
@@ -201,16 +166,42 @@ def counterfactuals(
     Raises:
         InputError: asked for, and not run.
     """
-    pairwise = twin.a.pairwise and twin.b.pairwise
-    runs = counterfactual and pairwise
-    why = "those are left out" if pairwise else "a many-body potential decides inside its energy function"
-    most = repeats_asked(repeats, runs, why)
+    reason = twin.a.imposable or twin.b.imposable
+    runs = counterfactual and reason is None
+    most = repeats_asked(repeats, runs, reason or "those are left out")
     if back and not runs:
         raise InputError(
-            f"A under B's decisions was asked for, and B under A's is not run: {why}",
+            f"A under B's decisions was asked for, and B under A's is not run: "
+            f"{reason or 'those are left out'}",
             remedy="Leave out back",
         )
     return runs, runs if back is None else back, most
+
+
+def repeats_asked(repeats: int | None, counterfactual: bool, why: str = "those are left out") -> int:
+    """Repeats at most: those asked for, or the default where they would tell anything.
+
+    Args:
+        repeats: as asked; None for the default.
+        counterfactual: whether there are runs under the other run's decisions.
+        why: there are none.
+
+    Raises:
+        InputError: below 0, too few to tell anything, or asked for where they would not be run.
+    """
+    if repeats is None:
+        return REPEATS if counterfactual else 0
+    if repeats < 0 or 0 < repeats < FEWEST:
+        raise InputError(
+            f"repeats = {repeats}; expected 0, or {FEWEST} and more",
+            remedy="So few could never be clear" if repeats > 0 else None,
+        )
+    if repeats and not counterfactual:
+        raise InputError(
+            f"repeats = {repeats}, and no runs under A's decisions, which repeats tell from chance: {why}",
+            remedy="Leave out the repeats, or ask for 0",
+        )
+    return repeats
 
 
 def _beyond(step: int) -> int:
@@ -218,24 +209,32 @@ def _beyond(step: int) -> int:
     return int(np.ceil(PATIENCE * step)) + 1
 
 
-def _repeated(
-    found: Fork, most: int, seed: int, progress: Callable[[int, int, dict[str, Any]], None] | None
-) -> Fork:
+def perturbation(fork: Fork) -> float:
+    """How much the starts of repeats are displaced, length: what the choice does to the runs at first.
+
+    A smaller perturbation would leave the rounding errors of both runs the same, and their splits with them.
+    """
+    begins = (fork.dates.fork if fork.dates.seed is None else fork.dates.seed) or 0
+    soon = fork.series["B"][begins : min(max(begins, 1) + _SOON, fork.dates.fork or fork.steps + 1)]
+    return min(float(np.nanmax(soon, initial=0.0)), _LARGEST * fork.tolerance)
+
+
+def _repeated(found: Fork, most: int, seed: int, progress: Progress | None) -> Fork:
     """The same with as many repeats as its verdict wants."""
-    twin, series = found.twin, dict(found.series)
-    starts: list[Start] = []
+    a, b, series, tolerance = found.twin.a, found.twin.b, dict(found.series), found.tolerance
+    programs: list[Any] = []
     while wanted := found.verdict.wanted:
-        starts = starts or perturbed(twin, found.tolerance, most, seed)
+        programs = programs or b.nudged(perturbation(found), most, seed)
         done = len(found.repeats)
         if progress is not None:
             progress(found.steps, found.steps, {"phase": f"repeats {done + 1} to {done + wanted} of {most}"})
-        delays, tolerance = [], found.tolerance
-        runs = repeat(twin, starts[done : done + wanted], found.steps, tolerance, _GUARD * tolerance)
-        for number, (free, handed) in enumerate(runs, done + 1):
-            delays.append(Delay.of(free, handed, tolerance))
+        delays = []
+        runs = a.repeats(programs[done : done + wanted], found.steps, tolerance, _GUARD * tolerance)
+        for number, (free, under) in enumerate(runs, done + 1):
+            delays.append(Delay.of(free, under, tolerance))
             series[f"B {number}"] = np.append(free, np.full(found.steps + 1 - len(free), np.nan))
         repeats = (*found.repeats, *delays)
-        verdict = judge(found.dates, series["B"], series["B|A"], found.tolerance, repeats, most)
+        verdict = judge(found.dates, series["B"], series["B|A"], tolerance, repeats, most)
         found = replace(found, series=series, repeats=repeats, verdict=verdict)
     return found
 
@@ -244,39 +243,40 @@ def _judged(
     twin: Twin,
     asked: int,
     tolerance: float,
-    gathered: list[Stretch],
-    flips: tuple[CrossFlip, ...],
+    gathered: list[PairRows],
+    flips: list[Any],
     total: int,
-    doubts: dict[str, Ambiguous],
+    doubts: dict[str, Any],
     most: int,
 ) -> Fork:
     series = _series(gathered)
-    bits = np.concatenate([stretch.bits for stretch in gathered])
-    if gathered[-1].failed["A"] or gathered[-1].failed["B"]:
+    bits = np.concatenate([rows.bits for rows in gathered])
+    failed = {name: word for name, word in gathered[-1].failed.items() if word}
+    ended = [name for name in ("A", "B") if name in failed]
+    if ended:
         # what one run does after the other has ended is no comparison
         end = int(np.flatnonzero(np.isfinite(series["B"])).max(initial=0)) + 1
         series, bits = {name: values[:end] for name, values in series.items()}, bits[:end]
         total -= sum(flip.step >= end for flip in flips)
-        flips = tuple(flip for flip in flips if flip.step < end)
+        flips = [flip for flip in flips if flip.step < end]
     free = series["B"]
     splits = {name: split_of(series[name], tolerance) for name in series if name[0] in "AB"}
-    first = next((flip.step for flip in flips), None)
-    ended = [name for name in ("A", "B") if gathered[-1].failed[name]]
-    if first is None and len(ended) == 1:
-        # that one run can go on and the other cannot is a fork if anything is
-        first = len(free) - 1
-    failed = {name: word for stretch in gathered[-1:] for name, word in stretch.failed.items() if word}
+    first = flips[0].step if flips else None
     seed = int(bits.argmax()) if bits.any() else None
-    told = None
-    if not flips and len(ended) == 1:
-        # one of them has no state after it: no bit can be the same
+    cause = None
+    if first is None and len(ended) == 1:
+        # that one run can go on and the other cannot is a fork if anything is; the one that ended has no
+        # state after it, so no bit can be the same
+        first = len(free) - 1
         seed = first if seed is None else seed
-        word, other = failed[ended[0]], "B" if ended[0] == "A" else "A"
-        told = f"run {ended[0]} ended in a {word} at step {first} and run {other} did not"
+        (name,) = ended
+        cause = f"run {name} ended in a {failed[name]} at step {first} and run {'AB'[name == 'A']} did not"
     dates = Dates(seed, first, splits["B"])
-    handed = series.get("B|A")
+    together = [flip for flip in flips if flip.step == first]
+    decision = None
+    if together:
+        decision = twin.a.decision(twin.b, together, float(free[max(0, together[0].step - 1)]))
     rates = {name: growth(series[name], tolerance) for name in ("B", "B|A") if name in series}
-    verdict = judge(dates, free, handed, tolerance, (), most, ended=told)
     cells = table(series, tolerance)
     return Fork(
         twin,
@@ -284,70 +284,33 @@ def _judged(
         asked,
         tolerance,
         dates,
-        _decision(twin, flips, series),
+        decision,
         series,
-        flips,
+        tuple(flips),
         total,
         doubts,
         rates,
         splits,
         cells,
         shares(cells, rates["B"].rate),
-        verdict,
+        judge(dates, free, series.get("B|A"), tolerance, (), most, ended=cause),
         (),
         failed,
+        gathered[-1].runs,
     )
 
 
-def _series(gathered: list[Stretch]) -> dict[str, np.ndarray]:
-    series = {"step": np.concatenate([np.arange(s.first, s.first + s.rows) for s in gathered])}
-    for name in gathered[0].separation:
-        series[name] = np.concatenate([s.separation[name] for s in gathered])
-    series["cross"] = np.concatenate([s.cross for s in gathered])
-    for name in gathered[0].energy:
-        series[f"energy {name}"] = np.concatenate([s.energy[name] for s in gathered])
-    if "B|A" in gathered[0].overridden:
-        series["overridden"] = np.concatenate([s.overridden["B|A"] for s in gathered])
-        series["furthest"] = np.concatenate([s.furthest["B|A"] for s in gathered])
-    for name in ("A", "B"):
-        series[f"nearest {name}"] = np.concatenate([s.nearest[name] for s in gathered])
-        series[f"bound {name}"] = np.concatenate([s.bound[name] for s in gathered])
-        series[f"ambiguous {name}"] = np.concatenate([s.ambiguous[name] for s in gathered])
+def _series(gathered: list[PairRows]) -> dict[str, np.ndarray]:
+    def joined(column: str, name: str) -> np.ndarray:
+        return np.concatenate([getattr(rows, column)[name] for rows in gathered])
+
+    head = gathered[0]
+    series = {"step": np.concatenate([np.arange(rows.first, rows.first + rows.rows) for rows in gathered])}
+    series |= {name: joined("separation", name) for name in head.separation}
+    series["cross"] = np.concatenate([rows.cross for rows in gathered])
+    series |= {f"energy {name}": joined("energy", name) for name in head.energy}
+    if "B|A" in head.overridden:
+        series |= {name: joined(name, "B|A") for name in ("overridden", "furthest")}
+    for name in head.nearest:
+        series |= {f"{column} {name}": joined(column, name) for column in ("nearest", "bound", "ambiguous")}
     return series
-
-
-def _decision(twin: Twin, flips: tuple[CrossFlip, ...], series: dict[str, np.ndarray]) -> Decision | None:
-    if not flips:
-        return None
-    step = flips[0].step
-    together = [flip for flip in flips if flip.step == step and flip.differs]
-    chosen = min(together, key=lambda flip: abs(flip.margin) if np.isfinite(flip.margin) else np.inf)
-    before = float(series["B"][max(0, step - 1)])
-    if np.isfinite(chosen.margin):
-        margin, bound, run = chosen.margin, chosen.bound, chosen.run
-    else:
-        margin, bound = _start_margin(twin, chosen)
-        run = "start"
-    return Decision(
-        step,
-        chosen.i,
-        chosen.j,
-        run,
-        chosen.entered,
-        margin,
-        bound,
-        abs(margin) <= bound,
-        before,
-        len(together) - 1,
-    )
-
-
-def _start_margin(twin: Twin, flip: CrossFlip) -> tuple[float, float]:
-    """Margin and bound of a pair in A's start, where no flip came before it."""
-    a = twin.a
-    start = twin.start_a or first_state(a)
-    x = np.asarray(start.state.x).T
-    kind = int(a.type_of(np.array([flip.i]), np.array([flip.j]))[0])
-    d = HostCell(a.cell, a.decider.dtype).displacement(x[[flip.i]], x[[flip.j]])
-    quantity = float(a.decider.host_quantity(*d)[0])
-    return a.decider.thresholds[kind].value - quantity, float(a.decider.bounds_at(x.T[None])[0, kind])

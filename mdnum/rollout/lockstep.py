@@ -7,88 +7,17 @@ how many pairs there are, and nothing of the past is kept but the pairs that dif
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
-from typing import Any
+from collections.abc import Iterator
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from mdnum.rollout.compared import Apart, differ
-from mdnum.rollout.crossing import CrossFlip, Crossing
+from mdnum.program import PairRows
+from mdnum.rollout.compared import Apart, CrossFlip, CrossRecorder, Frame, differ
 from mdnum.rollout.engine import Segment, Start
 from mdnum.rollout.flips import Ambiguous
-from mdnum.rollout.frame import Frame
-from mdnum.rollout.handed import Handed, Overridden
-from mdnum.rollout.tracks import Rows, Track, joined
+from mdnum.rollout.tracks import Handed, Overridden, Rows, Track, joined
 from mdnum.systems.build import Simulation
-
-
-@dataclass(frozen=True)
-class Stretch:
-    """Some steps of the runs together.
-
-    Attributes:
-        first: step of the first row.
-        separation: largest distance between an atom of A and the same atom of another run, length, by the
-            name ("B", "B|A"), of "A|B" from B, and the other way around, "A|B from A" and
-            "B|A from B"; shape (rows,), NaN where a run has ended.
-        bits: whether any bit of the state of A and B differs, shape (rows,).
-        energy: total energy by run, shape (rows,).
-        cross: pairs that A and B decide differently, shape (rows,).
-        flips: cross-run flips of these steps, in order.
-        overridden: by counterfactual: decisions it would have made otherwise, shape (rows,).
-        furthest: by counterfactual: distance of the furthest of them from its cutoff, length, shape (rows,).
-        nearest: of A and B, how far the pair next to its cutoff is from it at least, length, shape (rows,).
-        bound: of A and B, how far rounding can move a distance that is compared, length, shape (rows,).
-        ambiguous: of A and B, how many decisions rounding could have changed, shape (rows,).
-        doubts: which ones they are.
-        failed: by run, "blow-up" or "runaway" where it ended that way.
-    """
-
-    first: int
-    separation: dict[str, Float[np.ndarray, "rows"]]
-    bits: np.ndarray
-    energy: dict[str, Float[np.ndarray, "rows"]]
-    cross: Int[np.ndarray, "rows"]
-    flips: Sequence[CrossFlip]
-    overridden: dict[str, Float[np.ndarray, "rows"]]
-    furthest: dict[str, Float[np.ndarray, "rows"]]
-    nearest: dict[str, Float[np.ndarray, "rows"]]
-    bound: dict[str, Float[np.ndarray, "rows"]]
-    ambiguous: dict[str, Float[np.ndarray, "rows"]]
-    doubts: dict[str, Ambiguous]
-    failed: dict[str, str]
-
-    @property
-    def rows(self) -> int:
-        """Number of steps."""
-        return len(self.cross)
-
-    def until(self, last: int) -> Stretch:
-        """The rows up to a step, and what happened in them."""
-        rows = last - self.first + 1
-        if rows >= self.rows:
-            return self
-        # whatever has a value for each row, in an array or in a dictionary of arrays, and nothing else
-        cut = {one.name: _first_rows(getattr(self, one.name), rows) for one in fields(self)}
-        doubts = {run: doubt.where(doubt.step <= last) for run, doubt in self.doubts.items()}
-        flips = [flip for flip in self.flips if flip.step <= last]
-        # a run that failed within these rows has no separation at the last of them; A has rows up to its end
-        failed = {
-            run: word if np.isnan(cut["separation"].get(run, np.zeros(rows))[-1]) else ""
-            for run, word in self.failed.items()
-        }
-        return Stretch(**{**cut, "flips": flips, "doubts": doubts, "failed": failed})
-
-
-def _first_rows(value: Any, rows: int) -> Any:
-    """The first rows of an array, or of each array of a dictionary; anything else as it is."""
-    if isinstance(value, np.ndarray):
-        return value[:rows]
-    if isinstance(value, dict):
-        return {name: _first_rows(one, rows) for name, one in value.items()}
-    return value
 
 
 def lockstep(
@@ -102,7 +31,7 @@ def lockstep(
     handed: bool = True,
     back: bool = False,
     guard: float | None = None,
-) -> Iterator[Stretch]:
+) -> Iterator[PairRows]:
     """Advance both runs, and what is compared with them, a stretch of A's steps at a time.
 
     Args:
@@ -124,7 +53,7 @@ def lockstep(
     leader = Track(a, last, start_a, listener=forward)
     follower = Track(b, last, start_b, frame, listener=backward)
     cell_a = Apart(a.cell)
-    crossing: Crossing | None = None
+    crossing: CrossRecorder | None = None
     while leader.segment() is not None:
         end = leader.ready
         rows_a, flips_a = leader.until(end)
@@ -133,7 +62,7 @@ def lockstep(
         opening: list[CrossFlip] = []
         if crossing is None:
             assert leader.first_pairs is not None and follower.first_pairs is not None
-            crossing = Crossing(leader.first_pairs, follower.first_pairs, a.atoms)
+            crossing = CrossRecorder(leader.first_pairs, follower.first_pairs, a.atoms)
             opening = crossing.opening()
         cross, flips = crossing.take(rows_a.first, len(rows_a), flips_a, flips_b)
         separation = {"B": apart(cell_a, rows_a, rows_b)}
@@ -165,7 +94,7 @@ def lockstep(
         ambiguous = {
             name: np.where(np.isnan(nearest[name]), np.nan, _per_row(doubts[name], rows_a)) for name in doubts
         }
-        yield Stretch(
+        yield PairRows(
             rows_a.first,
             separation,
             _bits_differ(rows_a, rows_b),

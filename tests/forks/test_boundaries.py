@@ -9,8 +9,9 @@ from small_systems import LENNARD_JONES, crystal, make
 
 from mdnum.errors import InputError
 from mdnum.forks.boundaries import boundaries
-from mdnum.forks.confirm import digests, digests_elsewhere
-from mdnum.forks.dials import dial, names
+from mdnum.forks.child import digests, digests_elsewhere
+from mdnum.forks.worlds import program_of
+from mdnum.rollout.dials import names
 from mdnum.rollout.engine import Engine
 from mdnum.systems.build import build
 
@@ -37,12 +38,11 @@ def solid():
 
 def brute(system, key: str, steps: int, values: np.ndarray) -> list[tuple[float, float]]:
     """Adjacent values whose runs hold different sets of pairs at some step, by sets of pairs."""
-    simulation = build(system)
-    one = dial(simulation, key)
+    number = program_of(system).number(key)
     held = []
     for value in values:
         sets = []
-        for segment in Engine(one.turn(simulation, float(value)), steps).segments():
+        for segment in Engine(number.at(float(value)).simulation, steps).segments():
             for bits in segment.rows_of("bits"):
                 i, j = segment.table.decided(bits)
                 sets.append(frozenset(zip(i.tolist(), j.tolist(), strict=True)))
@@ -68,8 +68,8 @@ def test_a_crossing_in_closed_form_is_found_where_it_is(crossings):
         # k additions of a rounded product: each half an ulp of a position below 4
         assert abs(boundary.above.at - expected) <= (k + 1) * 2.0**-52 * 4 / SPEED / k
         assert boundary.above.at == np.nextafter(boundary.below.at, 1.0)
-        assert (boundary.step, boundary.i, boundary.j, boundary.also) == (k, 0, 1, 0)
-        assert boundary.above.inside and not boundary.below.inside
+        assert (boundary.step, boundary.subject, boundary.also) == (k, (0, 1), 0)
+        assert (boundary.below.decided, boundary.above.decided) == (0, 1)
         # at rest is not inside: the comparison is `<`
         assert boundary.above.margin > 0 >= boundary.below.margin
         assert boundary.confirmed is True
@@ -93,7 +93,7 @@ def test_the_last_step_alone_makes_no_jump_and_an_earlier_one_does(crossings):
 )
 def test_brute_force_over_all_floats_finds_the_same(key, at, width):
     system, steps = solid(), 30
-    at = dial(build(system), key).value if at is None else at
+    at = program_of(system).number(key).value if at is None else at
     coarse = boundaries(system, key, at, at + width, steps, cells=8, most=1, confirm=False)
     (one,) = coarse.boundaries
     ulp = np.spacing(one.below.at)
@@ -127,24 +127,16 @@ def test_the_radius_is_turned_without_compiling_and_agrees_with_the_program_prop
     found = boundaries(meeting(), "cutoff.radius", 2.26, 2.30, 12, cells=2)
     # the distance after k steps of 1/20 is 3 - k/16: 2.3125, 2.25 from the pair's own motion alone up to
     # its entry; both atoms then fall faster, so a boundary between is where a later step meets the radius
-    simulation = build(meeting())
-    one = dial(simulation, "radius")
-    assert one.compiles
+    number = program_of(meeting()).number("radius")
+    assert number.compiles
     for value in (2.27, 2.29):
-        assert list(digests(meeting(), "radius", 12, [value])) == [_digest(one.turn(simulation, value), 12)]
+        assert digests(meeting(), "radius", 12, [value]) == [number.at(value).history(12).digest]
     assert all(boundary.confirmed for boundary in found.boundaries)
-
-
-def _digest(simulation, steps: int) -> str:
-    from mdnum.forks.histories import history
-
-    return history(simulation, steps).digest
 
 
 def test_what_is_left_is_told():
     found = boundaries(meeting(), "timestep", 0.04, 0.105, 9, cells=32, most=2, confirm=False)
     assert len(found.boundaries) == 2 and len(found.unresolved) == 4
-    assert "4 more stretches" in found.words
     assert found.boundaries[0].confirmed is None
 
 

@@ -6,24 +6,25 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from forks.harness import crystal, pair
 
-from mdnum.forks import Fork, Twin, fork
+from mdnum.forks import Fork, fork
 from mdnum.forks.certified import certified, protection, wider
 from mdnum.rollout.engine import Engine
 from mdnum.rollout.flips import decided_pairs
-from mdnum.systems.build import Simulation, build
+from mdnum.systems.build import Simulation
 
 STEPS = 180
-#: Warm enough that float32 decides a pair otherwise within so few steps.
-WARM = {"dynamics.temperature": 0.3}
 
 
 @pytest.fixture(scope="module")
 def found() -> Fork:
-    """The crystal, and with decisions in float32."""
-    a = build("argon/crystal-108", WARM)
-    b = build("argon/crystal-108", WARM | {"precision.decision": "float32"})
-    return fork(Twin(a, b, "decisions in float32"), STEPS, counterfactual=False)
+    """The crystal, and with decisions in float32, warm enough that a pair is decided otherwise so soon."""
+    return fork(pair(warm(), warm(precision__decision="float32")), STEPS, counterfactual=False)
+
+
+def warm(**overrides: str | float) -> Simulation:
+    return crystal(dynamics__temperature=0.3, **overrides)
 
 
 def every_pair(simulation: Simulation):
@@ -44,7 +45,7 @@ def squared(simulation: Simulation, x: np.ndarray, dtype: str) -> tuple[np.ndarr
 
 
 def test_ambiguous_decisions_are_those_within_the_bound_and_no_other_is_wrong(found):
-    b = found.twin.b
+    b = found.twin.b.simulation
     threshold, bound, exact = b.decider.thresholds[0].value, b.decider.bounds[0], b.r_cut**2
     listed = set(zip(found.doubts["B"].step.tolist(), found.doubts["B"].i.tolist(),
                      found.doubts["B"].j.tolist(), strict=True))  # fmt: skip
@@ -67,7 +68,7 @@ def test_ambiguous_decisions_are_those_within_the_bound_and_no_other_is_wrong(fo
 
 
 def test_the_nearest_pair_protects_until_the_runs_could_have_moved_it(found):
-    a = found.twin.a
+    a = found.twin.a.simulation
     away, needed = protection(found)
     nearest = np.array(
         [np.abs(np.sqrt(squared(a, x, "float64")[1]) - a.r_cut).min() for _, x, _ in every_pair(a)]
@@ -85,29 +86,28 @@ def test_the_nearest_pair_protects_until_the_runs_could_have_moved_it(found):
 
 
 def test_two_runs_of_one_program_are_protected_by_their_bounds_alone(found):
-    a = found.twin.a
-    dates = certified(fork(Twin(a, a, "nothing"), STEPS, counterfactual=False))
+    a = found.twin.a.simulation
+    dates = certified(fork(pair(a, a), STEPS, counterfactual=False))
     assert dates.protected == STEPS and dates.shadow is None and dates.shadow_step is None
 
 
 def test_the_wider_program_is_the_shadow(found):
     assert wider(found.twin) == "A"
-    a, b = found.twin.a, found.twin.b
-    assert wider(Twin(b, a, "the other way")) == "B"
+    a, b = found.twin.a.simulation, found.twin.b.simulation
+    assert wider(pair(b, a)) == "B"
     assert certified(found).shadow_step == found.dates.fork - 1
-    narrow = build("argon/crystal-108", {"precision.force": "float32"} | WARM)
-    assert wider(Twin(b, narrow, "one role each")) is None
-    assert wider(Twin(a, a, "nothing")) is None
-    assert wider(Twin(a, replace(b, positions=b.positions + 1e-9), "another start")) is None
-    later = build("argon/crystal-108", {"precision.force": "float32", "dynamics.timestep": 0.002} | WARM)
-    assert wider(Twin(a, later, "another step")) is None
+    # one role each, nothing, another start, another step
+    later = warm(precision__force="float32", dynamics__timestep=0.002)
+    assert wider(pair(b, warm(precision__force="float32"))) is None
+    for other in (a, replace(b, positions=b.positions + 1e-9), later):
+        assert wider(pair(a, other)) is None
 
 
 def test_what_decides_inside_its_energy_function_is_not_certified(found):
     class ManyBody(Simulation):
         pairwise = False
 
-    a = found.twin.a
+    a = found.twin.a.simulation
     other = ManyBody(**{name: getattr(a, name) for name in a.__dataclass_fields__})
-    dates = certified(replace(found, twin=Twin(other, other, "nothing")))
+    dates = certified(replace(found, twin=pair(other, other)))
     assert dates.horizon == {} and dates.protected is None and dates.shadow is None

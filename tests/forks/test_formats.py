@@ -11,9 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import small_systems
+from forks.harness import made as twin_of
 
-from mdnum.forks.choices import Format, parse
-from mdnum.forks.choices.formats import FORMATS, FormattedSimulation
+from mdnum.forks.choices import FormatChoice, unavailable
+from mdnum.forks.choices.lists import FORMATS
+from mdnum.forks.reordered import FormattedSimulation
 from mdnum.md.cell import wrap_positions
 from mdnum.md.jaxmd import as_neighbor_list, displacement, upstream
 from mdnum.precision.orders import Halves, Sequential, Twice
@@ -170,17 +172,17 @@ def test_a_list_in_another_format_holds_the_same_pairs(simulation):
     wrapped, _ = wrap_positions(simulation.cell, simulation.positions)
     plain = simulation.verlet_list().build(wrapped, simulation.cell)
     for word in FORMATS:
-        twin = parse(f"format={word}").make(simulation.system)
-        table = twin.b.verlet_list().build(wrapped, simulation.cell)
+        twin = twin_of(f"format={word}", simulation.system)
+        table = twin.b.simulation.verlet_list().build(wrapped, simulation.cell)
         held, before = (np.sort(one.unsorted(), axis=1)[:, : plain.occupancy] for one in (table, plain))
         assert np.array_equal(held, before)
         assert table.pairs == plain.pairs and table.slots % 8 == 0
-        assert twin.a.lists != twin.b.lists
+        assert twin.a.simulation.lists != twin.b.simulation.lists
         # by label, padding last in each half
         labels = np.append(table.order, len(table.order))[table.index]
         for half in np.split(labels, 2 if word == "ordered-sparse" else 1):
             assert (np.diff(half, axis=0) >= 0).all()
-    assert Format("sparse").why_not(replace(simulation.system, spec=_pairwise(simulation))) is not None
+    assert unavailable(FormatChoice(word="sparse"), replace(simulation.system, spec=_pairwise(simulation)))
 
 
 def _pairwise(simulation: Simulation):

@@ -6,22 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from forks.harness import crystal, crystal_system, followed, made, moved, pair
 
 from mdnum.errors import InputError
-from mdnum.forks import Twin, fork
-from mdnum.forks.repeats import nudged, seed_size
-from mdnum.rollout.engine import first_state
-from mdnum.systems.build import Simulation, build
-
-
-def moved(simulation: Simulation, size: float) -> Simulation:
-    noise = np.random.default_rng(0).standard_normal(simulation.positions.shape)
-    return replace(simulation, positions=simulation.positions + size * noise)
+from mdnum.forks import fork
+from mdnum.forks.pair import perturbation
+from mdnum.rollout.program import MdProgram
+from mdnum.systems.build import build
 
 
 def test_in_a_cold_crystal_the_flips_are_the_cause():
-    a = build("argon/crystal-108")
-    found = fork(Twin(a, moved(a, 1e-6), "start"), 3000, split=0.03, back=True)
+    found = followed(1e-6, 1500, split=0.03, back=True)
     assert found.verdict.word == "cause"
     assert found.splits["B"] is not None and found.splits["B|A"] is None and found.splits["A|B"] is None
     assert np.nanmax(found.series["B|A"]) < 1e-5
@@ -32,65 +27,94 @@ def test_in_a_cold_crystal_the_flips_are_the_cause():
     assert not decision.ambiguous and found.dates.seed == 0
 
 
-def test_between_shells_nothing_forks():
-    a = build("argon/crystal-108", {"cutoff.radius": 1.35})
-    found = fork(Twin(a, moved(a, 1e-6), "start"), 1500, split=0.03)
-    assert found.verdict.word == "no fork"
+@pytest.mark.parametrize(
+    ("radius", "size", "steps", "word"), [(1.35, 1e-6, 1500, "no fork"), (None, 0.0, 200, "same")]
+)
+def test_without_a_fork_nothing_is_judged(radius, size, steps, word):
+    a = crystal() if radius is None else crystal(cutoff__radius=radius)
+    found = fork(pair(a, moved(a, size)), steps, split=0.03)
+    assert found.verdict.word == word
     assert found.dates.fork is None and found.dates.split is None and found.decision is None
 
 
-def test_the_same_program_is_the_same():
-    a = build("argon/crystal-108")
-    found = fork(Twin(a, build("argon/crystal-108"), "nothing"), 200)
-    assert found.verdict.word == "same"
-
-
-def test_every_series_ends_at_the_last_step_wherever_the_stretches_end():
+def test_a_horizon_too_short_is_open_and_every_series_ends_at_the_last_step():
     """A's stretches are as long as its program makes them: no 37 steps."""
-    a = build("argon/crystal-108")
-    found = fork(Twin(a, moved(a, 1e-6), "start"), 37, back=True, repeats=0)
+    found = followed(1e-6, 37, back=True, repeats=0)
     assert {name: len(values) for name, values in found.series.items()} == dict.fromkeys(found.series, 38)
+    longer = followed(1e-6, 120, split=0.03, repeats=0)
+    assert longer.verdict.word == "open" and longer.dates.fork is not None
 
 
-def test_a_horizon_too_short_is_open():
-    a = build("argon/crystal-108")
-    found = fork(Twin(a, moved(a, 1e-6), "start"), 120, split=0.03, repeats=0)
-    assert found.verdict.word == "open"
-    assert found.dates.fork is not None
+@pytest.mark.parametrize("size", [0.0, 1e-3])
+def test_nudged_starts_differ_by_the_size_asked_for_and_never_by_nothing(size):
+    program = MdProgram(crystal(precision__state="float32"))
+    for one in program.nudged(size, 3, 1):
+        d = np.asarray(one.start.state.x, np.float64) - np.asarray(program.start.state.x, np.float64)
+        largest = np.sqrt((d**2).sum(axis=0)).max()
+        assert largest > 0 and (not size or largest == pytest.approx(size, rel=1e-3))
 
 
-def test_nudged_starts_differ_by_the_size_asked_for_and_never_by_nothing():
-    a = build("argon/crystal-108", {"precision.state": "float32"})
-    start = first_state(a)
-    for size in (0.0, 1e-3):
-        for one in nudged(a, start, size, 3, 1):
-            d = np.asarray(one.state.x, np.float64) - np.asarray(start.state.x, np.float64)
-            largest = np.sqrt((d**2).sum(axis=0)).max()
-            assert largest > 0
-            if size:
-                assert largest == pytest.approx(size, rel=1e-3)
+def test_repeats_are_perturbed_by_what_a_choice_does_at_first():
+    assert 1e-7 < perturbation(followed(1e-7, 120, repeats=0)) < 1e-5
 
 
-def test_the_seed_of_a_choice_is_measured():
-    a = build("argon/crystal-108")
-    b = moved(a, 1e-7)
-    assert 1e-7 < seed_size(Twin(a, b, "start")) < 1e-5
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"steps": 0}, "steps = 0"),
+        ({"split": -1.0}, "split = -1"),
+        ({"repeats": 4, "counterfactual": False}, "repeats = 4, and no runs under A's decisions"),
+        ({"repeats": 3}, "repeats = 3; expected 0, or 4 and more"),
+        ({"back": True, "counterfactual": False}, "A under B's decisions was asked for"),
+    ],
+)
+def test_what_would_not_be_run_is_refused(options, words):
+    with pytest.raises(InputError, match=words):
+        fork(pair(crystal(), crystal()), **({"steps": 10} | options))
 
 
-def test_what_cannot_be_compared_is_refused():
-    a = build("argon/crystal-108")
+def test_runs_of_different_size_are_refused():
     with pytest.raises(InputError, match="108 and 864 atoms"):
-        fork(Twin(a, build("argon/liquid-864"), "another system"), 10)
-    with pytest.raises(InputError, match="steps = 0"):
-        fork(Twin(a, a, "nothing"), 0)
-    with pytest.raises(InputError, match="split = -1"):
-        fork(Twin(a, a, "nothing"), 10, split=-1.0)
+        fork(pair(crystal(), build("argon/liquid-864")), 10)
 
 
 @pytest.mark.slow
 def test_a_run_that_ends_before_any_decision_differs_is_a_fork_by_itself():
-    b = build("argon/crystal-108", overrides={"dynamics.timestep": 2.0})
-    found = fork(Twin(build("argon/crystal-108"), b, "time step"), 4, repeats=0, counterfactual=False)
+    b = crystal(dynamics__timestep=2.0)
+    found = fork(pair(crystal(), b), 4, repeats=0, counterfactual=False)
     assert found.failed.keys() == {"B"} and not found.flips
     assert found.dates.seed == found.dates.fork == found.steps
-    assert found.verdict.word == "open" and "that is the fork" in found.verdict.reasons[0]
+    assert found.verdict.word == "open"
+
+
+# --- repeats ------------------------------------------------------------------------------------------
+
+
+def test_the_verdict_on_a_liquid_rests_on_repeats():
+    """The crystal melting splits whatever it decides; each repeat is a pair as its start would be alone."""
+    hot = made("precision", crystal_system(dynamics__temperature=3.0))
+    found = fork(hot, 1100, repeats=4, back=False)
+    count = found.verdict.count
+    assert count is not None and (count.pairs, count.most) == (5, 5)
+    assert found.verdict.word != "cause" and len(found.repeats) == 4
+    assert {name for name in found.series if name.startswith("B ")} == {"B 1", "B 2", "B 3", "B 4"}
+    # alone, from its start, the pair of runs is followed by another path through the code
+    starts = hot.b.nudged(perturbation(found), 4, seed=0)
+    alone = fork(replace(hot, b=starts[2]), 1100, repeats=0, back=False)
+    assert (alone.splits["B"], alone.splits["B|A"]) == (found.repeats[2].free, found.repeats[2].handed)
+    # and the first starts do not depend on how many there are
+    ((free, _),) = hot.a.repeats(
+        hot.b.nudged(perturbation(found), 1, 0), 1100, found.tolerance, 3 * found.tolerance
+    )
+    assert int((free > found.tolerance).argmax()) == found.repeats[0].free
+
+
+def test_a_split_near_the_end_is_followed_further():
+    """It splits at step 784: in 800 steps that could be a delay, and before it there is nothing to follow."""
+    twin = made("precision", crystal_system(dynamics__seed=2))
+    found = fork(twin, 800, back=False)
+    assert found.dates.split is not None and 0.9 * 800 < found.dates.split <= 800
+    assert found.verdict.word == "cause" and found.steps >= 1.2 * found.dates.split > 800
+    assert found.repeats == () and found.verdict.count is None
+    before = found.dates.split - 1
+    assert fork(twin, before, back=False).steps == before

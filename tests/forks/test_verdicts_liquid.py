@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from ase import Atoms
 from ase.build import bulk
+from forks.harness import made
 from small_systems import make
 
 from mdnum.forks import Fork, fork
-from mdnum.forks.choices import parse
 from mdnum.rollout.engine import Engine
 from mdnum.systems import System
 from mdnum.systems.build import build
@@ -57,9 +57,8 @@ def liquid(seed: int) -> Atoms:
 @pytest.fixture(scope="module")
 def forks() -> dict[str, list[Fork]]:
     """Float32 arithmetic beside float64, by cutoff and start."""
-    choice = parse("precision")
     return {
-        cut: [fork(choice.make(argon(liquid(seed), cut)), 1000, back=False) for seed in STARTS]
+        cut: [fork(made("precision", argon(liquid(seed), cut)), 1000, back=False) for seed in STARTS]
         for cut in CUTS
     }
 

@@ -7,8 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mdnum.dynamics import Dynamics
-from mdnum.md.stepper import MdState, PairDynamics
+from mdnum.md.pairforce import MdState, PairDynamics
 from mdnum.rollout.engine import Engine, first_state
 from mdnum.systems.build import build
 
@@ -28,8 +27,7 @@ def crystal():
 
 def test_told_its_own_decisions_it_is_the_rollout(crystal):
     simulation, dynamics, state = crystal
-    contract: Dynamics = dynamics
-    advance = jax.jit(lambda s: contract.step(s, dynamics.decide(s)))
+    advance = jax.jit(lambda s: dynamics.step(s, dynamics.decide(s)))
     for _ in range(40):
         state = advance(state)
     (segment,) = list(Engine(simulation, 40).segments())

@@ -12,6 +12,7 @@ from rollout.harness import frames_of, go, write_system
 from mdnum.forks import Twin, fork
 from mdnum.forks.certified import certified, protection
 from mdnum.forks.exact.bounds import certified_horizon
+from mdnum.rollout.program import MdProgram
 from mdnum.rollout.run import run
 from mdnum.store import RunFolder
 from mdnum.systems.build import build
@@ -79,11 +80,13 @@ def test_horizons_end_before_the_first_decision_that_rounding_made(path, whole):
     first = int(np.flatnonzero(series["ambiguous"])[0])
     assert found.horizon == first and found.wrong is not None
     assert found.bounds == (whole.summary["cutoff"]["bound"],)
-    dates = fork(Twin(wide, narrow, "decisions in float32"), STEPS, counterfactual=False)
+    dates = fork(
+        Twin(MdProgram(wide), MdProgram(narrow), "decisions in float32"), STEPS, counterfactual=False
+    )
     assert dates.decision is not None and dates.decision.ambiguous
     assert certified(dates).horizon["B"].step == first - 1
     assert certified(dates).horizon["A"].decisions == 0
-    twice = fork(Twin(narrow, narrow, "nothing"), STEPS, counterfactual=False)
+    twice = fork(Twin(MdProgram(narrow), MdProgram(narrow), "nothing"), STEPS, counterfactual=False)
     _, needed = protection(twice)
     assert needed[-1] > 10 * needed[0] > 0 and (np.diff(needed) >= 0).all()
 

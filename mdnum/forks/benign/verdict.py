@@ -11,11 +11,10 @@ import numpy as np
 from jaxtyping import Float
 
 from mdnum.errors import InputError
-from mdnum.forks.benign import rule
-from mdnum.forks.benign.calibration import Calibration, Planted, calibrate
+from mdnum.forks.benign.calibration import RUNS, Calibration, Planted, calibrate
 from mdnum.forks.benign.ensemble import ensemble, starts
-from mdnum.forks.twin import Twin
 from mdnum.md.integrators import Langevin
+from mdnum.program import Twin
 from mdnum.systems.build import Simulation
 
 #: Features that are named, at most.
@@ -44,7 +43,6 @@ class Benign:
             where none were. Its exact 95 % interval is in `false_positive_bounds`.
         false_positive_bounds: see there.
         false_positives: verdicts "fail" that were counted, and of how many.
-        says: the answer in words.
     """
 
     passed: bool
@@ -57,7 +55,6 @@ class Benign:
     false_positive_rate: float
     false_positive_bounds: tuple[float, float]
     false_positives: tuple[int, int]
-    says: str
 
 
 def benign(
@@ -91,22 +88,23 @@ def benign(
     check(twin)
     if calibration is None:
         calibration = calibrate(
-            twin.a,
-            start=twin.start_a,
+            twin.a.simulation,
+            start=twin.a.begin,
             members=members,
             held_out=held_out,
             tries=tries,
             steps=steps,
             progress=progress,
         )
-    elif not _same_program(calibration.simulation, twin.a):
+    elif not _same_program(calibration.simulation, twin.a.simulation):
         raise InputError(
             f"the calibration is of {calibration.simulation.system.name} with other settings or positions",
             remedy="Calibrate with this comparison's own program",
         )
     window = calibration.window
-    begin = starts(twin.b, rule.RUNS, _SEED, twin.start_b)
-    rows = ensemble(twin.b, begin, [window.step], calibration.ruler)[0]
+    b = twin.b.simulation
+    begin = starts(b, RUNS, _SEED, twin.b.begin)
+    rows = ensemble(b, begin, [window.step], calibration.ruler)[0]
     whole = np.isfinite(rows).all(axis=1)
     scores = np.full((len(rows), len(window.space.sigma)), np.nan)
     scores[whole] = window.space.scores(rows[whole])
@@ -125,7 +123,6 @@ def benign(
         calibration.rate,
         calibration.rate_bounds,
         (calibration.false_positives, calibration.triples),
-        _says(twin, calibration, passed, failing, int((~whole).sum())),
     )
 
 
@@ -135,12 +132,8 @@ def check(twin: Twin) -> None:
     Raises:
         InputError: runs of different size, or with different noise.
     """
-    a, b = twin.a, twin.b
-    if a.atoms != b.atoms:
-        raise InputError(
-            f"the runs have {a.atoms} and {b.atoms} atoms", remedy="Compare runs of one structure"
-        )
-    keys = [_key(one) for one in (a, b)]
+    twin.a.check(twin.b)
+    keys = [_key(one.simulation) for one in (twin.a, twin.b)]
     if (keys[0] is None) != (keys[1] is None) or not np.array_equal(keys[0], keys[1]):  # type: ignore[arg-type]
         raise InputError(
             "the runs have different noise, so they part at the first step whatever else they do",
@@ -176,16 +169,3 @@ def _failing(calibration: Calibration, rows: np.ndarray, scores: np.ndarray) -> 
     # none is where they are beyond the limit only together, as a sum of energies that is kept can be
     chosen = [k for k in telling if abs(z[k]) > limit] or telling
     return {names[k]: float(z[k]) for k in chosen[:_NAMED]}
-
-
-def _says(twin: Twin, calibration: Calibration, passed: bool, failing: dict[str, float], blown: int) -> str:
-    where = f"after {calibration.window.step} steps"
-    if passed:
-        return (
-            f"These runs differ ({twin.difference}), and nothing you would measure does: {where}, energies, "
-            f"pressure, forces and pair distances lie in the scatter of {calibration.members} runs of A."
-        )
-    if blown:
-        return f"Not benign ({twin.difference}): {blown} of {rule.RUNS} runs of B blew up."
-    first = ", ".join(f"{name} ({z:+.3g} σ)" for name, z in failing.items())
-    return f"Not benign ({twin.difference}): {where} B is given away by {first}."

@@ -1,37 +1,40 @@
-"""What can be varied, one numerical choice at a time."""
+"""What can be varied, one numerical choice at a time, of either world."""
 
 from __future__ import annotations
 
-from mdnum.forks.choices.arithmetic import Precision, Summation
-from mdnum.forks.choices.base import Choice
-from mdnum.forks.choices.energy import EnergyShift
-from mdnum.forks.choices.formats import Format
+from mdnum.forks.choices.arithmetic import PrecisionChoice, Stopping, Summation
+from mdnum.forks.choices.base import CHOICES, Choice, parse, shipped, twin_of, unavailable, world_of
+from mdnum.forks.choices.decisions import ContactStep, Inverted, Iterations
 from mdnum.forks.choices.frames import Images, Relabel, Rotate, Translate
-from mdnum.forks.choices.inputs import Noise, StartUlp, Ulps
-from mdnum.forks.choices.lists import Builder, Order, Rebuild, Skin
-from mdnum.forks.choices.registry import BY_NAME, names, parse
-from mdnum.forks.choices.screen import Screened, screen
+from mdnum.forks.choices.inputs import Cap, EnergyShift, NoiseChoice, StartUlp, Ulps
+from mdnum.forks.choices.lists import Builder, FormatChoice, Order, RebuildChoice, Skin
 
 __all__ = [
-    "BY_NAME",
+    "CHOICES",
     "Builder",
+    "Cap",
     "Choice",
+    "ContactStep",
     "EnergyShift",
-    "Format",
+    "FormatChoice",
     "Images",
-    "Noise",
+    "Inverted",
+    "Iterations",
+    "NoiseChoice",
     "Order",
-    "Precision",
-    "Rebuild",
+    "PrecisionChoice",
+    "RebuildChoice",
     "Relabel",
     "Rotate",
-    "Screened",
     "Skin",
     "StartUlp",
+    "Stopping",
     "Summation",
     "Translate",
     "Ulps",
-    "names",
     "parse",
-    "screen",
+    "shipped",
+    "twin_of",
+    "unavailable",
+    "world_of",
 ]

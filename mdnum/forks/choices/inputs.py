@@ -1,36 +1,54 @@
-"""Choices of the input: a number of the file by an ulp, a coordinate by an ulp, another noise."""
+"""Choices of the input: a number of the file, a coordinate of the start, the noise, an energy's constant."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any
 
-import equinox as eqx
-import jax
 import numpy as np
 
 from mdnum.errors import InputError
-from mdnum.forks.choices.base import check, is_langevin, varied
-from mdnum.forks.twin import Twin
-from mdnum.md.cell import wrap_positions
-from mdnum.md.integrators import Langevin
+from mdnum.forks.choices.base import (
+    Choice,
+    built,
+    choice,
+    is_langevin,
+    number,
+    simulations,
+    some_ulps,
+    world_of,
+)
+from mdnum.forks.worlds import as_used, floats, not_possible, program_of, twin, varied
 from mdnum.precision.ulp import neighbor
-from mdnum.systems.build import build
-from mdnum.systems.load import System
+from mdnum.program import Twin
+from mdnum.systems import System
+from mdnum.systems.ball import FixedRule
 
+#: Numbers that ship as choices, whether a system has them or not.
+OFTEN = {
+    "md": (
+        "cutoff.radius", "cutoff.in_sigma", "dynamics.timestep", "dynamics.temperature", "potential.sigma",
+        "potential.epsilon",
+    ),
+    "ball": (
+        "contact.k", "contact.damping", "contact.eps", "contact.alpha", "contact.restitution",
+        "contact.rest_speed", "contact.hysteresis", "stop.tol", "stop.enter", "integrator.timestep",
+        "flight.gravity",
+    ),
+}  # fmt: skip
 #: So close to a face of the box, as a share of it, an ulp could take an atom across.
 _NEAR = 1e-6
 
 
-@dataclass(frozen=True)
-class Ulps:
-    """A number of the system file, moved to a float near it.
+@choice("ulps")
+class Ulps(Choice):
+    """A number of the system file, moved to a float near it in the format that it is used in.
 
     The temperature of a run at constant energy is that of its drawn velocities: both runs draw theirs.
 
     Attributes:
-        key: dotted, such as "cutoff.radius" or "potential.pairs.A-B.sigma".
+        key: dotted, such as "cutoff.radius", "potential.pairs.A-B.sigma" or "stop.tol".
         ulps: how many floats away, with sign.
     """
 
@@ -38,57 +56,50 @@ class Ulps:
     ulps: int = 1
 
     def __post_init__(self):
-        if self.ulps == 0:
-            raise InputError("0 ulps change nothing", where=self.name, remedy="Write +1 or -1")
+        some_ulps(self.ulps, self.name)
 
     @property
-    def name(self) -> str:
-        """Such as "ulps=cutoff.radius:+1"."""
-        return f"ulps={self.key}:{self.ulps:+d}"
+    def argument(self) -> str:
+        return f"{self.key}:{self.ulps:+d}"
 
-    @property
-    def about(self) -> str:
-        """One line."""
+    @classmethod
+    def parse(cls, argument: str, role: str, both: str | None) -> Choice:
+        if not argument:
+            raise InputError("no number is named", where="ulps", remedy="Write such as ulps=cutoff.radius:+1")
+        key, _, count = argument.partition(":")
+        return cls(key, number(count, int, "ulps") if count else 1)
+
+    @classmethod
+    def shipped(cls, world: str) -> Iterable[Choice]:
+        return [cls(key) for key in OFTEN[world]]
+
+    def describe(self, world: str = "md") -> str:
         return f"{self.key} by {self.ulps:+d} ulp{'s' if abs(self.ulps) > 1 else ''}"
 
-    @property
-    def must_hold(self) -> bool:
-        """Another number is another model."""
-        return False
-
-    def why_not(self, system: System) -> str | None:
-        """The file may have no such number."""
-        numbers = dict(float_keys(system))
+    def reason_unavailable(self, system: Any) -> str | None:
+        numbers = floats(system)
         if self.key not in numbers:
-            return f"it has no number {self.key}; there are {', '.join(numbers)}"
+            # one that somebody wrote may be a slip of the pen
+            known = "" if self.key in OFTEN[world_of(system)] else f"; there are {', '.join(numbers)}"
+            return f"it has no number {self.key}{known}"
         if numbers[self.key] == 0:
             return f"{self.key} is 0, and the next float is nothing beside any other number"
-        return None
+        if world_of(system) == "md":
+            return None
+        return not_possible(system, {self.key: self._moved(system)[1]}, self.name)
 
-    def make(self, system: System) -> Twin:
-        """The system, and with the number's neighbor."""
-        check(self, system)
-        before = dict(float_keys(system))[self.key]
-        after = float(neighbor(before, self.ulps))
-        words = f"{self.key} = {after!r}, not {before!r}"
+    def _moved(self, system: Any) -> tuple[float, float]:
+        """The number as the program has it, and its neighbor."""
+        before, dtype = as_used(system, self.key)
+        return before, float(neighbor(before, self.ulps, np.dtype(dtype)))
+
+    def make(self, system: Any) -> Twin:
+        before, after = self._moved(system)
+        difference = f"{self.key} = {after!r}, not {before!r}"
         if self.key == "dynamics.temperature" and not is_langevin(system) and system.velocities is not None:
             system = _drawn(system)
-            words += " (both with drawn velocities)"
-        return Twin(build(system), build(varied(system, {self.key: after})), words)
-
-
-def float_keys(system: System) -> Iterator[tuple[str, float]]:
-    """The numbers of a system file that are floats, by their dotted keys."""
-    # what is asked of a system is no part of it
-    yield from _floats((), system.spec.model_dump(mode="python", exclude_none=True, exclude={"fork"}))
-
-
-def _floats(path: tuple[str, ...], table: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
-    for key, value in table.items():
-        if isinstance(value, float):
-            yield ".".join((*path, key)), value
-        elif isinstance(value, Mapping):
-            yield from _floats((*path, key), value)
+            difference += " (both with drawn velocities)"
+        return twin(system, {self.key: after}, self.name, difference)
 
 
 def _drawn(system: System) -> System:
@@ -99,101 +110,129 @@ def _drawn(system: System) -> System:
     return replace(system, spec=system.spec.model_copy(update={"structure": structure}), atoms=atoms)
 
 
-@dataclass(frozen=True)
-class StartUlp:
+@choice("start")
+class StartUlp(Choice):
     """One coordinate of the start, moved to a float near it.
 
-    An ulp of a small coordinate would be lost in the first addition: by default it is the largest one.
-
     Attributes:
-        atom, axis: which coordinate; None for the largest.
+        which: the atom or the ball; None for that of the largest value. An ulp of a small coordinate would be
+            lost in the first addition.
+        what: 0, 1 or 2 for the axis of an atom's position, "height" or "velocity" of a ball; None for the
+            largest coordinate, or the height.
         ulps: how many floats of the state's dtype away, with sign.
     """
 
-    atom: int | None = None
-    axis: int | None = None
+    which: int | None = None
+    what: int | str | None = None
     ulps: int = 1
 
     def __post_init__(self):
-        if self.axis is not None and self.axis not in (0, 1, 2):
-            raise InputError(f"axis {self.axis}; expected 0, 1 or 2", where="start")
-        if self.ulps == 0:
-            raise InputError("0 ulps change nothing", where="start", remedy="Write +1 or -1")
+        if self.what not in (None, 0, 1, 2, "height", "velocity"):
+            known = "0, 1 or 2 of an atom, height or velocity of a ball"
+            raise InputError(f"coordinate {self.what!r}; expected {known}", where="start")
+        some_ulps(self.ulps, "start")
 
     @property
-    def name(self) -> str:
-        """Such as "start" or "start=17:0:+1"."""
-        return "start" if self.atom is None else f"start={self.atom}:{self.axis}:{self.ulps:+d}"
+    def argument(self) -> str:
+        parts = [str(part) for part in (self.which, self.what) if part is not None]
+        return "" if self == StartUlp() else ":".join([*parts, f"{self.ulps:+d}"])
 
-    @property
-    def about(self) -> str:
-        """One line."""
-        return f"one coordinate of the start by {self.ulps:+d} ulp"
+    @classmethod
+    def parse(cls, argument: str, role: str, both: str | None) -> Choice:
+        if not argument:
+            return cls()
+        parts = argument.split(":")
+        which = None if parts[0] in ("height", "velocity") else number(parts.pop(0), int, "start")
+        what = parts.pop(0) if parts else "height"
+        count = number(parts.pop(0), int, "start") if parts else 1
+        if parts:
+            raise InputError(f"{argument!r} is not which:what:ulps", where="start", remedy="start=17:0:+1")
+        if what not in ("height", "velocity"):
+            what = number(what, int, "start")
+        return cls(which, what, count)
 
-    @property
-    def must_hold(self) -> bool:
-        """Another start is another trajectory."""
-        return False
+    @classmethod
+    def shipped(cls, world: str) -> Iterable[Choice]:
+        return [cls()] if world == "md" else [cls(), cls(what="velocity")]
 
-    def why_not(self, system: System) -> str | None:
-        """There may be no such atom."""
-        atoms = len(system.atoms)
-        if self.atom is not None and not 0 <= self.atom < atoms:
-            return f"there is no atom {self.atom} among {atoms}"
+    def describe(self, world: str = "md") -> str:
+        if world == "md":
+            return f"one coordinate of the start by {self.ulps:+d} ulp"
+        which = "one ball" if self.which is None else f"ball {self.which}"
+        return f"{self.what or 'height'} of {which} at the start by {self.ulps:+d} ulp"
+
+    def reason_unavailable(self, system: Any) -> str | None:
+        world = world_of(system)
+        count = len(system.atoms) if world == "md" else system.balls
+        if self.which is not None and not 0 <= self.which < count:
+            return f"there is no {'atom' if world == 'md' else 'ball'} {self.which} among {count}"
+        if isinstance(self.what, str) is (world == "md") and self.what is not None:
+            return f"there is no coordinate {self.what}"
+        if world == "ball":
+            values, which = self._of_balls(program_of(system))
+            if values[which] == 0:
+                what = self.what or "height"
+                return f"the {what} is 0, and the next float is nothing beside any other number"
         return None
 
-    def make(self, system: System) -> Twin:
-        """The system, and with the other coordinate."""
-        check(self, system)
-        a = build(system)
+    def make(self, system: Any) -> Twin:
+        return self._make_md(system) if world_of(system) == "md" else self._make_ball(system)
+
+    def _make_md(self, system: System) -> Twin:
+        from mdnum.md.cell import wrap_positions
+
+        a = built(system)
         dtype = a.policy.dtype("state")
         x = wrap_positions(a.cell, a.positions)[0].astype(dtype)
-        if self.atom is None:
+        if self.which is None:
             fraction = x.astype(np.float64) @ np.asarray(a.cell.inverse)
             # an ulp must not carry it over a face
             inside = np.all(fraction < 1 - _NEAR, axis=1)
             size = np.abs(x) * inside[:, None]
             atom, axis = (int(k) for k in np.unravel_index(size.argmax(), x.shape))
         else:
-            atom, axis = self.atom, self.axis or 0
+            atom, axis = self.which, int(self.what or 0)
         before = x[atom, axis]
         x[atom, axis] = neighbor(before, self.ulps, dtype)
         moved = float(x[atom, axis] - before)
-        words = f"{'xyz'[axis]} of atom {atom} by {self.ulps:+d} ulp, {moved:.2g}"
-        return Twin(a, replace(a, positions=x.astype(np.float64)), words)
+        difference = f"{'xyz'[axis]} of atom {atom} by {self.ulps:+d} ulp, {moved:.2g}"
+        return simulations(a, replace(a, positions=x.astype(np.float64)), difference)
+
+    def _of_balls(self, program: Any) -> tuple[np.ndarray, int]:
+        """The coordinates of the balls, and which of them is moved."""
+        problem = program.problem
+        value = problem.v0 if self.what == "velocity" else problem.y0
+        dtype = problem.world.policy.dtype("state")
+        values = np.broadcast_to(np.asarray(value), np.shape(problem.y0)).astype(dtype)
+        return values, int(np.abs(values).argmax()) if self.which is None else self.which
+
+    def _make_ball(self, system: Any) -> Twin:
+        a: Any = program_of(system)
+        values, which = self._of_balls(a)
+        before = values[which]
+        values[which] = neighbor(before, self.ulps, values.dtype)
+        moved = float(values[which]) - float(before)
+        difference = f"{self.what or 'height'} of ball {which} by {self.ulps:+d} ulp, {moved:.2g}"
+        start = {"v0" if self.what == "velocity" else "y0": values.astype(np.float64)}
+        return Twin(a, replace(a, problem=replace(a.problem, **start)), difference)
 
 
-@dataclass(frozen=True)
-class Noise:
+@choice("noise")
+class NoiseChoice(Choice):
     """Another key of the thermostat's noise.
 
     Attributes:
         seed: of the key; None for the next after the system's own.
     """
 
+    worlds = ("md",)
     seed: int | None = None
 
     def __post_init__(self):
         if self.seed is not None and self.seed < 0:
             raise InputError(f"seed {self.seed} is negative", where="noise")
 
-    @property
-    def name(self) -> str:
-        """Such as "noise" or "noise=7"."""
-        return "noise" if self.seed is None else f"noise={self.seed}"
-
-    @property
-    def about(self) -> str:
-        """One line."""
-        return "another key of the thermostat's noise"
-
-    @property
-    def must_hold(self) -> bool:
-        """Another noise is another trajectory."""
-        return False
-
-    def why_not(self, system: System) -> str | None:
-        """Without a thermostat there is no noise."""
+    def reason_unavailable(self, system: System) -> str | None:
         if not is_langevin(system):
             return "there is no noise at constant energy (dynamics.kind is nve)"
         if self.seed == system.spec.dynamics.seed:
@@ -201,11 +240,75 @@ class Noise:
         return None
 
     def make(self, system: System) -> Twin:
-        """The system, and with the other noise: the start is the same."""
-        check(self, system)
-        a = build(system)
-        assert isinstance(a.integrator, Langevin)
+        import equinox as eqx
+        import jax
+
+        a = built(system)
         own = system.spec.dynamics.seed
         seed = own + 1 if self.seed is None else self.seed
         integrator = eqx.tree_at(lambda one: one.key, a.integrator, jax.random.key(seed))
-        return Twin(a, replace(a, integrator=integrator), f"noise of seed {seed}, not {own}")
+        return simulations(a, replace(a, integrator=integrator), f"noise of seed {seed}, not {own}")
+
+
+@choice("max_iter")
+class Cap(Choice):
+    """More iterations before the solver gives up, or of a fixed number of them.
+
+    Attributes:
+        more: how many, with sign.
+    """
+
+    worlds = ("ball",)
+    more: int = 1
+
+    def __post_init__(self):
+        some_ulps(self.more, self.name)
+
+    @property
+    def argument(self) -> str:
+        return f"{self.more:+d}"
+
+    def describe(self, world: str = "ball") -> str:
+        return f"{self.more:+d} iteration{'s' if abs(self.more) > 1 else ''} at most, or of a fixed number"
+
+    def _key(self, system: Any) -> tuple[str, int]:
+        stop = system.spec.stop
+        if isinstance(stop, FixedRule):
+            return "stop.count", stop.count
+        return "stop.max_iter", stop.max_iter
+
+    def reason_unavailable(self, system: Any) -> str | None:
+        if system.spec.stop is None:
+            return "its steps solve nothing, so there is no iteration to add"
+        key, value = self._key(system)
+        return not_possible(system, {key: value + self.more}, self.name)
+
+    def make(self, system: Any) -> Twin:
+        key, value = self._key(system)
+        return twin(system, {key: value + self.more}, self.name, f"{key} = {value + self.more}, not {value}")
+
+
+@choice("energy-shift")
+class EnergyShift(Choice):
+    """Pair energies shifted to zero at the cutoff, or not.
+
+    The two differ in the energy they conserve, and in nothing that moves: a constant has no derivative.
+    """
+
+    worlds = ("md",)
+    must_hold = True
+
+    def reason_unavailable(self, system: System) -> str | None:
+        cutoff = system.spec.cutoff
+        if cutoff is None:
+            return "the potential carries its own cutoff"
+        if cutoff.kind not in ("hard", "shifted"):
+            return f"a {cutoff.kind} cutoff changes the force too"
+        return None
+
+    def make(self, system: System) -> Twin:
+        assert system.spec.cutoff is not None
+        kind = system.spec.cutoff.kind
+        other = "shifted" if kind == "hard" else "hard"
+        b = built(varied(system, {"cutoff.kind": other}))
+        return simulations(built(system), b, f"cutoff {other}, not {kind}: the same forces")

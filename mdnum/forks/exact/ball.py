@@ -1,23 +1,90 @@
-"""The bouncing ball's program in exact rationals, and when runs of few bits leave its history."""
+"""The bouncing ball's program in exact arithmetic: its steps are sums and products of floats."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+import math
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any, SupportsFloat
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mdnum.ball.contacts import Impact, Penalty, Projection
-from mdnum.ball.integrators import ExplicitEuler, SemiImplicitEuler, VelocityVerlet
-from mdnum.ball.rollout import BallRun, simulate
+from mdnum.ball.integrators import BallVerlet, ExplicitEuler, SemiImplicitEuler
+from mdnum.ball.rollout import BallRun
 from mdnum.ball.state import BallState
-from mdnum.ball.stopping import Fixed, GlobalSum, Hysteresis, Maximum, PerInstance, Relative
+from mdnum.ball.stopping import FixedCount, GlobalSum, HysteresisStop, Maximum, PerInstance, Relative
 from mdnum.ball.world import World
 from mdnum.errors import InputError
-from mdnum.forks.exact.dyadic import HALF, ZERO, Dyadic
-from mdnum.precision import RolePrecision
+from mdnum.program import Decision
+
+
+@dataclass(frozen=True, eq=False)
+class Dyadic:
+    """mantissa * 2**exponent, of any size. Sums, differences and products of these are these again."""
+
+    mantissa: int
+    exponent: int = 0
+
+    @classmethod
+    def of(cls, value: SupportsFloat) -> Dyadic:
+        """A float of at most 64 bits, exactly.
+
+        Raises:
+            ValueError: it is not finite.
+        """
+        value = float(value)
+        if not math.isfinite(value):
+            raise ValueError(f"{value} is no number")
+        numerator, denominator = value.as_integer_ratio()
+        return cls(numerator, 1 - denominator.bit_length())
+
+    def __add__(self, other: Dyadic) -> Dyadic:
+        shift = self.exponent - other.exponent
+        if shift >= 0:
+            return Dyadic((self.mantissa << shift) + other.mantissa, other.exponent)
+        return Dyadic(self.mantissa + (other.mantissa << -shift), self.exponent)
+
+    def __neg__(self) -> Dyadic:
+        return Dyadic(-self.mantissa, self.exponent)
+
+    def __sub__(self, other: Dyadic) -> Dyadic:
+        return self + -other
+
+    def __mul__(self, other: Dyadic) -> Dyadic:
+        return Dyadic(self.mantissa * other.mantissa, self.exponent + other.exponent)
+
+    def __lt__(self, other: Dyadic) -> bool:
+        return (self - other).mantissa < 0
+
+    def __le__(self, other: Dyadic) -> bool:
+        return (self - other).mantissa <= 0
+
+    @property
+    def negative(self) -> bool:
+        """Whether it is below zero."""
+        return self.mantissa < 0
+
+    @property
+    def zero(self) -> bool:
+        """Whether it is zero."""
+        return self.mantissa == 0
+
+    def fraction(self) -> Fraction:
+        """The same number."""
+        return Fraction(self.mantissa) * Fraction(2) ** self.exponent
+
+    def __float__(self) -> float:
+        size = abs(self.mantissa)
+        cut = max(0, size.bit_length() - 64)
+        # the last of 64 bits says whether anything was cut: the rounding to 53 is then the correct one
+        kept = size >> cut | bool(size & ((1 << cut) - 1))
+        return math.ldexp(-kept if self.negative else kept, self.exponent + cut)
+
+
+ZERO = Dyadic(0)
+HALF = Dyadic(1, -1)
 
 Balls = list[Dyadic]
 
@@ -45,27 +112,6 @@ class BallHistory:
     bits: int
 
 
-@dataclass(frozen=True)
-class BallHorizon:
-    """How long a run keeps to the exact history.
-
-    Attributes:
-        dtype: of every role of the run.
-        horizon: first step (from 1) with another decision; None where there is none.
-        channel: "contact" or "stop"; "" without a difference.
-        ball: the first ball that it concerns; -1 without one.
-        height: that ball's exact height at the decision, m; NaN without one.
-        separation: largest |height - exact height| at each step, m, shape (steps + 1,).
-    """
-
-    dtype: str
-    horizon: int | None
-    channel: str
-    ball: int
-    height: float
-    separation: Float[np.ndarray, "rows"]
-
-
 def ball_history(world: World, start: BallState, steps: int) -> BallHistory:
     """A world's rollout in exact rationals: constants and start are the numbers that it holds.
 
@@ -91,8 +137,10 @@ def ball_history(world: World, start: BallState, steps: int) -> BallHistory:
     )
 
 
-def ball_horizon(history: BallHistory, run: BallRun) -> BallHorizon:
-    """When a run first decides otherwise than the exact history, and how far it was from it.
+def ball_horizon(history: BallHistory, run: BallRun) -> tuple[Decision | None, Float[np.ndarray, "rows"]]:
+    """The first decision of a run that is not the exact one, and its largest separation at each step, m.
+
+    The margin of the decision is minus the exact height.
 
     Raises:
         InputError: a run of another length or batch, or without its states.
@@ -103,58 +151,33 @@ def ball_horizon(history: BallHistory, run: BallRun) -> BallHorizon:
             remedy="Compare runs of equal size with every state kept",
         )
     counts = run.iterations if run.iterations.ndim == 2 else run.iterations[:, None]
-    located = isinstance(run.world.contact, Projection)
-    stops = (counts != history.iterations) & located
+    counts = np.broadcast_to(counts, history.iterations.shape)
+    stops = (counts != history.iterations) & isinstance(run.world.contact, Projection)
     contact = run.contact != history.contact
-    apart = np.abs(run.y.astype(np.float64) - history.y).max(axis=1)
-    dtype = run.world.policy.state
+    separation = np.abs(run.y.astype(np.float64) - history.y).max(axis=1)
     rows = np.flatnonzero((stops | contact).any(axis=1))
     if not len(rows):
-        return BallHorizon(dtype, None, "", -1, float("nan"), apart)
+        return None, separation
     row = int(rows[0])
     channel = "contact" if contact[row].any() else "stop"
-    ball = int((contact if channel == "contact" else stops)[row].argmax())
-    return BallHorizon(dtype, row + 1, channel, ball, float(history.height[row, ball]), apart)
-
-
-def certify_ball(
-    world: World,
-    y: Any,
-    v: Any,
-    steps: int,
-    dtypes: Sequence[str] = ("float64", "float32", "float16", "bfloat16"),
-    *,
-    own: bool = False,
-) -> tuple[BallHistory, tuple[BallHorizon, ...]]:
-    """The exact history of a ball, and the horizon of the same program in narrower numbers.
-
-    Args:
-        world: in double precision.
-        y, v: the start, m and m/s.
-        steps: to make.
-        dtypes: one run each, every role in it.
-        own: compare each run with the exact history from its own rounded constants and start, so that only
-            the rounding of its steps counts.
-
-    Returns:
-        the history of `world`, and a horizon for each dtype.
-    """
-    history = ball_history(world, world.start(y, v), steps)
-    horizons = []
-    for dtype in dtypes:
-        narrow = in_dtype(world, dtype)
-        begin = narrow.start(y, v)
-        against = ball_history(narrow, begin, steps) if own else history
-        horizons.append(ball_horizon(against, simulate(narrow, begin, steps)))
-    return history, tuple(horizons)
-
-
-def in_dtype(world: World, dtype: str) -> World:
-    """The same world with every role in one dtype, its constants rounded to it."""
-    policy = RolePrecision.all(dtype)
-    control = None if world.control is None else world.control.astype(policy.dtype("arithmetic"))
-    values = {name: world.value(name) for name in world.parameters}
-    return replace(world, policy=policy, control=control).with_values(values)
+    differing = (contact if channel == "contact" else stops)[row]
+    ball = int(differing.argmax())
+    decided = (history.contact, run.contact) if channel == "contact" else (history.iterations, counts)
+    a, b = (int(one[row, ball]) for one in decided)
+    decision = Decision(
+        channel=channel,
+        step=row + 1,
+        subject=(ball,),
+        run="A" if (a > b) == (channel == "contact") else "B",
+        entered=True,
+        a=a,
+        b=b,
+        margins={"A": -float(history.height[row, ball])},
+        bounds={},
+        separation=float(separation[row]),
+        also=int(differing.sum()) - 1,
+    )
+    return decision, separation
 
 
 class _ExactBall:
@@ -163,7 +186,7 @@ class _ExactBall:
     def __init__(self, world: World, start: BallState):
         contact, scheme = world.contact, world.integrator
         served = isinstance(contact, Penalty | Projection | Impact) and isinstance(
-            scheme, ExplicitEuler | SemiImplicitEuler | VelocityVerlet
+            scheme, ExplicitEuler | SemiImplicitEuler | BallVerlet
         )
         if not served or getattr(contact, "smooth", False):
             raise InputError(
@@ -228,7 +251,7 @@ class _ExactBall:
         return *plain, list(self.touching), counts
 
     def _push(self, free: Balls) -> Balls:
-        if isinstance(self.scheme, VelocityVerlet):
+        if isinstance(self.scheme, BallVerlet):
             vs = _plus(self.v, self.half, self.carried)
             self.y = heights = _plus(self.y, self.h, vs)
             self.touching = self._judge(heights, self.touching)
@@ -284,12 +307,12 @@ class _Rule:
     def __init__(self, world: World):
         rule: Any = world.contact.stop  # type: ignore[attr-defined]
         self.enter = None
-        if isinstance(rule, Hysteresis):
+        if isinstance(rule, HysteresisStop):
             self.enter, rule = _held(world, rule.enter), rule.rule
-        if type(rule) not in (GlobalSum, PerInstance, Maximum, Relative, Fixed):
+        if type(rule) not in (GlobalSum, PerInstance, Maximum, Relative, FixedCount):
             raise InputError(f"the exact ball knows no stopping rule {type(rule).__name__}")
         self.rule, self.max_iter = rule, rule.max_iter
-        self.tol = None if isinstance(rule, Fixed) else _held(world, rule.tol)
+        self.tol = None if isinstance(rule, FixedCount) else _held(world, rule.tol)
 
     def measure(self, depths: Balls) -> Balls:
         """The residual, or one for each ball."""

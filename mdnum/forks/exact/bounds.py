@@ -1,7 +1,7 @@
 """Decisions of a run, given its own states: which of them rounding could have decided otherwise.
 
 This looks at one step at a time. A decision that is right given the state is right for this run, which may
-have left the exact history long before (that is what `horizon` dates).
+have left the exact history long before (that is what `certify` dates).
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ import numpy as np
 from jaxtyping import Float
 
 from mdnum.errors import InputError
-from mdnum.forks.exact.horizon import taped
-from mdnum.forks.exact.program import ExactProgram, why_not, with_policy
-from mdnum.forks.exact.tape import Difference, Tape, first_difference
+from mdnum.forks.exact.tape import DecisionTape
 from mdnum.md.cell import Cell, HostCell
 from mdnum.md.decide import PairDecider
-from mdnum.precision import PrecisionPolicy
-from mdnum.rollout.engine import Engine, Segment, Start, first_state
+from mdnum.rollout.engine import FAILURES, Engine, Segment, Start
+from mdnum.rollout.flips import PairRecorder, decided_pairs
+from mdnum.rollout.frame import Frame
+from mdnum.rollout.tracks import rows_of
 from mdnum.systems.build import Simulation
 
 #: Ambiguous decisions that are listed; the count covers all of them.
@@ -31,7 +31,7 @@ _ROOT_BITS = 400
 
 
 @dataclass(frozen=True)
-class Ambiguous:
+class AmbiguousDecision:
     """A decision closer to its threshold than its rounding bound.
 
     Attributes:
@@ -72,29 +72,46 @@ class CertifiedHorizon:
     horizon: int | None
     wrong: int | None
     total: int
-    decisions: tuple[Ambiguous, ...]
+    decisions: tuple[AmbiguousDecision, ...]
     bounds: tuple[float, ...]
     closest: Float[np.ndarray, "rows"]
 
 
 @dataclass(frozen=True)
-class ShadowHorizon:
-    """How long a run and its shadow, of higher precision and from the same start, agree on every decision.
+class Taped:
+    """A real run as the tape of its decisions.
 
     Attributes:
-        steps: last step that was compared.
-        shadow: "float64" or "exact".
-        difference: the first decision that differs (run first, shadow second); None where there is none.
+        tape: what it decided.
+        x: wrapped positions, length, shape (rows, 3, atoms).
+        failed: "blow-up", "runaway", or "".
     """
 
-    steps: int
-    shadow: str
-    difference: Difference | None
+    tape: DecisionTape
+    x: Float[np.ndarray, "rows 3 atoms"]
+    failed: str
 
-    @property
-    def horizon(self) -> int | None:
-        """Its step."""
-        return None if self.difference is None else self.difference.step
+
+def taped(simulation: Simulation, steps: int, start: Start | None = None) -> Taped:
+    """Run a simulation and keep every decision and position up to a step."""
+    engine, recorder = Engine(simulation, steps, start=start), PairRecorder(simulation)
+    frame = Frame.same(simulation.atoms)
+    first, failed, last = np.empty(0, np.int64), "", 0
+    rows, at, keys, entered = [], [], [], []
+    for segment in engine.segments():
+        if not rows:
+            first = decided_pairs(simulation, segment, 0)
+        ledger = recorder.flips(segment)
+        at.append(ledger.step)
+        keys.append(ledger.subject[:, 0].astype(np.int64) * simulation.atoms + ledger.subject[:, 1])
+        entered.append(ledger.entered)
+        failed = segment.closes if segment.closes in FAILURES else ""
+        rows.append(rows_of(segment, frame, failed).x)
+        last = segment.last
+    step, key, now = np.concatenate(at).astype(np.int64), np.concatenate(keys), np.concatenate(entered)
+    order = np.lexsort((key, step))
+    tape = DecisionTape(simulation.atoms, last, first, step[order], key[order], now[order])
+    return Taped(tape, np.concatenate(rows), failed)
 
 
 def exact_margin(
@@ -154,7 +171,7 @@ def certified_horizon(
     """
     _check(simulation)
     last = simulation.system.spec.dynamics.steps if steps is None else steps
-    listed: list[Ambiguous] = []
+    listed: list[AmbiguousDecision] = []
     closest: list[np.ndarray] = []
     total, reached = 0, 0
     horizon = wrong = None
@@ -196,7 +213,7 @@ def _check(simulation: Simulation) -> None:
 
 def _ambiguous(
     simulation: Simulation, segment: Segment, row: int, bounds: Float[np.ndarray, "types"]
-) -> list[Ambiguous]:
+) -> list[AmbiguousDecision]:
     table, decider = segment.table, simulation.decider
     x = segment.unsorted("x", row)
     slot, column = np.nonzero(table.index < simulation.atoms)
@@ -212,7 +229,7 @@ def _ambiguous(
     for p in np.flatnonzero(np.abs(margin) <= bounds[kind]).tolist():
         exact, inside = exact_margin(decider, simulation.cell, x[i[p]], x[j[p]], int(kind[p]))
         found.append(
-            Ambiguous(
+            AmbiguousDecision(
                 segment.first + row,
                 int(i[p]),
                 int(j[p]),
@@ -224,36 +241,3 @@ def _ambiguous(
             )
         )
     return sorted(found, key=lambda one: (one.i, one.j))
-
-
-def shadow_horizon(simulation: Simulation, steps: int | None = None) -> ShadowHorizon:
-    """Until when a shadow agrees with a run on every decision.
-
-    The shadow of a run with any role in single precision is the same system in double precision, from the
-    run's own start. That of a run in double precision is the exact program.
-
-    Raises:
-        InputError: double precision throughout, and the exact program cannot follow the system.
-    """
-    _check(simulation)
-    last = simulation.system.spec.dynamics.steps if steps is None else steps
-    run = taped(simulation, last).tape
-    if simulation.policy == PrecisionPolicy():
-        refused = why_not(simulation)
-        if refused is not None:
-            raise refused
-        shadow, tape = "exact", ExactProgram(simulation).run(last).tape
-    else:
-        shadow, tape = "float64", _shadow(simulation, last)
-    difference = first_difference(run, tape)
-    return ShadowHorizon(min(run.steps, tape.steps), shadow, difference)
-
-
-def _shadow(simulation: Simulation, last: int) -> Tape:
-    begin = first_state(simulation)
-    state = begin.state
-    wide = state._replace(
-        **{name: getattr(state, name).astype(np.float64) for name in ("x", "v", "x_before")}
-    )
-    start = Start(wide, begin.reference)
-    return taped(with_policy(simulation, PrecisionPolicy()), last, start).tape

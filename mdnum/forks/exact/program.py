@@ -20,9 +20,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mdnum.errors import InputError
-from mdnum.forks.exact.laws import Undecided, pull_of
-from mdnum.forks.exact.tape import Tape
+from mdnum.forks.exact.laws import pull_of
+from mdnum.forks.exact.tape import DecisionTape
 from mdnum.md.cell import complete
+from mdnum.md.cutoffs import Undecided
 from mdnum.md.integrators import VelocityVerlet
 from mdnum.md.potentials import LennardJones
 from mdnum.precision import PrecisionPolicy, gamma
@@ -41,7 +42,7 @@ _U = 2.0**-53
 
 
 @dataclass(frozen=True)
-class Exact:
+class ExactHistory:
     """The certified history.
 
     Attributes:
@@ -57,7 +58,7 @@ class Exact:
         seconds: of the run that succeeded.
     """
 
-    tape: Tape
+    tape: DecisionTape
     margin: Float[np.ndarray, "rows"]
     radius: Float[np.ndarray, "rows"]
     x: Float[np.ndarray, "rows atoms 3"]
@@ -83,7 +84,7 @@ def installed() -> bool:
     return find_spec("flint") is not None
 
 
-def why_not(simulation: Simulation) -> InputError | None:
+def unsupported(simulation: Simulation) -> InputError | None:
     """What keeps a system from being certified, with a remedy; None where nothing does."""
     where = "system"
     if not simulation.pairwise or not isinstance(simulation.potential, LennardJones):
@@ -138,9 +139,9 @@ class ExactProgram:
     """
 
     def __init__(self, simulation: Simulation, start: Start | None = None):
-        refused = why_not(simulation)
-        if refused is not None:
-            raise refused
+        error = unsupported(simulation)
+        if error is not None:
+            raise error
         begin = start or first_state(_wide(simulation))
         if int(begin.state.step) != 0:
             raise InputError(f"the start is at step {int(begin.state.step)}; an exact run begins at step 0")
@@ -178,7 +179,7 @@ class ExactProgram:
         *,
         bits: int | None = None,
         progress: Callable[[int, int], None] | None = None,
-    ) -> Exact:
+    ) -> ExactHistory:
         """Every decision up to a step, proven; with more bits where the first ones did not do.
 
         Args:
@@ -226,7 +227,7 @@ class _Run:
         rate = (grown[known[-1]] - grown[known[len(known) // 4]]) / (known[-1] - known[len(known) // 4])
         return math.ceil(1.1 * rate * self.steps) + 2 * _BITS_LEFT
 
-    def all(self, progress, restarts: int) -> Exact:
+    def all(self, progress, restarts: int) -> ExactHistory:
         """The whole run."""
         from flint import ctx
 
@@ -239,7 +240,7 @@ class _Run:
         program = self.program
         keys = program._i.astype(np.int64) * program.atoms + program._j
         rows = [np.empty(0, np.int64)]
-        tape = Tape(
+        tape = DecisionTape(
             program.atoms,
             self.steps,
             keys[first],
@@ -248,7 +249,9 @@ class _Run:
             np.concatenate([np.empty(0, bool)] + [now for _, _, now in self._flips]),
         )
         seconds = time.perf_counter() - begin
-        return Exact(tape, self._margin, self._radius, self._x, self.bits, restarts, self._close, seconds)
+        return ExactHistory(
+            tape, self._margin, self._radius, self._x, self.bits, restarts, self._close, seconds
+        )
 
     def _all(self, progress) -> Bool[np.ndarray, "all_pairs"]:
         from flint import arb, ctx

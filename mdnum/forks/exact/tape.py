@@ -7,9 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Int
 
+from mdnum.program import Decision
+
 
 @dataclass(frozen=True)
-class Tape:
+class DecisionTape:
     """Every pair decision of a run from step 0 on: the pairs inside at the start, and what changed later.
 
     Attributes:
@@ -44,7 +46,7 @@ class Tape:
             (members.add if entered else members.discard)(key)
         return np.array(sorted(members), np.int64)
 
-    def until(self, last: int) -> Tape:
+    def until(self, last: int) -> DecisionTape:
         """The same tape up to a step."""
         kept = self.step <= last
         return replace(
@@ -56,25 +58,7 @@ class Tape:
         )
 
 
-@dataclass(frozen=True)
-class Difference:
-    """The first decision in which two tapes differ.
-
-    Attributes:
-        step: of the decision.
-        i, j: the pair, i < j; where several pairs differ at this step, the first.
-        inside: decision of the first tape and of the second.
-        also: further pairs that differ at this step.
-    """
-
-    step: int
-    i: int
-    j: int
-    inside: tuple[bool, bool]
-    also: int
-
-
-def first_difference(a: Tape, b: Tape) -> Difference | None:
+def first_difference(a: DecisionTape, b: DecisionTape) -> Decision | None:
     """The first step at which any pair is decided differently; None where there is none in both tapes.
 
     Raises:
@@ -93,9 +77,21 @@ def first_difference(a: Tape, b: Tape) -> Difference | None:
         step = min(row[0] for row in apart)
         differing = np.unique([key for at, key, _ in apart if at == step])
     key = int(differing[0])
-    inside = tuple(bool(np.isin(key, tape.inside(step))) for tape in (a, b))
-    return Difference(step, *a.pair(key), (inside[0], inside[1]), len(differing) - 1)
+    first, second = (int(np.isin(key, tape.inside(step))) for tape in (a, b))
+    return Decision(
+        channel="pair",
+        step=step,
+        subject=a.pair(key),
+        run="A" if first else "B",
+        entered=True,
+        a=first,
+        b=second,
+        margins={},
+        bounds={},
+        separation=float("nan"),
+        also=len(differing) - 1,
+    )
 
 
-def _rows(tape: Tape) -> set[tuple[int, int, bool]]:
+def _rows(tape: DecisionTape) -> set[tuple[int, int, bool]]:
     return set(zip(tape.step.tolist(), tape.key.tolist(), tape.entered.tolist(), strict=True))

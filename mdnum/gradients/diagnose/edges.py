@@ -1,6 +1,6 @@
 """The jump of a gradient across the nearest boundaries of decisions on either side of a parameter.
 
-Between two boundaries every run decides alike, and loss and gradient are smooth functions of the parameter.
+StepEnds two boundaries every run decides alike, and loss and gradient are smooth functions of the parameter.
 At a boundary one pair is decided otherwise between two adjacent floats. A step of an optimizer that is longer
 than the distance to the nearest boundary crosses into another program, and what the gradient does there says
 what that is worth.
@@ -8,24 +8,20 @@ what that is worth.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float
 
 from mdnum.errors import InputError, NumericalError
-from mdnum.forks.dials import Dial, dial
-from mdnum.forks.histories import margin
-from mdnum.forks.line import Line
+from mdnum.forks.boundaries import NumberLine
 from mdnum.gradients import parameters
-from mdnum.gradients.base import Problem, Progress
-from mdnum.gradients.diagnose.passes import passed
-from mdnum.gradients.diagnose.places import Edge, Edges
-from mdnum.gradients.symmetric import in_phase
+from mdnum.gradients.problem import Problem, Progress, in_phase
+from mdnum.gradients.recorded import passed, tape_of
 from mdnum.gradients.tangents import tangents
-from mdnum.gradients.tape import Tape
 from mdnum.md.cell import HostCell
 from mdnum.precision.ulp import ordinal
+from mdnum.program import Number
+from mdnum.rollout.program import MdProgram
 from mdnum.systems.build import Simulation
 
 #: How far from the parameter a boundary is looked for, as a share of its value.
@@ -34,14 +30,54 @@ REACH = 0.01
 _FIRST, _FACTOR = 1e-12, 8.0
 
 
+@dataclass(frozen=True)
+class DecisionEdge:
+    """The nearest boundary of decisions on one side of a parameter, and the gradient across it.
+
+    Attributes:
+        side: "below" or "above".
+        runs: that the search took.
+        found: whether one was found within reach; what follows is void where none was.
+        inside, beyond: adjacent floats; the run at `inside` decides as the one asked about, that at `beyond`
+            does not.
+        distance: from the parameter's value to `inside`, in its units.
+        step, i, j: the first decision that differs.
+        value_inside, value_beyond: the loss on either side.
+        gradient_inside, gradient_beyond: derivative by this parameter on either side, by method.
+    """
+
+    side: str
+    runs: int
+    found: bool = False
+    inside: float = float("nan")
+    beyond: float = float("nan")
+    distance: float = float("nan")
+    step: int = -1
+    i: int = -1
+    j: int = -1
+    value_inside: float = float("nan")
+    value_beyond: float = float("nan")
+    gradient_inside: dict[str, float] = field(default_factory=dict)
+    gradient_beyond: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class DecisionEdges:
+    """The nearest boundaries of decisions below and above the value of one parameter."""
+
+    name: str
+    value: float
+    below: DecisionEdge
+    above: DecisionEdge
+
+
 def edges(
     problem: Problem,
     name: str,
     *,
     reach: float = REACH,
-    budget: int = 2**29,
     progress: Progress | None = None,
-) -> Edges:
+) -> DecisionEdges:
     """The nearest boundary below and above a parameter, and the gradients across them.
 
     Where a pair first crosses otherwise is forecast with tangents; then runs are compared, on either side,
@@ -51,7 +87,6 @@ def edges(
         problem: the loss of a rollout of a pair potential.
         name: a parameter of one entry, full or short name.
         reach: how far to look, as a share of the parameter's value.
-        budget: bytes of the recorded run that are kept.
         progress: called with runs done, runs expected, and a phase in words.
 
     Raises:
@@ -72,34 +107,35 @@ def edges(
     value = float(here)
     if value == 0 or not 0 < reach < 1:
         raise InputError(f"{full} = {value:g} and reach = {reach:g}; expected a number, and a share below 1")
-    line = Line(problem.simulation, _dial(problem.simulation, full, value), problem.steps, _no_loss)
+    program = MdProgram(problem.simulation)
+    line = NumberLine(program, _number(program, full, value), problem.steps, _no_loss)
     ahead = _forecast(problem, full, budget, progress)
     below, above = (_edge(problem, line, full, value, sign, ahead[sign], reach, progress) for sign in (-1, 1))
-    return Edges(full, value, below, above, _sentence(full, value, below, above))
+    return DecisionEdges(full, value, below, above)
 
 
 def _no_loss(*_: object) -> float:
     return 0.0
 
 
-def _dial(simulation: Simulation, name: str, value: float) -> Dial:
-    """The parameter as something that can be turned without compiling anew."""
+def _number(program: MdProgram, name: str, value: float) -> Number:
+    """The parameter as a number that can be varied without compiling again."""
     if name == "cutoff.radius":
-        return dial(simulation, name)
+        return program.number(name)
 
-    def turn(one: Simulation, q: float) -> Simulation:
-        return parameters.with_values(one, {name: q})
+    def at(q: float) -> MdProgram:
+        return MdProgram(parameters.with_values(program.simulation, {name: q}))
 
-    return Dial(name, value, turn, turn, True)
+    return Number(name, value, "", at, at, True)
 
 
-def _forecast(problem: Problem, name: str, budget: int, progress: Progress | None) -> dict[int, float]:
+def _forecast(problem: Problem, name: str, progress: Progress | None) -> dict[int, float]:
     """Shifts of the parameter, by sign, at which tangents see the first pair cross; infinite where none."""
     if name == "box.scale":
         # the images move too, which these differences of positions leave out
         return {-1: np.inf, 1: np.inf}
     simulation = problem.simulation
-    tape = Tape(simulation, problem.loss, problem.steps, flips=True, budget=budget)
+    tape = tape_of(problem, True)
     cell, radii = HostCell(simulation.cell), np.asarray(simulation.decider.r_cut)
     nearest = {-1: np.inf, 1: np.inf}
     along = 1.0 if name == "cutoff.radius" else 0.0
@@ -129,14 +165,14 @@ def _forecast(problem: Problem, name: str, budget: int, progress: Progress | Non
 
 def _edge(
     problem: Problem,
-    line: Line,
+    line: NumberLine,
     name: str,
     value: float,
     sign: int,
     ahead: float,
     reach: float,
     progress: Progress | None,
-) -> Edge:
+) -> DecisionEdge:
     side = "above" if sign > 0 else "below"
     before = len(line.known)
     end = reach * abs(value)
@@ -159,7 +195,7 @@ def _edge(
         if line.digest(place) != own:
             beyond = place
         elif shift >= end:
-            return _nothing(side, len(line.known) - before)
+            return DecisionEdge(side, len(line.known) - before)
         else:
             inside, shift = place, shift * _FACTOR
     while abs(beyond - inside) > 1:
@@ -171,70 +207,30 @@ def _edge(
             beyond = middle
     step, i, j = _first(line, inside, beyond)
     near, far = (line.value(place) for place in (inside, beyond))
-    value_near, gradient_near = _gradients(problem, line.at(inside), name)
-    value_far, gradient_far = _gradients(problem, line.at(beyond), name)
+    value_near, gradient_near = _gradients(problem, line.at(inside).simulation, name)
+    value_far, gradient_far = _gradients(problem, line.at(beyond).simulation, name)
     runs = len(line.known) - before
-    return Edge(
-        side,
-        True,
-        near,
-        far,
-        abs(near - value),
-        step,
-        i,
-        j,
-        value_near,
-        value_far,
-        gradient_near,
+    return DecisionEdge(
+        side, runs, True, near, far, abs(near - value), step, i, j, value_near, value_far, gradient_near,
         gradient_far,
-        runs,
-    )
+    )  # fmt: skip
 
 
-def _nothing(side: str, runs: int) -> Edge:
-    nan = float("nan")
-    return Edge(side, False, nan, nan, nan, -1, -1, -1, nan, nan, {}, {}, runs)
-
-
-def _first(line: Line, inside: int, beyond: int) -> tuple[int, int, int]:
+def _first(line: NumberLine, inside: int, beyond: int) -> tuple[int, int, int]:
     """The first decision that differs: the pair that is nearest to its threshold on both sides."""
-    runs = [line.run(place) for place in (inside, beyond)]
-    step = runs[0].first_difference(runs[1])
-    assert step is not None
-    if any(len(run.marks) <= step for run in runs):
-        raise NumericalError(f"{line.dial.key} = {line.value(beyond)!r}: the run blew up at step {step}")
-    looks = [line.look(place, step) for place in (inside, beyond)]
-    differing: Sequence[int] = np.setxor1d(looks[0].pairs, looks[1].pairs, assume_unique=True).tolist()
-
-    def far(key: int) -> float:
-        i, j = divmod(key, line.simulation.atoms)
-        places = zip((inside, beyond), looks, strict=True)
-        return max(abs(margin(line.at(place), seen.x, i, j)) for place, seen in places)
-
-    i, j = divmod(min(differing, key=far), line.simulation.atoms)
-    return step, i, j
+    found = line.boundary(inside, beyond)
+    if found is None:
+        raise NumericalError(f"{line.number.key} = {line.value(beyond)!r}: the run blew up")
+    i, j = found.subject
+    return found.step, i, j
 
 
 def _gradients(problem: Problem, simulation: Simulation, name: str) -> tuple[float, dict[str, float]]:
     """Loss and derivatives by one parameter of another simulation."""
-    tape = Tape(simulation, problem.loss, problem.steps, flips=True)
     there = Problem(simulation, problem.loss, problem.steps)
-    found: dict[str, float] = {}
-    for word, saltation in (("symmetric", False), ("event-aware", True)):
-        made: Float[np.ndarray, ""] = passed(there, [name], saltation=saltation, tape=tape).gradient[name]
-        found[word] = float(made)
+    tape = tape_of(there, True)
+    found = {
+        word: float(passed(there, [name], saltation=saltation, tape=tape).gradient[name])
+        for word, saltation in (("symmetric", False), ("event-aware", True))
+    }
     return tape.value, found
-
-
-def _sentence(name: str, value: float, below: Edge, above: Edge) -> str:
-    told = []
-    for one in (below, above):
-        if not one.found:
-            told.append(f"none within reach {one.side}")
-            continue
-        jump = one.gradient_beyond["event-aware"] - one.gradient_inside["event-aware"]
-        told.append(
-            f"{one.distance:.2g} {one.side} (pair ({one.i}, {one.j}) at step {one.step}; the loss jumps by "
-            f"{one.value_beyond - one.value_inside:.2g}, the gradient by {jump:.2g})"
-        )
-    return f"Boundaries of decisions around {name} = {value:.6g}: {' and '.join(told)}."

@@ -1,4 +1,4 @@
-"""The exact ball against plain rationals, and the horizons of narrow balls."""
+"""The exact ball against plain rationals."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mdnum.ball import (
+    BallVerlet,
     EventLocated,
     ExplicitEuler,
     GlobalSum,
@@ -20,18 +21,16 @@ from mdnum.ball import (
     PerInstance,
     Projection,
     SemiImplicitEuler,
-    VelocityVerlet,
     World,
     simulate,
 )
 from mdnum.errors import InputError
-from mdnum.forks.exact.ball import ball_history, ball_horizon, certify_ball, in_dtype
-from mdnum.forks.exact.dyadic import Dyadic
+from mdnum.forks.exact.ball import Dyadic, ball_history, ball_horizon
 
 SCHEMES = {
     "explicit-euler": ExplicitEuler,
     "semi-implicit-euler": SemiImplicitEuler,
-    "velocity-verlet": VelocityVerlet,
+    "velocity-verlet": BallVerlet,
 }
 H, G, START = 0.01, 9.81, 0.71
 
@@ -108,7 +107,7 @@ def test_a_projection_against_fractions(scheme):
 def test_control_and_hysteresis_as_the_program_has_them():
     """Short enough for float64 to decide as exact arithmetic does."""
     control = np.linspace(-3.0, 3.0, 40)
-    world = World.create(Penalty(900.0, 2.0), VelocityVerlet(H), G, control, hysteresis=0.02)
+    world = World.create(Penalty(900.0, 2.0), BallVerlet(H), G, control, hysteresis=0.02)
     start = world.start([0.2, 0.35])
     history, run = ball_history(world, start, 80), simulate(world, start, 80)
     np.testing.assert_array_equal(history.contact, run.contact)
@@ -116,38 +115,18 @@ def test_control_and_hysteresis_as_the_program_has_them():
     assert np.any(history.contact & (history.height > 0))
 
 
-def test_narrow_numbers_leave_and_wide_ones_stay():
-    """The steps at which plain rationals say that 16 bits leave (tests of the ball's record)."""
-    world = World.create(Penalty(512.0), SemiImplicitEuler(2.0**-6), 9.75)
-    history, rows = certify_ball(world, 0.40625, 0.0, 300)
-    found = {row.dtype: row.horizon for row in rows}
-    assert found == {"float64": None, "float32": None, "float16": 170, "bfloat16": 66}
-    row = next(row for row in rows if row.dtype == "float16")
-    assert row.channel == "contact" and row.ball == 0 and abs(row.height) < 0.05
-    assert row.separation[0] == 0 and row.separation[-1] > 0
-    assert history.contact.sum() > 30
-
-
-def test_constants_that_are_rounded_are_part_of_the_difference_unless_they_are_its_own():
-    world = World.create(Penalty(900.1), SemiImplicitEuler(0.01), 9.81)
-    _, (against_wide,) = certify_ball(world, 1.01, 0.0, 40, ("float16",))
-    _, (against_own,) = certify_ball(world, 1.01, 0.0, 40, ("float16",), own=True)
-    assert against_wide.separation[0] > 0 and against_own.separation[0] == 0
-
-
 def test_a_stop_that_differs_is_dated():
     world = World.create(Projection(0.5, 0.5, GlobalSum(1e-4, 100)), SemiImplicitEuler(0.01))
-    _, rows = certify_ball(world, [1.0, 1.1, 1.3], 0.0, 60, ("float64", "float16"))
-    assert rows[0].horizon is None
-    assert rows[1].channel == "stop" and rows[1].horizon is not None
-    # planted: one iteration more in one step
     start = world.start([1.0, 1.1, 1.3])
     history, run = ball_history(world, start, 60), simulate(world, start, 60)
+    assert ball_horizon(history, run)[0] is None
+    # planted: one iteration more in one step
     counts = run.iterations.copy()
     counts[50] += 1
     object.__setattr__(run, "iterations", counts)
-    found = ball_horizon(history, run)
-    assert (found.horizon, found.channel) == (51, "stop")
+    decision, _ = ball_horizon(history, run)
+    assert decision is not None and (decision.step, decision.channel) == (51, "stop")
+    assert decision.b == decision.a + 1 == int(counts[50])
 
 
 def test_what_is_not_rational_is_refused():
@@ -166,4 +145,3 @@ def test_what_is_not_rational_is_refused():
     history = ball_history(world, world.start(1.0), 10)
     with pytest.raises(InputError, match="equal size"):
         ball_horizon(history, simulate(world, world.start(1.0), 11))
-    assert in_dtype(world, "float16").policy.state == "float16"

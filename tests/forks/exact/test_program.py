@@ -12,8 +12,8 @@ import small_systems
 from ase import Atoms
 
 from mdnum.errors import InputError
-from mdnum.forks.exact.program import ExactProgram, _Run, why_not
-from mdnum.forks.exact.tape import Tape, first_difference
+from mdnum.forks.exact.program import ExactProgram, _Run, unsupported
+from mdnum.forks.exact.tape import DecisionTape, first_difference
 from mdnum.rollout.engine import first_state
 from mdnum.systems.build import Simulation, build
 
@@ -73,7 +73,7 @@ def rational_flips(simulation: Simulation, steps: int, digits: int = 400):
     return flips
 
 
-def rows(tape: Tape) -> list[tuple[int, int, int, bool]]:
+def rows(tape: DecisionTape) -> list[tuple[int, int, int, bool]]:
     return [
         (step, *tape.pair(key), entered)
         for step, key, entered in zip(
@@ -152,7 +152,7 @@ def test_two_precisions_agree_and_a_small_one_is_raised():
 
 
 def test_a_real_run_starts_on_the_exact_history():
-    from mdnum.forks.exact.horizon import taped
+    from mdnum.forks.exact.bounds import taped
 
     simulation = liquid()
     exact = ExactProgram(simulation).run(60)
@@ -169,7 +169,7 @@ def test_a_planted_wrong_decision_is_found(seed: int):
     key = rng.choice(atoms * atoms, 80, replace=False)
     entered = rng.random(80) < 0.5
     first = np.sort(key[~entered])
-    tape = Tape(atoms, 500, first, step, key, entered)
+    tape = DecisionTape(atoms, 500, first, step, key, entered)
     row = int(rng.integers(80))
     # one decision that comes a step late, one that never comes, one that is not there
     late = replace(tape, step=np.where(np.arange(80) == row, step + 1, step))
@@ -185,14 +185,14 @@ def test_a_planted_wrong_decision_is_found(seed: int):
     )
     for other in (late, never):
         found = first_difference(tape, other)
-        assert found is not None and (found.step, found.i, found.j) == (step[row], *divmod(key[row], atoms))
-        assert found.inside == (bool(entered[row]), not entered[row])
+        assert found is not None and (found.step, found.subject) == (step[row], divmod(key[row], atoms))
+        assert (found.a, found.b) == (entered[row], not entered[row])
     found = first_difference(tape, extra)
-    assert found is not None and (found.step, found.i * atoms + found.j) == (250, extra_key)
-    assert found.inside == (False, True)
+    assert found is not None and (found.step, found.subject) == (250, divmod(extra_key, atoms))
+    assert (found.a, found.b) == (0, 1)
     assert first_difference(tape, tape) is None
     start = first_difference(tape, replace(tape, first=first[1:]))
-    assert start is not None and start.step == 0 and start.i * atoms + start.j == first[0]
+    assert start is not None and start.step == 0 and start.subject == divmod(first[0], atoms)
 
 
 def test_a_pair_exactly_at_the_cutoff_is_decided_by_the_convention():
@@ -219,7 +219,7 @@ def test_a_pair_exactly_at_the_cutoff_is_decided_by_the_convention():
 
 def test_species_masses_and_a_tilted_box():
     """Pair types, unequal masses and lattice vectors off the axes, against the real run."""
-    from mdnum.forks.exact.horizon import taped
+    from mdnum.forks.exact.bounds import taped
 
     atoms = small_systems.mixture()
     matrix = np.array(atoms.cell)
@@ -231,17 +231,17 @@ def test_species_masses_and_a_tilted_box():
     assert first_difference(exact.tape, run.tape) is None and exact.tape.flips > 5
 
 
-def test_what_cannot_be_certified_is_refused():
+def test_what_cannot_be_certified_is_error():
     morse = {"kind": "morse", "depth": 1.0, "alpha": 5.0, "r0": 1.1}
     simulation = build(small_systems.make(small_systems.crystal(), morse, {"kind": "hard", "radius": 1.6}))
     with pytest.raises(InputError, match=r"Lennard-Jones potentials, not 'morse'.*Use a lennard-jones"):
         ExactProgram(simulation)
     langevin = {"kind": "langevin", "timestep": 0.004, "temperature": 1.0, "friction": 1.0, "seed": 1}
-    refused = why_not(liquid(dynamics=langevin))
-    assert refused is not None and refused.where == "dynamics.kind"
-    refused = why_not(build("argon/liquid-864"))
-    assert refused is not None and "864 atoms" in str(refused)
-    assert why_not(liquid()) is None
+    error = unsupported(liquid(dynamics=langevin))
+    assert error is not None and error.where == "dynamics.kind"
+    error = unsupported(build("argon/liquid-864"))
+    assert error is not None and "864 atoms" in str(error)
+    assert unsupported(liquid()) is None
     with pytest.raises(InputError, match="steps = -1"):
         ExactProgram(liquid()).run(-1)
 
@@ -255,13 +255,13 @@ def test_bits_follow_the_growth_of_the_balls():
 
 
 def test_only_the_first_step_that_differs_is_reported():
-    tape = Tape(
+    tape = DecisionTape(
         20, 50, np.array([9]), np.array([10, 10, 30]), np.array([45, 47, 3]), np.array([True, True, True])
     )
     bare = replace(tape, step=tape.step[:0], key=tape.key[:0], entered=tape.entered[:0])
     found = first_difference(bare, tape)
     assert found is not None
-    assert (found.step, found.i, found.j, found.also, found.inside) == (10, 2, 5, 1, (False, True))
+    assert (found.step, found.subject, found.also, (found.a, found.b)) == (10, (2, 5), 1, (0, 1))
     # a tape that ended before is not different
     assert first_difference(replace(bare, steps=9), tape) is None
     with pytest.raises(ValueError, match="20 and 21 atoms"):

@@ -1,0 +1,371 @@
+"""The ball as a `Program`: its rollouts are short, so they are kept whole and compared at once."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from mdnum.ball.compare import CrossDecision, cross_decisions, overridden
+from mdnum.ball.contacts import Projection
+from mdnum.ball.limits import spacing
+from mdnum.ball.problem import START, BallProblem
+from mdnum.ball.rollout import BallRun, simulate
+from mdnum.ball.state import BallDecisions
+from mdnum.errors import InputError
+from mdnum.events.ledger import Ledger
+from mdnum.program import Decision, DecisionHistory, Differing, Number, PairRows
+
+#: Words of system files for what the world calls otherwise.
+_SHORT = {"timestep": "h", "dt": "h", "height": "y0", "velocity": "v0", "tolerance": "tol"}
+#: Units of what is not a pure number.
+_UNITS = {"y0": "m", "v0": "m/s", "h": "s", "tol": "m", "gravity": "m/s²", "k": "1/s²", "damping": "1/s"}
+
+
+@dataclass(frozen=True)
+class ImposedDecision:
+    """One decision that is imposed on a run, which makes all others by itself.
+
+    Attributes:
+        channel: "contact" or "stop".
+        step: from 1.
+        ball: whose; -1 for the count that all balls share.
+        value: whether it touches (0 or 1), or how many iterations it makes.
+    """
+
+    channel: Literal["contact", "stop"]
+    step: int
+    ball: int
+    value: int
+
+
+@dataclass(frozen=True)
+class BallProgram:
+    """World, start and steps of a ball, and how they are compared with another's.
+
+    Attributes:
+        problem: the program.
+        name: of the system.
+        order: its balls are those of the other program in this order; None where they are the same.
+        pins: decisions that are imposed on it.
+    """
+
+    problem: BallProblem
+    name: str = "ball"
+    order: tuple[int, ...] | None = None
+    pins: tuple[ImposedDecision, ...] = ()
+    _runs: dict[int, BallRun] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    @property
+    def size(self) -> int:
+        """Number of balls."""
+        return int(np.size(self.problem.y0))
+
+    @property
+    def steps(self) -> int:
+        """That the system's own run makes."""
+        return self.problem.steps
+
+    @property
+    def timestep(self) -> float:
+        """Seconds."""
+        return float(self.problem.world.integrator.h)
+
+    @property
+    def unit(self) -> str:
+        """Of heights."""
+        return "m"
+
+    @property
+    def scale(self) -> float:
+        """The largest start height; of balls that start on the floor, the largest that they reach."""
+        start = self.problem.world.start(self.problem.y0, self.problem.v0)
+        height = float(np.abs(np.asarray(start.y, np.float64)).max())
+        if height:
+            return height
+        heights = np.abs(self.run(self.steps).y.astype(np.float64))
+        return float(heights[np.isfinite(heights).all(axis=1)].max()) or 1.0
+
+    @property
+    def streams(self) -> bool:
+        """Every step that was asked for is compared, and none beyond."""
+        return False
+
+    @property
+    def imposable(self) -> None:
+        """Any decisions can be imposed."""
+        return None
+
+    def check(self, other: BallProgram) -> None:
+        """Check that both decide the same things of the same number of balls.
+
+        Raises:
+            InputError: they do not.
+        """
+        kinds = [type(one.problem.world.contact).__name__ for one in (self, other)]
+        if kinds[0] != kinds[1] or (self.problem.world.lift is None) != (other.problem.world.lift is None):
+            raise InputError(
+                f"{kinds[0]} and {kinds[1]} decide different things",
+                remedy="Compare programs with one kind of contact",
+            )
+        if self.size != other.size:
+            raise InputError(
+                f"{self.size} balls and {other.size}", remedy="Compare programs of the same number of balls"
+            )
+
+    def run(self, steps: int, decisions: BallDecisions | None = None) -> BallRun:
+        """A rollout, its balls in the order of the other program.
+
+        Args:
+            steps: to make.
+            decisions: imposed on the balls in that order; its own, and its pins, when None.
+        """
+        if decisions is None and steps in self._runs:
+            return self._runs[steps]
+        problem, index = self.problem, None if self.order is None else list(self.order)
+        if decisions is None:
+            imposed = self._pinned(steps)
+        elif index is None:
+            imposed = decisions
+        else:
+            counts = decisions.iterations
+            counts = counts[:, index] if counts.ndim == 2 else counts
+            imposed = BallDecisions(decisions.contact[:, index], counts)
+        run = simulate(problem.world, problem.world.start(problem.y0, problem.v0), steps, imposed=imposed)
+        run = run if index is None else _reordered(run, np.asarray(index))
+        if decisions is None:
+            self._runs[steps] = run
+        return run
+
+    def _pinned(self, steps: int) -> BallDecisions | None:
+        """The pins, -1 wherever the program decides by itself; None where there are none."""
+        if not self.pins:
+            return None
+        world = self.problem.world
+        solve = jax.eval_shape(
+            lambda: world.advance(world.start(self.problem.y0, self.problem.v0))[1].solve.iterations
+        )
+        contact = np.full((steps, self.size), -1, np.int8)
+        iterations = np.full((steps, *solve.shape), -1, np.int32)
+        for pin in self.pins:
+            if pin.step > steps:
+                continue
+            if pin.channel == "contact":
+                contact[pin.step - 1, pin.ball] = pin.value
+            elif iterations.ndim == 1:
+                iterations[pin.step - 1] = pin.value
+            else:
+                iterations[pin.step - 1, pin.ball] = pin.value
+        return BallDecisions(contact, iterations)  # type: ignore[arg-type]
+
+    def lockstep(
+        self, other: BallProgram, last: int, *, forward: bool, back: bool, guard: float | None
+    ) -> Iterator[PairRows]:
+        """All steps at which both runs are finite (see `Program.lockstep`)."""
+        asked = last
+        runs = {"A": self.run(asked), "B": other.run(asked)}
+        a, b = runs.values()
+        last, failed = _ends(a, b)
+        flips = cross_decisions(a, b, last)
+        separation = {"B": _apart(a, b, last)}
+        y, v = (np.stack([getattr(run, name)[: last + 1] for run in (a, b)]) for name in "yv")
+        overridden_count: dict[str, np.ndarray] = {}
+        furthest: dict[str, np.ndarray] = {}
+        if forward:
+            runs["B|A"] = other.run(asked, a.decisions())
+            overridden_count["B|A"], furthest["B|A"] = overridden(runs["B|A"], last)
+            separation["B|A"] = _guarded(_apart(a, runs["B|A"], last), furthest["B|A"], guard)
+            from_b = _apart(b, runs["B|A"], last)
+            separation["B|A from B"] = np.where(np.isnan(separation["B|A"]), np.nan, from_b)
+        if back:
+            runs["A|B"] = self.run(asked, b.decisions())
+            separation["A|B"] = _apart(b, runs["A|B"], last)
+            separation["A|B from A"] = _apart(a, runs["A|B"], last)
+        steps = np.array([flip.step for flip in flips], np.int64)
+        yield PairRows(
+            first=0,
+            separation=separation,
+            bits=((y[0] != y[1]) | (v[0] != v[1])).any(axis=1),
+            energy={name: run.energy[: last + 1].mean(axis=1) for name, run in runs.items() if name != "A|B"},
+            cross=np.bincount(steps, minlength=last + 1)[: last + 1],
+            flips=flips,
+            overridden=overridden_count,
+            furthest=furthest,
+            nearest={},
+            bound={},
+            ambiguous={},
+            doubts={},
+            failed=failed,
+            runs=runs,
+        )
+
+    def repeats(
+        self, others: Sequence[BallProgram], last: int, tolerance: float, guard: float
+    ) -> list[tuple[Float[np.ndarray, "steps"], Float[np.ndarray, "steps"]]]:
+        """Separations of perturbed runs (see `Program.repeats`)."""
+        # of the number of steps that was run before: another one would be another compiled program
+        steps = min((known for known in self._runs if known >= last), default=last)
+        a = self.run(steps)
+        found = []
+        for other in others:
+            under = other.run(steps, a.decisions())
+            separation = _guarded(_apart(a, under, last), overridden(under, last)[1], guard)
+            found.append((_apart(a, other.run(steps), last), separation))
+        return found
+
+    def nudged(self, size: float, count: int, seed: int) -> list[BallProgram]:
+        """The program with its start heights displaced at random by up to `size`, an ulp at least."""
+        rng = np.random.default_rng(seed)
+        y = np.asarray(np.atleast_1d(self.problem.y0), np.float64)
+        size = max(size, spacing(float(np.abs(y).max()), self.problem.world.policy.state))
+        moved = [y + size * rng.uniform(-1, 1, y.shape) for _ in range(count)]
+        return [replace(self, problem=replace(self.problem, y0=y0)) for y0 in moved]
+
+    def decision(self, other: BallProgram, flips: Sequence[CrossDecision], separation: float) -> Decision:
+        """The first decision at a fork: a contact before a stop, the first ball."""
+        first = flips[0]
+        return Decision(
+            channel=first.channel,
+            step=first.step,
+            subject=() if first.ball < 0 else (first.ball,),
+            run=first.run,
+            entered=True,
+            a=first.a,
+            b=first.b,
+            margins={"A": first.margin_a, "B": first.margin_b},
+            bounds={"A": first.bound_a, "B": first.bound_b},
+            separation=separation,
+            also=len(flips) - 1,
+        )
+
+    def number(self, key: str) -> Number:
+        """A parameter by the key of the system file, its last word, or the world's own name.
+
+        Raises:
+            InputError: there is none of that name.
+        """
+        word = key.rpartition(".")[2]
+        word = _SHORT.get(word, word)
+        problem, world = self.problem, self.problem.world
+        if word not in START and not world.has(word):
+            known = ", ".join([*world.parameters, *START])
+            raise InputError(f"{key!r} is no number that can be varied", remedy=f"Use one of: {known}")
+
+        def at(value: float) -> BallProgram:
+            filled = np.full(np.atleast_1d(np.asarray(problem.y0)).shape, value)
+            moved = problem.with_values({word: filled if word in START else value})
+            return replace(self, problem=moved)
+
+        values = np.unique(np.asarray(problem.values([word])[word], np.float64))
+        is_gain = word == "k" and isinstance(world.contact, Projection)
+        role = "state" if word in START else "decision" if word in ("tol", "enter") else "arithmetic"
+        return Number(
+            key=word,
+            value=float(values[0]) if len(values) == 1 else None,
+            unit="" if is_gain else _UNITS.get(word, ""),
+            at=at,
+            proper=at,
+            positive=word not in ("y0", "v0", "gravity"),
+            zero=True,
+            dtype=world.policy.dtype(role),
+        )
+
+    def history(self, steps: int, loss: Callable[..., float] | None = None) -> DecisionHistory:
+        """What a run decides (see `Program.history`); its loss is that of the problem."""
+        problem = replace(self.problem, steps=steps)
+        run = problem.run(keep=False)
+        contact, counts = run.contact, run.iterations.reshape(steps, -1)
+        marks = [
+            hashlib.blake2b(touches.tobytes() + count.tobytes(), digest_size=8).digest()
+            for touches, count in zip(contact, counts, strict=True)
+        ]
+        digest = hashlib.blake2b(contact.tobytes() + run.iterations.tobytes(), digest_size=16).hexdigest()
+        value, _ = problem.value_and_grad([], jax.tree.map(jnp.asarray, run.decisions()))
+        x = run.y[-1].astype(np.float64)
+        every = np.frombuffer(b"".join(marks), np.uint64)
+        return DecisionHistory(every, digest, x, value, float("nan"), "", first=1)
+
+    def differing(self, other: BallProgram, steps: int, step: int, key: str) -> Differing:
+        """The first decision that differs at a step, with the gradients of the loss on both sides."""
+        problems = [replace(one.problem, steps=steps) for one in (self, other)]
+        runs = [problem.run(history=True) for problem in problems]
+        flips = [flip for flip in cross_decisions(runs[0], runs[1], step) if flip.step == step]
+        first = flips[0]
+        if first.channel == "stop" and first.ball < 0:
+            margins = [
+                _stop_margin(run, step - 1, min(first.a, first.b), margin)
+                for run, margin in zip(runs, (first.margin_a, first.margin_b), strict=True)
+            ]
+            flips[0] = first._replace(margin_a=margins[0], margin_b=margins[1])
+        name = self.number(key).key
+        gradients = tuple(
+            problem.value_and_grad([name], jax.tree.map(jnp.asarray, run.decisions()))[1][name]
+            for problem, run in zip(problems, runs, strict=True)
+        )
+        return Differing(self.decision(other, flips, float("nan")), gradients)
+
+
+def _stop_margin(run: BallRun, row: int, iteration: int, margin: float) -> float:
+    """Threshold minus residual at an iteration of a solve of all balls, from the residuals of every one."""
+    if run.history is None or not isinstance(run.world.contact, Projection):
+        return margin
+    rule = run.world.contact.stop
+    first = jnp.asarray(run.history[row, 0])
+    return float(rule.threshold(first, jnp.asarray(iteration))) - float(run.history[row, iteration])
+
+
+def _reordered(run: BallRun, order: Int[np.ndarray, "balls"]) -> BallRun:
+    """A run with its balls in the order of the other program."""
+    place = np.argsort(order)
+    columns = ("y", "v", "height", "contact", "iterations", "reason", "residual", "margin", "before")
+    arrays = {name: getattr(run, name) for name in columns}
+    turned = {
+        name: values[:, place] for name, values in arrays.items() if values.ndim == 2 and values.shape[1] > 0
+    }
+    flips: Ledger = run.contacts
+    ball = order[flips.subject[:, 0]]
+    rows = np.lexsort((ball, flips.step))
+    names = ("step", "entered", "margin", "bound", "jump")
+    contacts = replace(
+        flips,
+        subject=ball[rows, None],
+        **{name: getattr(flips, name)[rows] for name in names},
+        extra={name: values[rows] for name, values in flips.extra.items()},
+    )
+    return replace(run, **turned, contacts=contacts)
+
+
+def _apart(one: BallRun, other: BallRun, last: int) -> Float[np.ndarray, "times"]:
+    """Largest difference of heights at each step, m; infinite where one of them is no number."""
+    y = [run.y[: last + 1].astype(np.float64) for run in (one, other)]
+    with np.errstate(invalid="ignore"):
+        off = np.abs(y[0] - y[1])
+    return np.where(np.isfinite(off), off, np.inf).max(axis=1)
+
+
+def _ends(a: BallRun, b: BallRun) -> tuple[int, dict[str, str]]:
+    """The last step at which both runs are finite, and which of them is not after it."""
+    ends = {}
+    for name, run in (("A", a), ("B", b)):
+        finite = np.isfinite(run.y.astype(np.float64)) & np.isfinite(run.v.astype(np.float64))
+        broken = ~finite.all(axis=1)
+        if broken.any():
+            ends[name] = int(broken.argmax()) - 1
+    last = min([a.steps, *ends.values()])
+    if last < 0:
+        raise InputError("a start height is not finite in this precision", remedy="Use a wider dtype")
+    return last, {name: "blow-up" if ends.get(name) == last else "" for name in "AB"}
+
+
+def _guarded(separation: np.ndarray, furthest: np.ndarray, guard: float | None) -> np.ndarray:
+    """The same, NaN after the step at which a contact far from the floor is imposed."""
+    beyond = furthest > (np.inf if guard is None else guard)
+    if beyond.any():
+        separation[int(beyond.argmax()) + 1 :] = np.nan
+    return separation

@@ -1,0 +1,273 @@
+"""When runs leave the exact history, and which precision keeps them on it longest; of both worlds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from mdnum.errors import InputError
+from mdnum.events.forks import Growth, growth
+from mdnum.forks.worlds import program_of, varied
+from mdnum.program import Decision, Program
+from mdnum.systems import BallSystem, System
+
+Progress = Callable[[int, int, dict[str, Any]], None]
+Roles = Mapping[str, str]
+
+MD_ROLES = ("state", "force", "decision", "accumulate")
+BALL_ROLES = ("state", "arithmetic", "decision", "accumulate")
+_NARROW: Roles = dict.fromkeys(MD_ROLES, "float32")
+
+#: Precisions that are ranked of molecular dynamics, from none to all in double; a role not named is float64.
+MD_POLICIES: Mapping[str, Roles] = {
+    "float32": _NARROW,
+    **{
+        f"float32, {' and '.join(wide)} float64": {**_NARROW, **dict.fromkeys(wide, "float64")}
+        for wide in (("decision",), ("accumulate",), ("decision", "accumulate"), ("state",))
+    },
+    "float64, force float32": {"force": "float32"},
+    "float64, force bfloat16": {"force": "bfloat16"},
+    "float64": {},
+}
+#: Of a ball: every role in one format, or one role alone in float32.
+BALL_POLICIES: Mapping[str, Roles] = {
+    **{name: dict.fromkeys(BALL_ROLES, name) for name in ("float64", "float32", "float16", "bfloat16")},
+    **{f"{role} in float32": {role: "float32"} for role in BALL_ROLES},
+}
+#: Separation from the exact run up to which its growth is fitted, as a share of the program's scale.
+_SATURATED = 0.04
+#: Quality of a fit from which on a growth counts as exponential.
+_EXPONENTIAL = 0.95
+
+
+@dataclass(frozen=True)
+class PolicyHorizon:
+    """How long a run in one precision keeps to the exact history.
+
+    Attributes:
+        name: of the precision.
+        roles: dtype by role.
+        horizon: first step with a decision other than the exact one; None where there is none.
+        decision: that decision, exact (A) and the run's (B), with the exact margin in the quantity's space.
+        separation: largest distance from the exact places at each step, length.
+        growth: of that separation.
+        failed: how the run ended, where badly.
+        gain: share of the steps that double precision gains over single which this policy gains; an upper
+            bound where double precision never left; NaN where unknown.
+        closer: bits by which its positions are closer to the exact ones than those of single precision
+            throughout, while both decide exactly; NaN where unknown.
+        reason_unavailable: why it cannot run in this precision; None where it did.
+    """
+
+    name: str
+    roles: Roles
+    horizon: int | None = None
+    decision: Decision | None = None
+    separation: Float[np.ndarray, "rows"] | None = None
+    growth: Growth | None = None
+    failed: str = ""
+    gain: float = float("nan")
+    closer: float = float("nan")
+    reason_unavailable: str | None = None
+
+    @property
+    def margin(self) -> float:
+        """Of the decision at fault in the exact run; NaN without one."""
+        return float("nan") if self.decision is None else self.decision.margins["A"]
+
+    def is_all(self, dtype: str) -> bool:
+        """Whether every role has this dtype."""
+        return set(self.roles.values()) == {dtype}
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """The exact history of a system, and the horizons of real runs against it.
+
+    Attributes:
+        steps: last step.
+        timestep: in the user's units of time.
+        exact: the history, a `program.ExactHistory` or a `ball.BallHistory`.
+        ranking: precisions, longest horizon first; those that cannot run come last.
+        steps_per_bit: by how many steps one more bit puts a horizon off: ln 2 over the growth rate of the
+            separation from the exact run; NaN where no growth was seen.
+    """
+
+    steps: int
+    timestep: float
+    exact: Any
+    ranking: tuple[PolicyHorizon, ...]
+    steps_per_bit: float
+
+    def of(self, name: str) -> PolicyHorizon:
+        """The row of a policy.
+
+        Raises:
+            KeyError: it was not asked for.
+        """
+        return {row.name: row for row in self.ranking}[name]
+
+
+def certify(
+    system: System | BallSystem,
+    steps: int | None = None,
+    policies: Mapping[str, Roles] | None = None,
+    progress: Progress | None = None,
+) -> Certificate:
+    """The exact history of a system, and the step at which a run in each precision leaves it.
+
+    The numbers of the file are those that float64 has; a narrower run rounds them too, which is part of what
+    it does differently.
+
+    Args:
+        system: Lennard-Jones, NVE, at most 108 atoms; or a ball whose steps are sums and products. Its own
+            precision is not used.
+        steps: last step; default the system's own.
+        policies: dtype by role, by the name of the precision; default `MD_POLICIES` or `BALL_POLICIES`. Roles
+            that it does not name are float64.
+        progress: called with what is done, of how much, and a dictionary of figures.
+
+    Raises:
+        InputError: the system cannot be certified, or steps below 1.
+    """
+    is_ball = isinstance(system, BallSystem)
+    own = system.spec.integrator.steps if is_ball else system.spec.dynamics.steps
+    last = own if steps is None else steps
+    if last < 1:
+        raise InputError(f"steps = {last}; expected at least 1", remedy="Ask for one step or more")
+    if policies is None:
+        policies = BALL_POLICIES if is_ball else MD_POLICIES
+    wide = dict.fromkeys(BALL_ROLES if is_ball else MD_ROLES, "float64")
+    every = {name: {**wide, **roles} for name, roles in policies.items()}
+    note = progress or (lambda done, total, info: None)
+    certifier: Any = _certify_ball if is_ball else _certify_md
+    program, exact, rows = certifier(system, last, every, note)
+    rows = _with_gains(rows, last)
+    rows.sort(key=lambda row: (row.reason_unavailable is not None, -_or_beyond(row.horizon)))
+    return Certificate(last, program.timestep, exact, tuple(rows), _steps_per_bit(rows))
+
+
+def _or_beyond(horizon: int | None) -> float:
+    return float("inf") if horizon is None else horizon
+
+
+def _row(
+    program: Program, name: str, roles: Roles, decision: Decision | None, separation: np.ndarray, failed: str
+) -> PolicyHorizon:
+    horizon = None if decision is None else decision.step
+    fit = growth(separation, _SATURATED * program.scale)
+    return PolicyHorizon(name, roles, horizon, decision, separation, fit, failed)
+
+
+def _certify_md(system: System, last: int, policies: Mapping[str, Roles], note: Progress):
+    from mdnum.forks.exact.bounds import taped
+    from mdnum.forks.exact.program import ExactProgram, unsupported, with_policy
+    from mdnum.forks.exact.tape import first_difference
+    from mdnum.md.cell import HostCell
+    from mdnum.precision import PrecisionPolicy
+
+    program: Any = program_of(system)
+    simulation = program.simulation
+    error = unsupported(simulation)
+    if error is not None:
+        raise error
+    info = {"phase": "in exact arithmetic", "unit": "steps"}
+    exact = ExactProgram(simulation).run(last, progress=lambda done, total: note(done, total, info))
+    cell = HostCell(simulation.cell)
+    matrix = np.where(np.array(simulation.pbc)[:, None], np.asarray(simulation.cell.matrix), 0.0)
+
+    def reduced(x: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3"]:
+        """Positions within a box of the origin: a displacement takes off one lattice vector at most."""
+        return x - np.floor(x @ np.asarray(simulation.cell.inverse)) @ matrix
+
+    rows = []
+    for done, (name, roles) in enumerate(policies.items()):
+        note(done, len(policies), {"phase": name, "unit": "policies"})
+        run = taped(with_policy(simulation, PrecisionPolicy(**roles)), last)
+        decision = first_difference(exact.tape, run.tape)
+        common = min(len(exact.x), len(run.x))
+        d = cell.displacement(reduced(exact.x[:common]), np.moveaxis(run.x[:common], 1, 2))
+        separation = np.sqrt(np.max(d[0] ** 2 + d[1] ** 2 + d[2] ** 2, axis=1))
+        if decision is not None:
+            place = reduced(exact.x[decision.step])
+            i, j = decision.subject
+            dx, dy, dz = cell.displacement(place[[i]], place[[j]])
+            kind = int(simulation.type_of(np.array([i]), np.array([j]))[0])
+            margin = simulation.decider.r_cut[kind] ** 2 - float((dx * dx + dy * dy + dz * dz)[0])
+            decision = replace(decision, margins={"A": margin})
+        rows.append(_row(program, name, roles, decision, separation, run.failed))
+    return program, exact, rows
+
+
+def _certify_ball(system: BallSystem, last: int, policies: Mapping[str, Roles], note: Progress):
+    from mdnum.forks.exact.ball import ball_history, ball_horizon
+
+    system = system.for_steps(last)
+
+    def program_in(name: str, roles: Roles) -> Any:
+        values = {f"precision.{role}": dtype for role, dtype in roles.items()}
+        return program_of(varied(system, {**values, "precision.rounding": "nearest"}, name))
+
+    exact = program_in("float64", dict.fromkeys(BALL_ROLES, "float64"))
+    problem = exact.problem
+    note(0, 0, {"phase": "the exact history"})
+    history = ball_history(problem.world, problem.world.start(problem.y0, problem.v0), last)
+    rows = []
+    for done, (name, roles) in enumerate(policies.items()):
+        note(done, len(policies), {"phase": name, "unit": "policies"})
+        try:
+            program = program_in(name, roles)
+        except InputError as error:
+            reason = error.message.removeprefix(f"variant {name!r}: ")
+            rows.append(PolicyHorizon(name, roles, reason_unavailable=reason))
+            continue
+        decision, separation = ball_horizon(history, program.run(last))
+        rows.append(_row(exact, name, roles, decision, separation, ""))
+    return exact, history, rows
+
+
+def _steps_per_bit(rows: list[PolicyHorizon]) -> float:
+    """ln 2 over the growth rate of the run whose growth could be followed longest."""
+    # separations that grow by a power of time, as those of a lone pair, are no exponentials
+    fits = [row.growth for row in rows if row.growth is not None]
+    fits = [fit for fit in fits if fit.rate > 0 and fit.r_squared > _EXPONENTIAL]
+    if not fits:
+        return float("nan")
+    return float(np.log(2) / max(fits, key=lambda fit: fit.last - fit.first).rate)
+
+
+def _with_gains(rows: list[PolicyHorizon], last: int) -> list[PolicyHorizon]:
+    """What each policy gains over single precision throughout, where that leaves the exact history."""
+    low = next((row for row in rows if row.is_all("float32")), None)
+    high = next((row for row in rows if row.is_all("float64")), None)
+    if low is None or low.horizon is None:
+        return rows
+    # a double precision that never left gains at least the steps up to the last: shares are upper bounds then
+    reach = None if high is None else last if high.horizon is None else high.horizon
+    done = []
+    for row in rows:
+        gain = float("nan")
+        if reach is not None and reach > low.horizon and row.horizon is not None:
+            gain = (row.horizon - low.horizon) / (reach - low.horizon)
+        done.append(replace(row, gain=gain, closer=_closer(low, row)))
+    return done
+
+
+def _closer(base: PolicyHorizon, row: PolicyHorizon) -> float:
+    """By how many bits a run is closer to the exact positions, while both decide as the exact program does.
+
+    The median over the second half of the steps before the first decision at fault: unlike the horizon, it
+    does not hang on which pair happens to come close to its cutoff.
+    """
+    if base.separation is None or row.separation is None:
+        return float("nan")
+    end = min(horizon for horizon in (base.horizon, row.horizon) if horizon is not None)
+    a, b = (separation[end // 2 : end] for separation in (base.separation, row.separation))
+    if not len(a) or not len(b) or not np.all(b[: len(a)] > 0):
+        return float("nan")
+    with np.errstate(divide="ignore"):
+        return float(np.median(np.log2(a[: len(b)] / b)))

@@ -1,0 +1,450 @@
+"""Runs of molecular dynamics made once more around a fork: its atoms, overridden decisions, minimal causes.
+
+A decision is overridden by imposing A's on B, while B decides everything else. The fewest pairs that keep B
+with A are found by bisection and delta debugging, as Verrou finds the instructions of a program.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from mdnum.errors import InputError
+from mdnum.events.forks import split_of
+from mdnum.forks.pair import Fork
+from mdnum.md.cell import HostCell
+from mdnum.rollout.compared import Apart
+from mdnum.rollout.engine import Engine, Segment
+from mdnum.rollout.flips import PairRecorder, decided_pairs
+from mdnum.rollout.frame import Frame
+from mdnum.rollout.lockstep import apart
+from mdnum.rollout.pins import Pin, Pins
+from mdnum.rollout.program import MdProgram, pair_bound, pair_margin
+from mdnum.rollout.tracks import Track
+
+#: How far around the pair atoms are shown, in its cutoffs.
+REACH = 1.25
+#: A minimal cause keeps the runs together up to so many times the step of the split.
+_BEYOND = 1.25
+#: Positions of A are kept at so many steps of a search.
+_SAMPLES = 400
+
+
+@dataclass(frozen=True)
+class Neighborhood:
+    """Atoms around the deciding pair, at the fork.
+
+    Attributes:
+        atoms: labels of A; the pair first, the others by their distance from its middle, shape (near,).
+        positions: in A, from the middle of the pair, length, shape (near, 3).
+        moved: B's positions minus A's, length, shape (near, 3).
+        margins: of the deciding pair in A and in B, as each program computes it, in the quantity's space.
+        bounds: on the rounding errors of these.
+    """
+
+    atoms: Int[np.ndarray, "near"]
+    positions: Float[np.ndarray, "near 3"]
+    moved: Float[np.ndarray, "near 3"]
+    margins: tuple[float, float]
+    bounds: tuple[float, float]
+
+
+def neighborhood(fork: Fork, reach: float = REACH) -> Neighborhood | None:
+    """The atoms around the pair at the fork, from both runs followed up to there; None where there is none.
+
+    Args:
+        reach: radius, in cutoffs of A.
+    """
+    if fork.decision is None:
+        return None
+    program_a, program_b = fork.twin.a, fork.twin.b
+    a, b = program_a.simulation, program_b.simulation
+    i, j = fork.decision.subject
+    # to the same last step as the first time, so that no program is compiled again
+    x_a, x_b = (program.positions_at(fork.decision.step, fork.asked) for program in (program_a, program_b))
+    if x_a is None or x_b is None:
+        return None
+    cell = HostCell(a.cell)
+    across = np.stack(cell.displacement(x_a[[i]], x_a[[j]]), axis=-1)[0]
+    from_i = np.stack(cell.displacement(np.broadcast_to(x_a[i], x_a.shape), x_a), axis=-1)
+    # the nearest image of i may be another than that of the middle, so both ends are tried
+    from_j = np.stack(cell.displacement(np.broadcast_to(x_a[j], x_a.shape), x_a), axis=-1)
+    from_middle = from_i - across / 2
+    other = from_j + across / 2
+    nearer = (other**2).sum(axis=1) < (from_middle**2).sum(axis=1)
+    from_middle[nearer] = other[nearer]
+    distance = np.sqrt((from_middle**2).sum(axis=1))
+    distance[[i, j]] = -1.0
+    order = np.argsort(distance, kind="stable")
+    chosen = order[distance[order] <= reach * a.r_cut]
+    chosen = np.concatenate([[i, j], chosen[(chosen != i) & (chosen != j)]])
+    moved = np.stack(cell.displacement(x_a[chosen], x_b[chosen]), axis=-1)
+    margins = pair_margin(a, x_a, i, j), pair_margin(b, x_b, i, j, labels=a)
+    frame = program_b.frame or Frame.same(b.atoms)
+    kind = int(a.type_of(np.array([i]), np.array([j]))[0])
+    own = frame.inverse.positions(x_b.T[None])
+    bounds = pair_bound(a, x_a, i, j), float(b.decider.bounds_at(own)[0, kind])
+    return Neighborhood(chosen, from_middle[chosen], moved, margins, bounds)
+
+
+# --- overridden decisions -----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class DecidedPairs:
+    """What a run decided about some pairs.
+
+    Attributes:
+        atoms: of the run.
+        first: keys i * atoms + j, i < j, of those inside at its first step.
+        changes: steps at which each of them flipped, by key, ascending.
+    """
+
+    atoms: int
+    first: frozenset[int]
+    changes: dict[int, tuple[int, ...]]
+
+    @classmethod
+    def of(
+        cls, program: MdProgram, keys: Iterable[int], last: int,
+        watch: Callable[[Segment], None] | None = None,
+    ) -> DecidedPairs:  # fmt: skip
+        """Follow a run to a last step; `watch` is called with every segment."""
+        simulation = program.simulation
+        recorder = PairRecorder(simulation)
+        changes: dict[int, list[int]] = {key: [] for key in keys}
+        first: frozenset[int] | None = None
+        for segment in Engine(simulation, last, start=program.begin).segments():
+            if first is None:
+                first = frozenset(changes).intersection(decided_pairs(simulation, segment, 0).tolist())
+            ledger = recorder.flips(segment)
+            named = ledger.subject[:, 0].astype(np.int64) * simulation.atoms + ledger.subject[:, 1]
+            for step, key in zip(ledger.step.tolist(), named.tolist(), strict=True):
+                if key in changes:
+                    changes[key].append(step)
+            if watch is not None:
+                watch(segment)
+        every = {key: tuple(steps) for key, steps in changes.items()}
+        return cls(simulation.atoms, first or frozenset(), every)
+
+    def pins(self, keys: Iterable[int], first: int, last: int) -> Pins:
+        """These pairs' decisions, to be imposed over a window of steps."""
+        return Pins(
+            [Pin(*divmod(key, self.atoms), first, last, self.changes[key], key in self.first) for key in keys]
+        )
+
+
+@dataclass(frozen=True)
+class Pinned:
+    """B with some decisions overridden by A's.
+
+    Attributes:
+        pairs: whose decisions were.
+        first, last: steps of the window in which they were.
+        separation: from A at each step, length; NaN where a run has ended.
+        split: first step beyond the tolerance; None where there is none.
+        free: split without the pins.
+    """
+
+    pairs: tuple[tuple[int, int], ...]
+    first: int
+    last: int
+    separation: Float[np.ndarray, "steps"]
+    split: int | None
+    free: int | None
+
+
+def pinned(
+    fork: Fork,
+    pairs: Sequence[tuple[int, int]] | None = None,
+    *,
+    first: int | None = None,
+    last: int | None = None,
+    steps: int | None = None,
+) -> Pinned:
+    """Run B again, with A's decisions about some pairs imposed, and see how it leaves A.
+
+    Args:
+        fork: a pair of runs of one labeling.
+        pairs: (i, j); default the pair at the fork, for as long as the two runs first disagreed about it.
+        first, last: the steps of the window; default the whole run where pairs are named.
+        steps: last step; default as far as the runs were followed.
+
+    Raises:
+        InputError: no fork and no pairs, pairs that there are not, many-body potentials, or runs seen in
+            other labels or axes.
+    """
+    check_pins(fork)
+    a, b = fork.twin.a, fork.twin.b
+    last_step = fork.steps if steps is None else steps
+    if pairs is None:
+        if fork.decision is None:
+            raise InputError("the runs do not fork", remedy="Name the pairs to pin")
+        i, j = fork.decision.subject
+        pairs = [(i, j)]
+        spell = disagreements(fork, i, j)[0]
+        first = spell[0] if first is None else first
+        last = (spell[1] or fork.steps) - 1 if last is None else last
+    window = 0 if first is None else first, last_step if last is None else last
+    for pair in pairs:
+        _check_pair(pair, a.size)
+    keys = [min(pair) * a.size + max(pair) for pair in pairs]
+    imposed = DecidedPairs.of(a, keys, last_step).pins(keys, *window)
+    leader = Track(a.simulation, last_step, a.begin, flips=False)
+    follower = Track(b.simulation, last_step, b.begin, flips=False, pins=imposed)
+    cell = Apart(a.simulation.cell)
+    parts = []
+    while leader.segment() is not None:
+        end = leader.ready
+        rows, _ = leader.until(end)
+        parts.append(apart(cell, rows, follower.until(end)[0]))
+    separation = np.concatenate(parts)
+    named = tuple((int(key // a.size), int(key % a.size)) for key in keys)
+    return Pinned(named, *window, separation, split_of(separation, fork.tolerance), fork.dates.split)
+
+
+def _check_pair(pair: tuple[int, int], atoms: int) -> None:
+    if not (0 <= min(pair) < max(pair) < atoms):
+        raise InputError(f"no pair {pair[0]}-{pair[1]} of {atoms} atoms", where="pin")
+
+
+def parse_pin(text: str, atoms: int) -> dict[str, Any]:
+    """What `pinned` is to pin, from words: "fork", "3-75", "3-75:600..700".
+
+    Raises:
+        InputError: none of these, or a pair that there is not.
+    """
+    if text.strip() == "fork":
+        return {}
+    named = re.fullmatch(r"(\d+)\s*[-–]\s*(\d+)(?::(\d+)\.\.(\d+))?", text.strip())
+    if named is None:
+        raise InputError(
+            f"{text!r} names no decision", where="pin", remedy="Write fork, 3-75 or 3-75:600..700"
+        )
+    pair = int(named[1]), int(named[2])
+    _check_pair(pair, atoms)
+    first, last = (None if part is None else int(part) for part in named.groups()[2:])
+    if first is not None and last is not None and first > last:
+        raise InputError(f"steps {first} to {last} are none", where="pin", remedy="Give the first step first")
+    return {"pairs": [pair], "first": first, "last": last}
+
+
+def check_pins(fork: Fork) -> None:
+    """Refuse a pair of runs whose single decisions cannot be imposed.
+
+    Raises:
+        InputError: many-body potentials, or runs seen in other labels or axes.
+    """
+    a, b = fork.twin.a, fork.twin.b
+    if a.imposable or b.imposable:
+        raise InputError(
+            "decisions cannot be imposed on a many-body potential",
+            remedy="Use a system with a pair potential",
+        )
+    if b.frame is not None and not b.frame.is_same:
+        raise InputError("the runs have other labels or axes", remedy="Choose a variation without")
+
+
+def disagreements(fork: Fork, i: int, j: int) -> list[tuple[int, int | None]]:
+    """The steps from which on a pair was decided differently, and at which no longer; None where it stayed.
+
+    Of the cross-run flips that were kept.
+    """
+    spells: list[tuple[int, int | None]] = []
+    for flip in fork.flips:
+        if (flip.i, flip.j) != (i, j):
+            continue
+        if flip.differs:
+            spells.append((flip.step, None))
+        elif spells:
+            spells[-1] = spells[-1][0], flip.step
+    return spells
+
+
+# --- minimal causes -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Minimal:
+    """A smallest set of pairs that restores agreement.
+
+    Attributes:
+        pairs: pairs (i, j) whose pinning to A's decisions, from the start to the horizon, keeps B with A;
+            None where no set does.
+        proven: whether none of them can be left out; False where the runs allowed did not suffice.
+        fork_alone: whether pinning the pair at the fork alone is enough.
+        candidates: pairs that the runs decided differently before the split.
+        tests: runs that were made.
+        horizon: up to which step B had to stay with A.
+        reason: one sentence.
+    """
+
+    pairs: tuple[tuple[int, int], ...] | None
+    proven: bool
+    fork_alone: bool
+    candidates: int
+    tests: int
+    horizon: int
+    reason: str
+
+
+def minimal_cause(
+    fork: Fork, *, tests: int = 80, progress: Callable[[int, int], None] | None = None
+) -> Minimal:
+    """A 1-minimal set of pairs whose pinning removes a split.
+
+    Args:
+        fork: a pair of runs that has forked and split, of one labeling.
+        tests: runs of B at most.
+        progress: called with the tests made and allowed.
+
+    Raises:
+        InputError: the runs did not split, are seen in other labels or axes, or have many-body potentials.
+
+    Error: 1-minimal only: no single pair can be left out, but another, smaller set may exist.
+    """
+    split = fork.dates.split
+    if fork.dates.fork is None or split is None or fork.decision is None:
+        raise InputError("the runs did not split", remedy="Run longer, or with a smaller split tolerance")
+    check_pins(fork)
+    atoms = fork.twin.a.size
+    # pairs that differ before the split, in the order in which they first do
+    differing = (flip for flip in fork.flips if flip.differs and flip.step < split)
+    keys = list(dict.fromkeys(flip.i * atoms + flip.j for flip in differing))
+    search = _Search(fork, keys, int(_BEYOND * split) + 1, tests, progress)
+    whose = f"their decisions from the start to step {search.horizon:,} are A's"
+    i, j = fork.decision.subject
+    if search.holds([i * atoms + j]):
+        reason = f"the pair at the fork alone is enough ({whose}: {search.horizon + 1:,} decisions)"
+        return search.answer([i * atoms + j], True, reason)
+    if not search.holds(keys):
+        return search.answer(
+            None, False, "with all of them pinned the runs split as well: no set of pairs is the cause"
+        )
+    # bisection is quick where the decisions do not depend on one another; what it leaves is thinned further
+    best = _required(keys, search, search.made + (tests - search.made) // 2)
+    best = _ddmin(best if search.known(best) else keys, search)
+    if search.spent:
+        reason = f"{len(best)} pairs are enough; {search.made} runs did not show whether fewer are ({whose})"
+        return search.answer(best, False, reason, proven=False)
+    reason = f"{len(best)} pairs are enough, and none of them can be left out ({whose})"
+    return search.answer(best, False, reason)
+
+
+class _Search:
+    """Runs of B with some pairs pinned to what A decided, and their answers."""
+
+    def __init__(
+        self,
+        fork: Fork,
+        keys: Sequence[int],
+        horizon: int,
+        allowed: int,
+        progress: Callable[[int, int], None] | None,
+    ):
+        self.fork, self.horizon, self.allowed, self.progress = fork, horizon, allowed, progress
+        self.candidates = len(keys)
+        self.made = 0
+        self._known: dict[frozenset[int], bool] = {}
+        self._cell = HostCell(fork.twin.a.simulation.cell)
+        self._every = max(1, horizon // _SAMPLES)
+        self._positions: dict[int, np.ndarray] = {}
+        self._decided = DecidedPairs.of(fork.twin.a, keys, horizon, self._keep)
+
+    @property
+    def spent(self) -> bool:
+        """Whether no more runs are allowed."""
+        return self.made >= self.allowed
+
+    def known(self, keys: Sequence[int]) -> bool:
+        """Whether these pairs are known to be enough."""
+        return self._known.get(frozenset(keys), False)
+
+    def answer(self, keys: Sequence[int] | None, alone: bool, reason: str, *, proven: bool = True) -> Minimal:
+        """The outcome."""
+        atoms = self.fork.twin.a.size
+        pairs = None if keys is None else tuple(divmod(key, atoms) for key in sorted(keys))
+        proven = proven and pairs is not None
+        return Minimal(pairs, proven, alone, self.candidates, self.made, self.horizon, reason)
+
+    def _keep(self, segment: Segment) -> None:
+        """A's positions now and then."""
+        for row in range(segment.rows):
+            if (segment.first + row) % self._every == 0:
+                self._positions[segment.first + row] = segment.unsorted("x", row).astype(np.float64)
+
+    def holds(self, keys: Sequence[int]) -> bool:
+        """Whether B stays with A when these pairs are pinned; False once no more runs are allowed."""
+        name = frozenset(keys)
+        if name not in self._known:
+            if self.spent:
+                return False
+            self._known[name] = self._stays(keys)
+            self.made += 1
+            if self.progress is not None:
+                self.progress(self.made, self.allowed)
+        return self._known[name]
+
+    def _stays(self, keys: Sequence[int]) -> bool:
+        b, tolerance = self.fork.twin.b, self.fork.tolerance
+        reached = -1
+        pins = self._decided.pins(keys, 0, self.horizon)
+        for segment in Engine(b.simulation, self.horizon, start=b.begin, pins=pins).segments():
+            for row in range(segment.rows):
+                step = segment.first + row
+                if step in self._positions:
+                    here = segment.unsorted("x", row).astype(np.float64)
+                    d = self._cell.displacement(self._positions[step], here)
+                    if not float(np.max(sum(c * c for c in d))) <= tolerance**2:
+                        return False
+            reached = segment.last
+        return reached >= self.horizon
+
+
+def _required(keys: list[int], search: _Search, until: int) -> list[int]:
+    """A set that should be enough, by bisection for one required pair after the other (QuickXplain).
+
+    About log2(n) runs for each pair, where delta debugging needs their square; but it assumes that more pins
+    never do harm. It gives up at `until` runs.
+
+    Source: Junker, QuickXplain, AAAI 2004.
+    """
+    required: list[int] = []
+    pool = keys
+    while pool and search.made < until and not (required and search.holds(required)):
+        low, high = 0, len(pool)
+        while high - low > 1 and search.made < until:
+            middle = (low + high) // 2
+            if search.holds([*required, *pool[:middle]]):
+                high = middle
+            else:
+                low = middle
+        required.append(pool[high - 1])
+        pool = pool[: high - 1]
+    return required
+
+
+def _ddmin(keys: list[int], search: _Search) -> list[int]:
+    """A subset that is enough, 1-minimal if the runs allowed suffice (Zeller and Hildebrandt 2002)."""
+    parts = 2
+    while len(keys) >= 2 and not search.spent:
+        size = -(-len(keys) // parts)
+        blocks = [keys[k : k + size] for k in range(0, len(keys), size)]
+        smaller = next((block for block in blocks if search.holds(block)), None)
+        if smaller is not None:
+            keys, parts = smaller, 2
+            continue
+        rests = ([key for key in keys if key not in set(block)] for block in blocks)
+        rest = next((rest for rest in rests if rest and search.holds(rest)), None)
+        if rest is not None:
+            keys, parts = rest, max(parts - 1, 2)
+        elif parts >= len(keys):
+            break
+        else:
+            parts = min(len(keys), 2 * parts)
+    return keys

@@ -1,0 +1,331 @@
+"""The contract between a world and everything that runs its systems again, and what such runs leave.
+
+A world (molecular dynamics, the bouncing ball, a stranger's) implements `Program`: everything that decides
+the bits of a run, its start included. Forks, parameter maps, screening and certificates are written once
+against it and know neither atoms nor balls. Decide outside, act inside: a program acts on decisions that it
+is given, so a ledger holds what was used, and the decisions of one program can be imposed on another.
+
+Molecular dynamics: `mdnum.rollout.program.MdProgram`. The ball: `mdnum.ball.program.BallProgram`, made of a
+`Problem` (world, y0, v0, steps, loss). That adapter needs of `mdnum.ball`: `simulate(world, start, steps,
+told=decisions)` and its `BallRun` with all decisions, margins and heights; `Problem.with_values` and
+`Problem.value_and_grad`; `height_bound` and `residual_bound`; `counts_alike`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any, Protocol
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt64
+
+
+class Program(Protocol):
+    """One way to run one system.
+
+    Attributes:
+        name: of the system.
+        size: number of atoms or balls.
+        steps: that the system's own run makes.
+        timestep: in the units of the system's file.
+        unit: of lengths.
+        scale: the length that tolerances are shares of: the longest cutoff, the largest start height.
+        streams: whether runs may go on beyond the steps that were asked for; one that is kept whole does not.
+        imposable: why decisions cannot be imposed on it; None where they can.
+    """
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def size(self) -> int: ...
+    @property
+    def steps(self) -> int: ...
+    @property
+    def timestep(self) -> float: ...
+    @property
+    def unit(self) -> str: ...
+    @property
+    def scale(self) -> float: ...
+    @property
+    def streams(self) -> bool: ...
+    @property
+    def imposable(self) -> str | None: ...
+
+    def check(self, other: Any) -> None:
+        """Check that another program decides the same things of the same subjects.
+
+        Raises:
+            InputError: it does not.
+        """
+        ...
+
+    def lockstep(
+        self, other: Any, last: int, *, forward: bool, back: bool, guard: float | None
+    ) -> Iterator[PairRows]:
+        """Run this program (A) and another (B) side by side.
+
+        Args:
+            last: last step.
+            forward: whether to run B under A's decisions too, "B|A".
+            back: whether to run A under B's decisions too, "A|B".
+            guard: length; a run ends when an imposed decision is further than this from its threshold: it
+                would no longer be a decision that rounding could have changed.
+        """
+        ...
+
+    def repeats(
+        self, others: Sequence[Any], last: int, tolerance: float, guard: float
+    ) -> list[tuple[Float[np.ndarray, "steps"], Float[np.ndarray, "steps"]]]:
+        """Separations from this program of each other one, free and under this one's decisions.
+
+        Args:
+            others: the same program from perturbed starts.
+            last: last step; runs may end earlier where every one has split.
+            tolerance: of the split, length.
+            guard: as in `lockstep`.
+        """
+        ...
+
+    def nudged(self, size: float, count: int, seed: int) -> list[Any]:
+        """The program from starts displaced at random, the furthest by about `size`, an ulp at least."""
+        ...
+
+    def decision(self, other: Any, flips: Sequence[Any], separation: float) -> Decision:
+        """The decision at a fork.
+
+        Args:
+            flips: cross-run flips of that step, of a stretch.
+            separation: of the runs at the step before, length.
+        """
+        ...
+
+    def number(self, key: str) -> Number:
+        """A number of the system by its key, to be varied.
+
+        Raises:
+            InputError: no such number, or several; names the known ones.
+        """
+        ...
+
+    def history(self, steps: int, loss: Callable[..., float] | None = None) -> DecisionHistory:
+        """What a run of so many steps decides, and where it ends."""
+        ...
+
+    def differing(self, other: Any, steps: int, step: int, key: str) -> Differing:
+        """What this program and another, at an adjacent value of a number, decide differently at a step.
+
+        Args:
+            steps: of their runs.
+            key: of the number.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class Twin:
+    """Two programs that differ in one numerical choice.
+
+    Attributes:
+        a, b: the programs.
+        difference: what differs, one line.
+        changes: keys of the system file whose values differ, with both values.
+    """
+
+    a: Any
+    b: Any
+    difference: str
+    changes: Mapping[str, list[Any]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class PairRows:
+    """Some steps of two runs side by side.
+
+    Attributes:
+        first: step of the first row.
+        separation: largest distance between the runs, length, of "B" and "B|A" from A, of "A|B" from B, and
+            the other way around, "A|B from A" and "B|A from B"; shape (rows,), NaN where a run has ended.
+        bits: whether any bit of the state of A and B differs, shape (rows,).
+        energy: by run, shape (rows,).
+        cross: decisions in which A and B differ, shape (rows,).
+        flips: cross-run flips of these steps, in order; each has a `step`.
+        overridden: by counterfactual: decisions it would have made otherwise, shape (rows,).
+        furthest: by counterfactual: distance of the furthest of them from its threshold, length.
+        nearest: of A and B, distance of the decision nearest to its threshold from it, length, shape (rows,).
+        bound: of A and B, how far rounding can move what is compared, length, shape (rows,).
+        ambiguous: of A and B, decisions that rounding could have changed, shape (rows,).
+        doubts: which ones they are: a tuple of columns, the first of them the step.
+        failed: by run, "blow-up" or "runaway" where it ended that way, else "".
+        runs: whole runs by name, where a world keeps them.
+    """
+
+    first: int
+    separation: dict[str, Float[np.ndarray, "rows"]]
+    bits: Bool[np.ndarray, "rows"]
+    energy: dict[str, Float[np.ndarray, "rows"]]
+    cross: Int[np.ndarray, "rows"]
+    flips: Sequence[Any]
+    overridden: dict[str, Float[np.ndarray, "rows"]]
+    furthest: dict[str, Float[np.ndarray, "rows"]]
+    nearest: dict[str, Float[np.ndarray, "rows"]]
+    bound: dict[str, Float[np.ndarray, "rows"]]
+    ambiguous: dict[str, Float[np.ndarray, "rows"]]
+    doubts: dict[str, Any]
+    failed: dict[str, str]
+    runs: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def rows(self) -> int:
+        """Number of steps."""
+        return len(self.cross)
+
+    def until(self, last: int) -> PairRows:
+        """The rows up to a step, and what happened in them."""
+        rows = last - self.first + 1
+        if rows >= self.rows:
+            return self
+        # whatever has a value for each row, in an array or in a dictionary of arrays, and nothing else
+        cut = {one.name: _first_rows(getattr(self, one.name), rows) for one in fields(self)}
+        doubts = {run: doubt.where(doubt.step <= last) for run, doubt in self.doubts.items()}
+        flips = [flip for flip in self.flips if flip.step <= last]
+        # a run that failed within these rows has no separation at the last of them; A has rows up to its end
+        failed = {
+            run: word if np.isnan(cut["separation"].get(run, np.zeros(rows))[-1]) else ""
+            for run, word in self.failed.items()
+        }
+        return PairRows(**{**cut, "flips": flips, "doubts": doubts, "failed": failed})
+
+
+def _first_rows(value: Any, rows: int) -> Any:
+    """The first rows of an array, or of each array of a dictionary; anything else as it is."""
+    if isinstance(value, np.ndarray):
+        return value[:rows]
+    if isinstance(value, dict):
+        return {name: _first_rows(one, rows) for name, one in value.items()}
+    return value
+
+
+@dataclass(frozen=True)
+class Decision:
+    """The decision at a fork.
+
+    Attributes:
+        channel: "pair", "contact" or "stop".
+        step: of the fork.
+        subject: labels of the atoms of a pair, or of the ball; empty where one decision is the whole batch's.
+        run: the run that made the decision, "A" or "B": in which the pair flipped, the ball touches, the
+            solver stops first; "start" where the runs differ from the start on.
+        entered: whether the pair entered its cutoff in that run; True for a contact and a stop.
+        a, b: what each run decided: 0 or 1, or a number of iterations.
+        margins, bounds: by run, in the quantity's space; NaN where a run made no such decision.
+        separation: of the runs at the step before, length.
+        also: further decisions that differ at this step.
+    """
+
+    channel: str
+    step: int
+    subject: tuple[int, ...]
+    run: str
+    entered: bool
+    a: int
+    b: int
+    margins: Mapping[str, float]
+    bounds: Mapping[str, float]
+    separation: float
+    also: int
+
+    @property
+    def margin(self) -> float:
+        """Of the run that made it; of A at the start."""
+        return self.margins["A" if self.run == "start" else self.run]
+
+    @property
+    def bound(self) -> float:
+        """On the rounding error of that margin."""
+        return self.bounds["A" if self.run == "start" else self.run]
+
+    @property
+    def ambiguous_in(self) -> list[str]:
+        """Runs in which rounding alone could have decided otherwise."""
+        return [name for name, bound in self.bounds.items() if bound > 0 and abs(self.margins[name]) <= bound]
+
+    @property
+    def ambiguous(self) -> bool:
+        """Whether it could have in the run that made it."""
+        return abs(self.margin) <= self.bound
+
+
+@dataclass(frozen=True)
+class Number:
+    """One number of a system that can be varied.
+
+    Attributes:
+        key: as system files have it where they do.
+        value: what the system says, in the units of its file; None where a batch has several.
+        unit: of it; empty for a pure number and where it is not known.
+        at: the program at another value, without compiling again.
+        proper: the program at another value, as a user runs it.
+        positive: whether only values above 0 make sense.
+        zero: whether 0 does too.
+        dtype: of the floats that the number can have.
+    """
+
+    key: str
+    value: float | None
+    unit: str
+    at: Callable[[float], Any]
+    proper: Callable[[float], Any]
+    positive: bool
+    zero: bool = False
+    dtype: Any = np.float64
+
+    @property
+    def compiles(self) -> bool:
+        """Whether the program that a user runs is compiled for each value."""
+        return self.at is not self.proper
+
+
+@dataclass(frozen=True)
+class DecisionHistory:
+    """What a run decided, step by step, and where it ended.
+
+    Attributes:
+        marks: of each step, a number that any other decisions of that step have different (up to collisions
+            of 64 bits); shorter where the run failed, shape (rows,).
+        digest: all decisions in one word of 32 hexadecimal digits.
+        x: at the last step, unwrapped, length, shape (atoms, 3) or (balls,).
+        loss, energy: at the last step; NaN where the run failed.
+        failed: "blow-up" or "runaway" where it ended that way, else "".
+        first: step of the first row.
+    """
+
+    marks: UInt64[np.ndarray, "rows"]
+    digest: str
+    x: Float[np.ndarray, "..."]
+    loss: float
+    energy: float
+    failed: str
+    first: int = 0
+
+    def first_difference(self, other: DecisionHistory) -> int | None:
+        """The first step at which two runs decide differently; None where they decide alike."""
+        common = min(len(self.marks), len(other.marks))
+        differ = np.flatnonzero(self.marks[:common] != other.marks[:common])
+        if len(differ):
+            return self.first + int(differ[0])
+        return None if len(self.marks) == len(other.marks) else self.first + common
+
+
+@dataclass(frozen=True)
+class Differing:
+    """The decisions in which two programs with neighboring numbers differ at one step, the nearest first.
+
+    Attributes:
+        decision: the one whose margin is closest to 0 on both sides; a, b, margins and bounds are those of
+            the two programs.
+        gradients: of the loss along the number on both sides, decisions held; empty where none is taken.
+    """
+
+    decision: Decision
+    gradients: tuple[float, ...] = ()

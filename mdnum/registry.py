@@ -1,0 +1,193 @@
+"""Things with names that people write: cutoffs, choices, methods, checks; and those that other packages add.
+
+A registry maps a name to a *value*: an object that is used as it is, or a class or function that makes one.
+A package outside mdnum adds its own by an entry point of the registry's group, such as
+
+    [project.entry-points."mdnum.cutoffs"]
+    "smooth-cubic" = "my_package.cutoffs:SmoothCubic"
+
+Nothing of it is imported before its name is used or described.
+"""
+
+from __future__ import annotations
+
+import difflib
+import functools
+import importlib
+import inspect
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from importlib import metadata
+from typing import Any, Generic, TypeVar
+
+from mdnum.errors import InputError
+
+T = TypeVar("T")
+#: Nothing is like a longer word, and to find that out takes minutes.
+_LONGEST_WORD = 100
+
+
+def nearest(word: str, known: Iterable[str]) -> str | None:
+    """The known word most like this one, or None when none is like it."""
+    if len(word) > _LONGEST_WORD:
+        return None
+    folded = {option.lower(): option for option in known}
+    close = difflib.get_close_matches(word.lower(), list(folded), n=1)
+    return folded[close[0]] if close else None
+
+
+def unknown(noun: str, word: str, known: Iterable[str], *, where: str | None = None) -> InputError:
+    """The error for a name that does not exist: what it may have meant, and what there is."""
+    known = list(known)
+    close = nearest(word, known)
+    hint = f"Did you mean {close}? " if close else ""
+    return InputError(f"no {noun} {word!r}", remedy=f"{hint}Known are {', '.join(known)}", where=where)
+
+
+@functools.lru_cache
+def _plugins(group: str, path: tuple[str, ...]) -> tuple[metadata.EntryPoint, ...]:
+    # by the search path, which says whose entry points there are
+    return tuple(sorted(metadata.entry_points(group=group), key=lambda point: point.name))
+
+
+@dataclass(frozen=True)
+class Registry(Generic[T]):
+    """Values by name, in the order in which they were added, then those of other packages.
+
+    Attributes:
+        noun: what one of them is called, for messages.
+        group: entry points by which other packages add theirs.
+        kind: class that a value is an instance or a subclass of; functions are taken at their word.
+        separator: between a name and its argument.
+        check: called with a value of another package when it is loaded; raises where it is not what it says.
+    """
+
+    noun: str
+    group: str
+    kind: type | None = None
+    separator: str = "="
+    check: Callable[[Any], None] | None = None
+    _own: dict[str, Any] = field(default_factory=dict, repr=False)
+    _descriptions: dict[str, str] = field(default_factory=dict, repr=False)
+
+    def add(self, name: str, value: Any = None, *, description: str | None = None) -> Any:
+        """Add a value of mdnum's own, or decorate the class or function that is one.
+
+        Args:
+            name: what people write.
+            value: the value, or "module:attribute" to import on first use.
+            description: one line; by default the value's `description` or the first line of its docstring.
+        """
+        if value is None:
+            return lambda decorated: self.add(name, decorated, description=description)
+        if name in self._own:
+            raise ValueError(f"two values of {self.noun} {name!r}")
+        self._own[name] = value
+        if description:
+            self._descriptions[name] = description
+        return value
+
+    @property
+    def shipped(self) -> tuple[str, ...]:
+        """Names of mdnum's own."""
+        return tuple(self._own)
+
+    def _added(self) -> dict[str, metadata.EntryPoint]:
+        added: dict[str, metadata.EntryPoint] = {}
+        for point in _plugins(self.group, tuple(sys.path)):
+            taken = "mdnum" if point.name in self._own else None
+            if point.name in added and added[point.name].value != point.value:
+                taken = _package(added[point.name])
+            if taken:
+                raise InputError(
+                    f"package {_package(point)} adds the {self.noun} {point.name!r}, which {taken} has",
+                    remedy=f"Uninstall {_package(point)}, or use a version of it that names it otherwise",
+                )
+            added[point.name] = point
+        return added
+
+    def __iter__(self) -> Iterator[str]:
+        yield from self._own
+        yield from self._added()
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._own or name in self._added()
+
+    def __getitem__(self, name: str) -> Any:
+        """The value of this name.
+
+        Raises:
+            InputError: there is none, or the package that adds it is broken; names what there is.
+        """
+        if name in self._own:
+            value = self._own[name]
+            if isinstance(value, str):
+                module, _, attribute = value.partition(":")
+                value = self._own[name] = getattr(importlib.import_module(module), attribute)
+            return value
+        point = self._added().get(name)
+        if point is None:
+            raise unknown(self.noun, name, self)
+        try:
+            loaded: Any = point.load()
+            a_kind = isinstance(loaded, type) and issubclass(loaded, self.kind or object)
+            if not (a_kind or inspect.isroutine(loaded) or isinstance(loaded, self.kind or object)):
+                raise TypeError(f"{point.value} is no {self.kind}")
+            named = getattr(loaded, "name", None)
+            if isinstance(named, str) and named != point.name:
+                raise ValueError(f"its name is {named!r}")
+            if self.check:
+                self.check(loaded)
+        except Exception as error:
+            raise InputError(
+                f"{self.noun} {name!r} of package {_package(point)} cannot be used: "
+                f"{type(error).__name__}: {error}",
+                remedy=f"Correct or uninstall {_package(point)}",
+            ) from error
+        return loaded
+
+    def parse(self, text: str) -> T:
+        """What `text` names: a name alone, or "name=argument".
+
+        A class or function is called, with the argument's text where one is given (its `parse`, if it has
+        one). Anything else is returned as it is, and takes no argument.
+
+        Raises:
+            InputError: no such name, an argument for a name that takes none, or none for one that needs it.
+        """
+        name, separator, argument = text.strip().partition(self.separator)
+        value: Any = self[name]
+        makes = _makes(value)
+        if not makes and not separator:
+            return value
+        arguments = (argument,) if separator else ()
+        maker: Any = getattr(value, "parse", value if makes else None) if separator else value
+        try:
+            inspect.signature(maker).bind(*arguments)
+        except TypeError:
+            wrong = "takes no argument" if separator else f"needs an argument: {name}{self.separator}..."
+            raise InputError(f"the {self.noun} {name!r} {wrong}", remedy=self.description(name)) from None
+        return maker(*arguments)
+
+    def description(self, name: str) -> str:
+        """One line on what the value of this name is."""
+        if name in self._descriptions:
+            return self._descriptions[name]
+        value = self[name]
+        described = getattr(value, "description", None)
+        if isinstance(described, str):
+            return described
+        return (inspect.getdoc(value) or "").partition("\n")[0].rstrip(".")
+
+    def package(self, name: str) -> str:
+        """The package that the value of this name comes from."""
+        return "mdnum" if name in self._own else _package(self._added()[name])
+
+
+def _makes(value: object) -> bool:
+    return isinstance(value, type) or inspect.isroutine(value)
+
+
+def _package(point: metadata.EntryPoint) -> str:
+    return point.dist.name if point.dist else point.value.partition(".")[0].partition(":")[0]

@@ -1,0 +1,297 @@
+"""Molecular dynamics as a `Program`: run side by side, under imposed decisions, nudged and varied."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int, UInt64
+
+from mdnum.errors import InputError
+from mdnum.md.cell import HostCell
+from mdnum.program import Decision, DecisionHistory, Differing, Number, PairRows
+from mdnum.rollout.compared import Apart, CrossFlip, Frame
+from mdnum.rollout.dials import Dial, dial, unit
+from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, first_state, unwrapped
+from mdnum.rollout.flips import decided_pairs, fingerprint_of_bits
+from mdnum.rollout.lockstep import Counterfactual, apart, lockstep
+from mdnum.rollout.tracks import Handed, Track
+from mdnum.systems.build import Simulation
+
+#: A loss of the final state: of the simulation, unwrapped positions and velocities per internal time.
+Loss = Callable[[Simulation, Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"]], float]
+
+
+def squared_displacement(simulation: Simulation, x: np.ndarray, v: np.ndarray) -> float:
+    """Mean squared displacement from the start, length squared: the loss unless another is asked for."""
+    return float(np.mean(np.sum((x - simulation.positions) ** 2, axis=1)))
+
+
+@dataclass(frozen=True)
+class MdProgram:
+    """A simulation, where it begins, and how its atoms and axes are those that it is compared in.
+
+    Attributes:
+        simulation: the system as objects.
+        begin: its start; None for the system's own.
+        frame: how its labels and axes are those of the other program; None where they are the same.
+    """
+
+    simulation: Simulation
+    begin: Start | None = None
+    frame: Frame | None = None
+
+    @property
+    def name(self) -> str:
+        """Of the system."""
+        return self.simulation.system.name
+
+    @property
+    def size(self) -> int:
+        """Number of atoms."""
+        return self.simulation.atoms
+
+    @property
+    def steps(self) -> int:
+        """That the system's own run makes."""
+        return self.simulation.system.spec.dynamics.steps
+
+    @property
+    def timestep(self) -> float:
+        """In the user's unit of time."""
+        return float(self.simulation.system.spec.dynamics.timestep)
+
+    @property
+    def unit(self) -> str:
+        """Of lengths."""
+        return self.simulation.units.length
+
+    @property
+    def scale(self) -> float:
+        """The longest cutoff."""
+        return self.simulation.r_cut
+
+    @property
+    def streams(self) -> bool:
+        """A run may go on for as long as a verdict needs."""
+        return True
+
+    @property
+    def imposable(self) -> str | None:
+        """Only pair potentials act on decisions that they are given."""
+        if self.simulation.pairwise:
+            return None
+        return "a many-body potential decides inside its energy function"
+
+    @cached_property
+    def start(self) -> Start:
+        """Where it begins."""
+        return self.begin or first_state(self.simulation)
+
+    def check(self, other: MdProgram) -> None:
+        """Check that both have the same number of atoms.
+
+        Raises:
+            InputError: they do not.
+        """
+        if self.size != other.size:
+            raise InputError(
+                f"the runs have {self.size} and {other.size} atoms", remedy="Compare runs of one structure"
+            )
+
+    def lockstep(
+        self, other: MdProgram, last: int, *, forward: bool, back: bool, guard: float | None
+    ) -> Iterator[PairRows]:
+        """Both runs, and counterfactuals, a stretch at a time (see `Program.lockstep`)."""
+        return lockstep(
+            self.simulation,
+            other.simulation,
+            last,
+            start_a=self.begin,
+            start_b=other.begin,
+            frame=other.frame,
+            handed=forward,
+            back=back,
+            guard=guard,
+        )
+
+    def repeats(
+        self, others: Sequence[MdProgram], last: int, tolerance: float, guard: float
+    ) -> list[tuple[Float[np.ndarray, "steps"], Float[np.ndarray, "steps"]]]:
+        """Separations of perturbed runs, all beside one run of this program (see `Program.repeats`)."""
+        a = self.simulation
+        frame = others[0].frame or Frame.same(a.atoms)
+        imposed = [Counterfactual(Handed(b.simulation, a, b.begin, frame), guard) for b in others]
+
+        def listen(segment: Segment) -> None:
+            for run in imposed:
+                run(segment)
+
+        leader = Track(a, last, self.begin, flips=False, listener=listen)
+        free = [Track(b.simulation, last, b.begin, frame, flips=False) for b in others]
+        cell = Apart(a.cell)
+        parts: list[tuple[list[np.ndarray], list[np.ndarray]]] = [([], []) for _ in others]
+        while leader.segment() is not None:
+            end = leader.ready
+            rows, _ = leader.until(end)
+            for (own, under), run, counterfactual in zip(parts, free, imposed, strict=True):
+                own.append(apart(cell, rows, run.until(end)[0]))
+                under.append(apart(cell, rows, counterfactual.until(end)[0]))
+            if all(any((rows > tolerance).any() for rows in each) for pair in parts for each in pair):
+                break
+        return [(np.concatenate(own), np.concatenate(under)) for own, under in parts]
+
+    def nudged(self, size: float, count: int, seed: int) -> list[MdProgram]:
+        """The program with its atoms displaced at random, the furthest by about `size`.
+
+        By an ulp at least: a smaller displacement would be lost in the first addition.
+        """
+        rng = np.random.default_rng(seed)
+        x = np.asarray(self.start.state.x)
+        ulp = float(np.spacing(np.abs(x).max().astype(x.dtype)))
+        programs = []
+        for _ in range(count):
+            noise = rng.standard_normal(x.shape)
+            noise *= max(size, ulp) / np.sqrt((noise**2).sum(axis=0)).max()
+            moved = (x.astype(np.float64) + noise).astype(x.dtype)
+            state = self.start.state._replace(x=jnp.asarray(moved), x_before=jnp.asarray(moved))
+            start = replace(self.start, state=state, reference=moved.T.astype(np.float64))
+            programs.append(replace(self, begin=start))
+        return programs
+
+    def decision(self, other: MdProgram, flips: Sequence[CrossFlip], separation: float) -> Decision:
+        """The decision at a fork: of the pairs that differ there, the one nearest to its cutoff."""
+        differing = [flip for flip in flips if flip.differs]
+        flip = min(differing, key=lambda flip: abs(flip.margin) if np.isfinite(flip.margin) else np.inf)
+        if np.isfinite(flip.margin):
+            run, entered, margin, bound = flip.run, flip.entered, flip.margin, flip.bound
+            inside = entered == (run == "A")
+        else:
+            # no flip came before it: the margin is that of A's start
+            x = np.asarray(self.start.state.x).T
+            run, entered = "start", flip.entered
+            margin = pair_margin(self.simulation, x, flip.i, flip.j)
+            bound, inside = pair_bound(self.simulation, x, flip.i, flip.j), margin > 0
+        owner = "A" if run == "start" else run
+        return Decision(
+            channel="pair",
+            step=flip.step,
+            subject=(flip.i, flip.j),
+            run=run,
+            entered=entered,
+            a=int(inside),
+            b=int(not inside),
+            margins={owner: margin},
+            bounds={owner: bound},
+            separation=separation,
+            also=len(differing) - 1,
+        )
+
+    def number(self, key: str) -> Number:
+        """A number of the system, as `rollout.dials.dial` names them."""
+        found = dial(self.simulation, key)
+        at = self._turned(found, found.turn)
+        proper = self._turned(found, found.proper) if found.compiles else at
+        return Number(found.key, found.value, unit(self.simulation, found.key), at, proper, found.positive)
+
+    def _turned(self, found: Dial, turn: Callable[[Simulation, float], Simulation]):
+        return lambda value: replace(self, simulation=turn(self.simulation, value))
+
+    def history(self, steps: int, loss: Loss | None = None) -> DecisionHistory:
+        """What a run decides (see `Program.history`); the loss is the squared displacement by default."""
+        marks, segment = [], None
+        for segment in Engine(self.simulation, steps, start=self.begin).segments():
+            marks.append(marks_of(segment))
+        assert segment is not None
+        row = segment.rows - 1
+        x, images, v = (segment.unsorted(name, row) for name in ("x", "images", "v"))
+        x = unwrapped(np.asarray(self.simulation.cell.matrix), x, images)
+        every = np.concatenate(marks)
+        failed = segment.closes if segment.closes in FAILURES else ""
+        # a run that failed has no last step for a loss to be of
+        value = energy = float("nan")
+        if not failed:
+            value = float((loss or squared_displacement)(self.simulation, x, v.astype(np.float64)))
+            energy = float(segment.rows_of("potential")[row] + segment.rows_of("kinetic")[row])
+        digest = hashlib.blake2b(every.tobytes() + failed.encode(), digest_size=16).hexdigest()
+        return DecisionHistory(every, digest, x, value, energy, failed)
+
+    def differing(self, other: MdProgram, steps: int, step: int, key: str = "") -> Differing:
+        """The pairs that differ at a step, the one nearest to its cutoff in both programs."""
+        sides = [one._pairs_at(steps, step) for one in (self, other)]
+        keys = np.setxor1d(sides[0][0], sides[1][0], assume_unique=True)
+        pairs = [divmod(int(key), self.size) for key in keys]
+        margins = [
+            [pair_margin(one.simulation, x, i, j) for one, (_, x) in zip((self, other), sides, strict=True)]
+            for i, j in pairs
+        ]
+        place = min(range(len(pairs)), key=lambda k: max(abs(margin) for margin in margins[k]))
+        inside = [bool(np.isin(keys[place], held)) for held, _ in sides]
+        bounds = [
+            pair_bound(one.simulation, x, *pairs[place])
+            for one, (_, x) in zip((self, other), sides, strict=True)
+        ]
+        return Differing(
+            Decision(
+                channel="pair",
+                step=step,
+                subject=pairs[place],
+                run="A" if inside[0] else "B",
+                entered=True,
+                a=int(inside[0]),
+                b=int(inside[1]),
+                margins=dict(zip("AB", margins[place], strict=True)),
+                bounds=dict(zip("AB", bounds, strict=True)),
+                separation=float("nan"),
+                also=len(pairs) - 1,
+            )
+        )
+
+    def _pairs_at(self, steps: int, step: int) -> tuple[Int[np.ndarray, "inside"], np.ndarray]:
+        """Keys of the pairs inside at a step, and the positions; by the program that makes all the steps."""
+        for segment in Engine(self.simulation, steps, start=self.begin).segments():
+            if segment.last >= step:
+                row = step - segment.first
+                return decided_pairs(self.simulation, segment, row), segment.unsorted("x", row)
+        raise IndexError(f"the run has no step {step}")
+
+    def positions_at(self, step: int, last: int) -> Float[np.ndarray, "atoms 3"] | None:
+        """Wrapped positions at a step of a run to a last step, in the frame; None where it ended before."""
+        track = Track(self.simulation, last, self.begin, self.frame, flips=False)
+        while track.segment() is not None:
+            rows, _ = track.until(track.ready)
+            if rows is not None and rows.first + len(rows) > step:
+                return np.ascontiguousarray(rows.x[step - rows.first].T)
+        return None
+
+
+def marks_of(segment: Segment) -> UInt64[np.ndarray, "rows"]:
+    """The marks of the steps of a segment: hashes of the pairs inside, whatever their order and list."""
+    table = segment.table
+    rows = segment.rows_of("bits")
+    return np.array([fingerprint_of_bits(bits, table.index, table.order)[1] for bits in rows], np.uint64)
+
+
+def pair_margin(
+    simulation: Simulation, x: Float[np.ndarray, "atoms 3"], i: int, j: int, labels: Simulation | None = None
+) -> float:
+    """Threshold minus quantity of a pair, with the bits that the program decides by.
+
+    Args:
+        x: wrapped positions.
+        labels: whose labels i and j are; default the simulation's own.
+    """
+    decider = simulation.decider
+    kind = int((labels or simulation).type_of(np.array([i]), np.array([j]))[0])
+    d = HostCell(simulation.cell, decider.dtype).displacement(x[[i]], x[[j]])
+    return decider.thresholds[kind].value - float(decider.host_quantity(*d)[0])
+
+
+def pair_bound(simulation: Simulation, x: Float[np.ndarray, "atoms 3"], i: int, j: int) -> float:
+    """Bound on the rounding error of the margin of a pair at these positions."""
+    kind = int(simulation.type_of(np.array([i]), np.array([j]))[0])
+    return float(simulation.decider.bounds_at(x.T[None])[0, kind])

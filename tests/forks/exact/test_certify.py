@@ -1,0 +1,205 @@
+"""Horizons of real runs against the exact history, and rounding bounds of decisions against rationals."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from fractions import Fraction
+from functools import cache
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+import small_systems
+from hypothesis import given, settings
+
+from mdnum.errors import InputError
+from mdnum.forks.exact import bounds as exact_bounds
+from mdnum.forks.exact.bounds import certified_horizon, exact_margin, taped
+from mdnum.forks.exact.certify import BALL_POLICIES, MD_POLICIES, certify
+from mdnum.forks.exact.program import ExactProgram, with_policy
+from mdnum.forks.exact.tape import first_difference
+from mdnum.md.cell import Cell, HostCell
+from mdnum.md.decide import CONVENTIONS, PairDecider
+from mdnum.precision import PrecisionPolicy
+from mdnum.rollout.engine import Engine
+from mdnum.rollout.flips import PairRecorder
+from mdnum.systems import System, load
+from mdnum.systems.build import Simulation, build
+
+NARROW = PrecisionPolicy("float32", "float32", "float32", "float32")
+TILTED = np.array([[6.0, 0.0, 0.0], [1.1, 6.3, 0.0], [-0.9, 0.8, 5.7]])
+
+
+@cache
+def liquid(seed: int = 3) -> System:
+    return small_systems.make(
+        small_systems.crystal(2, 0.02, 1.68),
+        small_systems.LENNARD_JONES,
+        {"kind": "hard", "radius": 1.55},
+        dynamics={"kind": "nve", "timestep": 0.004, "temperature": 2.9, "seed": seed},
+        neighbors={"skin": 0.1},
+    )
+
+
+@cache
+def simulation(policy: PrecisionPolicy | None = None) -> Simulation:
+    whole = build(liquid(11))
+    return whole if policy is None else with_policy(whole, policy)
+
+
+@pytest.fixture
+def flint():
+    return pytest.importorskip("flint", reason="exact runs need python-flint")
+
+
+# --- horizons -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_single_precision_leaves_early_and_double_does_not(flint):
+    names = ("float64", "float32", "float32, accumulate float64", "float64, force bfloat16")
+    found = certify(liquid(), 400, {name: MD_POLICIES[name] for name in names})
+    assert found.ranking[0].name == "float64"
+    wide, narrow = found.of("float64"), found.of("float32")
+    assert wide.horizon is None and wide.decision is None and np.isnan(wide.margin)
+    assert wide.separation.max() < 1e-9 < narrow.separation.max()
+    decision = narrow.decision
+    assert decision is not None and decision.step == narrow.horizon and 20 < narrow.horizon < 400
+    i, j = decision.subject
+    inside = i * len(liquid().atoms) + j in found.exact.tape.inside(narrow.horizon)
+    assert (decision.a, decision.b) == (inside, not inside) and inside == (narrow.margin > 0)
+    # a margin of the size of the separation by then
+    assert abs(narrow.margin) < 10 * narrow.separation[narrow.horizon]
+    promoted = found.of("float32, accumulate float64")
+    assert narrow.gain == 0 and np.isnan(wide.gain) and narrow.closer == 0
+    # 29 bits more, of which some are lost in rounding more than one number a step
+    assert 24 < wide.closer < 34 and abs(promoted.closer) < 1
+    short = found.of("float64, force bfloat16")
+    assert found.ranking[-1] is short and short.horizon is not None
+    # eight bits instead of twenty-four, in the pair forces alone
+    assert 3 <= short.horizon < narrow.horizon / 5 and short.closer < -6
+    assert found.steps_per_bit == pytest.approx(np.log(2) / 0.024, rel=0.3)
+    with pytest.raises(KeyError):
+        found.of("float16")
+
+
+@pytest.mark.slow
+def test_a_planted_wrong_decision_of_a_run_is_its_horizon(flint, monkeypatch):
+    run = taped(build(liquid()), 60)
+    for row in range(0, run.tape.flips, 7):
+        kept = np.arange(run.tape.flips) != row
+        columns = {name: getattr(run.tape, name)[kept] for name in ("step", "key", "entered")}
+        planted = replace(run, tape=replace(run.tape, **columns))
+        monkeypatch.setattr(exact_bounds, "taped", lambda *_, planted=planted: planted)
+        (found,) = certify(liquid(), 60, {"planted": {}}).ranking
+        assert found.horizon == run.tape.step[row]
+        i, j = found.decision.subject
+        assert i * run.tape.atoms + j == run.tape.key[row]
+
+
+@pytest.mark.slow
+def test_two_precisions_prove_the_same_long_history(flint):
+    exact = ExactProgram(build(liquid()))
+    assert first_difference(exact.run(1200).tape, exact.run(1200, bits=900).tape) is None
+    found = certify(liquid(), 1200, {"float32": MD_POLICIES["float32"], "float64": {}})
+    wide, narrow = found.of("float64").horizon, found.of("float32").horizon
+    assert narrow is not None and wide is not None and wide > 3 * narrow
+
+
+def test_steps_and_systems_that_cannot_be_certified(flint):
+    with pytest.raises(InputError, match="steps = 0"):
+        certify(liquid(), 0)
+    with pytest.raises(InputError, match="864 atoms"):
+        certify(load("argon/liquid-864", world="md"), 10)
+
+
+def test_narrow_balls_leave_and_wide_ones_stay():
+    """The steps at which plain rationals say that 16 bits leave (tests of the ball's record)."""
+    given = {
+        "contact.k": 512.0, "integrator.timestep": 2.0**-6, "start.height": 0.40625, "flight.gravity": 9.75
+    }  # fmt: skip
+    system = load("ball/drop", given, world="ball")
+    found = certify(system, 300, {name: BALL_POLICIES[name] for name in ("float16", "float64", "bfloat16")})
+    horizons = {row.name: row.horizon for row in found.ranking}
+    assert horizons == {"float64": None, "float16": 170, "bfloat16": 66}
+    assert list(horizons) == ["float64", "float16", "bfloat16"]
+    row = found.of("float16")
+    assert (row.decision.channel, row.decision.subject) == ("contact", (0,)) and abs(row.margin) < 0.05
+    assert row.separation[0] == 0 and row.separation[-1] > 0 and found.exact.contact.sum() > 30
+    (cannot,) = certify(load("ball/stiff", world="ball"), 2, {"float16": BALL_POLICIES["float16"]}).ranking
+    assert cannot.reason_unavailable is not None and cannot.horizon is None
+
+
+# --- bounds -------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=30)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    offset=st.floats(-4, 4),
+    compare=st.sampled_from(CONVENTIONS),
+    roles=st.sampled_from([("float64", "float64"), ("float32", "float32"), ("float64", "float32")]),
+)
+def test_a_decision_further_away_than_its_bound_is_the_exact_one(seed, offset, compare, roles):
+    state, dtype = roles
+    cell = Cell.create(TILTED)
+    radius = 2.3
+    decider = PairDecider((radius,), compare, dtype, cell.reach(np.zeros((0, 3))), state)
+    rng = np.random.default_rng(seed)
+    start = rng.random(3) @ TILTED
+    direction = rng.standard_normal(3)
+    # some roundings away from the cutoff, across a face or not
+    r = radius * (1 + offset * float(np.finfo(dtype).eps))
+    end = start + r * direction / np.linalg.norm(direction)
+    end = end - np.floor(end @ np.asarray(cell.inverse)) @ TILTED
+    start, end = (a.astype(state) for a in (start, end))
+    d = HostCell(cell, dtype).displacement(start[None], end[None])
+    quantity = float(decider.host_quantity(*d)[0])
+    value = decider.thresholds[0].value
+    margin = Fraction(value) - Fraction(quantity)
+    exact, inside = exact_margin(decider, cell, start, end)
+    # the sign of the exact margin is the exact decision
+    assert inside == (exact >= 0 if compare.endswith("<=") else exact > 0)
+    assert abs(margin - exact) <= decider.bounds[0]
+    if abs(margin) > decider.bounds[0]:
+        assert bool(decider.inside(quantity, value)) == inside
+
+
+def test_horizons_of_a_narrow_run_and_a_wide_one():
+    narrow, wide = (certified_horizon(simulation(policy), 400) for policy in (NARROW, None))
+    assert wide.horizon is None and wide.wrong is None and wide.total == 0
+    assert narrow.horizon is not None and narrow.total == len(narrow.decisions) > 0
+    first = narrow.decisions[0]
+    assert first.step == narrow.horizon and abs(first.margin) <= first.bound
+    assert narrow.closest[: narrow.horizon].min() > narrow.bounds[0]
+    for one in narrow.decisions:
+        assert abs(one.margin - one.exact) <= one.bound
+        # r2 < : inside where the exact margin is above zero
+        assert one.wrong == (one.inside != (one.exact > 0))
+    if narrow.wrong is not None:
+        assert narrow.wrong >= narrow.horizon
+    # the recorder counts what is listed
+    recorder = PairRecorder(simulation(NARROW))
+    segments = Engine(simulation(NARROW), 400).segments()
+    assert sum(int(recorder.ambiguous(segment).sum()) for segment in segments) == narrow.total
+    assert narrow.bounds == simulation(NARROW).decider.bounds
+
+
+def test_a_wrong_decision_is_found(monkeypatch: pytest.MonkeyPatch):
+    """Margins of the opposite sign, planted: every ambiguous decision is then wrong."""
+    honest = certified_horizon(simulation(NARROW), 400)
+    assert honest.total
+
+    def planted(*given):
+        margin, inside = exact_margin(*given)
+        return -margin, not inside
+
+    monkeypatch.setattr(exact_bounds, "exact_margin", planted)
+    found = certified_horizon(simulation(NARROW), 400)
+    assert [one.wrong for one in found.decisions] == [not one.wrong for one in honest.decisions]
+
+
+def test_what_gives_no_bound_is_refused():
+    unsafe = replace(simulation(), rule=replace(simulation().rule, every=5))
+    with pytest.raises(InputError, match="may leave pairs out"):
+        certified_horizon(unsafe, 10)
