@@ -20,6 +20,9 @@ from mdnum.trajectories.rules import Capped, CutoffRule, Nearest
 from mdnum.trajectories.source import open_trajectory
 from mdnum.trajectories.tracker import Tracker
 
+# a liquid at every step takes longer to run than all the rest
+STRIDES = pytest.mark.parametrize("stride", [pytest.param(1, marks=pytest.mark.nightly), 4])
+
 TILTED = np.array([[9.0, 0, 0], [2.3, 8.1, 0], [-1.7, 3.3, 10.9]])
 
 
@@ -160,10 +163,10 @@ def quantized(positions, step):
     return np.round(positions / step) * step
 
 
-@pytest.mark.parametrize(("stride", "timestep"), [(1, 0.005), (4, 0.005)])
-def test_what_the_grid_of_an_xtc_does_to_flips(stride, timestep):
+@STRIDES
+def test_what_the_grid_of_an_xtc_does_to_flips(stride):
     # sigma = 1 Å and 0.001 nm: 43 % hidden and 57 % of those in the file made up, at every step
-    positions, length = liquid(60 if stride == 1 else 20, timestep, stride)
+    positions, length = liquid(60 if stride == 1 else 20, 0.005, stride)
     kept = quantized(positions, 0.01)
     missed, invented = missed_and_invented(memberships(positions, length), memberships(kept, length))
     frames = frames_of(kept[:8], length * np.eye(3))
@@ -178,9 +181,9 @@ def test_what_the_grid_of_an_xtc_does_to_flips(stride, timestep):
 
 
 @pytest.mark.parametrize(("k", "within"), [(4, 0.03), (12, 0.08)])
-@pytest.mark.parametrize(("stride", "timestep"), [(1, 0.005), (4, 0.005)])
-def test_what_the_grid_does_among_the_nearest(k, within, stride, timestep):
-    positions, length = liquid(60 if stride == 1 else 20, timestep, stride)
+@STRIDES
+def test_what_the_grid_does_among_the_nearest(k, within, stride):
+    positions, length = liquid(60 if stride == 1 else 20, 0.005, stride)
     kept = quantized(positions, 0.01)
 
     def neighbors(x):

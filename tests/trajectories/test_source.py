@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tracemalloc
 import warnings
+from pathlib import Path
 
 import ase.io
 import MDAnalysis
@@ -329,3 +330,25 @@ def test_a_format_whose_package_is_missing_names_it(kind, package):
         trajectory = open_trajectory(getattr(datafiles, kind), topology)
         universe = MDAnalysis.Universe(*(one for one in (topology, getattr(datafiles, kind)) if one))
         np.testing.assert_array_equal(next(trajectory.frames()).positions, universe.trajectory[0].positions)
+
+
+def test_the_libraries_still_lose_what_mdnum_reads_itself(tmp_path):
+    """The reasons for readers of mdnum's own: when one of these fails, a reader can go."""
+    text = Path(datafiles.two_water_gro).read_text().rstrip() + "\n"
+    (tmp_path / "two.gro").write_text(text * 2)
+    assert len(list(open_trajectory(tmp_path / "two.gro").frames())) == 2
+    assert MDAnalysis.Universe(tmp_path / "two.gro").trajectory.n_frames == 1
+    try:
+        images = ase.io.read(tmp_path / "two.gro", index=":", format="gromacs")
+    except Exception:
+        images = []
+    assert len(images) < 2
+    # every digit of a dump
+    dump = MDAnalysis.Universe(datafiles.LAMMPSDUMP, format="LAMMPSDUMP").trajectory.ts.positions
+    ours = next(iter(open_trajectory(datafiles.LAMMPSDUMP).frames())).positions
+    assert dump.dtype == np.float32 and (ours != ours.astype(np.float32)).any()
+    # Amber's file of a run that was killed
+    whole = Path(datafiles.NCDF).read_bytes()
+    (tmp_path / "cut.nc").write_bytes(whole[: int(0.7 * len(whole))])
+    with pytest.raises((ValueError, OSError, TypeError)):
+        MDAnalysis.Universe(datafiles.PRMncdf, tmp_path / "cut.nc", format="NCDF")
