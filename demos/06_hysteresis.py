@@ -18,7 +18,7 @@ from mdnum.ball import (
     simulate,
 )
 from mdnum.precision import RolePrecision
-from mdnum.precision.reductions import Reduction, make
+from mdnum.precision.reductions import Reduction, parse
 from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
 
 #: A ball that rests on a soft spring and is shaken: it wavers about the floor.
@@ -72,7 +72,7 @@ def run() -> Demo:
     """Flips of both channels with one threshold and with two."""
     contact: dict[float, BallRun] = {0.0: shaken(None)} | {lift: shaken(lift) for lift in LIFTS}
     rows = {lift: len(one.contacts) for lift, one in contact.items()}
-    stop = {gap: [pressed(make(order), gap) for order in ORDERS] for gap in (None, *GAPS)}
+    stop = {gap: [pressed(parse(order), gap) for order in ORDERS] for gap in (None, *GAPS)}
     starts = {gap: flips(runs[0].iterations > 0) for gap, runs in stop.items()}
     apart = {gap: int(np.sum(runs[0].iterations != runs[1].iterations)) for gap, runs in stop.items()}
     left = {gap: float(np.mean(runs[0].residual.astype(np.float64))) for gap, runs in stop.items()}

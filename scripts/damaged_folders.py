@@ -148,7 +148,7 @@ KINDS: dict[str, Callable[[Path], None]] = {
 
 def readers(kind: str) -> tuple[tuple[str, ...], ...]:
     """The commands that read a folder of a kind; "folder" and "other" stand for it and one like it."""
-    report, fork = ("report", "folder"), ("fork", "folder", "other", "--json")
+    report, fork = ("report", "folder"), ("fork", "compare", "folder", "other", "--json")
     resume = ("run", "--resume", "folder", "--no-check", "--no-report")
     return {
         "finished": (

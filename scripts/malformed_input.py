@@ -355,7 +355,7 @@ COMMANDS = (
     ["run", "pair/at-cutoff", "-o", "\0"],
     ["systems", "check", "pair/at-cutoff", "--set", "\x1b]0;x\x07=1"],
     ["fork", "pair/at-cutoff", "--vary", "\x1b[31m"],
-    ["fork", "pair/at-cutoff", "--along", "cutoff.radius=\x1b:2"],
+    ["fork", "map", "pair/at-cutoff", "cutoff.radius=\x1b:2"],
     ["grad", "pair/at-cutoff", "--of", "\x1b[31m"],
     ["flips", "\x1b[31m.xtc"],
     ["flips", "x" * 5000],

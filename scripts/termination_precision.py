@@ -31,7 +31,7 @@ from mdnum.ball import BallProblem, GlobalSum, Projection, ResidualPenetration, 
 from mdnum.gradients.ball import ThroughIterations
 from mdnum.precision import RolePrecision
 from mdnum.precision.policy import ALL
-from mdnum.precision.reductions import make
+from mdnum.precision.reductions import parse
 
 ORDERS = ("sequential", "pairwise", "exact")
 SHAKE = 3.0
@@ -53,7 +53,7 @@ class Row:
 def pose(state: str, kind: str, order: str, balls: int, steps: int, tol: float) -> BallProblem:
     """Balls shaken by a seeded random acceleration; only the residual's sum differs from call to call."""
     policy = RolePrecision(state, state, kind, kind, "float64")
-    contact = Projection(0.5, 0.5, GlobalSum(tol, 200, make(order)))
+    contact = Projection(0.5, 0.5, GlobalSum(tol, 200, parse(order)))
     control = SHAKE * np.random.default_rng(0).normal(size=(steps, balls))
     world = World.create(contact, SemiImplicitEuler(0.01), control=control, policy=policy)
     return BallProblem(world, np.zeros(balls), 0.0, steps, ResidualPenetration(1))

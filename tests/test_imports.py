@@ -54,8 +54,8 @@ def test_importing_brings_in_neither_jax_nor_jax_md(code: str):
 def test_a_fork_of_a_ball_brings_in_no_molecular_dynamics():
     """Every module that it runs, those that are imported late included."""
     loaded = _modules_after(
-        "import mdnum.cli.fork_ball, mdnum.workflow.fork_ball, mdnum.forks.choices, mdnum.forks.screen\n"
-        "import mdnum.forks.boundaries, mdnum.forks.exact.certify, mdnum.report.fork.ball\n"
+        "import mdnum.cli.fork, mdnum.workflow.fork_map, mdnum.workflow.fork_certify, mdnum.forks.choices\n"
+        "import mdnum.forks.boundaries, mdnum.forks.exact.certify, mdnum.forks.screen\n"
         "assert not [name for name in sys.modules if name.startswith(('mdnum.md', 'mdnum.rollout'))]\n"
     )
     assert "jax" in loaded and "jax_md" not in loaded

@@ -29,7 +29,7 @@ _check = typer.Typer(help="Compare a system with ASE and other codes.", **_PLAIN
 
 app.command("run")(run.run)
 app.command("ball")(ball.ball)
-app.command("fork")(fork.fork)
+app.add_typer(fork.fork, name="fork")
 app.command("grad")(grad.grad)
 app.command("flips")(flips.flips)
 app.command("audit")(audit.audit)

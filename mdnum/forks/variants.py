@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mdnum.errors import InputError, MdnumError
-from mdnum.forks.programs import ProgramName
+from mdnum.forks.child import ProgramName
 from mdnum.md.cell import Cell, displacement
 from mdnum.safe_path import environment, python
 from mdnum.systems.load import System
@@ -176,8 +176,8 @@ def variants(
 
 
 def _process(variant: Variant, folder: Path, k: int, steps: int) -> tuple[Ran, np.ndarray | None]:
-    task = {
-        "system": str(folder / "system"),
+    question = {
+        "path": str(folder / "system"),
         "steps": steps,
         "program": variant.program,
         "reduction": variant.reduction,
@@ -185,15 +185,17 @@ def _process(variant: Variant, folder: Path, k: int, steps: int) -> tuple[Ran, n
     }
     flags = " ".join([os.environ.get("XLA_FLAGS", ""), *variant.flags]).strip()
     # a program cached by another variant must not answer for this one; these flags are a CPU's
-    told = {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "JAX_ENABLE_COMPILATION_CACHE": "false"}
+    settings = {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "JAX_ENABLE_COMPILATION_CACHE": "false"}
     begin = time.perf_counter()
-    command = python("-m", "mdnum.forks.programs", json.dumps(task))
-    words = ""
+    file = folder / f"{k}.json"
+    file.write_text(json.dumps(question))
+    command = python("-m", "mdnum.forks.child", str(file))
+    failed = ""
     try:
-        # nothing that a child says may reach the output of the parent
+        # nothing that a child prints may reach the output of the parent
         done = subprocess.run(
             command,
-            env=environment(**told),
+            env=environment(**settings),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
@@ -202,15 +204,15 @@ def _process(variant: Variant, folder: Path, k: int, steps: int) -> tuple[Ran, n
             timeout=_TIMEOUT,
         )
     except subprocess.TimeoutExpired:
-        words = f"took longer than {_TIMEOUT} s"
+        failed = f"took longer than {_TIMEOUT} s"
     else:
         if done.returncode:
-            said = [line for line in done.stderr.splitlines() if line.strip()]
-            words = said[-1].strip() if said else f"ended with exit code {done.returncode}"
+            lines = [line for line in done.stderr.splitlines() if line.strip()]
+            failed = lines[-1].strip() if lines else f"ended with exit code {done.returncode}"
     seconds = time.perf_counter() - begin
-    if words:
-        return Ran(variant, (), -1, None, float("nan"), seconds, words), None
-    x = np.load(task["out"])
+    if failed:
+        return Ran(variant, (), -1, None, float("nan"), seconds, failed), None
+    x = np.load(question["out"])
     hashes = tuple(hashlib.sha256(np.ascontiguousarray(row).tobytes()).hexdigest() for row in x)
     if not hashes:
         return Ran(variant, (), -1, None, float("nan"), seconds, "the skin was used up at once"), None

@@ -6,7 +6,6 @@ parameters (randomized); those of other contacts are in `ball_contacts`, that of
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
@@ -24,6 +23,7 @@ from mdnum.ball.world import World
 from mdnum.errors import InputError, MdnumError
 from mdnum.gradients.dependence import dependence, follow
 from mdnum.gradients.problem import Gradient, Kind
+from mdnum.numerics.scaling import check_scale, scaled_gradient
 from mdnum.registry import Registry
 
 
@@ -174,11 +174,8 @@ def evaluate(values, world, y0, v0, decisions, steps, loss):
 def differentiate(values, world, y0, v0, decisions, steps, loss, names, scale):
     """Loss and reverse-mode derivative under loss scaling, and what the run used, as one compiled program."""
     function, rest = _Rollout(steps, loss), (world, y0, v0, decisions)
-    value, pullback = jax.vjp(lambda values: function(values, *rest), values)
-    # the scale is the cotangent that the reverse pass starts with; a power of two, so that unscaling is exact
-    (gradient,) = pullback(scale.astype(value.dtype))
-    gradient = jax.tree.map(lambda g: g.astype(jnp.float64) / jnp.broadcast_to(scale, g.shape), gradient)
-    return value, gradient, follow(function, values, rest, names)
+    made = scaled_gradient(lambda values: function(values, *rest), scale, values)
+    return made, follow(function, values, rest, names)
 
 
 def used(
@@ -302,14 +299,13 @@ def scaled(
         InputError: it is not.
     """
     values, start = origin(problem, names), start_of(problem)
-    if not (scale > 0 and math.frexp(scale)[0] == 0.5):
-        raise InputError(f"a scale of {scale:g} is not a power of two", remedy="Give one: then it is exact")
+    check_scale(scale)
     factor = jnp.asarray(scale, jnp.float64)
-    value, gradient, marks = differentiate(
+    made, marks = differentiate(
         values, problem.world, *start, decisions, problem.steps, problem.loss, tuple(names), factor
     )
-    slopes = {name: float(gradient[name]) for name in names}
-    return Scaled(float(value), slopes, np.asarray(marks))
+    slopes = {name: float(made.gradient[name]) for name in names}
+    return Scaled(float(made.value), slopes, np.asarray(marks))
 
 
 def pinned_differences(problem: BallProblem, names: Sequence[str], decisions) -> dict[str, float]:

@@ -24,7 +24,7 @@ from mdnum.events import Ledger
 from mdnum.gradients.losses import Loss, LossContext, LossFrame
 from mdnum.md.latticestep import LatticeLangevin
 from mdnum.md.verlet import PairTable
-from mdnum.rollout.backward import Backward, Stretched
+from mdnum.rollout.backward import BackwardRun, Stretched
 from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, first_state, resume_point
 from mdnum.rollout.flips import PairRecorder
 from mdnum.systems.build import Simulation
@@ -313,7 +313,7 @@ class ReversibleTape(RunTape):
     def backward(self) -> Iterator[TapeStretch]:
         # the initial bath is empty
         baths = {**self.baths, 0: np.zeros((3, self.simulation.atoms), np.int64)}
-        way = Backward(self.simulation, self._end, baths)
+        way = BackwardRun(self.simulation, self._end, baths)
         self.stretches = 0
         for made in way.stretches():
             self._compare(made)

@@ -14,8 +14,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from mdnum.errors import FolderError
-from mdnum.store import manifest
-from mdnum.store.atomic import disk_errors, opened, replacing, subfolder
+from mdnum.store import files as manifest
+from mdnum.store.files import disk_errors, opened, replacing, subfolder
 
 _FLOAT, _INT, _SHORT, _BOOL, _TEXT = pa.float64(), pa.int64(), pa.int32(), pa.bool_(), pa.string()
 
@@ -58,8 +58,8 @@ COLUMNS: Mapping[str, Mapping[str, pa.DataType]] = MappingProxyType(
         "heights": _columns(step=_INT, ball=_SHORT, y=_FLOAT, v=_FLOAT),
         "separations": _columns(variant=_TEXT, step=_INT, separation=_FLOAT),
         "separation": _columns(
-            step=_INT, time=_FLOAT, free=_FLOAT, handed=_FLOAT, back=_FLOAT, cross=_INT, overridden=_FLOAT,
-            furthest=_FLOAT, energy_a=_FLOAT, energy_b=_FLOAT, energy_handed=_FLOAT,
+            step=_INT, time=_FLOAT, free=_FLOAT, imposed=_FLOAT, back=_FLOAT, cross=_INT, overridden=_FLOAT,
+            furthest=_FLOAT, energy_a=_FLOAT, energy_b=_FLOAT, energy_imposed=_FLOAT,
         ),
         "cross_flips": _columns(
             step=_INT, i=_SHORT, j=_SHORT, differs=_BOOL, run=_TEXT, entered=_BOOL, margin=_FLOAT,
@@ -81,8 +81,8 @@ COLUMNS: Mapping[str, Mapping[str, pa.DataType]] = MappingProxyType(
         ),
         "points": _columns(at=_FLOAT, history=_INT, loss=_FLOAT, energy=_FLOAT),
         "variants": _columns(
-            variant=_TEXT, program=_TEXT, flags=_TEXT, reduction=_TEXT, cluster=_INT, seed=_INT, steps=_INT,
-            separation=_FLOAT, seconds=_FLOAT, hash=_TEXT, failed=_TEXT,
+            variant=_TEXT, program=_TEXT, flags=_TEXT, reduction=_TEXT, cluster=_INT, first_bit=_INT,
+            steps=_INT, separation=_FLOAT, seconds=_FLOAT, hash=_TEXT, failed=_TEXT,
         ),
         "variant_separations": _columns(variant=_TEXT, step=_INT, separation=_FLOAT),
         "policies": _columns(
@@ -178,9 +178,11 @@ TABLES: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "md": ("series", "flips", "epochs"),
         "ball": ("steps", "contacts", "solver", "heights", "separations"),
         "demos": ("curves",),
-        "ball-fork": ("separation", "cross_flips", "around"),
-        "fork": ("separation", "cross_flips", "ambiguous_pairs", "neighborhood"),
-        "along": ("boundaries", "intervals", "points"),
+        "fork": ("separation", "cross_flips"),
+        "screen": (),
+        "compare": (),
+        "benign": (),
+        "map": ("boundaries", "intervals", "points"),
         "processes": ("variants", "variant_separations"),
         "certify": ("policies", "ambiguous", "policy_separations"),
         "forecast": ("foretold", "reach"),

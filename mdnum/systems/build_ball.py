@@ -14,8 +14,8 @@ from mdnum.ball import contacts, integrators, limits, stopping
 from mdnum.ball.problem import BallLoss, BallProblem, FinalHeight, MeanHeight, ResidualPenetration
 from mdnum.ball.world import World
 from mdnum.errors import InputError
-from mdnum.precision import neighbor, reductions
-from mdnum.precision.policy import RolePrecision
+from mdnum.numerics import neighbor, reductions
+from mdnum.numerics.roles import RolePrecision
 from mdnum.systems import ball, ball_checks
 from mdnum.systems.ball_system import BallSystem
 from mdnum.systems.load import load
@@ -142,12 +142,8 @@ def start(spec: ball.BallSpec) -> tuple[Float[np.ndarray, "balls"], Float[np.nda
     return np.broadcast_to(height, count).copy(), np.broadcast_to(velocity, count).copy()
 
 
-def _on_the_boundary(spec: ball.BallSpec, boundary: ball.Boundary) -> Float[np.ndarray, "balls"]:
-    """One penetration an ulp short of the tolerance, and the ulp in equal parts.
-
-    Summed largest first, each part is less than half an ulp of the sum and is rounded away; their exact sum
-    is the tolerance.
-    """
+def _on_the_boundary(spec: ball.BallSpec, boundary: ball.BoundaryTable) -> Float[np.ndarray, "balls"]:
+    """One penetration an ulp short of the tolerance, and the ulp in equal parts."""
     assert spec.stop is not None and not isinstance(spec.stop, ball.FixedRule)
     tol = spec.stop.tol
     below = float(np.nextafter(np.asarray(tol, limits.DTYPES[boundary.format]), 0))
@@ -208,7 +204,7 @@ def stop_rule(spec: ball.BallSpec) -> Any:
     return rule if table.enter is None else stopping.HysteresisStop(rule, table.enter)
 
 
-def _loss(table: ball.Loss) -> BallLoss:
+def _loss(table: ball.LossTable) -> BallLoss:
     if table.kind == "mean-height":
         return MeanHeight()
     if table.kind == "residual-penetration":

@@ -431,7 +431,7 @@ def _ball_system(
 
     from mdnum.systems import BallSystem, ball, ball_checks, load
 
-    kinds = get_args(ball.Loss.model_fields["kind"].annotation)
+    kinds = get_args(ball.LossTable.model_fields["kind"].annotation)
     if of is not None and of not in kinds:
         raise InputError(f"no loss {of!r} of a ball", remedy=f"There are {', '.join(kinds)}")
     changes: dict[str, Any] = {} if of is None else {"loss.kind": of}

@@ -9,7 +9,7 @@ from small_systems import LENNARD_JONES, crystal, make
 
 from mdnum.errors import InputError
 from mdnum.forks.boundaries import boundaries
-from mdnum.forks.confirm import digests, digests_elsewhere
+from mdnum.forks.child import digests, digests_elsewhere
 from mdnum.forks.worlds import program_of
 from mdnum.rollout.dials import names
 from mdnum.rollout.engine import Engine
@@ -130,7 +130,7 @@ def test_the_radius_is_turned_without_compiling_and_agrees_with_the_program_prop
     number = program_of(meeting()).number("radius")
     assert number.compiles
     for value in (2.27, 2.29):
-        assert list(digests(meeting(), "radius", 12, [value])) == [number.at(value).history(12).digest]
+        assert digests(meeting(), "radius", 12, [value]) == [number.at(value).history(12).digest]
     assert all(boundary.confirmed for boundary in found.boundaries)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mdnum.errors import InputError, MdnumError
-from mdnum.forks.programs import positions_of
+from mdnum.forks.child import positions_of
 from mdnum.forks.variants import REFERENCE, VARIANTS, Ran, Variant, _causes, _clustered, variants
 from mdnum.rollout.engine import Engine
 from mdnum.systems.build import build

@@ -20,8 +20,8 @@ STEPS = 1500
 #: From here on the nearest pair is closer to its cutoff than the runs can have moved it.
 NEAR = 390
 SHARES = [
-    {"what": "decisions", "reference": "A", "steps": 179, "at_least": True, "nats": 3.58},
-    {"what": "arithmetic", "reference": "B", "steps": -1, "at_least": False, "nats": -0.02},
+    {"what": "decisions", "reference": "A", "steps": 179, "at_least": True, "e_foldings": 3.58},
+    {"what": "arithmetic", "reference": "B", "steps": -1, "at_least": False, "e_foldings": -0.02},
 ]
 LYAPUNOV = {
     "rate": 0.019, "error": 0.0004, "rate_time": 1.9, "error_time": 0.04, "steps": 750, "chaotic": True,
@@ -46,8 +46,7 @@ def two_by_two(split: int | None) -> list[dict[str, Any]]:
     rows = (("A", "A", "A", None), ("B", "B", "A", split), ("B", "A", "A", None), ("A", "A", "B", split),
             ("B", "B", "B", None), ("B", "A", "B", split and split - 1))  # fmt: skip
     return [
-        {"arithmetic": x, "decisions": y, "from": z, "same": x == y == z, "split": at, "until": STEPS}
-        for x, y, z, at in rows
+        {"arithmetic": x, "decisions": y, "reference": z, "split": at, "until": STEPS} for x, y, z, at in rows
     ]
 
 
@@ -55,15 +54,15 @@ def make_fork(
     path: Path,
     *,
     summary: dict[str, Any] | None = None,
-    handed: bool = True,
+    imposed: bool = True,
     forks: bool = True,
     toml: str = TOML,
 ) -> RunFolder:
-    """Writes a folder as `mdnum fork` would: the free runs jump at the fork, those told A's decisions do not.
+    """Writes a folder as `mdnum fork` would: free runs jump at the fork, those under A's decisions do not.
 
     Args:
         summary: entries that replace the honest ones.
-        handed: with a counterfactual.
+        imposed: with a counterfactual.
         forks: with a fork; else the separation stays small.
     """
     step = np.arange(STEPS + 1)
@@ -78,13 +77,13 @@ def make_fork(
     folder.append(
         "separation",
         {
-            "step": step, "time": 0.01 * step, "free": free, "handed": quiet if handed else nothing,
+            "step": step, "time": 0.01 * step, "free": free, "imposed": quiet if imposed else nothing,
             "back": nothing, "cross": np.where(after, 1 + (step - FORK) // 50, 0),
-            "overridden": np.where(step % 200 == 0, after, False).astype(float) if handed else nothing,
-            "furthest": np.where((step % 200 == 0) & after, 1e-8, 0.0) if handed else nothing,
+            "overridden": np.where(step % 200 == 0, after, False).astype(float) if imposed else nothing,
+            "furthest": np.where((step % 200 == 0) & after, 1e-8, 0.0) if imposed else nothing,
             "energy_a": np.full(len(step), -5.0), "energy_b": -5.0 + free,
-            "energy_handed": -5.0 + quiet if handed else nothing,
-            "handed_from_b": free if handed else nothing, "back_from_a": nothing,
+            "energy_imposed": -5.0 + quiet if imposed else nothing,
+            "imposed_from_b": free if imposed else nothing, "back_from_a": nothing,
             "nearest_a": np.where(step < NEAR, 1e-6, 1e-9), "nearest_b": np.full(len(step), 1e-6),
             "ambiguous_a": np.zeros(len(step)), "ambiguous_b": np.where(step > 70, 2.0, 0.0),
             "repeat_1": 1.1 * free,
@@ -121,26 +120,28 @@ def make_fork(
     }
     folder.write_summary(
         {
-            "world": "fork", "system": "argon/synthetic", "about": "Nothing but exponentials.",
+            "system": "argon/synthetic", "about": "Nothing but exponentials.",
             "choice": "reduction=exact", "choice_about": "force sums exact", "must_hold": False,
             "difference": "force sums exact, not sequential",
             "changes": {"precision.reduction": ["sequential", "exact"]}, "atoms": 108, "steps": STEPS,
-            "steps_asked": STEPS, "timestep": 0.01, "units": "lj", "r_cut": 1.5, "seed": SEED,
-            "seed_time": 0.01 * SEED, "fork": FORK if forks else None, "fork_time": 4.0 if forks else None,
+            "steps_asked": STEPS, "timestep": 0.01, "units": "lj", "r_cut": 1.5, "first_bit": SEED,
+            "first_bit_time": 0.01 * SEED, "fork": FORK if forks else None,
+            "fork_time": 4.0 if forks else None,
             "split": split, "split_time": None if split is None else 0.01 * split, "tolerance": TOLERANCE,
-            "decision": DECISION if forks else None, "verdict": "cause" if forks else "no fork",
+            "decision": DECISION if forks else None, "effect": "cause" if forks else "no fork",
             "reasons": ["free, split at step 1321; under the first run's decisions not", "and so on"],
             "growth_rate": RATE if forks else None, "growth_rate_time": RATE / 0.01 if forks else None,
             "r_squared": 0.99 if forks else None, "growth": {"B": fit if forks else dict.fromkeys(fit)},
-            "predicted_split": None, "splits": {"B": split, "B|A": None} if handed else {"B": split},
-            "nats": None, "count": None, "repeated": [],
-            "handed_until": STEPS if handed else None, "handed_largest": SIZE,
+            "predicted_split": None, "predicted_by": None,
+            "splits": {"B": split, "B|A": None} if imposed else {"B": split},
+            "e_foldings": None, "count": None, "repeated": [],
+            "imposed_until": STEPS if imposed else None, "imposed_largest": SIZE,
             "separation_end": float(free[-1]),
             "separation_largest": float(free.max()), "overridden": 6, "cross_flips": 7_000 if forks else 0,
             "cross_flips_kept": 7_000 if forks else 0,
-            "table": two_by_two(split) if handed else [], "shares": SHARES if split and handed else [],
+            "table": two_by_two(split) if imposed else [], "shares": SHARES if split and imposed else [],
             "certified_horizon": {"A": STEPS, "B": 70}, "ambiguous": {"A": 0, "B": 2 * (STEPS - 70)},
-            "ambiguous_steps": {"A": 0, "B": STEPS - 70}, "ambiguous_kept": {"A": 0, "B": 2 * (STEPS - 70)},
+            "ambiguous_steps": {"A": 0, "B": STEPS - 70},
             "ambiguous_first": {
                 "A": None, "B": {"step": 71, "i": 5, "j": 8, "margin": 1.5e-7, "bound": 6e-6},
             },
@@ -157,27 +158,28 @@ def make_fork(
 
 DECISION: dict[str, Any] = {
     "channel": "pair", "step": FORK, "run": "B", "i": 3, "j": 4, "entered": True, "space": "r2",
-    "margin": 3e-10, "bound": 2e-15, "ambiguous": False, "margins": {"A": -6e-10, "B": 3e-10},
+    "margin": 3e-10, "bound": 2e-15, "ambiguous": False, "decided": {"A": 0, "B": 1},
+    "protects": 2, "margins": {"A": -6e-10, "B": 3e-10},
     "bounds": {"A": 2e-15, "B": 2e-15}, "ambiguous_in": [], "cutoffs": {"A": 1.5, "B": 1.5},
-    "distance": 1.4999999999, "margin_length": 1e-10, "bound_length": 7e-16, "separation_before": 1e-9,
+    "distance": 1.4999999999, "margin_length": 1e-10, "separation_before": 1e-9,
     "protected": 0.1, "also": 0,
 }  # fmt: skip
 
 
 def make_screen(path: Path, summary: dict[str, Any] | None = None) -> RunFolder:
     """Writes the folder of a screening."""
-    folder = RunFolder.create(path, world="fork")
+    folder = RunFolder.create(path, world="screen")
     folder.write_system(TOML)
     folder.finalize()
     folder.write_summary(
         {
-            "world": "fork", "system": "argon/synthetic", "about": "Nothing.", "choice": "all", "atoms": 108,
+            "system": "argon/synthetic", "about": "Nothing.", "atoms": 108,
             "steps": 1000, "steps_asked": 1000, "timestep": 0.01, "units": "lj",
             "ranking": [
-                ranked("precision.state", seed=0, fork=303, split=900), ranked("skin", seed=1),
-                ranked("order@exact", must_hold=True), ranked("ulps=dynamics.temperature:+1", seed=0),
+                ranked("precision.state", first_bit=0, fork=303, split=900), ranked("skin", first_bit=1),
+                ranked("order@exact", must_hold=True), ranked("ulps=dynamics.temperature:+1", first_bit=0),
             ],
-            "not_applicable": [{"choice": "noise", "why": "constant energy has none"}],
+            "not_applicable": [{"choice": "noise", "reason": "constant energy has none"}],
             "findings": [], "status": "complete", "seconds": 60.0,
         }
         | (summary or {})
@@ -188,6 +190,6 @@ def make_screen(path: Path, summary: dict[str, Any] | None = None) -> RunFolder:
 def ranked(choice: str, **entries: Any) -> dict[str, Any]:
     """A line of a ranking; by default of a choice that changes nothing."""
     return {
-        "choice": choice, "difference": f"{choice} differs", "seed": None, "fork": None, "split": None,
+        "choice": choice, "difference": f"{choice} differs", "first_bit": None, "fork": None, "split": None,
         "must_hold": False, "held": None, "steps": 1000, "failed": "",
     } | entries  # fmt: skip

@@ -12,7 +12,7 @@ import pytest
 from mdnum.ball import contacts, integrators, stopping
 from mdnum.ball import problem as losses
 from mdnum.errors import InputError
-from mdnum.precision.reductions import Blocked, Permuted
+from mdnum.numerics.reductions import Blocked, Permuted
 from mdnum.systems import build_ball, load
 from mdnum.systems.ball import BallSpec
 from mdnum.systems.build_ball import problem, start

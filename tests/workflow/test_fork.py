@@ -1,122 +1,146 @@
-"""A comparison into its folder: what is written agrees with what was followed, and what is refused."""
+"""A comparison into its folder, of either world: what is written agrees with what was followed."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+import sys
+import tomllib
+from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from command_line import call, printed
 
 import mdnum
 from mdnum.errors import FolderError, InputError
+from mdnum.events.chance import Delay
+from mdnum.events.forks import Dates, Growth
 from mdnum.forks import Twin, choices
 from mdnum.forks.screen import Screened
 from mdnum.forks.tangent import Lyapunov
+from mdnum.forks.worlds import program_of
+from mdnum.provenance import hashes
 from mdnum.rollout.engine import Engine
 from mdnum.store import RunFolder
-from mdnum.systems import build, load
-from mdnum.workflow import ForkResult, fork, fork_answers
+from mdnum.systems import load
+from mdnum.systems.load import copy
+from mdnum.workflow import fork_pair, frame
 
+#: `mdnum.workflow.fork` is the function.
+MODULE = sys.modules["mdnum.workflow.fork"]
 STEPS = 680
 #: Free runs only.
 BARE: dict[str, Any] = {"counterfactual": False, "repeats": 0}
+BALLS = """
+about = "Three balls."
+world = "ball"
+[start]
+height = [0.3, 0.301, 0.52]
+[contact]
+kind = "projection"
+k = 0.5
+[stop]
+rule = "sum"
+tol = 1e-3
+[integrator]
+kind = "semi-implicit-euler"
+timestep = 0.01
+steps = 120
+[fork]
+vary = "contact=earlier"
+split = 0.002
+"""
 
 
-@dataclass(frozen=True)
-class StandIn:
-    """A choice that makes what it is told to."""
+def use(monkeypatch, make, **looks):
+    """A choice that makes a twin of its own."""
 
-    twin: Any
-    must_hold: bool = False
-    name: str = "stand-in"
-    about: str = "for a test"
+    class StandIn(choices.Choice):
+        name = "stand-in"  # pyright: ignore
+        must_hold = looks.get("must_hold", False)
 
-    def why_not(self, system):
-        return None
+        def make(self, system):
+            return make(system)
 
-    def make(self, system):
-        return self.twin(system)
+    monkeypatch.setattr(choices, "parse", lambda text: StandIn())
 
 
-def use(monkeypatch, choice):
-    monkeypatch.setattr(choices, "parse", lambda text: choice)
+def codes(outcome) -> list[str]:
+    return [finding.code for finding in outcome.verdict.findings]
 
 
 @pytest.fixture(scope="module")
-def compared(tmp_path_factory) -> ForkResult:
+def crystal(tmp_path_factory):
     """float32 against float64 on the crystal, up to a little after the fork."""
     out = tmp_path_factory.mktemp("forks") / "crystal"
-    return mdnum.fork("argon/crystal-108", "precision", steps=STEPS, out=out, minimal=True, pin="fork")
+    return mdnum.fork("argon/crystal-108", steps=STEPS, out=out, minimal=True, pin="fork")
 
 
-def test_the_summary_says_what_was_followed(compared):
-    made, summary = compared.fork, compared.summary
-    assert made is not None and made.dates.fork is not None and made.dates.split is None
-    assert summary["world"] == "fork" and summary["status"] == "complete"
-    assert summary["system"] == "argon/crystal-108" and summary["choice"] == "precision"
-    assert (summary["seed"], summary["fork"], summary["split"]) == (1, made.dates.fork, None)
-    assert summary["fork_time"] == pytest.approx(0.004 * made.dates.fork)
-    assert summary["split_time"] is None
-    assert summary["verdict"] == "open" and summary["reasons"] == list(made.verdict.reasons)
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("systems") / "three.toml"
+    path.write_text(BALLS)
+    return path
+
+
+@pytest.fixture(scope="module")
+def balls(file, tmp_path_factory):
+    """What the system file asks for itself: its first contact a step earlier."""
+    return mdnum.fork(file, out=tmp_path_factory.mktemp("forks") / "three")
+
+
+def test_the_summary_says_what_was_followed(crystal):
+    made, summary = crystal.result, crystal.summary
+    assert made.dates.fork is not None and made.dates.split is None
+    assert summary["status"] == "complete"
+    # what is varied unless anything else is asked for
+    assert (summary["system"], summary["choice"]) == ("argon/crystal-108", "precision")
+    assert (summary["first_bit"], summary["fork"], summary["split"]) == (1, made.dates.fork, None)
+    assert summary["fork_time"] == pytest.approx(0.004 * made.dates.fork) and summary["split_time"] is None
+    assert summary["effect"] == "open" and summary["reasons"] == list(made.verdict.reasons)
     assert summary["growth_rate_time"] == pytest.approx(summary["growth_rate"] / 0.004)
     assert summary["changes"]["precision.force"] == ["float64", "float32"]
     assert summary["cross_flips"] == made.flips_total > 0
     assert set(summary["splits"]) == {"B", "B|A", "A|B"} and summary["repeated"] == []
-    assert [(cell["arithmetic"], cell["decisions"], cell["from"]) for cell in summary["table"]] == [
+    assert [(cell["arithmetic"], cell["decisions"], cell["reference"]) for cell in summary["table"]] == [
         ("A", "A", "A"), ("B", "B", "A"), ("B", "A", "A"), ("A", "B", "A"),
         ("A", "A", "B"), ("B", "B", "B"), ("B", "A", "B"), ("A", "B", "B"),
     ]  # fmt: skip
-    assert summary["shares"] == [] and summary["minimal"]["reason"] == "the runs did not split"
+    assert summary["shares"] == [] and summary["minimal"]["pairs"] is None
     # float32 decides: its own rounding is what makes it fork, and A is its shadow
     assert summary["certified_horizon"]["A"] == STEPS and summary["ambiguous"]["A"] == 0
     assert summary["certified_horizon"]["B"] < made.dates.fork and summary["ambiguous"]["B"] > 0
     assert summary["protected_until"] < made.dates.fork
     assert (summary["shadow"], summary["shadow_horizon"]) == ("A", made.dates.fork - 1)
-    assert summary["pinned"]["pairs"] == [[made.decision.i, made.decision.j]]
+    assert summary["pinned"]["pairs"] == [list(made.decision.subject)]
     assert summary["pinned"]["first"] == made.dates.fork and summary["pinned"]["split"] is None
     exponent = summary["lyapunov"]
     assert exponent["steps"] == 400 and exponent["rate_time"] == pytest.approx(exponent["rate"] / 0.004)
-    assert "HORIZON_SHORT" in [finding["code"] for finding in summary["findings"]]
-    assert summary["headline"].startswith(f"The runs fork at step {made.dates.fork}")
-    assert json.loads((compared.folder / "summary.json").read_text()) == summary
+    assert "HORIZON_SHORT" in codes(crystal)
+    assert json.loads((crystal.folder / "summary.json").read_text()) == summary
 
 
-def test_the_tables_hold_the_series(compared):
-    folder = RunFolder.open(compared.folder)
-    assert folder.world == "fork"
-    table, series = folder.read("separation"), compared.fork.series
-    assert table["step"].tolist() == list(range(STEPS + 1))
+def test_the_tables_hold_the_series(crystal):
+    folder = RunFolder.open(crystal.folder)
+    table, series = folder.read("separation"), crystal.result.series
     np.testing.assert_allclose(table["time"], 0.004 * np.arange(STEPS + 1))
-    for column, name in (("free", "B"), ("handed", "B|A"), ("back", "A|B"),
-                           ("energy_b", "energy B"), ("overridden", "overridden")):  # fmt: skip
+    for column, name in (("step", "step"), ("free", "B"), ("imposed", "B|A"), ("back", "A|B"),
+                         ("energy_b", "energy B"), ("overridden", "overridden"), ("nearest_a", "nearest A"),
+                         ("back_from_a", "A|B from A"), ("ambiguous_b", "ambiguous B")):  # fmt: skip
         np.testing.assert_array_equal(table[column], series[name])
-    for column, name in (("back_from_a", "A|B from A"), ("nearest_a", "nearest A"),
-                         ("ambiguous_b", "ambiguous B")):  # fmt: skip
-        np.testing.assert_array_equal(table[column], series[name])
-    doubts = folder.read("ambiguous_pairs")
-    first = compared.summary["ambiguous_first"]
-    assert first["A"] is None and first["B"] == {
-        name: doubts[name][0] for name in ("step", "i", "j", "margin", "bound")
-    }
-    assert set(doubts["run"]) == {"B"} and len(doubts["step"]) == compared.summary["ambiguous"]["B"]
+    doubts, first = folder.read("ambiguous_pairs"), crystal.summary["ambiguous_first"]
+    assert first["A"] is None and first["B"] == {name: doubts[name][0] for name in doubts if name != "run"}
+    assert set(doubts["run"]) == {"B"} and len(doubts["step"]) == crystal.summary["ambiguous"]["B"]
     assert (np.abs(doubts["margin"]) <= doubts["bound"]).all()
     np.testing.assert_array_equal(np.bincount(doubts["step"], minlength=STEPS + 1), table["ambiguous_b"])
     flips = folder.read("cross_flips")
-    assert len(flips["step"]) == compared.fork.flips_total
-    assert flips["step"][0] == compared.summary["fork"]
+    assert len(flips["step"]) == crystal.result.flips_total and flips["step"][0] == crystal.summary["fork"]
     # the pairs that differ are the flips that opened a difference less those that closed one
     change = np.where(flips["differs"], 1, -1)
     held = np.array([change[flips["step"] <= step].sum() for step in table["step"]])
     np.testing.assert_array_equal(held, table["cross"])
-
-
-def test_the_folder_is_a_system_that_loads_again(compared):
-    again = load(compared.folder)
-    assert again.name == "argon/crystal-108" and len(again.atoms) == 108
-    assert (compared.folder / "report.html").exists() and (compared.folder / "log.txt").exists()
-    assert RunFolder.open(compared.folder).provenance["system"] == "argon/crystal-108"
 
 
 def positions(simulation, step):
@@ -134,13 +158,13 @@ def nearest(cell, vectors):
     return np.take_along_axis(images, (images**2).sum(-1).argmin(-1)[..., None, None], -2)[..., 0, :]
 
 
-def test_the_atoms_at_the_fork_are_those_of_the_runs(compared):
-    made, around = compared.summary["decision"], RunFolder.open(compared.folder).read("neighborhood")
-    twin = compared.fork.twin
+def test_the_atoms_at_the_fork_are_those_of_the_runs(crystal):
+    made, around = crystal.summary["decision"], RunFolder.open(crystal.folder).read("neighborhood")
+    a, b = crystal.result.twin.a.simulation, crystal.result.twin.b.simulation
     i, j = made["i"], made["j"]
     assert around["atom"][:2].tolist() == [i, j]
-    x_a, x_b = positions(twin.a, made["step"]), positions(twin.b, made["step"])
-    cell = np.asarray(twin.a.cell.matrix)
+    x_a, x_b = positions(a, made["step"]), positions(b, made["step"])
+    cell = np.asarray(a.cell.matrix)
     middle = x_a[i] + nearest(cell, x_a[j] - x_a[i]) / 2
     place = np.stack([around[name] for name in "xyz"], axis=1)
     moved = np.stack([around[f"d{name}"] for name in "xyz"], axis=1)
@@ -148,8 +172,7 @@ def test_the_atoms_at_the_fork_are_those_of_the_runs(compared):
     np.testing.assert_allclose(moved, nearest(cell, x_b[around["atom"]] - x_a[around["atom"]]), atol=1e-12)
     # all that are near, and none that is not
     distance = np.sqrt((nearest(cell, x_a - middle) ** 2).sum(axis=1))
-    assert set(around["atom"].tolist()) == set(np.flatnonzero(distance <= 1.25 * twin.a.r_cut).tolist())
-    assert np.abs(moved).max() == pytest.approx(made["separation_before"], rel=0.5)
+    assert set(around["atom"].tolist()) == set(np.flatnonzero(distance <= 1.25 * a.r_cut).tolist())
     # the flip is a matter of float32's rounding: its margin is within B's bound, and not in A's
     gap = np.linalg.norm(place[1] - place[0])
     assert made["distance"] == pytest.approx(gap, abs=1e-9)
@@ -158,46 +181,107 @@ def test_the_atoms_at_the_fork_are_those_of_the_runs(compared):
     assert made["ambiguous_in"] == ["B"] and not made["ambiguous"]
 
 
+def test_a_ball_has_the_same_summary(crystal, balls):
+    made, summary = balls.result, balls.summary
+    assert (summary["system"], summary["balls"], summary["choice"]) == ("three", 3, "contact=earlier")
+    assert summary["steps"] == 120 and summary["timestep"] == 0.01 and summary["tolerance"] == 0.002
+    assert (summary["first_bit"], summary["fork"]) == (made.dates.seed, made.dates.fork)
+    assert summary["effect"] == "cause" and summary["status"] == "complete"
+    decision = summary["decision"]
+    assert (decision["channel"], decision["step"]) == ("contact", summary["fork"])
+    assert (decision["run"], decision["decided"]) == ("B", {"A": 0, "B": 1})
+    # the ball was above the floor in both runs: the margin is minus one height
+    assert decision["margins"]["A"] == decision["margins"]["B"] < 0
+    assert not decision["ambiguous"] and decision["bounds"]["A"] > 0
+    assert summary["splits"] == {"B": made.dates.split, "B|A": None, "A|B": None}
+    assert summary["imposed_largest"] == 0.0 and len(summary["table"]) == 8
+    assert summary["cross_flips"] == summary["cross_contacts"] + summary["cross_stops"] > 0
+    alone = {"atoms", "r_cut", "shadow", "shadow_horizon", "protected_until", "certified_horizon", "pinned",
+             "ambiguous", "ambiguous_steps", "ambiguous_first", "lists_complete", "lyapunov", "minimal",
+             "lyapunov_reason"}  # fmt: skip
+    assert set(crystal.summary) - set(summary) == alone
+    assert set(summary) - set(crystal.summary) == {
+        "balls", "contact_kind", "integrator", "counted", "cross_contacts", "cross_stops",
+    }  # fmt: skip
+
+
+def test_the_tables_of_a_ball_are_those_of_its_runs(balls):
+    folder, made = RunFolder.open(balls.folder), balls.result
+    table = folder.read("separation")
+    for column, name in (("free", "B"), ("imposed", "B|A"), ("back", "A|B"), ("energy_b", "energy B")):
+        np.testing.assert_array_equal(table[column], made.series[name])
+    rows = folder.read("cross_flips")
+    a, b = made.runs["A"], made.runs["B"]
+    contact = rows["channel"].astype(str) == "contact"
+    expected = {(int(row) + 1, int(ball)) for row, ball in np.argwhere(a.contact != b.contact)}
+    found = set(zip(rows["step"][contact].tolist(), rows["ball"][contact].tolist(), strict=True))
+    assert found == expected and len(found) == contact.sum()
+    stops = np.flatnonzero(a.iterations != b.iterations)
+    np.testing.assert_array_equal(rows["step"][~contact], stops + 1)
+    np.testing.assert_array_equal(rows["a"][~contact], a.iterations[stops])
+    around, one = folder.read("around"), balls.summary["decision"]["ball"]
+    mine = around["run"].astype(str) == "B"
+    np.testing.assert_array_equal(around["y"][mine], b.y[around["step"][mine], one])
+    assert bool(around["contact"][mine][around["step"][mine] == made.dates.fork][0])
+
+
+def test_a_folder_is_a_system_that_loads_again_and_a_page_that_is_written_again(crystal, balls):
+    for outcome, size in ((crystal, "atoms"), (balls, "balls")):
+        again = load(outcome.folder)
+        assert again.name == outcome.summary["system"]
+        count = len(again.atoms) if size == "atoms" else again.balls
+        assert count == outcome.summary[size] and (outcome.folder / "log.txt").exists()
+        assert RunFolder.open(outcome.folder).provenance["system"] == again.name
+        text = (outcome.folder / "report.html").read_text(encoding="utf-8")
+        assert outcome.verdict.headline in text.replace("&#39;", "'")
+        frame.finish(outcome.folder)
+        assert (outcome.folder / "report.html").read_text(encoding="utf-8") == text
+        assert json.loads((outcome.folder / "summary.json").read_text()) == outcome.summary
+    assert tomllib.loads((balls.folder / "system.toml").read_text())["fork"]["vary"] == "contact=earlier"
+
+
 def test_a_choice_that_changes_nothing_is_said_to(tmp_path):
-    result = fork(
-        "pair/at-cutoff", "translate=lattice", steps=40, out=tmp_path / "here", report=False, **BARE
+    found = mdnum.fork(
+        "pair/at-cutoff", "translate=lattice", steps=40, out=tmp_path / "x", report=False, **BARE
     )
-    assert result.summary["verdict"] == "same" and result.summary["must_hold"]
-    assert result.summary["headline"] == "The same trajectory: no bit differs in 40 steps."
-    assert result.summary["findings"] == [] and result.summary["decision"] is None
-    assert result.summary["lyapunov"] is None and result.summary["lyapunov_reason"].startswith("no bit")
-    assert RunFolder.open(result.folder).rows("neighborhood") == 0
-    assert not (result.folder / "report.html").exists()
+    assert found.summary["effect"] == "same" and found.summary["must_hold"] and found.verdict.tone == "good"
+    assert codes(found) == [] and found.summary["decision"] is None
+    assert found.summary["lyapunov"] is None and found.summary["lyapunov_reason"]
+    assert not (found.folder / "neighborhood.parquet").exists()
+    assert not (found.folder / "report.html").exists()
 
 
-def test_a_promise_that_is_broken_is_an_error(tmp_path, monkeypatch):
-    def other_cutoff(system):
-        return Twin(build(system), build("pair/at-cutoff", {"cutoff.radius": 2.4}), "another cutoff")
-
-    use(monkeypatch, StandIn(other_cutoff, must_hold=True))
-    result = fork("pair/at-cutoff", "stand-in", steps=400, out=tmp_path / "here", **BARE)
-    codes = {finding["code"]: finding["severity"] for finding in result.summary["findings"]}
-    assert codes["MUST_HOLD_FORKED"] == "error"
-    assert result.summary["fork"] is not None
+@pytest.mark.parametrize("world", ["md", "ball"])
+def test_a_promise_that_is_broken_is_an_error(tmp_path, monkeypatch, file, world):
+    name, changed, steps = {
+        "md": ("pair/at-cutoff", {"cutoff.radius": 2.4}, 400), "ball": (file, {"start.height": [0.3, 0.301, 0.53]}, 60),
+    }[world]  # fmt: skip
+    other = load(name, changed)
+    use(
+        monkeypatch,
+        lambda system: Twin(program_of(system), program_of(other, steps), "planted"),
+        must_hold=True,
+    )
+    found = mdnum.fork(name, "stand-in", steps=steps, out=tmp_path / "here", report=False, **BARE)
+    assert codes(found)[0] == "MUST_HOLD_FORKED" and found.verdict.tone == "error"
+    assert found.summary["first_bit"] is not None and found.summary["imposed_until"] is None
 
 
 def test_a_run_that_blows_up_on_one_side_is_reported(tmp_path, monkeypatch):
-    def wild(system):
-        return Twin(build(system), build("argon/crystal-108", {"dynamics.timestep": 10.0}), "a wild step")
-
-    use(monkeypatch, StandIn(wild))
-    result = fork("argon/crystal-108", "stand-in", steps=60, out=tmp_path / "here", report=False, **BARE)
-    assert result.summary["status"] == "failed" and list(result.summary["failed"]) == ["B"]
-    assert [finding["code"] for finding in result.summary["findings"]] == ["RUN_FAILED"]
+    wild = load("argon/crystal-108", {"dynamics.timestep": 10.0})
+    use(monkeypatch, lambda system: Twin(program_of(system), program_of(wild), "a wild step"))
+    found = mdnum.fork("argon/crystal-108", "stand-in", steps=60, out=tmp_path / "x", report=False, **BARE)
+    assert found.summary["status"] == "failed" and list(found.summary["failed"]) == ["B"]
+    assert codes(found) == ["RUN_FAILED"]
     # the comparison ends where B does, not where the stretch of A's steps does
-    last = result.summary["steps"]
-    assert last < 5 and len(result.fork.series["B"]) == last + 1
-    assert np.isfinite(result.fork.series["energy A"]).all() and result.summary["fork"] <= last
-    assert result.summary["headline"].startswith(f"Run B ended in a {result.summary['failed']['B']} at step ")
-    assert all(flip.step <= last for flip in result.fork.flips)
+    last = found.summary["steps"]
+    assert last < 5 and len(found.result.series["B"]) == last + 1 and found.summary["fork"] <= last
+    assert np.isfinite(found.result.series["energy A"]).all()
+    assert all(flip.step <= last for flip in found.result.flips)
 
 
-def test_screening_ranks_what_was_screened(tmp_path, monkeypatch):
+@pytest.mark.parametrize("name", ["argon/crystal-108", "ball/drop"])
+def test_screening_ranks_what_was_screened(tmp_path, monkeypatch, name):
     rows = [
         Screened("early", "one", 0, 3, 90, False, None, 100),
         Screened("late", "two", 1, 70, None, True, None, 100, "blow-up of B"),
@@ -210,29 +294,25 @@ def test_screening_ranks_what_was_screened(tmp_path, monkeypatch):
         progress(0, 4, "early")
         return rows
 
-    monkeypatch.setattr(choices, "screen", screen)
-    result = fork(
-        "argon/crystal-108", "all", steps=100, out=tmp_path / "here",
-        progress=lambda *given: seen.append(given),
-    )  # fmt: skip
-    summary = result.summary
-    assert result.fork is None
-    assert [one["choice"] for one in summary["ranking"]] == ["early", "late", "never"]
-    assert summary["not_applicable"] == [{"choice": "noise", "why": "no noise"}]
-    assert summary["headline"] == "late must not change a bit, and does."
-    assert [finding["code"] for finding in summary["findings"]] == ["MUST_HOLD_FORKED", "RUN_FAILED"]
+    monkeypatch.setattr("mdnum.forks.screen.screen", screen)
+    found = mdnum.fork(name, "all", steps=100, out=tmp_path / "x", progress=lambda *given: seen.append(given))
+    assert found.result == rows
+    assert [row["choice"] for row in found.summary["ranking"]] == ["early", "late", "never"]
+    assert found.summary["not_applicable"] == [{"choice": "noise", "reason": "no noise"}]
+    assert codes(found) == ["MUST_HOLD_FORKED", "CHOICE_FAILED"] and found.verdict.tone == "error"
     assert seen[0] == (0, 4, {"phase": "early (1 of 4)"})
-    page = (result.folder / "report.html").read_text(encoding="utf-8")
+    page = (found.folder / "report.html").read_text(encoding="utf-8")
     assert "broken" in page and "holds" in page and "no noise" in page
 
 
 @pytest.mark.parametrize(
     ("system", "vary", "options", "words"),
     [
-        ("ball/drop", "skin", {}, "no choice 'skin' of a ball"),
+        ("ball/drop", "skin", {}, "it is a choice of molecular dynamics"),
         ("argon/crystal-108", "precison", {}, "no choice 'precison'"),
         ("argon/crystal-108", "noise", {}, "noise"),
         ("argon/crystal-108", "precision", {"steps": 0}, "steps = 0"),
+        ("ball/drop", "precision", {"steps": 0}, "steps = 0"),
         ("argon/crystal-108", "precision", {"split": -1.0}, "split = -1"),
         ("argon/crystal-108", "precision", {"repeats": -1}, "repeats = -1"),
         ("argon/crystal-108", "precision", {"overrides": {"cutoff.knd": 1}}, "knd"),
@@ -244,55 +324,175 @@ def test_screening_ranks_what_was_screened(tmp_path, monkeypatch):
         ("silicon/tersoff-512", "precision", {"repeats": 4}, "many-body"),
         ("ball/drop", "start", {"repeats": 4, "counterfactual": False}, "repeats = 4"),
         ("ball/drop", "start", {"minimal": True}, "minimal is an option of molecular dynamics"),
-        ("ball/drop", "start", {"pin": "fork", "back": False}, "pin and back are options of molecular"),
-        ("ball/drop", "start", {"lyapunov": True}, "lyapunov is an option of molecular dynamics"),
         ("ball/drop", "all", {"split": 0.1, "repeats": 4}, "split and repeats are options of one comparison"),
         ("argon/crystal-108", "all", {"minimal": True}, "minimal is an option of one comparison"),
-        ("argon/crystal-108", "all", {"split": 0.1, "lyapunov": False}, "split and lyapunov are options"),
     ],
 )
 def test_what_is_refused_leaves_no_folder(tmp_path, system, vary, options, words):
     with pytest.raises(InputError, match=words):
-        fork(system, vary, out=tmp_path / "here", **options)
+        mdnum.fork(system, vary, out=tmp_path / "here", **options)
     assert not (tmp_path / "here").exists()
 
 
-def test_overrides_of_a_loaded_system_and_used_folders_are_refused(tmp_path):
-    system = load("pair/at-cutoff")
-    with pytest.raises(InputError, match="while it is loaded"):
-        fork(system, "precision", overrides={"dynamics.steps": 3})
+def test_overrides_of_a_loaded_system_and_used_folders_are_refused(tmp_path, file):
+    for system in (load("pair/at-cutoff"), load(file)):
+        with pytest.raises(InputError, match="while it is loaded"):
+            mdnum.fork(system, "precision", overrides={"dynamics.steps": 3})
     (tmp_path / "summary.json").write_text("{}")
     with pytest.raises(FolderError, match="already holds"):
-        fork(system, "precision", steps=3, out=tmp_path)
+        mdnum.fork("pair/at-cutoff", "precision", steps=3, out=tmp_path)
 
 
-def test_a_run_that_stops_leaves_the_folder_free(tmp_path, monkeypatch):
+def test_a_run_that_stops_leaves_the_folder_free(tmp_path):
     def stop(step, steps, info):
         if info["phase"] == "run":
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        fork("pair/at-cutoff", "start", steps=3, out=tmp_path / "here", progress=stop, **BARE)
+        mdnum.fork("pair/at-cutoff", "start", steps=3, out=tmp_path / "here", progress=stop, **BARE)
     RunFolder.create(tmp_path / "here", overwrite=True).close()
 
 
-@pytest.mark.parametrize(
-    ("rate", "chaotic", "words"),
-    [(0.02, True, None), (1e-4, False, "slower than growth"), (0.006, False, "400 steps do not tell it")],
-)
-def test_an_exponent_that_is_none_says_why(compared, monkeypatch, rate, chaotic, words):
-    size = rate * np.arange(401.0)
-    made = Lyapunov(400, 0.004, rate, 1e-5, size, size, 80, chaotic)
-    monkeypatch.setattr("mdnum.forks.tangent.lyapunov", lambda *given: made)
-    found = fork_answers.exponent(compared.fork)
-    reason = found["lyapunov_reason"]
-    assert reason is None if words is None else reason.startswith(words)
-    assert found["lyapunov"]["ratio"] == (
-        pytest.approx(compared.fork.growth["B"].rate / rate) if chaotic else None
+def test_a_question_stands_in_the_file_and_is_no_part_of_the_system(tmp_path, monkeypatch):
+    seen = []
+    monkeypatch.setattr(
+        MODULE,
+        "followed",
+        lambda system, twin, told, asked, *_: seen.append((told["choice"], asked.steps, asked.split)),
     )
+    path = copy("pair/at-cutoff", tmp_path)
+    path.write_text(path.read_text() + '\n[fork]\nvary = "reduction=exact"\nsteps = 70\nsplit = 0.01\n')
+    mdnum.fork(path)
+    mdnum.fork(path, "order", steps=30)
+    mdnum.fork(path, overrides={"fork.vary": "start"})
+    mdnum.fork("pair/at-cutoff", "order")
+    assert seen == [
+        ("reduction=exact", 70, 0.01), ("order", 30, 0.01), ("start", 70, 0.01), ("order", None, None),
+    ]  # fmt: skip
+    plain, asking = load("pair/at-cutoff"), load(path)
+    assert hashes(plain)["program"] == hashes(asking)["program"]
+    assert "[fork]" in asking.to_toml() and "[fork]" not in plain.to_toml()
+    for setting, words in (({"fork.vari": "order"}, "Did you mean vary"), ({"fork.steps": 0}, "steps")):
+        with pytest.raises(InputError, match=words):
+            load(path, setting)
+
+
+@pytest.mark.parametrize(("rate", "chaotic"), [(0.02, True), (1e-4, False), (0.006, False)])
+def test_an_exponent_that_is_none_says_why(crystal, monkeypatch, rate, chaotic):
+    size = rate * np.arange(401.0)
+    lyapunov = Lyapunov(400, 0.004, rate, 1e-5, size, size, 80, chaotic)
+    monkeypatch.setattr("mdnum.forks.tangent.lyapunov", lambda *given: lyapunov)
+    found = fork_pair._exponent(crystal.result)
+    assert (found["lyapunov_reason"] is None) == chaotic
+    ratio = crystal.result.growth["B"].rate / rate
+    assert found["lyapunov"]["ratio"] == (pytest.approx(ratio) if chaotic else None)
     # an ulp of a coordinate between 4 and 8 has grown to the tolerance: from the size of the tangent
-    ulp = found["lyapunov"]["ulp"]
-    assert ulp == 2.0**-50 or ulp == 2.0**-51
-    expected = np.log(compared.fork.tolerance / ulp) / rate if chaotic else None
-    split = found["lyapunov"]["ulp_split"]
-    assert split is None if expected is None else split == pytest.approx(expected, abs=1)
+    ulp, split = found["lyapunov"]["ulp"], found["lyapunov"]["ulp_split"]
+    assert ulp in (2.0**-50, 2.0**-51)
+    expected = np.log(crystal.result.tolerance / ulp) / rate
+    assert split == pytest.approx(expected, abs=1) if chaotic else split is None
+
+
+def test_a_prediction_says_what_it_comes_from(crystal):
+    steady = 1e-12 * np.exp(0.02 * np.arange(900.0))
+    # a power law is no exponential: the exponent alone can tell
+    power = 1e-9 * np.arange(61.0) ** 2
+
+    def predicted(free, split=None, rate=None):
+        made = SimpleNamespace(
+            dates=Dates(0, 5, split), series={"B": free}, tolerance=0.1, steps=len(free) - 1
+        )
+        exponent = {"lyapunov": {"rate": rate, "chaotic": True}} if rate else {}
+        found: Any = fork_pair._predicted(made, exponent)  # type: ignore[arg-type]
+        return found["predicted_split"], found["predicted_by"]
+
+    at, by = predicted(steady, rate=0.5)
+    assert by == "growth" and at == pytest.approx(np.log(0.1 / 1e-12) / 0.02, abs=1)
+    assert predicted(power) == predicted(steady, split=9) == (None, None)
+    assert predicted(power, rate=0.0036) == (round(60 + np.log(0.1 / 3.6e-6) / 0.0036), "exponent")
+    # repeats that did not split are kept, and a fit that is none has no line
+    delays = (Delay(12, 40, 99, 99), Delay(None, 30, 99, 99))
+    made = replace(crystal.result, repeats=delays, growth={"B": Growth(float("nan"), float("nan"), -1, -1)})
+    found = fork_pair._numbers(made)
+    assert found["repeated"] == [{"free": 12, "imposed": 40}, {"free": None, "imposed": 30}]
+    assert found["growth"]["B"]["intercept"] is None
+
+
+NARROW = {f"precision.{role}": "float32" for role in ("force", "decision", "accumulate")}
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    root = tmp_path_factory.mktemp("runs")
+    for name, overrides in (("a", {}), ("b", NARROW)):
+        mdnum.run(
+            "argon/crystal-108", steps=60, out=root / name, overrides=overrides, check=False, report=False
+        )
+    return root
+
+
+def test_a_replay_meets_the_stored_runs(runs, capsys):
+    asked = {"repeats": 0, "back": False, "lyapunov": False}
+    found = mdnum.fork_folders(runs / "a", runs / "b", replay=True, split=1e-9, out=runs / "fork", **asked)
+    summary = found.summary
+    assert summary["stored"]["fork"] == summary["fork"] and summary["reproduced"]
+    # what the two folders cannot say
+    assert summary["split"] is not None and summary["effect"] in ("no fork", "cause", "open", "bystander")
+    assert {key for key, _, _ in summary["differences"]} >= set(NARROW)
+    assert (runs / "fork" / "report.html").stat().st_size > 10_000
+    RunFolder.open(runs / "fork").write_summary({**summary, "reproduced": False})
+    assert "NOT_REPRODUCED" in codes(frame.finish(runs / "fork", report=False))
+    with pytest.raises(InputError, match="repeats and back and lyapunov are options of a replay"):
+        mdnum.fork_folders(runs / "a", runs / "b", **asked)
+    assert call("fork", "compare", str(runs / "a"), str(runs / "b"), "-o", str(runs / "seen")) == 0
+    lines = printed(capsys)
+    assert any(line.startswith("precision.force float64 float32") for line in lines)
+    assert call("fork", "compare", str(runs / "a"), str(runs / "nowhere")) == 2
+    assert "no such folder" in capsys.readouterr().err
+
+
+def test_two_finished_runs_of_a_ball(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    small = ("--no-report", "--steps", "480", "--set", "gradient.of=[]", "--set", "variants={}")
+    for name, more in (("a", ()), ("b", ("--set", "start.height=1.01")), ("c", ())):
+        assert call("ball", "ball/drop", *small, *more, "-o", name) == 0
+    found = mdnum.fork_folders("a", "b").summary
+    assert found["differences"] == [["start.height", 1.0, 1.01]] and found["first_bit"] == 0
+    a, b = (RunFolder.open(name).read("contacts") for name in "ab")
+    # the lower ball touches first
+    assert found["fork"] == a["step"][0] < b["step"][0] and found["channel"] == "contact"
+    (flip,) = found["decisions"]
+    assert (flip["run"], flip["subject"], flip["entered"]) == ("A", [0], True)
+    assert flip["margin"] == a["margin"][0]
+    same = mdnum.fork_folders("a", "c", report=False)
+    assert same.summary["first_bit"] is same.summary["fork"] is None and same.verdict.tone == "good"
+    with pytest.raises(InputError, match="not followed again"):
+        mdnum.fork_folders("a", "b", replay=True)
+
+
+@pytest.mark.parametrize("passed", [True, False])
+def test_an_ensemble_that_differs_is_a_finding(tmp_path, monkeypatch, passed):
+    answer = SimpleNamespace(window=40)
+    plain = {
+        "passed": passed, "window": 40, "components": 2, "limit": 2.1, "scores": [[0.1, 3.0]] * 3,
+        "failing": {} if passed else {"pressure": 8.0}, "false_positives": [1, 30],
+    }  # fmt: skip
+    monkeypatch.setattr("mdnum.forks.benign.benign", lambda twin, **_: answer)
+    monkeypatch.setattr(MODULE, "plain", lambda found: plain)
+    asked = ("fork", "benign", "pair/at-cutoff", "start", "-o", str(tmp_path / "x"))
+    assert call(*asked) == (0 if passed else 1)
+    summary = RunFolder.open(tmp_path / "x").summary
+    assert [one["code"] for one in summary["findings"]] == ([] if passed else ["NOT_BENIGN"])
+    assert summary["steps"] == 40 and (tmp_path / "x" / "report.html").exists()
+
+
+def test_what_a_ball_cannot_be_asked_says_what_can(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for ask, words in (
+        (lambda: mdnum.fork_processes(load("ball/drop")), "mdnum ball --demo determinism"),
+        (lambda: mdnum.fork_forecast("ball/drop", 1e-6), "the margin that mdnum ball records"),
+        (lambda: mdnum.workflow.fork_benign("ball/drop", "start"), "no ensemble"),
+    ):
+        with pytest.raises(InputError, match=words):
+            ask()
+    assert not list(tmp_path.iterdir())

@@ -1,89 +1,159 @@
-"""A ranking of precisions into its folder: tables, page and verdict agree with the certificate."""
+"""Precisions against exact arithmetic and programs against each other, into a folder: tables and verdict."""
 
 from __future__ import annotations
 
-import re
+import stat
+import subprocess
+import sys
 
 import numpy as np
 import pytest
-from report.test_html import Tags
+from command_line import call, printed
 
 import mdnum
-from mdnum.forks.exact import POLICIES, installed
-from mdnum.report.fork import certify as page
-from mdnum.report.fork.question import load
+from mdnum.forks import variants
+from mdnum.forks.exact.certify import MD_POLICIES
+from mdnum.forks.exact.program import installed
+from mdnum.forks.variants import Ran, Variant
 from mdnum.store import RunFolder
-
-# two precisions of a run, the exact one, and a second look at every decision
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(not installed(), reason="needs python-flint")]
+from mdnum.systems import load
+from mdnum.workflow import frame
 
 STEPS = 240
+#: Heights that sums and products of few digits reach: plain rationals follow it.
+SMALL = {
+    "contact.k": 512, "integrator.timestep": 0.015625, "start.height": 0.40625, "flight.gravity": 9.75,
+}  # fmt: skip
+FEW = {"bfloat16": {"state": "bfloat16", "arithmetic": "bfloat16", "decision": "bfloat16"}, "float64": {}}
 
 
 @pytest.fixture(scope="module")
 def certified(tmp_path_factory):
     """The crystal whose shell lies at a hard cutoff, a little further than single precision keeps to it."""
-    few = {name: POLICIES[name] for name in ("float32", "float64")}
+    few = {name: MD_POLICIES[name] for name in ("float32", "float64")}
     out = tmp_path_factory.mktemp("certified") / "crystal"
     return mdnum.fork_certify("argon/crystal-108", steps=STEPS, policies=few, out=out)
 
 
+# two precisions of a run, the exact one, and a second look at every decision
+@pytest.mark.slow
+@pytest.mark.skipif(not installed(), reason="needs python-flint")
 def test_the_tables_hold_the_certificate(certified):
     folder = RunFolder.open(certified.folder)
-    assert folder.world == "certify" and folder.summary == certified.summary
-    table, ranking = folder.read("policies"), certified.certificate.ranking
+    table, ranking = folder.read("policies"), certified.result.ranking
     assert table["policy"].tolist() == [row.name for row in ranking] == ["float64", "float32"]
     assert table["horizon"].tolist() == [-1 if row.horizon is None else row.horizon for row in ranking]
     assert 0 < table["horizon"][1] < STEPS and table["horizon"][0] == -1
     assert table["force"].tolist() == ["float64", "float32"]
     apart = folder.read("policy_separations")
     for row in ranking:
-        mine = apart["policy"] == row.name
-        np.testing.assert_array_equal(apart["separation"][mine], row.separation)
-        assert apart["step"][mine].tolist() == list(range(len(row.separation)))
+        np.testing.assert_array_equal(apart["separation"][apart["policy"] == row.name], row.separation)
     # seven digits and sixteen
     last = [apart["separation"][apart["policy"] == name][20] for name in ("float32", "float64")]
     assert last[0] > 1e4 * last[1] > 0
-
-
-def test_ambiguous_decisions_are_counted_listed_and_exported(certified):
-    table = RunFolder.open(certified.folder).read("ambiguous")
-    told = certified.summary["ambiguous"]
-    assert set(told) == {"float32", "float64"}
-    for name, one in told.items():
-        mine = table["policy"] == name
-        assert one["total"] == np.count_nonzero(mine) == certified.ambiguous[name].total
-        assert one["horizon"] == (table["step"][mine].min() if one["total"] else None)
-    assert told["float32"]["total"] > 0
-    assert np.all(np.abs(table["margin"]) <= table["bound"]) and np.all(table["i"] < table["j"])
+    ambiguous, numbers = folder.read("ambiguous"), certified.summary["ambiguous"]
+    assert set(numbers) == {"float32", "float64"} and numbers["float32"]["total"] > 0
+    for name, one in numbers.items():
+        mine = ambiguous["policy"] == name
+        assert one["total"] == np.count_nonzero(mine)
+        assert one["horizon"] == (ambiguous["step"][mine].min() if one["total"] else None)
+    assert np.all(np.abs(ambiguous["margin"]) <= ambiguous["bound"])
     # exact arithmetic decides by the sign of the exact margin
-    np.testing.assert_array_equal(table["wrong"], table["inside"] != (table["exact"] > 0))
+    np.testing.assert_array_equal(ambiguous["wrong"], ambiguous["inside"] != (ambiguous["exact"] > 0))
+    figures = sorted(path.stem for path in (certified.folder / "figures").iterdir())
+    assert figures == ["ranking", "separations"]
 
 
-def test_the_page_says_what_the_folder_holds(certified):
-    text = (certified.folder / "report.html").read_text(encoding="utf-8")
-    tags = Tags()
-    tags.feed(text)
-    assert tags.open == [] and tags.sources == []
-    words = re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", text))
-    assert sorted(path.stem for path in (certified.folder / "figures").iterdir()) == [
-        "ranking",
-        "separations",
-    ]
-    total = certified.summary["ambiguous"]["float32"]["total"]
-    assert re.search(rf"float32 state float32, .* {total:,} from step", words)
+@pytest.fixture(scope="module")
+def ball(tmp_path_factory):
+    out = tmp_path_factory.mktemp("certified") / "ball"
+    return mdnum.fork_certify("ball/drop", steps=80, policies=FEW, overrides=SMALL, out=out)
 
 
-def test_who_leaves_first_is_the_headline(certified, tmp_path):
-    (_, run) = load(certified.folder, "certify")
-    rows = run.summary["policies"]
+def test_a_ball_is_certified(ball, tmp_path):
+    rows = {row["name"]: row for row in ball.summary["policies"]}
+    assert ball.result.steps == 80 and rows["float64"]["horizon"] is None
+    assert rows["bfloat16"]["horizon"] == ball.result.ranking[1].horizon > 0
+    assert (rows["bfloat16"]["channel"], rows["bfloat16"]["subject"]) == ("contact", [0])
+    assert rows["bfloat16"]["arithmetic"] == "bfloat16" and rows["bfloat16"]["accumulate"] == "float64"
+    loaded = load("ball/drop", SMALL)
+    again = mdnum.fork_certify(loaded, steps=80, policies=FEW, out=tmp_path / "x", report=False)
+    assert again.summary["policies"] == ball.summary["policies"]
 
-    def told(*horizons):
-        changed = [{**row, "horizon": at} for row, at in zip(rows, horizons, strict=True)]
-        one = type(run)(run.path, {**run.summary, "policies": changed}, "", {}, run.tables)
-        return page.judge(one)
 
-    assert told(None, None).headline.startswith("Every precision keeps") and told(None, None).tone == "good"
-    assert "1 of 2 precisions keeps" in told(None, 40).headline
-    assert "float32 leaves it first, at step 40" in told(None, 40).headline
-    assert told(70, 40).headline.startswith("No precision keeps") and told(70, 40).tone == "info"
+def test_who_leaves_first_is_the_headline(ball):
+    folder = RunFolder.open(ball.folder)
+
+    def judged(*horizons, **more):
+        rows = [{**row, "horizon": at} for row, at in zip(ball.summary["policies"], horizons, strict=True)]
+        folder.write_summary({**ball.summary, "policies": rows, **more})
+        return frame.finish(folder, report=False).verdict
+
+    assert judged(None, None).tone == "good"
+    some = judged(None, 40)
+    assert some.tone == "info" and "bfloat16 leaves it first, at step 40" in some.headline
+    assert judged(70, 40).headline.startswith("No precision keeps")
+    wrong = {"float64": {"total": 1, "horizon": 5, "wrong": 9}}
+    assert [one.code for one in judged(None, None, ambiguous=wrong).findings] == ["WRONG_DECISION"]
+
+
+#: First step at which a program leaves the loop that the others are compared with, and how fast.
+LEAVES, FEW_STEPS = {"AVX": (3, 1e-15), "reversed": (2, 4e-15)}, 6
+
+
+def stand_in(variant: Variant, folder, k: int, steps: int):
+    """A process that takes no time: its positions leave the start's from a given step on."""
+    if variant.name == "SSE4.2":
+        return Ran(variant, (), -1, None, float("nan"), 0.5, "took longer than 600 s"), None
+    first, rate = LEAVES.get(variant.name, (FEW_STEPS + 1, 0.0))
+    x = np.tile(load(folder / "system", world="md").atoms.positions.T, (steps, 1, 1))
+    for step in range(first, steps + 1):
+        x[step - 1, 0, 7] += rate * 2.0**step
+    return Ran(variant, tuple(row.tobytes().hex()[:4096] for row in x), -1, None, 0.0, 0.5), x
+
+
+def test_the_folder_holds_clusters_dates_and_separations(tmp_path, monkeypatch):
+    monkeypatch.setattr(variants, "_process", stand_in)
+    which = [variants.REFERENCE, Variant("again"), Variant("AVX"), Variant("reversed"), Variant("SSE4.2")]
+    compared = mdnum.fork_processes("argon/crystal-108", steps=FEW_STEPS, which=which, out=tmp_path / "x")
+    folder, summary = RunFolder.open(compared.folder), compared.summary
+    table = folder.read("variants")
+    assert table["variant"].tolist() == ["scan", "again", "AVX", "reversed", "SSE4.2"]
+    assert table["cluster"].tolist() == [0, 0, 1, 2, -1] and table["first_bit"].tolist() == [-1, -1, 3, 2, -1]
+    np.testing.assert_allclose(table["separation"][:4], [0, 0, 64e-15, 256e-15], rtol=0.05)
+    apart = folder.read("variant_separations")
+    mine = apart["separation"][apart["variant"] == "AVX"]
+    assert len(mine) == FEW_STEPS and not mine[:2].any() and mine[2] == pytest.approx(8e-15, rel=0.2)
+    assert summary["clusters"] == [["scan", "again"], ["AVX"], ["reversed"]]
+    # a program that failed is named and does not stop the others
+    (finding,) = compared.verdict.findings
+    assert finding.code == "VARIANT_FAILED" and finding.values["failed"] == "took longer than 600 s"
+    assert (compared.folder / "report.html").exists()
+
+
+def test_programs_from_the_command_line(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(variants, "_process", stand_in)
+    assert call("fork", "processes", "argon/crystal-108", "--steps", str(FEW_STEPS), "--no-report") == 1
+    lines = printed(capsys)
+    assert any("reversed" in line and " 2 6 " in line for line in lines)
+    assert any("SSE4.2 took longer than 600 s" in line for line in lines)
+
+
+def test_what_a_process_says_stays_out_of_the_output(tmp_path, monkeypatch, capfd):
+    talker = tmp_path / "python"
+    talker.write_text('#!/bin/sh\necho spam\necho "  it broke " >&2\nexit 3\n')
+    talker.chmod(talker.stat().st_mode | stat.S_IXUSR)
+    monkeypatch.setattr(sys, "executable", str(talker))
+    row, x = variants._process(variants.REFERENCE, tmp_path, 0, 3)
+    assert x is None and row.failed == "it broke"
+    assert capfd.readouterr().out == ""
+
+
+def test_a_process_that_takes_too_long_is_a_row(tmp_path, monkeypatch):
+    def never(command, timeout, **_):
+        raise subprocess.TimeoutExpired(command, timeout)
+
+    monkeypatch.setattr(subprocess, "run", never)
+    row, x = variants._process(variants.REFERENCE, tmp_path, 0, 3)
+    assert x is None and row.failed == f"took longer than {variants._TIMEOUT} s"

@@ -3,25 +3,20 @@
 from __future__ import annotations
 
 import json
-import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from ase import Atoms
-from report.test_html import Tags
+from command_line import call
 from small_systems import LENNARD_JONES, make
 
 import mdnum
-from mdnum import report
-from mdnum.cli import main
 from mdnum.errors import FolderError, InputError
-from mdnum.forks.boundaries import MOST
-from mdnum.report.fork import map as page
-from mdnum.report.fork.question import Question, load
 from mdnum.rollout.engine import Engine
 from mdnum.store import RunFolder
 from mdnum.systems import build
+from mdnum.workflow import frame
 
 APART, RADIUS, SPEED, STEPS = 3.0, 2.5, 1.25, 9
 
@@ -52,9 +47,9 @@ def displacement(timestep: float) -> float:
 @pytest.mark.slow
 def test_the_folder_holds_the_piecewise_map(mapped):
     folder = RunFolder.open(mapped.folder)
-    assert folder.world == "along" and folder.summary == mapped.summary
+    assert folder.world == "map" and folder.summary == mapped.summary
     summary = mapped.summary
-    assert (summary["world"], summary["question"], summary["key"]) == ("fork", "along", "dynamics.timestep")
+    assert summary["key"] == "dynamics.timestep"
     assert (summary["low"], summary["high"], summary["value"]) == (0.06, 0.105, 0.07)
     edges, pieces, points = (folder.read(name) for name in ("boundaries", "intervals", "points"))
     # inside from the first step k on with APART - SPEED k dt < RADIUS
@@ -79,59 +74,61 @@ def test_the_folder_holds_the_piecewise_map(mapped):
 
 @pytest.mark.slow
 def test_the_page_says_what_the_folder_holds(mapped):
+    figures = sorted(path.stem for path in (mapped.folder / "figures").iterdir())
+    assert figures == ["detail", "jumps", "map"]
+    sections = {section.title: section.parts for section in mapped.page.sections}
+    rows = sections["Boundaries"][1].rows
+    for edge, row in zip(mapped.summary["boundaries"], rows, strict=True):
+        assert row[1:6] == (repr(edge["below"]), repr(edge["above"]), edge["step"], "0–1", "in above")
+    # in the figure, beside its line
+    plot = sections["Along dynamics.timestep"][0]
+    assert [text for _, text in plot.verticals] == ["0–1, step 6", "0–1, step 5", "0–1, step 4"]
+    at, jumps = plot.series[0].x, plot.series[1]
+    assert np.isnan(at).sum() == 3 and jumps.label == "jump" and len(jumps.x) == 9
     text = (mapped.folder / "report.html").read_text(encoding="utf-8")
-    tags = Tags()
-    tags.feed(text)
-    assert tags.open == [] and tags.sources == []
-    assert sorted(path.stem for path in (mapped.folder / "figures").iterdir()) == ["detail", "jumps", "map"]
-    words = re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", text))
-    for edge in mapped.summary["boundaries"]:
-        assert f"{edge['below']!r} {edge['above']!r} {edge['step']} 0–1 in above" in words
-        # in the figure, beside its line
-        assert f"0–1, step {edge['step']}" in words
-    assert "change at 3 places between dynamics.timestep = 0.06 and 0.105" in words
-    (mapped.folder / "report.html").unlink()
-    report.write(mapped.folder)
+    frame.finish(mapped.folder)
     assert (mapped.folder / "report.html").read_text(encoding="utf-8") == text
 
 
-def judged(mapped, tmp_path, **changes):
-    folder = RunFolder.create(tmp_path / "one", world="along")
-    source = RunFolder.open(mapped.folder)
-    for name in ("boundaries", "intervals", "points"):
-        folder.append(name, source.read(name))
+def judged(path, summary, tables=None):
+    folder = RunFolder.create(path, world="map")
+    for name, columns in (tables or {}).items():
+        folder.append(name, columns)
     folder.finalize()
-    folder.write_summary({**mapped.summary, **changes})
-    return page.judge(load(folder, "along")[1])
+    folder.write_summary(summary)
+    return frame.finish(folder, report=False).verdict
 
 
 @pytest.mark.slow
 def test_what_a_person_must_know_is_a_finding(mapped, tmp_path):
-    assert [one.code for one in judged(mapped, tmp_path / "a").findings] == ["NOT_CONFIRMED"]
+    source = RunFolder.open(mapped.folder)
+    tables = {name: source.read(name) for name in ("boundaries", "intervals", "points")}
+
+    def verdict(name, **changes):
+        return judged(tmp_path / name, {**mapped.summary, **changes}, tables)
+
+    assert [one.code for one in verdict("a").findings] == ["NOT_CONFIRMED"]
     edges = [{**edge, "confirmed": "yes"} for edge in mapped.summary["boundaries"]]
     sure = {"confirm": True, "confirmed": 3, "boundaries": edges}
-    verdict = judged(mapped, tmp_path / "b", **sure)
-    assert verdict.findings == () and verdict.tone == "info"
-    assert any("a fresh process finds the same" in sentence for sentence in verdict.evidence)
-    moved = [{**edges[0], "confirmed": "no"}, *edges[1:]]
-    verdict = judged(mapped, tmp_path / "c", confirm=True, confirmed=2, boundaries=moved)
-    (finding,) = verdict.findings
-    assert (finding.code, verdict.tone) == ("NOT_REPRODUCED", "warning")
-    assert repr(edges[0]["above"]) in finding.text and "1 boundary" in finding.title
-    verdict = judged(mapped, tmp_path / "d", **sure, unresolved=[[0.08, 0.09]], failed_runs=3)
-    assert [one.code for one in verdict.findings] == ["RUNS_FAILED", "MORE_BOUNDARIES"]
-    quiet = judged(
-        mapped, tmp_path / "e", boundaries=[], confirm=True, confirmed=0, jump_largest=None,
-        apart_largest=None, intervals=mapped.summary["intervals"][:1],
+    fine = verdict("b", **sure)
+    assert fine.findings == () and fine.tone == "info"
+    moved = verdict("c", confirm=True, confirmed=2, boundaries=[{**edges[0], "confirmed": "no"}, *edges[1:]])
+    assert (moved.findings[0].code, moved.tone) == ("NOT_REPRODUCED", "warning")
+    assert moved.findings[0].values == {"n": 1, "places": repr(edges[0]["above"])}
+    left = verdict("d", **sure, unresolved=[[0.08, 0.09]], failed_runs=3)
+    assert [one.code for one in left.findings] == ["RUNS_FAILED", "MORE_BOUNDARIES"]
+    quiet = verdict(
+        "e", boundaries=[], confirm=True, confirmed=0, jump_largest=None, separation_largest=None,
+        intervals=mapped.summary["intervals"][:1],
     )  # fmt: skip
-    assert quiet.tone == "good" and quiet.headline.startswith("One history")
+    assert quiet.tone == "good"
 
 
 @pytest.mark.slow
 def test_from_the_command_line(mapped, tmp_path, monkeypatch, capsys):
     path = meeting().write(tmp_path / "system")
     monkeypatch.chdir(tmp_path)
-    first, second, third = mapped.map.boundaries
+    first, second, third = mapped.result.boundaries
     # a run that fails has no loss, and what has none no jump
     failing = replace(second, below=replace(second.below, loss=np.nan), confirmed=True)
     edges = (replace(first, confirmed=False), failing, replace(third, confirmed=True))
@@ -140,66 +137,48 @@ def test_from_the_command_line(mapped, tmp_path, monkeypatch, capsys):
     def search(system, key, low, high, steps, **options):
         asked.append((key, low, high, steps, options["most"], options["confirm"]))
         options["progress"](1, 7, {"phase": "running a grid", "unit": "runs"})
-        return replace(mapped.map, boundaries=edges, unresolved=((0.08, 0.09),), failed=2)
+        return replace(mapped.result, boundaries=edges, unresolved=((0.08, 0.09),), failed=2)
 
     monkeypatch.setattr("mdnum.forks.boundaries.boundaries", search)
-    arguments = ["fork", str(path), "--along", "timestep=0.06:0.105", "--no-report"]
-    with pytest.raises(SystemExit) as stopped:
-        main([*arguments, "--most", "3", "--json", "-o", "here"])
+    arguments = ["fork", "map", str(path), "timestep=0.06:0.105", "--no-report"]
+    assert call(*arguments, "--most", "3", "--json", "-o", "here") == 1
     answer = json.loads(capsys.readouterr().out)
     # the default number of steps, and a boundary that a fresh process does not find is a finding
-    assert asked == [("dynamics.timestep", 0.06, 0.105, STEPS, 3, True)] and stopped.value.code == 1
+    assert asked == [("dynamics.timestep", 0.06, 0.105, STEPS, 3, True)]
     assert [one["code"] for one in answer["findings"]] == ["NOT_REPRODUCED", "RUNS_FAILED", "MORE_BOUNDARIES"]
     assert answer["boundaries"][1]["jump"] is None
     assert answer["jump_largest"] == max(abs(edge.jump) for edge in (first, third))
     assert answer["folder"] == "here" and answer["boundaries"][0]["confirmed"] == "no"
     assert "running a grid: 1 of 7 runs" in (tmp_path / "here/log.txt").read_text()
     assert not (tmp_path / "here/report.html").exists()
-    with pytest.raises(SystemExit):
-        main(["report", "here"])
-    assert (tmp_path / "here/report.html").exists()
+    assert call("report", "here") == 0 and (tmp_path / "here/report.html").exists()
     capsys.readouterr()
-    with pytest.raises(SystemExit):
-        main(arguments)
-    said = capsys.readouterr().out
-    assert all(repr(side.at) in said for edge in edges for side in (edge.below, edge.above))
-    assert "wrote runs/fork-" in said and asked[1][4] == MOST
+    call(*arguments)
+    printed = capsys.readouterr().out
+    assert all(repr(side.at) in printed for edge in edges for side in (edge.below, edge.above))
+    assert asked[1][4] is None
 
 
 @pytest.mark.slow
-def test_a_ball_has_a_map_too(tmp_path, capsys):
+def test_a_ball_has_a_map_too(tmp_path, monkeypatch):
     """Solver iterations along the tolerance: each cuts what is left to 1 - alpha k of it."""
-    asked = [
-        "fork",
-        "ball/batch-on-the-boundary",
-        "--along",
-        "stop.tol=0.0005:0.002",
-        "-o",
-        str(tmp_path / "one"),
-    ]
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as stopped:
-        patch.setattr("mdnum.forks.confirm._answered", lambda asked, values, tell: ["other"] * len(values))
-        main([*asked, "--json"])
-    answer = json.loads(capsys.readouterr().out)
-    assert stopped.value.code == 1 and answer["key"] == "tol" and answer["loss"] == "residual penetration"
-    whole = answer["value"]
-    edges = answer["boundaries"]
-    assert [
-        edge["above"] > whole * 0.75**k >= edge["below"] for k, edge in zip((2, 1, 0), edges, strict=True)
-    ]
-    np.testing.assert_allclose(
-        [edge["below"] for edge in edges], [whole * 0.75**k for k in (2, 1, 0)], rtol=1e-6
-    )
+    elsewhere = lambda system, key, steps, values, *_, **__: ["other"] * len(values)  # noqa: E731
+    monkeypatch.setattr("mdnum.forks.boundaries.digests_elsewhere", elsewhere)
+    found = mdnum.fork_map("ball/batch-on-the-boundary", "stop.tol", 0.0005, 0.002, out=tmp_path / "one")
+    answer, edges = found.summary, found.summary["boundaries"]
+    assert answer["key"] == "tol" and answer["loss"] == "residual penetration"
+    assert [one.code for one in found.verdict.findings] == ["NOT_REPRODUCED"]
+    places = [answer["value"] * 0.75**k for k in (2, 1, 0)]
+    assert [edge["above"] > at >= edge["below"] for edge, at in zip(edges, places, strict=True)]
+    np.testing.assert_allclose([edge["below"] for edge in edges], places, rtol=1e-6)
     for edge in edges:
         assert np.nextafter(np.float32(edge["below"]), np.float32(1)) == np.float32(edge["above"])
         assert edge["channel"] == "stop" and edge["confirmed"] == "no" and edge["jump"] > 0
-    assert edges[-1]["says"] == "the solver makes 0 iterations instead of 1"
+    assert (edges[-1]["who"], edges[-1]["way"]) == ("solver", "1 → 0")
     pieces = RunFolder.open(tmp_path / "one").read("intervals")
     assert pieces["low"][1:].tolist() == [edge["above"] for edge in edges]
     # the loss is what the solver leaves: the same on a whole interval, a step up at each boundary
     np.testing.assert_array_equal(pieces["loss_low"], pieces["loss_high"])
-    page = (tmp_path / "one/report.html").read_text(encoding="utf-8")
-    assert "solver<br>1 → 0" in page
 
 
 def test_what_cannot_be_is_refused_before_there_is_a_folder(tmp_path):
@@ -223,12 +202,34 @@ def test_what_cannot_be_is_refused_before_there_is_a_folder(tmp_path):
 
 def test_runs_that_all_blow_up_are_no_single_history(tmp_path):
     summary = {
-        "key": "potential.sigma", "low": 3.4, "high": 3.41, "value": 1.0, "steps": 500, "evaluations": 65,
-        "failed_runs": 65, "boundaries": [], "unresolved": [], "confirm": True, "confirmed": 0,
+        "system": "x", "key": "potential.sigma", "key_unit": "", "low": 3.4, "high": 3.41, "value": 1.0,
+        "steps": 500,
+        "evaluations": 65, "failed_runs": 65, "boundaries": [], "unresolved": [], "confirm": True,
+        "confirmed": 0, "loss": "x", "loss_unit": "", "intervals": [], "histories": 1, "jump_largest": None,
+        "separation_largest": None, "seconds": 1.0, "compiles": False, "timestep": 0.1, "atoms": 2,
     }  # fmt: skip
-    verdict = page.judge(Question(tmp_path, summary, "", {}, {}))
-    assert verdict.headline.startswith("All 65 runs between potential.sigma = 3.4 and 3.41 blew up")
-    assert verdict.evidence == ("The interval is far above the system's own value, 1.0.",)
-    assert verdict.tone == "warning" and "far above" in verdict.findings[0].remedy
-    inside = {**summary, "low": 0.9, "high": 1.1}
-    assert page.judge(Question(tmp_path, inside, "", {}, {})).evidence == ()
+    verdict = judged(tmp_path / "far", summary)
+    assert verdict.tone == "warning" and verdict.evidence == ()
+    assert "far above" in verdict.findings[0].values["away"]
+    inside = judged(tmp_path / "inside", {**summary, "low": 0.9, "high": 1.1})
+    assert inside.findings[0].values["away"] == ""
+
+
+def test_a_forecast_names_the_flip_that_comes(tmp_path):
+    found = mdnum.fork_forecast("argon/crystal-108", 1e-6, steps=60, out=tmp_path / "a")
+    first = found.summary["first"][0]
+    # the fork of two runs that far apart is at step 5, by this pair
+    assert (first["step"], first["i"], first["j"]) == (5, 28, 64)
+    assert (tmp_path / "a/report.html").exists()
+    reach = RunFolder.open(tmp_path / "a").read("reach")
+    # the first step at which the nearest decision is nearer than the displacement is the step forecast
+    assert int(np.flatnonzero(reach["positive"] <= 1e-6)[0]) == 5
+    assert (reach["i"][5], reach["j"][5]) == (28, 64)
+    # what ends a forecast before the run is a finding, but for a flip
+    folder = RunFolder.open(tmp_path / "a")
+    for ends, codes in (("flip", []), ("size", ["FORECAST_ENDS_SIZE"]), ("list", ["FORECAST_ENDS_LIST"])):
+        folder.write_summary({**found.summary, "ends": ends, "first": [], "until": 40})
+        assert [one.code for one in frame.finish(folder, report=False).verdict.findings] == codes
+    folder.write_summary({**found.summary, "ends": "close", "until": -1, "ulp": 1e-6})
+    found = frame.finish(folder, report=False).verdict
+    assert [one.code for one in found.findings] == ["BELOW_ROUNDING", "FORECAST_ENDS_CLOSE"]

@@ -18,7 +18,7 @@ from mdnum.systems import BallSystem, System
 
 #: Reductions whose result does not depend on the order of their terms.
 ORDERLESS = ("exact", "fixed-point")
-#: What `--processes` varies, and people may look for here.
+#: What `mdnum fork processes` varies, and people may look for here.
 _PROGRAMS = ("jit", "eager", "vmap", "grad", "xla")
 _WORLDS = {"md": "of molecular dynamics", "ball": "of a ball"}
 
@@ -171,7 +171,7 @@ def parse(text: str) -> Choice:
     if family in _PROGRAMS:
         raise InputError(
             f"{text} is another program of one run, and no choice of two",
-            remedy="Ask `mdnum fork SYSTEM --processes`",
+            remedy="Ask `mdnum fork processes SYSTEM`",
         )
     if head in CHOICES and (argument or not equals) and (both or not at):
         kind: type[Choice] = CHOICES[head]

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mdnum.errors import InputError, NumericalError
-from mdnum.forks.boundaries import Line
+from mdnum.forks.boundaries import NumberLine
 from mdnum.gradients import parameters
 from mdnum.gradients.problem import Problem, Progress, in_phase
 from mdnum.gradients.recorded import passed, tape_of
@@ -108,8 +108,8 @@ def edges(
     if value == 0 or not 0 < reach < 1:
         raise InputError(f"{full} = {value:g} and reach = {reach:g}; expected a number, and a share below 1")
     program = MdProgram(problem.simulation)
-    line = Line(program, _number(program, full, value), problem.steps, _no_loss)
-    ahead = _forecast(problem, full, progress)
+    line = NumberLine(program, _number(program, full, value), problem.steps, _no_loss)
+    ahead = _forecast(problem, full, budget, progress)
     below, above = (_edge(problem, line, full, value, sign, ahead[sign], reach, progress) for sign in (-1, 1))
     return DecisionEdges(full, value, below, above)
 
@@ -165,7 +165,7 @@ def _forecast(problem: Problem, name: str, progress: Progress | None) -> dict[in
 
 def _edge(
     problem: Problem,
-    line: Line,
+    line: NumberLine,
     name: str,
     value: float,
     sign: int,
@@ -216,7 +216,7 @@ def _edge(
     )  # fmt: skip
 
 
-def _first(line: Line, inside: int, beyond: int) -> tuple[int, int, int]:
+def _first(line: NumberLine, inside: int, beyond: int) -> tuple[int, int, int]:
     """The first decision that differs: the pair that is nearest to its threshold on both sides."""
     found = line.boundary(inside, beyond)
     if found is None:

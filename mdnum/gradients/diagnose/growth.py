@@ -246,7 +246,7 @@ class ScalingWatch:
     """
 
     def __init__(self, steps: int, format: str = "float16"):
-        self.format = formats.get(format)
+        self.format = formats.format_of(format)
         self.steps, self.numbers = steps, 0
         self.largest, self.smallest = np.zeros(steps + 1), np.full(steps + 1, np.inf)
         self.overflow, self.underflow, self.subnormal = (np.zeros(steps + 1, np.int64) for _ in range(3))

@@ -1,0 +1,500 @@
+"""The page of a pair of runs, of either world; from the folder alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.patches import Circle
+
+from mdnum.report.browse import Browse, Column, plain_rows
+from mdnum.report.finding import Verdict
+from mdnum.report.section import Figure, Key, Page, Plot, Role, Section, Series, Table, pairs
+from mdnum.report.svg import BAD, FIRST, MUTED, SECOND
+from mdnum.report.words import count, listed, many, number, plain
+from mdnum.workflow.fork_verdict import DECISION, TEXTS, TWO_BY_TWO, WHAT, agreeing, sides, subject
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Canvas
+
+    from mdnum.workflow.frame import View
+
+#: r² from which a separation counts as one exponential.
+FITS = 0.8
+#: Rows of the table of decisions that the page carries.
+TABLE_ROWS = 5_000
+SPACES = {"r2": "r²", "r": "r", "height": "minus the height", "residual": "tolerance minus residual"}
+#: A split that is expected is shown up to so many times the steps that were followed.
+_BEYOND = 2.0
+#: The longest arrow, in cutoffs.
+_ARROW = 0.5
+
+
+def page(view: View, verdict: Verdict) -> Page:
+    """The page of a pair of runs."""
+    s = view.summary
+    sections = [
+        Section("Separation", [part for part in (_separation(view),) if part]),
+        Section(DECISION, [*_decision(view), *_around(view)], terminal=True),
+        Section(TWO_BY_TWO, list(_two_by_two(s)), terminal=True),
+        Section("One decision overridden", list(_pinned(view)), terminal=True),
+        Section("Minimal cause", list(_minimal(s)), terminal=True),
+        Section("How far the decisions are certain", list(_certain(view)), terminal=True),
+        Section("Growth", list(_growth(view)), terminal=True),
+        Section("After the fork", list(_after(view))),
+        Section("Decisions that differ", list(_flips(view))),
+        Section(WHAT, list(_what(view, s))),
+    ]
+    sections = [one for one in sections if one.parts]
+    title = f"{view.name}: {s['choice']}"
+    return Page(
+        title, str(s["difference"]), list(_keys(view)), sections, view.system_toml, view.folder.provenance
+    )
+
+
+def _keys(view: View) -> Iterator[Key]:
+    s, time = view.summary, view.units.time
+    for name, label, what in (
+        ("first_bit", "First bit", "bits differ"),
+        ("fork", "Fork", "a decision differs"),
+        ("split", "Split", "beyond the tolerance"),
+    ):
+        at = s[name]
+        none = f"none in {many(s['steps'], 'step')}"
+        note = none if at is None else f"{what}, {plain(s[f'{name}_time'], 6)} {time}"
+        yield Key(label, "–" if at is None else f"step {count(at)}", note)
+    fits = s["r_squared"]
+    guess = "" if s["predicted_split"] is None else f"; split expected at step {count(s['predicted_split'])}"
+    poor = ", but no single exponential" if fits is not None and fits < FITS else guess
+    yield Key("Growth rate", number(s["growth_rate_time"]), f"per {time}{poor}")
+    least = next((one for one in s["shares"] if one["what"] == "decisions" and one["reference"] == "A"), {})
+    worth = number(s["e_foldings"])
+    if s["e_foldings"] is None and s["effect"] == "cause":
+        # no split in sight: the share is at least what was followed
+        worth = f"> {number(least['e_foldings'])}" if least.get("e_foldings") else "∞"
+    yield Key("The flips were worth", worth, "e-foldings: growth rate × steps gained")
+    stops = f", {count(s['cross_stops'])} of them numbers of {s['counted']}" if "cross_stops" in s else ""
+    yield Key("Decisions that differ", count(s["cross_flips"]), f"made in one run only{stops}")
+
+
+def _dates(s: Mapping[str, Any], *, all_of_them: bool = False) -> tuple[tuple[float, str], ...]:
+    names = (("first_bit", "first bit"),) * all_of_them + (("fork", "fork"), ("split", "split"))
+    return tuple((float(s[name]), label) for name, label in names if s.get(name) is not None)
+
+
+def _positive(values: np.ndarray) -> np.ndarray:
+    """Without zeros, which a logarithmic axis has no place for."""
+    return np.where(values > 0, values, np.nan)
+
+
+def _has(table: Mapping[str, np.ndarray], name: str) -> bool:
+    return name in table and bool(np.any(np.nan_to_num(table[name]) > 0))
+
+
+def _separation(view: View) -> Plot | None:
+    """The separation of A from B, free and under imposed decisions, with the three dates."""
+    s, table = view.summary, view.table("separation")
+    if not _has(table, "free"):
+        return None
+    step = table["step"]
+    # a repeat is close to the run that it repeats and must not hide it: it comes first
+    repeats = [name for name in table if name.startswith("repeat_")]
+    series = [
+        Series("" if k else "B again, start perturbed", step, _positive(table[name]), role="muted")
+        for k, name in enumerate(repeats)
+    ]
+    named: tuple[tuple[str, str, Role], ...] = (
+        ("free", "A and B, free", "first"), ("imposed", "A and B under A’s decisions", "second"),
+        ("back", "B and A under B’s decisions", "third"), ("pinned", "A and B, decision overridden", "bad"),
+    )  # fmt: skip
+    for name, label, role in named:
+        if _has(table, name):
+            # before the fork the lines lie upon one another
+            series.append(Series(label, step, _positive(table[name]), role=role, dashed=name != "free"))
+    verticals, guess = _dates(s, all_of_them=True), s["predicted_split"]
+    shown = guess is not None and guess <= _BEYOND * s["steps"]
+    if shown:
+        verticals += ((float(guess or 0), "split expected"),)
+    fit = s["growth"]["B"]
+    if fit["rate"] is not None and fit["r_squared"] >= FITS:
+        at = np.linspace(fit["first"], (guess or 0) if shown else fit["last"], 60)
+        line = np.exp(fit["intercept"] + fit["rate"] * at)
+        series.append(Series("growth, fitted", at, line, role="ink", dashed=True))
+    ball = "balls" in s
+    return Plot(
+        "separation", "Separation of the two runs", f"step (of {plain(s['timestep'])} {view.units.time})",
+        f"{'largest difference of heights' if ball else 'largest distance of an atom from itself'} "
+        f"({view.units.length})",
+        tuple(series), y_scale="log", verticals=verticals,
+        horizontals=((float(s["tolerance"]), "split tolerance"),),
+        caption=TEXTS("separation_caption" if _has(table, "imposed") else "separation_caption_free"),
+    )  # fmt: skip
+
+
+def _decision(view: View) -> Iterator[Any]:
+    """The decision at the fork."""
+    s, unit = view.summary, view.units.length
+    d = s["decision"]
+    if d is None:
+        return
+    name = "at_start" if d["run"] == "start" else d["channel"]
+    values = {**d, **sides(d), "counted": s.get("counted"), "subject": subject(s)}
+    when = f"{count(d['step'])}, {plain(d['step'] * s['timestep'], 6)} {view.units.time}"
+    also = f"; {many(d['also'], 'more decision')} at the same step" if d["also"] else ""
+    rows = [("Decision", TEXTS(f"decided_{name}", **values)), ("Step", when + also)]
+    slope = 1.0
+    if d["channel"] == "pair":
+        cutoffs = d["cutoffs"]
+        own = cutoffs["B" if d["run"] == "B" else "A"]
+        rows.append(("Distance", f"{number(d['distance'], 11)} {unit}, cutoff {number(own, 11)} {unit}"))
+        if cutoffs["A"] != cutoffs["B"]:
+            off = number(cutoffs["B"] - cutoffs["A"], 3, signed=True)
+            rows.append(("Cutoff", f"not the same number in both runs: B’s is {off} {unit} off A’s"))
+        slope = d["margin"] / d["margin_length"] if d["margin_length"] else 1.0
+    for run, margin in d["margins"].items():
+        bound = d["bounds"][run]
+        ambiguous = run in d["ambiguous_in"]
+        kind = "none" if margin is None else "ambiguous" if ambiguous else "exact" if not bound else "sure"
+        sized = {"margin": margin, "bound": bound, "space": SPACES[d["space"]]}
+        sized |= {"times": abs(margin) / bound if margin and bound else None}
+        text = TEXTS(f"margin_{kind}", **sized)
+        if slope != 1.0 and margin is not None:
+            text += f" ({number(margin / slope, 3, signed=True)} {unit})"
+        rows.append((f"Margin in {run}", text))
+    kind = "none" if d["protected"] is None else "kept" if d["protected"] >= d["protects"] else "lost"
+    rows.append(("Separation the step before", TEXTS(f"protection_{kind}", **d, unit=unit)))
+    yield pairs(rows)
+
+
+def _around(view: View) -> Iterator[Any]:
+    """The atoms around the deciding pair, or the heights of the deciding ball."""
+    d = view.summary["decision"]
+    if d is None:
+        return
+    if "balls" in view.summary:
+        table, series = view.table("around"), []
+        named: tuple[tuple[str, Role], ...] = (("A", "first"), ("B", "second"))
+        for name, role in named:
+            mine = table["run"].astype(str) == name
+            step, height, touching = (table[column][mine] for column in ("step", "y", "contact"))
+            # B on A: before the fork one line hides the other
+            series.append(Series(name, step, height, role=role, dashed=name == "B"))
+            if touching.any():
+                label = f"{name} in contact"
+                series.append(Series(label, step[touching], height[touching], mark="points", role=role))
+        yield Plot(
+            "around", f"Ball {table['ball'][0]} around the fork", "step", "height (m)", tuple(series),
+            verticals=((float(d["step"]), "fork"),), horizontals=((0.0, "floor"),),
+            caption=TEXTS("around_caption"),
+        )  # fmt: skip
+        return
+    table = view.table("neighborhood")
+    if len(table["atom"]) > 1:
+        i, j = table["atom"][:2].tolist()
+        alt = f"{many(len(table['atom']) - 2, 'atom')} around the pair {i}–{j} in A and in B, projected."
+        yield Figure("atoms", TEXTS("atoms_caption"), alt, lambda figure: _atoms(view, table, figure), 4.0)
+
+
+def _atoms(view: View, table: Mapping[str, np.ndarray], figure: Canvas) -> None:
+    """A and B side by side, each with the pair in the plane and its cutoff around the first atom."""
+    d = view.summary["decision"]
+    x, moved = (
+        np.stack([table[k] for k in names], axis=1) for names in (("x", "y", "z"), ("dx", "dy", "dz"))
+    )
+    # along the pair, across it where the neighbors spread most, and toward the eye
+    along = (x[1] - x[0]) / np.linalg.norm(x[1] - x[0])
+    _, _, axes = np.linalg.svd(x - np.outer(x @ along, along), full_matrices=True)
+    across = next(a - (a @ along) * along for a in (*axes, *np.eye(3)) if abs(a @ along) < 0.9)
+    across /= np.linalg.norm(across)
+    basis = np.stack([along, across, np.cross(along, across)])
+    flat, shift = x @ basis.T, moved @ basis.T
+    longest = float(np.sqrt((shift[:, :2] ** 2).sum(axis=1)).max())
+    factor = 10.0 ** np.floor(np.log10(_ARROW * d["cutoffs"]["A"] / longest)) if longest > 0 else 0.0
+    slope = d["margin"] / d["margin_length"] if d["margin_length"] else 1.0
+    shade: Any = np.clip(
+        1.0 - 0.8 * np.abs(flat[:, 2]) / max(float(np.abs(flat[:, 2]).max()), 1e-300), 0.15, 1
+    )
+    for panel, name in zip(figure.subplots(1, 2), "AB", strict=True):
+        inside, cutoff = bool(d["decided"][name]), float(d["cutoffs"][name])
+        panel.scatter(flat[2:, 0], flat[2:, 1], s=26, c=MUTED, alpha=shade[2:], lw=0)
+        panel.add_patch(Circle(tuple(flat[0, :2]), cutoff, fill=False, ec=SECOND, lw=1.2))
+        panel.plot(flat[:2, 0], flat[:2, 1], "o-" if inside else "o--", color=FIRST, lw=1.6, ms=6)
+        for k, atom in enumerate(table["atom"][:2].tolist()):
+            side = {"xytext": (-7, 6), "ha": "right"} if k == 0 else {"xytext": (7, 6), "ha": "left"}
+            panel.annotate(str(atom), tuple(flat[k, :2]), textcoords="offset points", fontsize=8.5, **side)
+        beyond = number(-d["margins"][name] / slope, 3, signed=True)
+        word = "inside" if inside else "outside"
+        panel.set_title(f"{name}: {word}, r − cutoff = {beyond} {view.units.length}", fontsize=9, loc="left")
+        if name == "B" and factor:
+            panel.quiver(flat[:, 0], flat[:, 1], factor * shift[:, 0], factor * shift[:, 1], angles="xy",
+                         scale_units="xy", scale=1.0, color=BAD, width=0.005)  # fmt: skip
+            panel.set_ylabel(f"arrows × {factor:.0e}")
+        reach = 1.12 * max(float(np.abs(flat[:, :2]).max()), 1.5 * cutoff)
+        panel.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
+        panel.set_xlabel(f"along the pair ({view.units.length})")
+
+
+def _two_by_two(s: Mapping[str, Any]) -> Iterator[Any]:
+    """Whose arithmetic, whose decisions: when each run splits from A and from B, and what each is worth."""
+    cells, rows = s["table"], {}
+    for cell in cells:
+        key = cell["arithmetic"], cell["decisions"]
+        at = f"> {count(cell['until'])}" if cell["split"] is None else count(cell["split"])
+        same = key == (cell["reference"],) * 2
+        rows.setdefault(key, {})[cell["reference"]] = f"is {cell['reference']}" if same else at
+    if len(rows) < 3 or all(cell["split"] is None for cell in cells):
+        return
+    lines = [(a, "its own" if a == d else f"{d}’s", at.get("A"), at.get("B")) for (a, d), at in rows.items()]
+    repeated = s["repeated"]
+    for whose, name in (("its own", "free"), ("A’s", "imposed")):
+        seen = [one[name] for one in repeated if one[name] is not None]
+        unseen = [f"{len(repeated) - len(seen)} of {len(repeated)} not seen to"] * (len(seen) < len(repeated))
+        steps = [f"{count(min(seen))} to {count(max(seen))}"] if seen else []
+        if repeated:
+            lines.append(("B, start perturbed", whose, "; ".join(steps + unseen), None))
+    yield TEXTS("two_by_two")
+    yield Table(("arithmetic", "decisions", "splits from A at", "from B at"), lines)
+    worth: dict[str, dict[str, str]] = {}
+    for one in s["shares"]:
+        more = "> " if one["at_least"] else ""
+        text = f"{more}{many(one['steps'], 'step')}"
+        if one["e_foldings"] is not None:
+            text += f", {more}{number(one['e_foldings'])} e-foldings"
+        worth.setdefault(one["what"], {})[one["reference"]] = text
+    if worth:
+        yield TEXTS("shares")
+        rows = [(what, at.get("A"), at.get("B")) for what, at in worth.items()]
+        yield Table(("without the difference in", "seen from A", "seen from B"), rows)
+
+
+def _pinned(view: View) -> Iterator[Any]:
+    pinned = view.summary.get("pinned")
+    if pinned is None:
+        return
+    if pinned["pairs"] is None:
+        yield TEXTS("pinned_none", **pinned)
+        return
+    names = listed([f"{i}–{j}" for i, j in pinned["pairs"]])
+    kind = "kept" if pinned["split"] is None else "splits"
+    yield TEXTS(f"pinned_{kind}", **{**pinned, "pairs": names}, unit=view.units.length)
+
+
+def _minimal(s: Mapping[str, Any]) -> Iterator[Any]:
+    minimal = s.get("minimal")
+    if minimal is None:
+        return
+    yield TEXTS("minimal_tests" if minimal["tests"] else "minimal_none", **minimal)
+    if minimal["pairs"]:
+        rows = []
+        for pair in minimal["pairs"]:
+            spells = [
+                f"from {count(first)} on" if end is None
+                else count(first) if end == first + 1
+                else f"{count(first)} to {count(end - 1)}"
+                for first, end in pair["differs"]
+            ]  # fmt: skip
+            more = f", and {many(len(spells) - 3, 'time')} more" if len(spells) > 3 else ""
+            rows.append((f"{pair['i']}–{pair['j']}", ", ".join(spells[:3]) + more))
+        yield Table(("pair", "decided differently, steps"), rows)
+
+
+def _certain(view: View) -> Iterator[Any]:
+    """How far the decisions are certain, by themselves and against the other run's."""
+    s, rows = view.summary, []
+    for name, step in (s.get("certified_horizon") or {}).items():
+        ambiguous, first = s["ambiguous"][name], s["ambiguous_first"][name]
+        text = TEXTS("certified" if step >= 0 else "certified_never", step=step)
+        if ambiguous:
+            text += "; " + TEXTS("certified_after", n=ambiguous, steps=s["ambiguous_steps"][name])
+        if first is not None:
+            text += ", " + TEXTS("certified_first", **first)
+        if not s["lists_complete"][name]:
+            text += "; " + TEXTS("certified_listed")
+        rows.append((f"Certified, {name}", text))
+    until = s.get("protected_until")
+    if until is not None:
+        kind = "throughout" if until >= s["steps"] else "until" if until >= 0 else "never"
+        rows.append(("Protected", TEXTS(f"protected_{kind}", until=until)))
+    if s.get("shadow"):
+        other = "B" if s["shadow"] == "A" else "A"
+        rows.append(
+            ("Shadow horizon", TEXTS("shadow", step=s["shadow_horizon"], wide=s["shadow"], other=other))
+        )
+    if not rows:
+        return
+    yield TEXTS("certain")
+    yield pairs(rows)
+    table = view.table("separation")
+    if _has(table, "nearest_a") and _has(table, "free"):
+        verticals = _dates(s)
+        if until is not None and 0 <= until < s["steps"]:
+            verticals = ((float(until), "protected"), *verticals)
+        nearest, moved = _positive(table["nearest_a"]), _positive(2 * table["free"])
+        series = (
+            Series("nearest pair of A to its cutoff", table["step"], nearest, mark="points", role="muted"),
+            Series("twice the separation of A and B", table["step"], moved, role="first"),
+        )
+        yield Plot(
+            "protection", "Nearest decision and separation", "step", f"length ({view.units.length})", series,
+            y_scale="log", verticals=verticals, caption=TEXTS("protection_caption"),
+        )  # fmt: skip
+
+
+def _growth(view: View) -> Iterator[Any]:
+    s, time, rows = view.summary, view.units.time, []
+    for name, fit in s["growth"].items():
+        label = "A and B, free" if name == "B" else "Under A’s decisions"
+        kind = "none" if fit["rate"] is None else "poor" if fit["r_squared"] < FITS else "fitted"
+        rate = fit["rate"] or 0.0
+        values = {**fit, "per_time": rate / s["timestep"], "time": time}
+        text = TEXTS(f"growth_{kind}", **values)
+        if kind == "fitted" and rate > 0:
+            text += "; " + TEXTS("growth_doubles", steps=float(np.log(2)) / rate)
+        rows.append((label, text))
+    found, reason = s.get("lyapunov"), s.get("lyapunov_reason")
+    if found is not None:
+        text = TEXTS("lyapunov" if found["ratio"] is None else "lyapunov_ratio", **found, time=time)
+        rows.append(("Lyapunov exponent", f"{text}; {reason}" if reason else text))
+        if found["ulp_split"] is not None:
+            rows.append(("An ulp of the start", TEXTS("lyapunov_ulp", **found, unit=view.units.length)))
+    elif reason:
+        rows.append(("Lyapunov exponent", f"none: {reason}"))
+    yield pairs(rows)
+
+
+def _after(view: View) -> Iterator[Plot]:
+    """What differs at each step: decisions, those that were overridden, energies."""
+    s, table = view.summary, view.table("separation")
+    length, dates = view.units.length, _dates(s)
+    for name, title, label in (
+        ("cross", "Decisions that the two runs make differently", "decisions that differ"),
+        ("overridden", "Decisions overridden in the run under A’s decisions", "decisions overridden"),
+    ):
+        if _has(table, name):
+            values = _positive(table[name].astype(float))
+            wide = np.nanmax(values) > 30
+            series = (Series(label, table["step"], values, mark="points"),)
+            yield Plot(
+                name, title, "step", label, series, y_scale="log" if wide else "linear", verticals=dates,
+                caption=TEXTS(f"{name}_caption"),
+            )  # fmt: skip
+    if _has(table, "furthest") and "balls" not in s:
+        series = (Series("", table["step"], _positive(table["furthest"]), mark="points"),)
+        yield Plot(
+            "furthest", "Distance of overridden pairs from their cutoff", "step",
+            f"furthest from its cutoff ({length})", series, y_scale="log", verticals=dates,
+            horizontals=((float(s["tolerance"]), "split tolerance"),), caption=TEXTS("furthest_caption"),
+        )  # fmt: skip
+    named: tuple[tuple[str, str, Role], ...] = (
+        ("energy_b", "B, free", "first"), ("energy_imposed", "B under A’s decisions", "second"),
+    )  # fmt: skip
+    off: list[tuple[str, Role, np.ndarray]] = [
+        (label, role, np.abs(table[name] - table["energy_a"])) for name, label, role in named
+    ]
+    lines = [Series(label, table["step"], _positive(y), role=role) for label, role, y in off if np.any(y > 0)]
+    if lines:
+        unit = f"|energy − energy of A| ({view.units.energy})"
+        yield Plot("energy", "Difference of total energies", "step", unit, tuple(lines), y_scale="log",
+                   verticals=dates, caption=TEXTS("energy_caption"))  # fmt: skip
+
+
+def _flips(view: View) -> Iterator[Any]:
+    """The first decisions that differ, to be searched."""
+    s, total = view.summary, view.summary["cross_flips"]
+    if not total:
+        yield TEXTS("no_flips")
+        return
+    ball = "balls" in s
+    table = view.folder.read("cross_flips", rows=TABLE_ROWS)
+    run_b = (table["run"].astype(str) == "B").astype(int)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.abs(table["margin"] / table["bound"]).astype(float)
+    columns: list[tuple[np.ndarray, int | None]] = [
+        (table[name].astype(int), None) for name in ("step", "i", "j")
+    ]
+    columns.append((run_b, None))
+    if ball:
+        columns += [((table["channel"].astype(str) == "stop").astype(int), None)]
+        columns += [(table[name].astype(int), None) for name in ("a", "b")]
+        shown = (
+            Column(1, "ball", kind="count"), Column(4, "decision", kind="word", words=("contact", "stop")),
+            Column(5, "in A", kind="count"), Column(6, "in B", kind="count"),
+        )  # fmt: skip
+        words = {"contact": (4, 0), "stop": (4, 1)}
+    else:
+        columns += [(table[name].astype(int), None) for name in ("entered", "differs")]
+        columns.append((run_b, None))
+        shown = (
+            Column(1, "pair", kind="pair"), Column(3, "run", kind="word", words=("A", "B")),
+            Column(4, "decision", kind="word", words=("left", "entered"), colors=("out", "in")),
+            Column(5, "the runs now", kind="word", words=("agree", "differ")),
+        )  # fmt: skip
+        words = {
+            "entered": (4, 1),
+            "in": (4, 1),
+            "left": (4, 0),
+            "out": (4, 0),
+            "differ": (5, 1),
+            "agree": (5, 0),
+        }
+    columns += [(table["margin"].astype(float), 4), (ratio, 3)]
+    rows = plain_rows(columns)
+    yield TEXTS("flips_ball" if ball else "flips_md", shown=len(rows), total=total, counted=s.get("counted"))
+    yield Browse(
+        name="flips", row_id="flip-rows", label="Search decisions",
+        placeholder="step:100..200, ambiguous, " + ("ball 3, contact" if ball else "3-17, atom 5, B"),
+        columns=(
+            Column(0, "step", kind="count"), *shown, Column(7, "margin"),
+            Column(8, "margin", "÷ bound", digits=2, missing="∞"),
+        ),
+        rows=rows, words={**words, "a": (3, 0), "b": (3, 1)}, ranges={"step": 0},
+        subjects=(1,) if ball else (1, 2), nouns=("ball",) if ball else ("atom", "pair"), ambiguous=8,
+    )  # fmt: skip
+
+
+def size(view: View) -> list[tuple[str, str]]:
+    """Rows on the system."""
+    s = view.summary
+    rows = [("System", str(s["about"]))] if s.get("about") else []
+    parts = many(s["balls"], "ball") if "balls" in s else many(s["atoms"], "atom")
+    asked = s.get("steps_asked")
+    more = f" ({count(asked)} asked for)" if asked and asked > s["steps"] else ""
+    text = f"{parts}, {many(s['steps'], 'step')} of {plain(s['timestep'])} {view.units.time}{more}"
+    kind = f", {s['contact_kind']} contact, {s['integrator']}" if "contact_kind" in s else ""
+    return [*rows, ("Size", text + kind)]
+
+
+def _what(view: View, s: Mapping[str, Any]) -> Iterator[Any]:
+    rows = [
+        *size(view),
+        ("Choice", f"{s['choice']}: {s['choice_about']}"),
+        ("A and B differ in", s["difference"]),
+    ]
+    if "reproduced" in s:
+        rows.append(("Replay", TEXTS("reproduced" if s["reproduced"] else "not_reproduced")))
+    if s.get("must_hold"):
+        rows.append(("Must hold", TEXTS("must_hold")))
+    split = TEXTS(
+        "split_ball" if "balls" in s else "split_md", tolerance=s["tolerance"], unit=view.units.length
+    )
+    rows.append(("Split", split))
+    if s["imposed_until"] is None:
+        rows.append(("Counterfactual", TEXTS("no_counterfactual")))
+    if s["count"] and s["count"]["pairs"] > 1:
+        rows.append(("Chance", TEXTS("chance", repeats=s["count"]["pairs"] - 1, agreeing=agreeing(s))))
+    yield pairs([*rows, ("Took", f"{number(s['seconds'], 2)} s")])
+    if s.get("differences"):
+        yield differences(s)
+    elif s["changes"]:
+        changed = [(key, _value(a), _value(b)) for key, (a, b) in s["changes"].items()]
+        yield Table(("key", "in A", "in B"), changed, "What differs in the system file")
+
+
+def differences(s: Mapping[str, Any]) -> Table:
+    """What was different about two finished runs."""
+    return Table(("key", "in A", "in B"), [(key, _value(a), _value(b)) for key, a, b in s["differences"]])
+
+
+def _value(value: Any) -> str:
+    return repr(value) if isinstance(value, float) else "none" if value is None else str(value)
