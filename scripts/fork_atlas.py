@@ -41,7 +41,7 @@ from matplotlib.colors import LogNorm
 from mdnum.errors import InputError, MdnumError
 from mdnum.events.chance import REPEATS
 from mdnum.forks import fork
-from mdnum.forks.choices import Choice, parse, shipped
+from mdnum.forks.choices import Choice, parse, shipped, unavailable
 from mdnum.forks.worlds import varied
 from mdnum.md.cutoffs import BY_NAME as CUTOFFS
 from mdnum.systems import System, load
@@ -154,7 +154,7 @@ def cell_of(system: System, word: str, kind: str, choice: Choice, steps: int, re
         )
 
     try:
-        reason = choice.why_not(system)
+        reason = unavailable(choice, system)
         if reason is not None:
             return ended("does not apply", reason)
         found = fork(choice.make(system), steps, repeats=repeats)

@@ -30,7 +30,7 @@ import numpy as np
 from _output import COLORS, figure, parser, save, say, start, table
 
 from mdnum.forks import Fork, fork
-from mdnum.forks.choices import Order, Summation
+from mdnum.forks.choices import Order, Summation, unavailable
 from mdnum.precision import reductions
 from mdnum.systems import Simulation, System, load
 
@@ -58,7 +58,7 @@ def study(system: System, word: str, steps: int) -> Row:
     own = shuffled.twin.a.simulation
     choice = Summation(word)
     found = None
-    if choice.why_not(system) is None:
+    if unavailable(choice, system) is None:
         found = fork(choice.make(system), steps, counterfactual=False)
     return Row(word, force_error(own, exact), found, shuffled.dates.seed)
 

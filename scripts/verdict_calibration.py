@@ -127,7 +127,7 @@ def gather(made: System, share: float, unseen: int, *, always: bool = False) -> 
     if unseen and found.dates.split is not None and (clear or always):
         programs = twin.b.nudged(perturbation(found), unseen, seed=1)
         runs = twin.a.repeats(programs, found.steps, found.tolerance, 3 * found.tolerance)
-        truth = [Delay.of(*run, found.tolerance) for run in runs]
+        truth = [Delay.of(free, under, found.tolerance) for free, under in runs]
     # the separations are stored in full: a verdict must be the same from the file
     kept = {name: found.series[name] for name in ("B", "B|A")}
     delays = {"seen": _rows(found.repeats), "unseen": _rows(truth)}

@@ -147,7 +147,7 @@ class BoundaryMap:
         return len({interval.digest for interval in self.intervals})
 
 
-class Line:
+class NumberLine:
     """Runs of one program along one number, addressed by the ordinal of a float.
 
     Args:
@@ -286,7 +286,7 @@ def boundaries(
     if last < 1:
         raise InputError(f"steps = {last}; expected at least 1")
     number = checked(program, key, low, high)
-    line = Line(program, number, last, loss)
+    line = NumberLine(program, number, last, loss)
     places = _grid(line, low, high, cells)
     note = progress or (lambda done, total, info: None)
     for k, place in enumerate(places):
@@ -327,7 +327,7 @@ def checked(program: Program, key: str, low: float, high: float) -> Number:
     return number
 
 
-def _grid(line: Line, low: float, high: float, cells: int) -> list[int]:
+def _grid(line: NumberLine, low: float, high: float, cells: int) -> list[int]:
     """Ordinals of the grid's floats: evenly spread, or all of them."""
     first, final = line.places([low, high])[0], line.places([low, high])[-1]
     if final - first <= cells:
@@ -335,7 +335,7 @@ def _grid(line: Line, low: float, high: float, cells: int) -> list[int]:
     return line.places(np.linspace(low, high, cells + 1))
 
 
-def _confirmed(system: Any, line: Line, found: list[Boundary], note: Progress) -> list[Boundary]:
+def _confirmed(system: Any, line: NumberLine, found: list[Boundary], note: Progress) -> list[Boundary]:
     """The same boundaries, compared with what a fresh process finds on either side."""
     sides = [side for boundary in found for side in (boundary.below, boundary.above)]
     digests = digests_elsewhere(
@@ -354,7 +354,7 @@ def _confirmed(system: Any, line: Line, found: list[Boundary], note: Progress) -
     ]
 
 
-def _mapped(line: Line, found: list[Boundary]) -> BoundaryMap:
+def _mapped(line: NumberLine, found: list[Boundary]) -> BoundaryMap:
     """Everything that was run, put in order."""
     places = sorted(line.known)
     values = [line.value(place) for place in places]

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mdnum.errors import InputError, NumericalError
-from mdnum.forks.boundaries import Line
+from mdnum.forks.boundaries import NumberLine
 from mdnum.gradients import parameters
 from mdnum.gradients.base import Problem, Progress
 from mdnum.gradients.diagnose.passes import passed
@@ -71,7 +71,7 @@ def edges(
     if value == 0 or not 0 < reach < 1:
         raise InputError(f"{full} = {value:g} and reach = {reach:g}; expected a number, and a share below 1")
     program = MdProgram(problem.simulation)
-    line = Line(program, _number(program, full, value), problem.steps, _no_loss)
+    line = NumberLine(program, _number(program, full, value), problem.steps, _no_loss)
     ahead = _forecast(problem, full, budget, progress)
     below, above = (_edge(problem, line, full, value, sign, ahead[sign], reach, progress) for sign in (-1, 1))
     return Edges(full, value, below, above, _sentence(full, value, below, above))
@@ -128,7 +128,7 @@ def _forecast(problem: Problem, name: str, budget: int, progress: Progress | Non
 
 def _edge(
     problem: Problem,
-    line: Line,
+    line: NumberLine,
     name: str,
     value: float,
     sign: int,
@@ -195,7 +195,7 @@ def _nothing(side: str, runs: int) -> Edge:
     return Edge(side, False, nan, nan, nan, -1, -1, -1, nan, nan, {}, {}, runs)
 
 
-def _first(line: Line, inside: int, beyond: int) -> tuple[int, int, int]:
+def _first(line: NumberLine, inside: int, beyond: int) -> tuple[int, int, int]:
     """The first decision that differs: the pair that is nearest to its threshold on both sides."""
     found = line.boundary(inside, beyond)
     if found is None:
