@@ -154,7 +154,7 @@ def _row(edge: Boundary) -> dict[str, Any]:
         "also": edge.also, "margin_below": below.margin, "margin_above": above.margin, "bound": edge.bound,
         "loss_below": below.loss, "loss_above": above.loss, "jump": edge.jump,
         **(gradients if edge.channel != "pair" else {}),
-        "energy_below": below.energy, "energy_above": above.energy, "apart": edge.apart,
+        "energy_below": below.energy, "energy_above": above.energy, "separation": edge.apart,
         "confirmed": {True: "yes", False: "no", None: "not asked"}[edge.confirmed],
     }  # fmt: skip
 
@@ -236,7 +236,8 @@ def page_map(view: View, verdict: Verdict) -> Page:
     rows = [
         (k + 1, repr(edge["below"]), repr(edge["above"]), edge["step"], edge["who"], edge["way"],
          edge["also"], edge["margin_below"], edge["margin_above"], edge["bound"], edge["jump"],
-         *((edge["gradient_below"], edge["gradient_above"]) if ball else (edge["apart"],)), edge["confirmed"])
+         *((edge["gradient_below"], edge["gradient_above"]) if ball else (edge["separation"],)),
+         edge["confirmed"])
         for k, edge in enumerate(edges)
     ]  # fmt: skip
     columns = ("", "below", "above", "step", "decision", "differs", "others", "margin below", "margin above",
@@ -327,13 +328,14 @@ def _map_figures(view: View, numbered: bool) -> Iterator[Plot]:
     if len(edges) < 2:
         return
     where = np.array([edge["above"] for edge in edges])
-    jump, apart = (
-        np.abs([np.nan if edge[name] is None else edge[name] for edge in edges]) for name in ("jump", "apart")
+    jump, separation = (
+        np.abs([np.nan if edge[name] is None else edge[name] for edge in edges])
+        for name in ("jump", "separation")
     )
     series = [Series(_with_unit("jump of the loss", s["loss_unit"]), where, jump, "points", "bad")]
-    if np.isfinite(apart).any():
+    if np.isfinite(separation).any():
         text = f"separation of the final states ({view.units.length})"
-        series.append(Series(text, where, apart, "points", "muted"))
+        series.append(Series(text, where, separation, "points", "muted"))
     yield Plot("jumps", "What changes at each boundary", label, "across the boundary", tuple(series),
                y_scale="log", caption=TEXTS("jumps_caption"))  # fmt: skip
 

@@ -39,7 +39,7 @@ _MD_ALONE = ("energy_back", "nearest_a", "nearest_b", "ambiguous_a", "ambiguous_
 
 
 @dataclass(frozen=True)
-class Asked:
+class PairQuestion:
     """What is to be found out about a pair of runs; the arguments of `fork`."""
 
     steps: int | None = None
@@ -115,7 +115,7 @@ def basics(system: System | BallSystem, steps: int | None) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def check(asked: Asked) -> None:
+def check(asked: PairQuestion) -> None:
     """Refuses what cannot be, before a folder is made."""
     from mdnum.forks.pair import repeats_asked
 
@@ -149,8 +149,8 @@ def logged(folder: RunFolder, progress: Progress | None) -> Progress:
 def followed(
     system: System | BallSystem,
     twin: Twin,
-    told: Mapping[str, Any],
-    asked: Asked,
+    labels: Mapping[str, Any],
+    asked: PairQuestion,
     further: Callable[[Fork], dict[str, Any]],
     out: str | Path | None,
     report: bool,
@@ -159,7 +159,7 @@ def followed(
     """Follow a twin and leave a fork folder.
 
     Args:
-        told: entries of the summary on what is varied; further: those that need the pair.
+        labels: entries of the summary on what is varied; further: those that need the pair.
     """
     from mdnum.forks import fork as follow
     from mdnum.forks.pair import counterfactuals
@@ -170,7 +170,7 @@ def followed(
     counterfactuals(twin, **options)
     with frame.new_folder("fork", f"fork-{system.name}", out, system=system) as folder:
         made = follow(twin, asked.steps, split=asked.split, progress=logged(folder, progress), **options)
-        summary = basics(system, asked.steps) | dict(told) | _numbers(made)
+        summary = basics(system, asked.steps) | dict(labels) | _numbers(made)
         tables = {"separation": _separation(made, is_ball)}
         if is_ball:
             summary |= {"decision": _decision(made), **_ball_flips(made, tables)}
@@ -284,7 +284,7 @@ def _decision(made: Fork) -> dict[str, Any] | None:
         thresholds = [one.decider.thresholds[kind].value for one in (a, b, run)]
         space, protects = run.decider.space, 2
         if space == "r2":
-            # the margin of r² is so many times that of r
+            # the margin of r² is this factor times that of r
             length = found.margin / (2.0 * run.decider.r_cut[kind])
         quantity = thresholds[2] - found.margin
         distance, *cutoffs = (
@@ -303,7 +303,9 @@ def _decision(made: Fork) -> dict[str, Any] | None:
     }  # fmt: skip
 
 
-def _of_md(made: Fork, asked: Asked, tables: dict[str, Any], progress: Progress | None) -> dict[str, Any]:
+def _of_md(
+    made: Fork, asked: PairQuestion, tables: dict[str, Any], progress: Progress | None
+) -> dict[str, Any]:
     """Entries and tables of a pair of molecular dynamics."""
     from mdnum.forks.certified import certified
     from mdnum.forks.replays import neighborhood

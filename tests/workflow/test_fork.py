@@ -254,7 +254,8 @@ def test_a_choice_that_changes_nothing_is_said_to(tmp_path):
 @pytest.mark.parametrize("world", ["md", "ball"])
 def test_a_promise_that_is_broken_is_an_error(tmp_path, monkeypatch, file, world):
     name, changed, steps = {
-        "md": ("pair/at-cutoff", {"cutoff.radius": 2.4}, 400), "ball": (file, {"start.height": [0.3, 0.301, 0.53]}, 60),
+        "md": ("pair/at-cutoff", {"cutoff.radius": 2.4}, 400),
+        "ball": (file, {"start.height": [0.3, 0.301, 0.53]}, 60),
     }[world]  # fmt: skip
     other = load(name, changed)
     use(
