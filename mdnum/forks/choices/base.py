@@ -64,7 +64,8 @@ class Choice:
 
     def describe(self, world: str = "md") -> str:
         """One line, for a system of a world."""
-        return (self.__doc__ or self.name).partition("\n")[0].rstrip(".")
+        text = (self.__doc__ or self.name).partition("\n")[0].rstrip(".")
+        return text[:1].lower() + text[1:] + summing(getattr(self, "both", None))
 
     @classmethod
     def parse(cls, argument: str, role: str, both: str | None) -> Choice:

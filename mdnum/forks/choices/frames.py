@@ -47,9 +47,6 @@ class Relabel(Summed):
 
     seed: int = 1
 
-    def describe(self, world: str = "md") -> str:
-        return "atoms in another order" + summing(self.both)
-
     def reason_unavailable(self, system: System) -> str | None:
         if is_langevin(system):
             return "the thermostat's noise belongs to labels: other atoms would get it"
@@ -89,9 +86,6 @@ class Rotate(Summed):
                 f"axes {self.axes!r}; expected another order of xyz, with or without signs (yzx, -x-yz)",
                 where="rotate",
             )
-
-    def describe(self, world: str = "md") -> str:
-        return "axes of the box exchanged or turned around" + summing(self.both)
 
     def _symmetry(self, system: System) -> str | None:
         pbc = np.asarray(system.atoms.pbc)

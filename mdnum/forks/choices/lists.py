@@ -192,7 +192,7 @@ class FormatChoice(Summed):
 
 @choice("builder")
 class Builder(Summed):
-    """Another search for neighbors.
+    """Lists by another search for neighbors.
 
     Attributes:
         both: reduction of both runs.
@@ -209,9 +209,6 @@ class Builder(Summed):
             raise InputError(
                 f"no list builder {self.word!r}; there are {', '.join(BUILDERS)}", where="builder"
             )
-
-    def describe(self, world: str = "md") -> str:
-        return "lists by another search" + summing(self.both)
 
     def reason_unavailable(self, system: System) -> str | None:
         if self.word is not None and built(system).builder == self.word:
@@ -242,9 +239,6 @@ class Skin(Summed):
         super().__post_init__()
         if self.length is not None and not self.length >= 0:
             raise InputError(f"skin = {self.length:g}; expected a length of 0 or more", where="skin")
-
-    def describe(self, world: str = "md") -> str:
-        return "another skin of the lists" + summing(self.both)
 
     def _length(self, system: System) -> float:
         if self.length is not None:
