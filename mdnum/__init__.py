@@ -23,6 +23,7 @@ _HOMES = {
     "bounce": "mdnum.workflow:bounce",
     "build": "mdnum.systems:build",
     "conform": "mdnum.workflow:conform",
+    "demonstrate": "mdnum.workflow:demonstrate",
     "diagnose": "mdnum.doctor:diagnose",
     "flips": "mdnum.workflow:flips",
     "fork": "mdnum.workflow:fork",
@@ -51,6 +52,7 @@ if TYPE_CHECKING:
     from mdnum.workflow import audit as audit_calculator
     from mdnum.workflow import bounce as bounce
     from mdnum.workflow import conform as conform
+    from mdnum.workflow import demonstrate as demonstrate
     from mdnum.workflow import flips as flips
     from mdnum.workflow import fork as fork
     from mdnum.workflow import fork_certify as fork_certify
@@ -73,6 +75,7 @@ __all__ = [
     "bounce",
     "build",
     "conform",
+    "demonstrate",
     "diagnose",
     "flips",
     "fork",

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable, Sequence
+from typing import TypeVar
 
 from mdnum.errors import InputError
+
+T = TypeVar("T")
 
 
 class Deadline:
@@ -36,3 +40,32 @@ class Deadline:
     def passed(self) -> bool:
         """Whether the time is up."""
         return self.left == 0.0
+
+
+def fewest(
+    items: Sequence[T], enough: Callable[[list[T]], bool], spent: Callable[[], bool] = lambda: False
+) -> list[T]:
+    """A subset of items that is enough, from which none can be left out unless the search was cut short.
+
+    Args:
+        items: enough together.
+        enough: decides a subset, in the order of items.
+        spent: whether no more may be asked.
+
+    Source: Zeller and Hildebrandt, Simplifying and Isolating Failure-Inducing Input, IEEE TSE 28, 183 (2002);
+        complements alone.
+    """
+    kept = list(items)
+    size = max(1, len(kept) // 2)
+    while not spent():
+        at, before = 0, len(kept)
+        while at < len(kept) and not spent():
+            rest = kept[:at] + kept[at + size :]
+            if enough(rest):
+                kept = rest
+            else:
+                at += size
+        if size == 1 and len(kept) == before:
+            break
+        size = max(1, min(size // 2, len(kept) // 2))
+    return kept

@@ -63,7 +63,7 @@ def collect(system: _System) -> dict[str, Any]:
     """
     import jax
 
-    import mdnum.precision  # noqa: F401 (float64 is among the settings recorded)
+    import mdnum.numerics  # noqa: F401 (float64 is among the settings recorded)
 
     around = surroundings()
     versions, processor = around["versions"], around["cpu"]

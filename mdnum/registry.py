@@ -130,19 +130,22 @@ class Registry(Generic[T]):
         if point is None:
             raise unknown(self.noun, name, self)
         try:
-            value = point.load()
-            a_kind = isinstance(value, type) and issubclass(value, self.kind or object)
-            if not (a_kind or inspect.isroutine(value) or isinstance(value, self.kind or object)):
+            loaded: Any = point.load()
+            a_kind = isinstance(loaded, type) and issubclass(loaded, self.kind or object)
+            if not (a_kind or inspect.isroutine(loaded) or isinstance(loaded, self.kind or object)):
                 raise TypeError(f"{point.value} is no {self.kind}")
+            named = getattr(loaded, "name", None)
+            if isinstance(named, str) and named != point.name:
+                raise ValueError(f"its name is {named!r}")
             if self.check:
-                self.check(value)
+                self.check(loaded)
         except Exception as error:
             raise InputError(
                 f"{self.noun} {name!r} of package {_package(point)} cannot be used: "
                 f"{type(error).__name__}: {error}",
                 remedy=f"Correct or uninstall {_package(point)}",
             ) from error
-        return value
+        return loaded
 
     def parse(self, text: str) -> T:
         """What `text` names: a name alone, or "name=argument".
@@ -155,7 +158,7 @@ class Registry(Generic[T]):
         """
         name, separator, argument = text.strip().partition(self.separator)
         value: Any = self[name]
-        makes = isinstance(value, type) or inspect.isroutine(value)
+        makes = _makes(value)
         if not makes and not separator:
             return value
         arguments = (argument,) if separator else ()
@@ -180,6 +183,10 @@ class Registry(Generic[T]):
     def package(self, name: str) -> str:
         """The package that the value of this name comes from."""
         return "mdnum" if name in self._own else _package(self._added()[name])
+
+
+def _makes(value: object) -> bool:
+    return isinstance(value, type) or inspect.isroutine(value)
 
 
 def _package(point: metadata.EntryPoint) -> str:

@@ -62,7 +62,7 @@ def memory(atoms: int, steps: int) -> list[dict[str, float]]:
 
 def _memory_of(atoms: int, steps: int) -> None:
     """The process that memory() looks at."""
-    from mdnum.rollout import run
+    from mdnum.rollout.run import run
 
     seen: list[dict[str, float]] = []
 

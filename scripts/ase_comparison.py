@@ -26,11 +26,11 @@ from pathlib import Path
 import numpy as np
 from _output import figure, parser, save, say, start, table
 
-from mdnum.md.cutoffs import BY_NAME
+from mdnum.md.cutoffs import CUTOFFS
 from mdnum.references import check_energy, check_pairs
 from mdnum.systems import System, load, names
 
-KINDS = tuple(BY_NAME)
+KINDS = tuple(CUTOFFS)
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ def draw(rows: list[Row], path: Path) -> None:
 def print_pairs(system: System) -> None:
     """The pair sets of every search as a table."""
     made = check_pairs(system)
-    columns = ("finder", "version", "pairs", "missing", "extra", "borderline", "stops counting", "verdict")
+    columns = ("search", "version", "pairs", "missing", "extra", "borderline", "stops counting", "verdict")
     table(
         f"\n{system.name}: {made.pairs:,} pairs with {made.compare} {made.r_cut:.6g} {system.units.length}",
         columns,

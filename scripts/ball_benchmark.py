@@ -45,7 +45,7 @@ def main() -> None:
     rows = []
     for name, (contact, scheme, parameter) in WORLDS.items():
         world = ball.World.create(contact, scheme)
-        problem = ball.Problem(world, np.linspace(0.5, 1.5, asked.balls), 0.0, asked.steps)
+        problem = ball.BallProblem(world, np.linspace(0.5, 1.5, asked.balls), 0.0, asked.steps)
 
         def gradient(problem=problem, parameter=parameter):
             return problem.value_and_grad([parameter, "y0"])

@@ -26,10 +26,10 @@ import numpy as np
 from _output import figure, parser, save, say, start, table
 
 from mdnum.ball import (
+    BallProblem,
     FinalHeight,
     Penalty,
     PerInstance,
-    Problem,
     Projection,
     ResidualPenetration,
     SemiImplicitEuler,
@@ -66,7 +66,7 @@ class Row:
     by_y0: float
 
 
-def problems(height: float, time: float, h: float) -> dict[str, Problem]:
+def problems(height: float, time: float, h: float) -> dict[str, BallProblem]:
     """The three floors under the same ball."""
     scheme, steps = SemiImplicitEuler(h), round(time / h)
     floors = {
@@ -75,12 +75,12 @@ def problems(height: float, time: float, h: float) -> dict[str, Problem]:
         "projection": (Projection(GAIN, 0.5, PerInstance(TOL, 1000)), ResidualPenetration()),
     }
     return {
-        name: Problem(World.create(contact, scheme), height, 0.0, steps, loss)
+        name: BallProblem(World.create(contact, scheme), height, 0.0, steps, loss)
         for name, (contact, loss) in floors.items()
     }
 
 
-def measure(problem: Problem, floor: str, knob: str, value: float) -> Row:
+def measure(problem: BallProblem, floor: str, knob: str, value: float) -> Row:
     """Run one setting, and differentiate it."""
     run = problem.run(keep=False)
     loss, slope = problem.value_and_grad(["k", "y0"])
@@ -100,7 +100,7 @@ def measure(problem: Problem, floor: str, knob: str, value: float) -> Row:
     )
 
 
-def turn(problem: Problem, floor: str, knob: str, factors: np.ndarray, time: float) -> Iterator[Row]:
+def turn(problem: BallProblem, floor: str, knob: str, factors: np.ndarray, time: float) -> Iterator[Row]:
     """One knob at several multiples of its value; the time at the end stays the same."""
     own = float(problem.world.value(knob))
     for factor in factors:

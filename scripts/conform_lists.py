@@ -18,7 +18,8 @@ from _output import figure, parser, save, say, start, table
 from mdnum.references.conformance.case import AREAS
 from mdnum.references.conformance.loading import installed, load
 from mdnum.references.conformance.reproduction import script
-from mdnum.references.conformance.suite import Report, examine
+from mdnum.references.conformance.results import Report
+from mdnum.references.conformance.suite import examine
 
 # compiles for every number of atoms
 _SLOW = ("jax-md", "jax-md-kept")

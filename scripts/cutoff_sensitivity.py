@@ -27,11 +27,11 @@ from _output import figure, parser, save, say, start, table
 from _record import record
 
 from mdnum.errors import InputError
-from mdnum.md.cutoffs import BY_NAME
+from mdnum.md.cutoffs import CUTOFFS
 from mdnum.systems import System, build, load
-from mdnum.systems.schema import ONSET_FRACTION, SwitchingCutoff
+from mdnum.systems.schema import ONSET_FRACTION
 
-KINDS = tuple(BY_NAME)
+KINDS = tuple(CUTOFFS)
 
 
 @dataclass(frozen=True)
@@ -60,8 +60,8 @@ def variant(system: System, kind: str, scale: float) -> dict[str, object]:
     for key in ("radius", "in_sigma"):
         if (value := getattr(cutoff, key)) is not None:
             values[f"cutoff.{key}"] = scale * value
-            if BY_NAME[kind].switches:
-                own = cutoff.onset if isinstance(cutoff, SwitchingCutoff) else None
+            if CUTOFFS.parse(kind).switches:
+                own = cutoff.onset
                 values["cutoff.onset"] = scale * (own or ONSET_FRACTION * value)
     for pair, value in (cutoff.pairs or {}).items():
         values[f"cutoff.pairs.{pair}"] = scale * value

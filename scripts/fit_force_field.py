@@ -38,11 +38,11 @@ from ase import Atoms
 from ase.build import bulk
 from jaxtyping import Array, Float
 
-from mdnum.gradients import Problem, by_word
-from mdnum.gradients.base import Method
+from mdnum.gradients import Problem, method
 from mdnum.gradients.ensemble import Replicas, settled
 from mdnum.gradients.losses import GreenKuboDiffusion, Loss, RadialDistribution
-from mdnum.gradients.tape import Tape
+from mdnum.gradients.problem import Method
+from mdnum.gradients.tape import RunTape
 from mdnum.systems import Simulation, System, SystemSpec, build
 
 SIGMA, EPSILON, TEMPERATURE, DENSITY = 3.405, 0.0103235, 150.0, 0.5 / 3.405**3
@@ -87,9 +87,9 @@ class Seen(Loss):
         g, d = self.both(total)
         return jnp.sum(self.by_g * g) + self.by_d * d
 
-    def why_not(self, around):
+    def reason_unavailable(self, around):
         """As its g(r)."""
-        return self.rdf.why_not(around)
+        return self.rdf.reason_unavailable(around)
 
 
 @dataclass(frozen=True)
@@ -157,7 +157,7 @@ def averages(problems: Sequence[Problem], values: dict[str, float]) -> tuple[np.
     for problem in problems:
         made = problem.at(values)
         assert isinstance(made.loss, Seen)
-        found.append(made.loss.both(Tape(made.simulation, made.loss, made.steps, budget=0).total))
+        found.append(made.loss.both(RunTape(made.simulation, made.loss, made.steps, budget=0).total))
     return np.mean([g for g, _ in found], axis=0), float(np.mean([d for _, d in found]))
 
 
@@ -194,7 +194,7 @@ def descend(word: str, problems, target: Target, guess: np.ndarray, iterations: 
     state = optimizer.init(logs)
     for step in range(iterations + 1):
         values = dict(zip(NAMES, np.exp(np.asarray(logs)).tolist(), strict=True))
-        loss, slope, g = gradient(by_word(word), problems, values, target)
+        loss, slope, g = gradient(method(word), problems, values, target)
         path.values.append(np.exp(np.asarray(logs)))
         path.losses.append(loss)
         path.gradients.append(slope)

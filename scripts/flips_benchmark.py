@@ -92,10 +92,10 @@ def motion(atoms: int, whole: int, strides: int) -> Motion:
 def mdnum_flips(length: float) -> Callable[[np.ndarray], int]:
     """Flips as mdnum finds them."""
     from mdnum.trajectories.frame import Box, Frame
-    from mdnum.trajectories.rules import Cutoff
+    from mdnum.trajectories.rules import CutoffRule
     from mdnum.trajectories.tracker import Tracker
 
-    tracker, box = Tracker(Cutoff(R_CUT)), Box(np.eye(3) * length, np.ones(3, bool))
+    tracker, box = Tracker(CutoffRule(R_CUT)), Box(np.eye(3) * length, np.ones(3, bool))
     return lambda x: len(tracker.step(Frame(tracker.frames, 0.0, x, box)))
 
 
@@ -196,13 +196,13 @@ def memory(length: float, frames: list[np.ndarray], total: int) -> list[dict[str
 def many(moved: Motion, name: str, chosen: list[np.ndarray], copies: tuple[int, int, int]) -> dict[str, Any]:
     """Seconds a frame of copies side by side, in a scattered order; none of the frames is left out."""
     from mdnum.trajectories.frame import Box, Frame
-    from mdnum.trajectories.rules import Cutoff
+    from mdnum.trajectories.rules import CutoffRule
     from mdnum.trajectories.tracker import Tracker
 
     edges = moved.length * np.array(copies)
     places = np.stack(np.meshgrid(*[np.arange(n) for n in copies], indexing="ij"), -1).reshape(-1, 1, 3)
     order = np.random.default_rng(1).permutation(len(places) * len(chosen[0]))
-    tracker, seconds, busy, flips = Tracker(Cutoff(R_CUT)), [], [], 0
+    tracker, seconds, busy, flips = Tracker(CutoffRule(R_CUT)), [], [], 0
     for at, x in enumerate(chosen):
         # as if there were no faces: a copy must not jump back by its own edge in the middle of the large box
         large = np.mod((x + places * moved.length).reshape(-1, 3)[order], edges)

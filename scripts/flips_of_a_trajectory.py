@@ -30,9 +30,9 @@ import numpy as np
 from _output import COLORS, figure, parser, save, say, start, table
 
 import mdnum
-from mdnum.trajectories.rules import Cutoff
+from mdnum.trajectories.ledger import FlipTable
+from mdnum.trajectories.rules import CutoffRule
 from mdnum.trajectories.source import open_trajectory
-from mdnum.trajectories.table import Flips
 from mdnum.trajectories.tracker import Tracker
 
 
@@ -83,12 +83,12 @@ def told(row: dict[str, Any], whole: int) -> list[Any]:
 
 def ledger(chosen: argparse.Namespace, radius: float, decimals: int | None) -> set[tuple[int, ...]]:
     """(frame, i, j, rank, entered) of every flip, from positions with so many decimals."""
-    tracker, found = Tracker(Cutoff(radius)), []
+    tracker, found = Tracker(CutoffRule(radius)), []
     for frame in open_trajectory(chosen.trajectory, chosen.topology).frames():
         if decimals is not None:
             frame = replace(frame, positions=np.round(frame.positions, decimals))
         found.append(tracker.step(frame))
-    rows = Flips.concatenate(found)
+    rows = FlipTable.concatenate(found)
     columns = (rows.frame, rows.i, rows.j, rows.rank, rows.entered)
     return set(zip(*(column.tolist() for column in columns), strict=True))
 

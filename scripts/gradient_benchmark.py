@@ -96,11 +96,11 @@ def gradient(system: System, method: str, *, finite: bool = True) -> Callable[[i
         finite: whether to insist on a gradient that is finite. After some ten thousand steps of a liquid none
             is: it has grown past all numbers, at the same cost.
     """
-    from mdnum.gradients import Problem, by_word
+    from mdnum.gradients import METHODS, Problem
     from mdnum.gradients.losses import VelocityAutocorrelation
     from mdnum.systems import build
 
-    simulation, found = build(system), by_word(method)
+    simulation, found = build(system), METHODS.parse(method)
 
     def run(steps: int) -> None:
         answer = found(Problem(simulation, VelocityAutocorrelation(), steps), NAMES)

@@ -28,7 +28,7 @@ from _liquid import liquid
 from _output import COLORS, figure, parser, save, say, start, table
 
 from mdnum.gradients import Problem
-from mdnum.gradients.diagnose import Growth, Spectrum, Trust, growth, spectrum, trust
+from mdnum.gradients.diagnose import GradientGrowth, Spectrum, Trust, growth, spectrum, trust
 from mdnum.gradients.losses import MeanSquaredDisplacement
 from mdnum.systems import Simulation, build
 
@@ -43,7 +43,7 @@ BETWEEN = 29 * np.log(2)
 class Found:
     """What is drawn of one cutoff."""
 
-    growth: Growth
+    growth: GradientGrowth
     spectrum: Spectrum
     narrow: Trust
     wide: Trust
@@ -97,16 +97,24 @@ def draw(found: dict[str, Found], tolerance: float, path: Path) -> None:
     left, right = drawn.subplots(1, 2)
     for (cutoff, one), color in zip(found.items(), COLORS, strict=False):
         for trusted, word, style in ((one.narrow, "float32", "-"), (one.wide, "float64", "--")):
-            y = trusted.relative["potential.sigma"]
+            y = trusted.table["relative.potential.sigma"]
             left.semilogy(
-                trusted.at, np.where(y > 0, y, np.nan), style, lw=1.2, color=color, label=f"{cutoff}, {word}"
+                trusted.table["horizon"],
+                np.where(y > 0, y, np.nan),
+                style,
+                lw=1.2,
+                color=color,
+                label=f"{cutoff}, {word}",
             )
-        scatter = one.wide.error.get("potential.sigma")
+        scatter = one.wide.table.get("error.potential.sigma")
         if scatter is not None:
-            left.semilogy(one.wide.at, scatter, ":", lw=1.2, color=color, label=f"{cutoff}, other starts")
-        right.semilogy(one.growth.horizon, one.growth.size, lw=1.2, color=color, label=f"{cutoff}: gradient")
+            left.semilogy(
+                one.wide.table["horizon"], scatter, ":", lw=1.2, color=color, label=f"{cutoff}, other starts"
+            )
+        grown = one.growth.table
+        right.semilogy(grown["horizon"], grown["size"], lw=1.2, color=color, label=f"{cutoff}: gradient")
         right.semilogy(
-            one.growth.horizon, one.growth.speed, ":", lw=1.2, color=color, label=f"{cutoff}: rms speed"
+            grown["horizon"], grown["speed"], ":", lw=1.2, color=color, label=f"{cutoff}: rms speed"
         )
     left.axhline(tolerance, lw=0.8, color="black")
     left.set_title("relative difference of two gradients (line: tolerance)")
@@ -135,8 +143,7 @@ def main() -> None:
     for cutoff, one in found.items():
         narrow, wide = one.rounding
         scatter = next((limit.horizon for limit in one.wide.limits if limit.what == "standard error"), None)
-        words = one.narrow.limits[0].says
-        flips = words.rpartition("step ")[2].rstrip(".") if "first differ" in words else None
+        flips = one.narrow.limits[0].values["first"]
         exponent = float(one.spectrum.exponents[0])
         rows.append((cutoff, one.growth.rate, exponent, narrow, wide, one.ratio, scatter, flips))
     columns = ("cutoff", "growth", "exponent", "float32", "float64", "ratio", "scatter", "flips")

@@ -38,13 +38,11 @@ from ase import Atoms
 from ase.build import bulk
 
 from mdnum.gradients import Problem
-from mdnum.gradients.boundary import Boundary, distances
-from mdnum.gradients.ensemble import Ensemble, Replicas, settled
-from mdnum.gradients.frames import frames
+from mdnum.gradients.averages import BoundaryTerm, distances, frames
+from mdnum.gradients.ensemble import Ensemble, Replicas, SmoothedDifferences, settled
 from mdnum.gradients.losses import MeanPotential, MeanTemperature, VelocityAutocorrelation
-from mdnum.gradients.smoothed import SmoothedDifferences
-from mdnum.gradients.symmetric import EventAware, Symmetric
-from mdnum.gradients.tape import Tape
+from mdnum.gradients.recorded import EventAware, Symmetric
+from mdnum.gradients.tape import RunTape
 from mdnum.systems import System, SystemSpec, build
 
 DENSITY, TEMPERATURE, TIMESTEP = 0.8442, 1.0, 0.004
@@ -164,8 +162,8 @@ def slopes(radii: Sequence[float], steps: int) -> list[Slope]:
     for radius in radii:
         simulation = build(system(crystal(108), radius, "langevin"))
         problem = Problem(simulation, MeanPotential(first=500, every=4), 500 + steps)
-        ours = Boundary()(problem, ("r_cut",))
-        seen = frames(Tape(simulation, problem.loss, problem.steps), ())
+        ours = BoundaryTerm()(problem, ("r_cut",))
+        seen = frames(RunTape(simulation, problem.loss, problem.steps), ())
         h = 0.02 * radius
         # what the energy gains from radius - h to radius + h, at each of the states
         gained = [

@@ -27,11 +27,11 @@ from pathlib import Path
 import numpy as np
 from _output import COLORS, figure, parser, save, say, start, table
 
-from mdnum.ball import GlobalSum, Problem, Projection, ResidualPenetration, SemiImplicitEuler, World
-from mdnum.ball.gradients import Unrolled
+from mdnum.ball import BallProblem, GlobalSum, Projection, ResidualPenetration, SemiImplicitEuler, World
+from mdnum.gradients.ball import ThroughIterations
 from mdnum.precision import RolePrecision
 from mdnum.precision.policy import ALL
-from mdnum.precision.reductions import make
+from mdnum.precision.reductions import parse
 
 ORDERS = ("sequential", "pairwise", "exact")
 SHAKE = 3.0
@@ -50,21 +50,21 @@ class Row:
     slope: float
 
 
-def pose(state: str, kind: str, order: str, balls: int, steps: int, tol: float) -> Problem:
+def pose(state: str, kind: str, order: str, balls: int, steps: int, tol: float) -> BallProblem:
     """Balls shaken by a seeded random acceleration; only the residual's sum differs from call to call."""
     policy = RolePrecision(state, state, kind, kind, "float64")
-    contact = Projection(0.5, 0.5, GlobalSum(tol, 200, make(order)))
+    contact = Projection(0.5, 0.5, GlobalSum(tol, 200, parse(order)))
     control = SHAKE * np.random.default_rng(0).normal(size=(steps, balls))
     world = World.create(contact, SemiImplicitEuler(0.01), control=control, policy=policy)
-    return Problem(world, np.zeros(balls), 0.0, steps, ResidualPenetration(1))
+    return BallProblem(world, np.zeros(balls), 0.0, steps, ResidualPenetration(1))
 
 
 def measure(state: str, kind: str, order: str, balls: int, steps: int, tol: float) -> Row:
     """Run it and differentiate it."""
     problem = pose(state, kind, order, balls, steps, tol)
     run = problem.run(keep=False)
-    made = Unrolled()(problem, ["k"], run)
-    return Row(kind, order, run.iterations, run.ended().get("cap", 0), made.value, made.gradient["k"])
+    made = ThroughIterations()(problem, ["k"], run)
+    return Row(kind, order, run.iterations, run.ended().get("cap", 0), made.value, float(made.gradient["k"]))
 
 
 def draw(rows: list[Row], path: Path) -> None:

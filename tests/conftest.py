@@ -45,8 +45,7 @@ _share_programs()
 # Annotations are checked when a function is called. Not those of the command line and the report: they
 # import slow packages lazily, so their annotations name what is not imported yet.
 _CHECKED = [
-    "mdnum.precision",
-    "mdnum.events",
+    "mdnum.numerics",
     "mdnum.md",
     "mdnum.ball",
     "mdnum.dynamics",

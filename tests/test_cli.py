@@ -23,7 +23,7 @@ from mdnum.errors import InputError, NumericalError
 from mdnum.plain import plain
 from mdnum.report.finding import conclude, restore
 from mdnum.report.section import Key, Page, Section, records
-from mdnum.store.naming import default_folder
+from mdnum.store.files import default_folder
 from mdnum.workflow.frame import Outcome
 
 SUMMARY: dict[str, Any] = {
@@ -372,18 +372,17 @@ def test_systems_list_and_copy_shipped_ones(crystal: Path, capsys: pytest.Captur
 def test_check_prints_every_record_and_exits_by_agreement(
     crystal: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
-    import mdnum.references.check as checks
+    import mdnum.references.energy_check as checks
 
     @dataclass
     class Report:
         ok: bool
-        findings: tuple[dict[str, str], ...] = ()
+        frames: tuple[()] = ()
+        is_ase: bool = True
+        precision: str = "float64"
 
         def rows(self) -> list[dict[str, Any]]:
             return [{"frame": "first", "energy": 1.25}, {"frame": "last", "energy": 2.5, "note": None}]
-
-        def to_dict(self) -> dict[str, Any]:
-            return {"rows": self.rows()}
 
     asked = []
     for ok in (True, False):
@@ -407,7 +406,7 @@ def test_doctor_exits_by_its_verdict(capsys: pytest.CaptureFixture[str], monkeyp
     import mdnum.doctor
 
     for status, expected in (("ok", 0), ("info", 0), ("unsafe", 1)):
-        row = mdnum.doctor.Row("jax version", status, "seen", None if status == "ok" else "do this")
+        row = mdnum.doctor.DoctorRow("jax version", status, "seen", None if status == "ok" else "do this")
         monkeypatch.setattr(mdnum.doctor, "diagnose", lambda row=row: mdnum.doctor.Diagnosis((row,), 0.5))
         assert call("doctor") == expected
         out = capsys.readouterr().out

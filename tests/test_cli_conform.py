@@ -1,4 +1,4 @@
-"""`mdnum conform` as a person calls it."""
+"""`mdnum conform`: a list of one's own, limits, mistakes, refusals, what is known of a list, and a kill."""
 
 from __future__ import annotations
 
@@ -11,15 +11,17 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
+import planted_lists
 import pytest
 from command_line import call, printed
 
-from mdnum.references.conformance.case import one
+from mdnum.references.conformance.case import once
 from mdnum.references.conformance.loading import from_object
+from mdnum.references.conformance.results import Report
 from mdnum.references.conformance.suite import examine
-from mdnum.report.conform.findings import judge
+from mdnum.report.finding import Finding, Verdict
 from mdnum.store import RunFolder
-from mdnum.workflow.conform import _summary
+from mdnum.workflow.conform import _summary, judge
 
 _MINE = """
 import numpy as np
@@ -31,6 +33,9 @@ def nearest_image(positions, cell, pbc, r_cut):
         apart = apart - np.rint(apart @ np.linalg.inv(cell)) @ cell
     near = (apart**2).sum(axis=1) < r_cut**2
     return i[near], j[near]
+
+def made(scale):
+    return nearest_image
 
 def without_pbc(positions, cell, r_cut):
     return [], []
@@ -71,23 +76,22 @@ def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_a_list_of_ones_own(mine: Path, capsys: pytest.CaptureFixture[str]):
     """Findings, scripts that reproduce them in another process, a page, and the same page again."""
-    assert call("conform", "mine.py:nearest_image", "--cases", "20", "--no-large") == 1
+    assert call("conform", "mine.py:made(scale=2)", "--cases", "20", "--no-large", "-o", "run") == 1
     lines = printed(capsys)
-    assert lines[0].startswith("mine:nearest_image failed")
     assert any(line.startswith("error: pairs inside the cutoff are missing") for line in lines)
-    folder = mine / "runs" / "conform-mine-nearest_image-1"
+    folder = mine / "run"
     page = (folder / "report.html").read_text()
     assert "reproduce-1-missing.py" in page and "<svg" in page and "cells narrower than two cutoffs" in page
     scripts = sorted(folder.glob("reproduce-*.py"))
-    assert scripts
     done = subprocess.run([sys.executable, scripts[0]], capture_output=True, text=True, check=False)
     assert done.returncode == 1 and "the list is wrong" in done.stdout, done.stderr
-    summary = RunFolder.open(folder).summary
-    assert not summary["conforms"] and summary["full"] is False and summary["superset"] is False
-    assert RunFolder.open(folder).world == "conform"
-    areas = RunFolder.open(folder).read("areas")
+    run = RunFolder.open(folder)
+    assert not run.summary["conforms"] and run.summary["full"] is False and run.summary["superset"] is False
+    assert [finding["code"] for finding in run.summary["findings"]] == ["MISSING"]
+    assert run.world == "conform"
+    areas = run.read("areas")
     assert dict(zip(areas["area"], areas["failed"], strict=True))["images"] > 5
-    assert list(RunFolder.open(folder).read("failures")["script"]) == [path.name for path in scripts]
+    assert list(run.read("failures")["script"]) == [path.name for path in scripts]
     (folder / "report.html").unlink()
     assert call("report", str(folder)) == 0
     assert (folder / "report.html").read_text() == page
@@ -100,107 +104,100 @@ def test_limits_make_it_conform(mine: Path, capsys: pytest.CaptureFixture[str]):
     document = json.loads(capsys.readouterr().out)
     assert document["conforms"] and not document["findings"] and document["wrong"] == 0
     assert sum(row["skipped"] for row in document["areas"]) > 20
-    assert "gave the right pairs in all of" in document["headline"]
     assert not (mine / "out" / "report.html").exists()
 
 
 def test_names_are_listed(capsys: pytest.CaptureFixture[str]):
     assert call("conform") == 0
-    said = "\n".join(printed(capsys))
-    assert "vesin" in said and "not installed" in said and "package.module:function" in said
+    assert {"vesin", "numpy", "jax-md-kept"} <= {line.split()[0] for line in printed(capsys) if line}
     assert call("conform", "--json") == 0
     rows = json.loads(capsys.readouterr().out)["lists"]
     assert {"list", "version", "kept", "what"} == set(rows[0])
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "part"),
     [
-        (("nowhere:pairs",), "cannot be imported"),
-        (("vesim",), "no list that is known"),
+        (("nowhere:pairs",), "nowhere: cannot be imported"),
         (("vesim",), "Did you mean vesin?"),
         (("mine.py:zebra",), "It has nearest_image"),
         (("mine.py:nearest",), "Did you mean nearest_image?"),
-        (("mine.py",), "mine.py is a file, and not a function in it. Give mine.py:nearest_image"),
+        (("mine.py",), "Give mine.py:nearest_image"),
         (("empty.py:pairs",), "It has no function"),
-        (("broken.py:pairs",), "(broken.py, line 1). Mend that line"),
+        (("broken.py:pairs",), "(broken.py, line 1)"),
         (("mine.py:np",), "neither a function nor an object with allocate and update"),
-        (
-            ("mine.py:without_pbc",),
-            "(positions, cell, r_cut) cannot be called with (positions, cell, pbc, r_cut)",
-        ),
-        (("mine.py:Half",), "a class without update. A list that is kept needs allocate and update"),
+        (("mine.py:without_pbc",), "cannot be called with (positions, cell, pbc, r_cut)"),
+        (("mine.py:Half",), "a class without update"),
         (("mine.py:Sized",), "Sized(size) cannot be called with ()"),
-        (("mine.py:Short",), "update(self, positions) cannot be called with (positions, cell)"),
-        (
-            ("mine.py:mask",),
-            "asked about a triple through a face, it returned ndarray of shape (3, 3), not (i, j)",
-        ),
-        (("mine.py:returns_nothing",), "it returned None. Give a function of (positions, cell, pbc, r_cut)"),
-        (("mine.py:raises",), "it raised AttributeError: 'numpy.ndarray' object has no attribute 'numpy'"),
+        (("mine.py:Sized(1, 2)",), "making it failed: TypeError"),
+        (("mine.py:Short",), ".update(positions) cannot be called with (positions, cell)"),
+        (("mine.py:mask",), "ndarray of shape (3, 3), not (i, j)"),
+        (("mine.py:returns_nothing",), "it returned None"),
+        (("mine.py:raises",), "AttributeError: 'numpy.ndarray' object has no attribute 'numpy'"),
         (("mine.py:nearest_image", "--limits", "tilted"), "no limit is called 'tilted'"),
         (("mine.py:nearest_image", "--precision", "double"), "float64, float32"),
     ],
 )
-def test_mistakes_are_told(mine: Path, arguments, said: str, capsys: pytest.CaptureFixture[str]):
+def test_mistakes_are_one_line(mine: Path, arguments, part: str, capsys: pytest.CaptureFixture[str]):
     assert call("conform", *arguments) == 2
-    told = capsys.readouterr().err
-    assert said in told and told.count("\n") == 1
+    line = capsys.readouterr().err
+    assert part in line and line.count("\n") == 1
     assert not (mine / "runs").exists()
 
 
-def _judged(function, cases):
-    """Verdict on a function that was asked some cases."""
-    found = examine(from_object(function, "it"), asked=cases, large=False)
-    names = [f"{number}.py" for number in range(len(found.failed))]
-    return judge(cast(Any, SimpleNamespace(name="it", summary=_summary(found, names, 0))))
+def _verdict(found: Report) -> Verdict:
+    names = [f"{n}.py" for n in range(len(found.failed))]
+    folder = SimpleNamespace(path=Path("it"))
+    return judge(cast(Any, SimpleNamespace(name="it", summary=_summary(found, names, 0), folder=folder)))
+
+
+def _judged(function, cases, **options) -> tuple[Verdict, dict[str, Finding]]:
+    """Verdict on a function that was asked some cases, and its findings by code."""
+    tested = from_object(function, "it").with_options(**options)
+    verdict = _verdict(examine(tested, asked=cases, large=False))
+    return verdict, {finding.code: finding for finding in verdict.findings}
+
+
+_PLACES = [[0.0, 0, 0], [0.5, 0, 0]]
+_TWO = once("two", "few", _PLACES, 4.0)
+_THREE = once("three", "images", [[0.1, 0, 0], [0.5, 0, 0], [0.6, 0, 0]], 4.0)
 
 
 def test_what_refuses_everything_is_not_called_safe():
     def refuses(positions, cell, pbc, r_cut):
         raise RuntimeError("boom")
 
-    two = [[0.0, 0, 0], [0.5, 0, 0]]
-    judged = _judged(refuses, [one("none", "few", []), one("two", "few", two), one("two", "images", two)])
-    assert judged.headline == "it answered no question."
-    codes = {one.code: one for one in judged.findings}
-    assert set(codes) == {"NOTHING_ANSWERED", "RAISED"} and codes["NOTHING_ANSWERED"].severity == "error"
-    assert "boom" in codes["NOTHING_ANSWERED"].text
+    cases = [once("none", "few", []), once("two", "few", _PLACES), once("two", "images", _PLACES)]
+    verdict, findings = _judged(refuses, cases)
+    assert set(findings) == {"NOTHING_ANSWERED", "RAISED"} and verdict.tone == "error"
+    assert "boom" in findings["NOTHING_ANSWERED"].text
 
 
-def test_what_answers_rightly_or_not_at_all_is_told_as_that():
-    def far(positions, cell, pbc, r_cut):
-        if np.abs(positions).max(initial=0.0) > 1.0:
-            raise IndexError("no such bin")
-        return ([0, 1], [1, 0]) if len(positions) == 2 else ([], [])
-
-    tested = [one("two", "few", [[0.0, 0, 0], [0.5, 0, 0]]), one("far", "outside", [[2.0, 0, 0]])]
-    judged = _judged(far, tested)
-    assert judged.headline == (
-        "it raises an exception by accident in 1 of 2 cases; in the 1 that it answered, the pairs are right."
-    )
-    assert any(line == "Where it fails: outside (1 of 1)." for line in judged.evidence)
+def _leaves(positions, cell, pbc, r_cut):
+    if len(positions) == 3:
+        raise SystemExit(3)
+    return ([0, 1], [1, 0]) if len(positions) == 2 else ([], [])
 
 
-def test_what_ends_the_process_is_not_told_as_right():
+def _far(positions, cell, pbc, r_cut):
+    if np.abs(positions).max(initial=0.0) > 1.0:
+        raise IndexError("no such bin")
+    return ([0, 1], [1, 0]) if len(positions) == 2 else ([], [])
+
+
+@pytest.mark.parametrize(
+    ("function", "code", "tone", "places"),
+    [(_far, "RAISED", "warning", [[2.0, 0, 0]]), (_leaves, "CRASHED", "error", [*_PLACES, [5.0, 0, 0]])],
+)
+def test_no_answer_is_told_from_a_wrong_one(function, code: str, tone: str, places):
     """The headline is that of the worst below it, and its counts are those of the table."""
-
-    def leaves(positions, cell, pbc, r_cut):
-        if len(positions) == 3:
-            raise SystemExit(3)
-        return ([0, 1], [1, 0]) if len(positions) == 2 else ([], [])
-
-    two = [[0.0, 0, 0], [0.5, 0, 0]]
-    cases = [one("two", "few", two), one("four", "few", [*two, [0, 5, 0], [0, 9, 0]])]
-    cases.append(one("three", "outside", [*two, [5.0, 0, 0]]))
-    judged = _judged(leaves, cases)
-    assert judged.tone == "error"
-    assert judged.headline == "it failed 2 of 3 cases."  # the pair of the four is missing, too
-    judged = _judged(leaves, cases[::2])
-    assert judged.tone == "error"
-    assert judged.headline == (
-        "it ends the process in 1 of 2 cases; in the 1 that it answered, the pairs are right."
-    )
+    cases = [once("two", "few", _PLACES), once("other", "outside", places)]
+    verdict, findings = _judged(function, cases)
+    assert set(findings) == {code} and verdict.tone == tone
+    assert findings[code].values["cases"] == 1 and "in 1 of 2 cases" in verdict.headline
+    cases.append(once("four", "few", [*_PLACES, [0, 0.9, 0], [0, 0.95, 0]]))
+    verdict, findings = _judged(function, cases)
+    assert verdict.headline == "it failed 2 of 3 cases."  # pairs of the four are missing, too
 
 
 def test_what_fails_only_after_another_goes_below_it():
@@ -213,29 +210,20 @@ def test_what_fails_only_after_another_goes_below_it():
             return [0], [1]  # from one of its atoms only
         return ([0, 1, 1], [1, 0, 0]) if broken and len(positions) == 2 else ([0, 1], [1, 0])
 
-    two = [[0.0, 0, 0], [0.5, 0, 0]]
     cases = [
-        one("two", "few", two),
-        one("four", "few", [*two, [5.0, 0, 0], [9.0, 0, 0]]),
-        one("again", "outside", two),
+        once("two", "few", _PLACES),
+        once("four", "few", [*_PLACES, [5.0, 0, 0], [9.0, 0, 0]]),
+        once("again", "outside", _PLACES),
     ]
-    found = examine(from_object(breaks), asked=cases, large=False, shrink=False)
+    found = examine(from_object(breaks, "it"), asked=cases, large=False, shrink=False)
     assert sorted(failed.code for failed in found.failed) == ["DUPLICATE", "ONE_SIDED"]
-    found.failed = [replace(failed, alone=failed.code == "ONE_SIDED") for failed in found.failed]
-    summary = _summary(found, ["1.py", "2.py"], 0)
-    judged = judge(cast(Any, SimpleNamespace(name="it", summary=summary)))
-    (finding,) = judged.findings
-    assert (
-        finding.code == "ONE_SIDED"
-        and "pairs are listed more than once (about outside; 2.py)" in finding.text
-    )
-    # by themselves they are two
-    found.failed = [replace(failed, alone=True) for failed in found.failed]
-    judged = judge(cast(Any, SimpleNamespace(name="it", summary=_summary(found, ["1.py", "2.py"], 0))))
-    assert len(judged.findings) == 2
+    for alone in (False, True):
+        found.failed = [replace(failed, alone=alone or failed.code == "ONE_SIDED") for failed in found.failed]
+        causes = {finding.code: finding.cause for finding in _verdict(found).findings}
+        assert causes == {"DUPLICATE": "" if alone else "ONE_SIDED", "ONE_SIDED": ""}
 
 
-def test_time_that_is_up_is_told():
+def test_time_that_is_up_is_reported():
     """How many of how many were asked; and what was not asked is not called right."""
 
     class TwoQuestions:
@@ -246,15 +234,97 @@ def test_time_that_is_up_is_told():
             self.left -= 1
             return self.left <= 0
 
-    def right(positions, cell, pbc, r_cut):
-        return ([0, 1], [1, 0]) if len(positions) == 2 else ([], [])
-
-    two = [[0.0, 0, 0], [0.5, 0, 0]]
-    cases = [one(f"{n}", "few", two) for n in range(5)]
-    found = examine(from_object(right), asked=cases, deadline=cast(Any, TwoQuestions()))
+    cases = [once(f"{n}", "few", _PLACES) for n in range(5)]
+    found = examine(from_object(_leaves, "it"), asked=cases, deadline=cast(Any, TwoQuestions()))
     assert (found.asked, found.left, found.questions) == (2, 3, 5)
-    judged = judge(cast(Any, SimpleNamespace(name="it", summary=_summary(found, [], 0))))
-    assert judged.headline == "As far as asked (2 of 5 cases), it gave the right pairs in 2 cases."
+    assert "2 of 5 cases" in _verdict(found).headline
+
+
+def test_one_mistake_has_one_script_and_names_all_areas():
+    def leaves(positions, cell, pbc, r_cut):
+        raise SystemExit(3)
+
+    def nothing(positions, cell, pbc, r_cut):
+        return [], []
+
+    areas = ("few", "boxes", "ties")
+    cases = [once(area, area, [*_PLACES, [n, 2.0, 3.0]], 4.0) for n, area in enumerate(areas)]
+    _, findings = _judged(leaves, [*cases, once("free", "axes", _PLACES)])
+    values = findings["CRASHED"].values
+    assert (values["cases"], values["areas"]) == (4, "every area")
+    assert findings["CRASHED"].remedy.startswith("Raise an exception")
+    _, findings = _judged(
+        nothing,
+        [*cases, once("none", "axes", [[0.0, 0, 0]])],
+        known={"MISSING": "It lists none.", "EXTRA": "It lists all."},
+    )
+    values = findings["MISSING"].values
+    assert (values["cases"], values["areas"]) == (3, "few, boxes and ties")
+    assert findings["MISSING"].text.endswith("It lists none.")  # what is known of a failure
+    images = once("images", "images", _PLACES, 0.7)
+    report = examine(from_object(nothing), asked=[*cases, images], large=False)
+    assert [(failed.code, failed.case.atoms) for failed in report.failed] == [("MISSING", 2), ("MISSING", 1)]
+
+
+class _Elsewhere:
+    """A part of an answer that lies on another device."""
+
+    def __array__(self, *_):
+        raise TypeError("copy it to the host first")
+
+
+@pytest.mark.parametrize("form", ["mapping", "tuple", "rows", "attributes"])
+def test_buffers_that_are_returned_again_are_reported(form: str):
+    buffer = np.zeros((2, 100), int)
+
+    def filled(positions, cell, pbc, r_cut):
+        rows = planted_lists.search(positions, cell, pbc, r_cut)
+        count = len(rows["i"])
+        buffer[0, :count], buffer[1, :count] = rows["i"], rows["j"]
+        i, j = buffer[:, :count]
+        return {
+            "mapping": {"i": i, "j": j, "energy": _Elsewhere()},
+            "tuple": (i, j),
+            "rows": buffer[:, :count].T,
+            "attributes": SimpleNamespace(i=i, j=j),
+        }[form]
+
+    _, findings = _judged(filled, [_TWO, _THREE])
+    assert {code: finding.severity for code, finding in findings.items()} == {"ALIASED": "info"}
+    assert findings["ALIASED"].values["case"] == "two"  # after what its conventions are found by
+    assert _judged(planted_lists.planted(""), [_TWO, _THREE])[1] == {}
+
+
+def _refusing(when):
+    def refuses(positions, cell, pbc, r_cut):
+        if when(positions, r_cut):
+            raise ValueError(f"{len(positions)} atoms are too many.")
+        rows = planted_lists.search(positions, cell, pbc, r_cut)
+        return rows["i"], rows["j"]
+
+    return refuses
+
+
+def test_a_refusal_that_depends_on_what_it_should_not_is_a_finding():
+    """The order of atoms, or what was asked before; not another unit of length, nor other images."""
+    _, findings = _judged(_refusing(lambda x, _: len(x) > 1 and x[0, 0] < x[-1, 0]), [_TWO, _THREE])
+    assert findings["UNEVEN_REFUSALS"].severity == "warning"
+    assert findings["UNEVEN_REFUSALS"].values["how"] == "with its atoms in reverse order"
+    asked = []
+
+    def second(x, _):
+        asked.append(len(x))
+        return len(asked) == 3  # the first finds out its conventions
+
+    _, findings = _judged(_refusing(second), [_TWO, _THREE])
+    assert findings["UNEVEN_REFUSALS"].values["how"].startswith("when it is asked anew")
+    outside = once("outside", "outside", [[0.25, 0, 0], [4.5, 0, 0]], 4.0, r_cut=4 / 3)
+    _, findings = _judged(_refusing(lambda x, _: x.max() > 4.0), [_TWO, outside])
+    assert set(findings) == {"REFUSES"}  # and nothing uneven
+    assert "with its atoms wrapped into the box" in findings["REFUSES"].values["also"]
+    far = once("far", "few", 8 * _TWO.stills[0].positions, 40.0, r_cut=8.0)
+    _, findings = _judged(_refusing(lambda _, r_cut: r_cut > 4.0), [_TWO, far])
+    assert "with all lengths multiplied by 0.12" in findings["REFUSES"].values["also"]
 
 
 _ENDS = """
@@ -281,14 +351,14 @@ def nearest_image(positions, cell, pbc, r_cut):
 """
 
 
-def test_an_examination_that_is_killed_goes_on(
+def test_an_examination_that_is_killed_is_resumed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     """By SIGKILL: what was found is there, and its summary is that of one that was not stopped."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "ends.py").write_text(_ENDS)
     limits = "minimum-image,orthorhombic,all-axes"
-    asked = (
+    asked = [
         "conform",
         "ends.py:nearest_image",
         "--cases",
@@ -297,7 +367,7 @@ def test_an_examination_that_is_killed_goes_on(
         "--no-report",
         "--limits",
         limits,
-    )
+    ]
     assert call(*asked, "-o", "whole") == 1
     (tmp_path / "armed").touch()
     done = subprocess.run(
@@ -305,7 +375,7 @@ def test_an_examination_that_is_killed_goes_on(
     )
     assert done.returncode == -9 and not (tmp_path / "armed").exists()
     kept = json.loads((tmp_path / "killed" / "answers.json").read_text())
-    wrong = [one for one in kept["cases"].values() if one["failures"]]
+    wrong = [result for result in kept["cases"].values() if result["failures"]]
     assert 20 < len(kept["cases"]) < 120 and wrong
     before = RunFolder.open("killed").summary
     assert before["status"] == "stopped" and before["left"] > 20
@@ -313,7 +383,7 @@ def test_an_examination_that_is_killed_goes_on(
     assert "As far as asked (" in (tmp_path / "killed" / "report.html").read_text()
     capsys.readouterr()
     assert call("conform", "mine", "--resume", "killed") == 2
-    assert "so LIST cannot be given" in capsys.readouterr().err
+    assert "LIST is an option of a new examination" in capsys.readouterr().err
     assert call("conform", "--resume", "killed", "--no-report") == 1
     whole, resumed = RunFolder.open("whole").summary, RunFolder.open("killed").summary
     assert {**whole, "seconds": 0} == {**resumed, "seconds": 0} and whole["status"] == "complete"
@@ -326,29 +396,9 @@ def test_an_examination_that_is_killed_goes_on(
     assert RunFolder.open("killed").summary["asked"] == whole["asked"]
 
 
-@pytest.mark.parametrize("text", ["", "[]", "3", "{}", '{"list": 1, "tested": 2, "options": 3}', "\0{"])
-def test_answers_that_cannot_be_read_are_told_in_a_line(text: str, tmp_path, capsys):
+@pytest.mark.parametrize("text", ["", "[]", "3", "{}", '{"word": 1, "tested": 2, "options": 3}', "\0{"])
+def test_answers_that_cannot_be_read_are_one_line(text: str, tmp_path, capsys):
     (tmp_path / "answers.json").write_text(text)
     assert call("conform", "--resume", str(tmp_path)) == 2
-    told = capsys.readouterr().err
-    assert "answers.json" in told and told.count("\n") == 1
-
-
-def test_one_mistake_has_one_script_and_names_all_areas():
-    def leaves(positions, cell, pbc, r_cut):
-        raise SystemExit(3)
-
-    def nothing(positions, cell, pbc, r_cut):
-        return [], []
-
-    two = [[0.0, 0, 0], [0.5, 0, 0]]
-    cases = [one(area, area, [*two, [n, 2.0, 3.0]], 4.0) for n, area in enumerate(("few", "boxes", "ties"))]
-    judged = _judged(leaves, [*cases, one("free", "axes", two)])
-    (crashed,) = (one for one in judged.findings if one.code == "CRASHED")
-    assert crashed.text.startswith("In 4 cases, in every area. ")
-    assert crashed.remedy.startswith("Raise an exception")
-    judged = _judged(nothing, [*cases, one("none", "axes", [[0.0, 0, 0]])])
-    (missing,) = (one for one in judged.findings if one.code == "MISSING")
-    assert missing.text.startswith("In 3 cases, about few, boxes and ties. ")
-    report = examine(from_object(nothing), asked=[*cases, one("images", "images", two, 0.7)], large=False)
-    assert [(failed.code, failed.case.atoms) for failed in report.failed] == [("MISSING", 2), ("MISSING", 1)]
+    line = capsys.readouterr().err
+    assert "answers.json" in line and line.count("\n") == 1

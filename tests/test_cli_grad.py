@@ -1,25 +1,27 @@
-"""`mdnum grad`, from the command line to the folder."""
+"""`mdnum grad`, from the command line to the folder, and what is found in folders without a simulation."""
 
 from __future__ import annotations
 
+import importlib
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from command_line import call, printed
 
 from mdnum.errors import InputError
-from mdnum.gradients.base import Problem
-from mdnum.gradients.ensemble import Ensemble
-from mdnum.gradients.smoothed import SmoothedDifferences
-from mdnum.report import write
+from mdnum.gradients import Problem, parameters
+from mdnum.gradients.ensemble import Ensemble, SmoothedDifferences
+from mdnum.gradients.losses import parse
 from mdnum.store import RunFolder
 from mdnum.systems import build
-from mdnum.workflow import grad_ball, grad_methods
-from mdnum.workflow.grad_words import loss, unit_of_loss, unit_of_parameter, words
+from mdnum.workflow import frame
 
 WELL = "pair/leaving-well"
+# the package has the function of this name
+grad: Any = importlib.import_module("mdnum.workflow.grad")
 
 
 @pytest.mark.parametrize(
@@ -46,82 +48,75 @@ WELL = "pair/leaving-well"
         (("ball/drop", "--also", "edges"), "this system is a ball"),
         (("ball/drop", "--of", "msd"), "There are final-height,"),
         (("ball/drop", "--wrt", "restitution"), "There are k, damping,"),
-        (("ball/drop", "--methods", "symmetric"), "no gradient called 'symmetric'"),
+        (("ball/drop", "--methods", "symmetric"), "no gradient 'symmetric'"),
     ],
 )
 def test_what_cannot_be_asked_is_refused_in_one_line(arguments, message, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert call("grad", *arguments) == 2
-    # a machine that is busy takes long enough to be told what is going on
-    told = [line for line in capsys.readouterr().err.splitlines() if not line.endswith(" s)")]
-    assert len(told) == 1 and message in told[0]
+    # a machine that is busy takes long enough for lines of progress
+    lines = [line for line in capsys.readouterr().err.splitlines() if not line.endswith(" s)")]
+    assert len(lines) == 1 and message in lines[0]
     # and leaves no folder behind
     assert not list(tmp_path.iterdir())
 
 
-def test_words_of_losses_take_numbers():
+def test_names_of_losses_take_numbers():
     simulation = build("argon/crystal-108")
-    word, made = loss("temperature: every=10, first=20", simulation, 100)
-    assert (word, made.every, made.first) == ("temperature", 10, 20)
-    _, curve = loss("rdf:bins=30", simulation, 100)
+    made = parse("temperature: every=10, first=20", simulation, 100)
+    assert (made.name, made.every, made.first) == ("temperature", 10, 20)
+    curve: Any = parse("rdf:bins=30", simulation, 100)
     # no bin reaches beyond half the box
-    assert curve.bins == 30 and curve.why_not is not None
+    assert curve.bins == 30
     Problem(simulation, curve, 100)
-    assert loss("diffusion-green-kubo:every=7", simulation, 100)[1].until == 98
+    late: Any = parse("diffusion-green-kubo:every=7", simulation, 100)
+    assert late.until == 98
     with pytest.raises(InputError, match="no number of the loss msd"):
-        loss("msd:bins=3", simulation, 100)
-    assert words(["a,b", "b, c,"]) == ("a", "b", "c")
-    assert unit_of_loss("vacf", simulation.units) == f"{simulation.units.energy}/{simulation.units.mass}"
-    assert unit_of_parameter("cutoff.radius", simulation.units) == simulation.units.length
-    assert unit_of_parameter("box.scale", simulation.units) == ""
-    assert unit_of_parameter("potential.lambda1", simulation.units) == "[lambda1]"
-
-
-def test_what_is_not_run_by_default_is_said_with_how_to_ask(monkeypatch):
-    simulation = build(WELL)
-    problem = Problem(simulation, loss("msd", simulation, 50)[1], 50)
-    names = ("potential.sigma", "initial.velocities")
-    chosen = grad_methods.plan(problem, names, None)
-    assert {"event-aware", "symmetric", "finite-differences"} == {one.name for one in chosen.methods}
-    # some 22 runs, since velocities have no finite differences: 2 atoms and 50 steps each
-    monkeypatch.setattr(grad_methods, "AFFORDABLE", 2199)
-    chosen = grad_methods.plan(problem, names, None)
-    assert "finite-differences" not in {one.name for one in chosen.methods}
-    left = next(one for one in chosen.left_out if one["what"] == "finite-differences")
-    assert left["why"] == "about 22 more runs of 50 steps" and left["how"] == "--methods finite-differences"
-    monkeypatch.setattr(grad_methods, "AFFORDABLE", 2200)
-    assert "finite-differences" in {one.name for one in grad_methods.plan(problem, names, None).methods}
-    # what cannot be had is said too, and not how to ask for it
-    reweighting = next(one for one in chosen.left_out if one["what"] == "reweighting")
-    assert "thermostat" in reweighting["why"] and not reweighting["how"]
-    assert [one.name for one in grad_methods.plan(problem, names, ("symmetric",)).methods] == ["symmetric"]
-
-
-def test_replicas_are_those_of_every_average():
-    simulation = build(WELL)
-    problem = Problem(simulation, loss("msd", simulation, 50)[1], 50)
-    chosen = grad_methods.plan(problem, ("potential.sigma",), None, replicas=5)
-    mean = next(one for one in chosen.methods if isinstance(one, Ensemble))
-    assert mean.replicas.count == 5 and mean.halvings == 0
-    (smoothed,) = grad_methods.plan(problem, ("potential.sigma",), ("smoothed-differences",), 5).methods
-    assert isinstance(smoothed, SmoothedDifferences) and smoothed.replicas.count == 5
-    assert not any(
-        isinstance(one, Ensemble) for one in grad_methods.plan(problem, ("potential.sigma",), None).methods
-    )
+        parse("msd:bins=3", simulation, 100)
+    assert grad.words(["a,b", "b, c,"]) == ("a", "b", "c")
+    units = {
+        name: parameters.unit(simulation, name) for name in ("cutoff.radius", "box.scale", "potential.l1")
+    }
+    assert list(units.values()) == [simulation.units.length, "", "[l1]"]
 
 
 @pytest.fixture(scope="module")
-def well(tmp_path_factory) -> Path:
-    """The folder of a pair that leaves its well."""
-    out = tmp_path_factory.mktemp("gradients") / "well"
-    options = ("--steps", "2000", "--methods", "event-aware,symmetric", "--no-report", "-o", str(out))
-    assert call("grad", WELL, "--of", "msd", "--wrt", "r_cut,initial.velocities", *options) == 0
-    return out
+def problem():
+    simulation = build(WELL)
+    return Problem(simulation, parse("msd", simulation, 50), 50)
+
+
+def test_what_is_not_run_by_default_is_listed_with_how_to_ask(problem, monkeypatch):
+    names = ("potential.sigma", "initial.velocities")
+    chosen, _ = grad.plan(problem, names, None)
+    assert {"event-aware", "symmetric", "finite-differences"} == {one.name for one in chosen}
+    # some 22 runs, since velocities have no finite differences: 2 atoms and 50 steps each
+    monkeypatch.setattr(grad, "AFFORDABLE", 2199)
+    chosen, left = grad.plan(problem, names, None)
+    assert "finite-differences" not in {one.name for one in chosen}
+    rows = {one["what"]: one for one in left}
+    late = rows["finite-differences"]
+    assert late["why"] == "about 22 more runs of 50 steps" and late["how"] == "--methods finite-differences"
+    # what is not available is listed too, and not how to ask for it
+    assert "thermostat" in rows["reweighting"]["why"] and not rows["reweighting"]["how"]
+    assert [one.name for one in grad.plan(problem, names, ("symmetric",))[0]] == ["symmetric"]
+
+
+def test_replicas_are_those_of_every_average(problem):
+    chosen, _ = grad.plan(problem, ("potential.sigma",), None, replicas=5)
+    mean = next(one for one in chosen if isinstance(one, Ensemble))
+    assert mean.replicas.count == 5 and mean.halvings == 0
+    ((smoothed,), _) = grad.plan(problem, ("potential.sigma",), ("smoothed-differences",), 5)
+    assert isinstance(smoothed, SmoothedDifferences) and smoothed.replicas.count == 5
+    assert not any(isinstance(one, Ensemble) for one in grad.plan(problem, ("potential.sigma",), None)[0])
 
 
 @pytest.mark.slow
-def test_the_folder_holds_the_derivative_of_the_closed_form(well, capsys):
-    folder = RunFolder.open(well)
+def test_the_folder_holds_the_derivative_of_the_closed_form(tmp_path):
+    out = tmp_path / "well"
+    options = ("--steps", "2000", "--methods", "event-aware,symmetric", "-o", str(out))
+    assert call("grad", WELL, "--of", "msd", "--wrt", "r_cut,initial.velocities", *options) == 0
+    folder = RunFolder.open(out)
     summary = folder.summary
     assert folder.world == "grad" and summary["status"] == "complete"
     made = {one["method"]: one for one in summary["methods"]}
@@ -134,16 +129,16 @@ def test_the_folder_holds_the_derivative_of_the_closed_form(well, capsys):
     speed2 = 1 + 2 * (u(1.8) - u(2.5))
     moved = np.sqrt(summary["value"])
     exact = moved * (1.8 + 2 * moved - 2.5) / speed2 * -slope
-    assert made["event-aware"]["gradient"]["cutoff.radius"] == pytest.approx(exact, rel=2e-3)
+    whole = made["event-aware"]["gradient"]["cutoff.radius"]
+    assert whole == pytest.approx(exact, rel=2e-3)
     assert made["symmetric"]["gradient"]["cutoff.radius"] == 0.0
     assert "exactly 0" in made["symmetric"]["notes"]["cutoff.radius"]
     (row,) = [one for one in summary["comparisons"] if one["name"] == "cutoff.radius"]
-    assert row["means"] == "missing saltation"
+    assert row["meaning"] == "missing saltation"
 
     # one flip, which is all of the derivative by the cutoff
     flips = folder.read("flip_contributions")
     assert len(flips["step"]) == 1 and not flips["entered"][0]
-    whole = made["event-aware"]["gradient"]["cutoff.radius"]
     assert flips["weight"][0] == pytest.approx(whole) == flips["contribution.cutoff.radius"][0]
     growth = folder.read("growth")
     assert growth["gradient.cutoff.radius"][-1] == pytest.approx(whole)
@@ -151,31 +146,28 @@ def test_the_folder_holds_the_derivative_of_the_closed_form(well, capsys):
     late = growth["step"] > flips["step"][0]
     assert late.any() and not growth["gradient.cutoff.radius"][late].any()
     many = made["event-aware"]["gradient"]["initial.velocities"]
-    with np.load(well / "gradients.npz") as arrays:
+    with np.load(out / "gradients.npz") as arrays:
         stored = arrays["event-aware/initial.velocities"]
     assert many["shape"] == list(stored.shape) and many["norm"] == pytest.approx(np.linalg.norm(stored))
-    assert (well / "provenance.json").exists() and "leaving" in folder.system_toml
+    assert (out / "provenance.json").exists() and "leaving" in folder.system_toml
 
-    # half the time step leaves three digits of it, and its pairs were looked at on both sides of the cutoff
+    # half the time step leaves three digits of it, and its pairs were examined on both sides of the cutoff
     trust = summary["trust"]
     assert trust["half"]["cutoff.radius"] == pytest.approx(exact, rel=1e-3)
     assert trust["verdict"] == "trusted" and trust["digits"]["cutoff.radius"] >= 2
-
-    write(well)
-    assert "gradient of msd" in (well / "report.html").read_text(encoding="utf-8")
-    assert call("report", str(well)) == 0
+    assert "gradient of msd" in (out / "report.html").read_text(encoding="utf-8")
+    assert call("report", str(out)) == 0
 
 
 @pytest.mark.slow
-def test_plain_alone_at_a_jump_is_done_and_told(tmp_path, capsys, monkeypatch):
+def test_plain_alone_at_a_jump_is_done_and_named(tmp_path, capsys, monkeypatch):
     # trust would be two programs more
-    monkeypatch.setattr(grad_methods, "_PARTS", ("agreement", "growth", "flips"))
+    monkeypatch.setattr(grad, "_PARTS", ("agreement", "growth", "flips"))
     options = ("--steps", "40", "--methods", "symmetric", "--no-report", "-o", str(tmp_path / "plain"))
     assert call("grad", WELL, "--of", "msd", "--wrt", "sigma", *options, "--json") == 1
     document = json.loads(capsys.readouterr().out)
-    codes = {one["code"] for one in document["findings"]}
-    assert "MISSING_SALTATION" in codes
-    # growth is that of the method that was asked for; it knows nothing of flips
+    assert "MISSING_SALTATION" in {one["code"] for one in document["findings"]}
+    # growth is that of the method that was asked for; it has nothing of flips
     assert document["growth"] and document["flips"] is None
     assert "flips" in {one["what"] for one in document["left_out"]}
 
@@ -185,8 +177,7 @@ def test_a_ball_is_compared_with_its_closed_form(tmp_path, capsys):
     out = tmp_path / "ball"
     asked = ("ball/zeno", "--wrt", "restitution", "--methods", "event-aware,implicit", "--no-report")
     assert call("grad", *asked, "-o", str(out)) == 0
-    lines = printed(capsys)
-    assert any(line.startswith("closed form 1.087") for line in lines)
+    assert any(line.startswith("closed form 1.087") for line in printed(capsys))
     summary = RunFolder.open(out).summary
     (made,) = summary["methods"]
     assert made["gradient"]["restitution"] == pytest.approx(summary["exact"]["restitution"], rel=1e-9)
@@ -194,5 +185,231 @@ def test_a_ball_is_compared_with_its_closed_form(tmp_path, capsys):
 
 
 def test_off_is_relative_to_what_is_right():
-    assert grad_ball._relative(1.98e-5, -4.125e-6) == pytest.approx(5.8)
-    assert grad_ball._relative(0.0, 0.0) == 0.0 and grad_ball._relative(1.0, 0.0) == float("inf")
+    assert grad.relative(1.98e-5, -4.125e-6) == pytest.approx(5.8)
+    assert grad.relative(0.0, 0.0) == 0.0 and grad.relative(1.0, 0.0) == float("inf")
+
+
+# -- a folder without a simulation: an exponential, and flips of which one outweighs the others ------
+
+STEPS, RATE = 500, 0.01
+EPSILON, RADIUS, START = "potential.epsilon", "cutoff.radius", "initial.velocities"
+#: A quarter of the derivative by the cutoff comes from the first of them.
+WEIGHTS = np.array([0.5, -0.3, 0.2, 0.1, *np.full(96, 1.5 / 96)])
+MANY = {"shape": [100, 3], "norm": 3.0, "largest": -1.0, "at": [7, 2]}
+
+
+def method(name: str, kind: str, epsilon: float, radius: float, **more: Any) -> dict[str, Any]:
+    gradient = {EPSILON: epsilon, RADIUS: radius, START: MANY}
+    kept = {"description": f"what {name} gives", "value": 1.5, "error": {}, "notes": {}, "details": {}}
+    return {"method": name, "kind": kind, "gradient": gradient, "seconds": 1.0, **kept, **more}
+
+
+def row(name: str, parameter: str, relative: float | None, meaning: str = "", **more: Any) -> dict[str, Any]:
+    base = {"name": parameter, "method": name, "reference": "event-aware", "size": 4.0, "values": {}}
+    return {**base, "relative": relative, "difference": 4 * (relative or 0), "meaning": meaning, **more}
+
+
+PLAIN = method("symmetric", "steps", 3.6, 0.0, notes={RADIUS: "exactly 0"})
+DETAILS = {"crossings": 100, "grazing": 0, "guard": 1e-3, "weight applied": 2.6, "weight left out": 0.0}
+AWARE = method("event-aware", "flow", 4.0, 2.0, details=DETAILS)
+TRUST: dict[str, Any] = {
+    "verdict": "limited", "horizon": 300, "limited_by": "near miss", "unknown": [], "tolerance": 0.01,
+    "limits": [
+        {"what": "near miss", "horizon": 300, "reached": True, "code": "short of", "values": {
+            "count": 1, "i": 3, "j": 5, "step": 77, "gap": 3e-5, "reach": 8e-5, "term": 1.9, "share": 0.9,
+            "column": RADIUS}},
+    ],
+    "half": {EPSILON: 4.02, RADIUS: 0.9},
+    "digits": {EPSILON: 2, RADIUS: 0},
+    "near": {"turns": 9, "within": 1, "heaviest": [
+        {"step": 77, "i": 3, "j": 5, "gap": 3e-5, "reach": 8e-5, "term": {EPSILON: 0.1, RADIUS: 1.9}},
+    ]},
+}  # fmt: skip
+
+
+def summary(**changes: Any) -> dict[str, Any]:
+    """Three methods, of which one misses what the flips add."""
+    values = ((EPSILON, "ε", 1.0), (RADIUS, "σ", 2.5), (START, "√(ε/m)", {**MANY, "norm": 17.0}))
+    return {
+        "world": "grad", "system": "argon/synthetic", "about": "Nothing was simulated.", "atoms": 100,
+        "steps": STEPS, "timestep": 0.01, "units": "lj", "value": 1.5, "force_jump": 0.04,
+        "loss": {"word": "msd", "about": "mean squared displacement at the last step", "unit": "σ²"},
+        "parameters": [{"name": name, "unit": unit, "value": value} for name, unit, value in values],
+        "reference": "event-aware",
+        "methods": [
+            PLAIN, AWARE, method("finite-differences", "values", 3.9, 1.9, error={EPSILON: 0.2, RADIUS: 0.1}),
+        ],
+        "comparisons": [
+            row("symmetric", EPSILON, 0.1, "missing saltation"),
+            row("symmetric", RADIUS, 1.0, "missing saltation"),
+            row("finite-differences", EPSILON, 0.025, "truncation and noise"),
+        ],
+        "growth": {
+            "clock": 0.3, "timestep": 0.01, "rate": RATE, "error": 1e-4, "time": 1.0, "gain": 148.0,
+            "word": "forward bounded, gradient not",
+        },
+        "flips": {
+            "flips": len(WEIGHTS), "grazing": 0, "total": {EPSILON: 4.0, RADIUS: 2.0},
+            "half": {EPSILON: 4, RADIUS: 4},
+            "share": {
+                EPSILON: {"smooth": 0.9, "pair enters": 0.04, "pair leaves": 0.06},
+                RADIUS: {"smooth": 0.0, "pair enters": 0.4, "pair leaves": 0.6},
+            },
+        },
+        "refused": [], "status": "complete", "seconds": 12.0,
+        "left_out": [{"what": "unrolled", "why": "it takes its time", "how": "--methods unrolled"}],
+        **changes,
+    }  # fmt: skip
+
+
+def write(path: Path, report: bool = False, **changes: Any) -> frame.Outcome:
+    """A finished gradient folder, judged."""
+    folder = RunFolder.create(path, world="grad")
+    folder.write_system('name = "argon/synthetic"\nunits = "lj"\n\n[dynamics]\ntimestep = 0.01\n')
+    folder.write_provenance({"command": "mdnum grad"})
+    horizon, flips = np.arange(STEPS + 1), np.arange(len(WEIGHTS))
+    size = np.exp(RATE * horizon)
+    growth = {
+        "horizon": horizon, "step": STEPS - horizon, "onto_positions": size, "onto_velocities": size,
+        "size": size, "speed": np.ones(STEPS + 1), f"gradient.{EPSILON}": 4 * size / size[-1] - 1,
+        f"gradient.{RADIUS}": np.where(horizon > 0, 2 * size / size[-1], 0.0), f"gradient.{START}": size,
+    }  # fmt: skip
+    terms = {
+        "step": 1 + 3 * flips, "i": flips, "j": flips + 1, "entered": flips % 2 == 0,
+        "margin": np.full(len(flips), 1e-3), "bound": np.full(len(flips), 1e-12),
+        "ambiguous": np.zeros(len(flips), bool), "radial_speed": np.where(flips % 2, 0.5, -0.5),
+        "weight": WEIGHTS, "grazing": np.zeros(len(flips), bool),
+        f"contribution.{EPSILON}": 0.2 * WEIGHTS, f"contribution.{RADIUS}": WEIGHTS,
+    }  # fmt: skip
+    frame.store(folder, summary(**changes), {"growth": growth, "flip_contributions": terms})
+    return frame.finish(folder, report=report)
+
+
+def plots(outcome: frame.Outcome) -> dict[str, Any]:
+    parts = [part for section in outcome.page.sections for part in section.parts]
+    return {part.name: part for part in parts if hasattr(part, "series")}
+
+
+def test_the_page_holds_what_the_folder_holds(tmp_path):
+    outcome = write(tmp_path / "run", report=True, trust=TRUST)
+    page = (outcome.folder / "report.html").read_text(encoding="utf-8")
+    names = sorted(path.stem for path in (outcome.folder / "figures").iterdir())
+    assert names == ["growth", "ranked", "running", "state"] and "argon/synthetic: gradient of msd" in page
+    assert outcome.summary["headline"].startswith("After 500 steps, d msd / d epsilon = 4.0 σ²/ε")
+    keys = {key.label: (key.value, key.note) for key in outcome.page.keys}
+    # the digits that half the time step leaves, and no more
+    assert keys[f"by {EPSILON}"] == ("4.0", "σ²/ε") and keys[f"by {RADIUS}"][0] == "2"
+    # a parameter's value times the derivative, from one step on
+    growth, state, running = (plots(outcome)[name].series for name in ("growth", "state", "running"))
+    by = {series.label: series.y for series in growth}
+    np.testing.assert_allclose(by[RADIUS][-1], 2.5 * 2.0)
+    np.testing.assert_allclose(by[START], 17.0 * np.exp(RATE * np.arange(1, STEPS + 1)))
+    np.testing.assert_allclose(state[1].y, np.exp(RATE * np.arange(STEPS + 1)), rtol=1e-9)
+    assert {series.label: series.y[-1] for series in running}[RADIUS] == pytest.approx(WEIGHTS.sum() / 2.0)
+
+
+PRIMAL = {"first state": 3, "first decision": None}
+
+
+@pytest.mark.parametrize(
+    ("changes", "code", "severity", "values"),
+    [
+        ({}, "FEW_FLIPS", "info", {"i": 0, "j": 1, "step": 1, "share": 0.25}),
+        ({"methods": [PLAIN], "reference": "symmetric", "comparisons": [], "flips": None},
+         "MISSING_SALTATION", "warning", {"jump": 0.04}),
+        ({"methods": [PLAIN], "reference": "symmetric", "flips": None}, "NO_DEPENDENCE", "warning",
+         {"name": RADIUS, "note": "exactly 0"}),
+        ({"methods": [{**AWARE, "gradient": {**AWARE["gradient"], EPSILON: float("nan")}}]}, "NOT_FINITE",
+         "error", {"names": EPSILON}),
+        ({"comparisons": [row("symmetric", EPSILON, 0.1, "unexplained", values={"explained": 1e-9})]},
+         "UNEXPLAINED", "warning", {"closeness": "10 % off"}),
+        ({"methods": [{**AWARE, "details": {**DETAILS, "grazing": 2, "weight left out": 0.5}}]}, "GRAZING",
+         "warning", {"grazing": 2, "share": 0.5 / 3.1}),
+        ({"methods": [{**AWARE, "details": {**DETAILS, "loss jumps": True}}]}, "LOSS_JUMPS", "warning", {}),
+        ({"methods": [{**AWARE, "details": {"primal": PRIMAL}}]}, "ANOTHER_PRIMAL", "info", {"state": 3}),
+        ({"methods": [{**AWARE, "details": {"primal": {**PRIMAL, "first decision": 40}}}]}, "ANOTHER_PRIMAL",
+         "warning", {"decision": 40}),
+        ({"trust": TRUST}, "BEYOND_TRUST", "warning", {"horizon": 300, "limit": "near miss"}),
+        ({"refused": [{"method": "boundary", "why": "it is no average"}]}, "DOES_NOT_APPLY", "info", {}),
+        ({"exact": {"y0": 2.0}, "reference": "closed form", "contact_kind": "impact", "flips": None,
+          "integrator": "semi-implicit-euler", "growth": None, "force_jump": None,
+          "comparisons": [row("event-aware", "y0", 0.1)]}, "NOT_THE_MOTION", "warning",
+         {"each": "event-aware (y0 10 % off)"}),
+    ],
+)  # fmt: skip
+def test_findings_follow_the_numbers(tmp_path, changes, code, severity, values):
+    found = {one.code: one for one in write(tmp_path / "one", **changes).verdict.findings}
+    assert found[code].severity == severity
+    assert {name: found[code].values[name] for name in values} == pytest.approx(values)
+
+
+def test_what_is_no_defect_is_not_found(tmp_path):
+    smooth = {"methods": [PLAIN], "reference": "symmetric", "force_jump": 0.0, "flips": None}
+    assert "MISSING_SALTATION" not in {one.code for one in write(tmp_path / "a", **smooth).verdict.findings}
+    assert [one.code for one in write(tmp_path / "b").verdict.findings] == ["FEW_FLIPS"]
+    near = {"exact": {"y0": 2.0}, "reference": "closed form", "contact_kind": "impact", "flips": None}
+    near |= {"comparisons": [row("event-aware", "y0", 0.009)], "integrator": "x", "growth": None}
+    assert "NOT_THE_MOTION" not in {one.code for one in write(tmp_path / "c", **near).verdict.findings}
+
+
+def open_trust(*unseen: str, unknown: tuple[str, ...] = ()) -> dict[str, Any]:
+    """Trust that is undecided: half the time step was not made, and these limits were not examined."""
+    limits = [
+        {"what": what, "horizon": None, "reached": False, "values": {},
+         "code": "half-step" if what == "near miss" else "not asked"}
+        for what in unseen
+    ]  # fmt: skip
+    more = {"half": {}, "digits": {}, "near": None, "verdict": "undecided", "limited_by": ""}
+    return {**TRUST, **more, "limits": limits, "unknown": unknown or unseen}
+
+
+@pytest.mark.parametrize(
+    ("trust", "tone", "words"),
+    [
+        (TRUST, "warning", "not trusted beyond step 300: near miss"),
+        (open_trust("time step", unknown=("other starts",)), "warning", "undecided, other starts not known"),
+        ({**TRUST, "verdict": "trusted", "limited_by": ""}, "good", "; trusted."),
+        (None, "info", "= 2.000 σ²/σ and"),
+    ],
+)
+def test_trusted_is_the_word_where_all_of_it_was_examined_alone(tmp_path, trust, tone, words):
+    verdict = write(tmp_path / "one", trust=trust).verdict
+    assert verdict.tone == tone and words in verdict.headline
+
+
+def test_two_digits_are_shown_where_nobody_knows_how_many_hold(tmp_path):
+    methods = [{**one, "gradient": {**one["gradient"], EPSILON: -0.0086653366}} for one in (PLAIN, AWARE)]
+    outcome = write(
+        tmp_path / "run", trust=open_trust("time step", "near miss"), methods=methods, report=True
+    )
+    key = next(key for key in outcome.page.keys if key.label == f"by {EPSILON}")
+    assert (key.value, key.note) == ("−0.0087", "σ²/ε, digits not known")
+    assert "0.00866" not in (outcome.folder / "report.html").read_text(encoding="utf-8")
+    # of a question that is none about trust they are shown in full
+    plain = write(tmp_path / "plain", methods=methods)
+    assert any(key.value.startswith("−0.008665") for key in plain.page.keys)
+
+
+@pytest.mark.parametrize(
+    ("trust", "left", "remedy"),
+    [
+        (open_trust("time step", "near miss"), "half the time step", "Leave out --no-half-step."),
+        (open_trust("time step", "near miss"), "", "--set dynamics.kind=nve"),
+        (open_trust("standard error", unknown=("other starts",)), "", "--replicas 8"),
+        (open_trust("near miss"), "", "fewer parameters"),
+    ],
+)
+def test_what_is_undecided_comes_with_what_to_do(tmp_path, trust, left, remedy):
+    ways = {"left_out": [{"what": left, "why": "", "how": "x"}]} if left else {}
+    found = {one.code: one for one in write(tmp_path / "one", trust=trust, **ways).verdict.findings}
+    assert remedy in found["UNDECIDED"].text
+
+
+def test_no_share_is_shown_of_a_derivative_without_a_digit(tmp_path):
+    outcome = write(tmp_path / "run", trust=TRUST)
+    few = next(one for one in outcome.verdict.findings if one.code == "FEW_FLIPS")
+    assert "25 %" not in few.text
+    assert any(EPSILON in line for line in outcome.verdict.evidence)
+    flips = next(one for one in outcome.page.sections if one.title == "Flips on the way")
+    rows = {line[0]: line[1:4] for line in flips.parts[1].rows}
+    assert rows[RADIUS] == [None] * 3 and rows[EPSILON][0] == "+90.0 %"

@@ -63,6 +63,8 @@ def walk(document: Any, path: str) -> Any:
     if key.endswith("{}"):
         found = walk(document, key[:-2])
         return {name: walk(one, rest) for name, one in found.items()} if isinstance(found, dict) else found
+    if isinstance(document, list) and key.isdecimal():
+        return walk(document[int(key)], rest)
     return walk(document[key], rest) if isinstance(document, dict) and key in document else None
 
 

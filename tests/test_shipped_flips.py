@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from rollout.harness import assert_ledger_is_complete, go
 
-from mdnum.events import Ledger, broken_alternations
+from mdnum.numerics import Ledger, broken_alternations
 from mdnum.systems import names
 
 # steps of a short run that sees some flips; a pair of atoms moves little and is cheap

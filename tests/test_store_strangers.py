@@ -13,11 +13,14 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from ase.build import bulk
+from pydantic_core import to_json
 from test_store import frame, series_rows, state_at, write_run
 
 from mdnum.errors import FolderError, InputError
-from mdnum.report import page
-from mdnum.store import RunFolder, atomic, checkpoint, manifest
+from mdnum.store import RunFolder, checkpoint
+from mdnum.store import files as atomic
+from mdnum.store import files as manifest
 
 PRECIOUS = b"somebody's only copy"
 
@@ -106,7 +109,7 @@ def test_temporary_names_cannot_be_foreseen(tmp_path, monkeypatch):
     monkeypatch.setattr(
         atomic.os, "replace", lambda one, other: (names.append(one.name), replace(one, other))
     )
-    page.publish(tmp_path, [], lambda pictures, notes: "page")
+    atomic.write_text(tmp_path / "report.html", "page")
     atomic.write_text(tmp_path / "summary.json", "{}")
     assert (tmp_path / "precious").read_bytes() == PRECIOUS
     assert len(set(names)) == 2 and not {".report.html.part", ".summary.json.part"} & set(names)
@@ -318,26 +321,26 @@ _OPTIONS = {
     "limits": [],
 }
 _CASE = {
-    "case": "x", "failures": [["MISSING", "a", 1, 0]], "refused": None, "ties": [0, 0], "aliased": False,
-    "single": False, "seconds": 0.1,
+    "case": "x", "failures": [{"code": "MISSING", "text": "a", "count": 1, "step": 0}], "refused": None,
+    "ties": [0, 0], "aliased": False, "single": False, "seconds": 0.1,
 }  # fmt: skip
 _STILL = {"positions": [[0.0, 0, 0]], "cell": np.eye(3).tolist(), "fresh": False, "skin": None}
 _SMALL = {"name": "x", "area": "few", "pbc": [True] * 3, "r_cut": 1.0, "skin": 0.0, "stills": [_STILL]}
 _ANSWERS = {
-    "list": "ase", "tested": ["ase", None], "options": _OPTIONS, "seconds": 1.0, "cases": {"0": _CASE},
-    "shrunk": {"k": {"case": _SMALL, "failures": [["MISSING", "a", 1, 0]], "alone": True}},
+    "word": "ase", "tested": ["ase", None], "options": _OPTIONS, "seconds": 1.0, "cases": {"0": _CASE},
+    "shrunk": {"k": {"case": _SMALL, "failures": _CASE["failures"], "alone": True}},
 }  # fmt: skip
 
 
 @pytest.mark.parametrize(
     ("where", "value"),
     [
-        ("tested", None), ("list", 5), ("options/cases", "x"), ("options/cases", 10**9),
+        ("tested", None), ("word", 5), ("options/cases", "x"), ("options/cases", 10**9),
         ("options/limits", 5), ("options/full", "maybe"), ("options", {}), ("seconds", "x"),
         ("cases/0", [1]), ("cases/0", "x"),
         ("cases/0/failures", [[1, 2]]), ("cases/0/failures", "abc"), ("cases/0/ties", [1]), ("cases", []),
         ("shrunk/k", {}), ("shrunk/k/case/stills", [{}]), ("shrunk/k/case/pbc", [1]),
-        ("shrunk/k/failures", [["MISSING", "a", 1, 7]]),
+        ("shrunk/k/failures/0/step", 7), ("shrunk/k/failures", []),
         ("shrunk/k/case/stills/0/positions", [[1e999, 0, 0]]),
         ("shrunk/k/case/stills/0/cell", [[1.0, 0, 0]]), ("", "[" * 100_000),
     ],
@@ -370,53 +373,48 @@ def test_more_questions_than_anybody_waits_for_are_refused(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-_PART = {
-    "name": "forces", "title": "Forces", "says": "x", "findings": [], "tables": {}, "numbers": {},
-    "curves": [{"title": "", "x_label": "", "y_label": "", "x": [0.0], "lines": {"a": [1.0]}, "marks": {},
-                "log_y": False}],
-    "skipped": [["a", "b"]], "seconds": 1.0, "asked": 1, "possible": 1,
-}  # fmt: skip
-_THRESHOLD = {
-    "radius": 1.0, "species": ["A", "A"], "order": 0, "jumps": [0.0] * 3, "doubt": [0.0] * 3, "inside": 1.0,
-    "outside": 1.0, "dies": False, "located": 0.0,
-}  # fmt: skip
+def _audit_state() -> dict:
+    from mdnum.audit.base import Chart, CheckResult, finding
+    from mdnum.audit.record import AuditState, encoded
+    from mdnum.audit.thresholds import PairThreshold
+
+    result = CheckResult(
+        (["failed"], {}), [finding("CURL", "error")], {}, [Chart("", "", "", [0.0], {"a": [1.0]})], {},
+        [("a", "b")], name="forces",
+    )  # fmt: skip
+    end = PairThreshold(1.0, ("A", "A"), 0, (0.0,) * 3, (0.0,) * 3, 1.0, 1.0, False, 0.0)
+    checks = ["forces", "curl"]
+    structure = encoded(bulk("Cu"))
+    state = AuditState(
+        "nosuch:X", True, structure, 1.0, "metal", checks, None, None, None, [result], thresholds=[end]
+    )
+    return json.loads(to_json(state))
 
 
 @pytest.mark.parametrize(
     ("where", "value"),
     [
-        ("", 0), ("atoms", "x"), ("atoms", '{"__ase_objtype__": "nosuch"}'), ("audit", 5), ("question", {}),
-        ("question/checks", ["nosuch"]), ("question/checks", 5), ("question/temperature", "x"),
-        ("parts", [{}]), ("parts", "x"), ("parts", None), ("parts/0/says", 5), ("parts/0/tables", [5]),
-        ("parts/0/skipped", [1]),
-        ("parts/0/findings", [{"code": 1}]), ("parts/0/curves", [{"x": "q"}]), ("cut", {}), ("files", 5),
-        ("pairs", [1]), ("thresholds", [{}]), ("thresholds/0/species", 5), ("seconds", "x"),
+        ("structure", "x"), ("structure", '{"__ase_objtype__": "nosuch"}'), ("name", 5), ("units", "x"),
+        ("checks", 5), ("checks", []), ("temperature", "x"), ("results", [{}]), ("results", None),
+        ("results/0/says", 5), ("results/0/tables", [5]), ("results/0/skipped", [1]),
+        ("results/0/findings", [{"code": 1}]), ("results/0/charts", [{"x": "q"}]),
+        ("results/0/charts/0/x", [1.0, 2.0]), ("cut", {}), ("failed", 5), ("failed", ["../x"]),
+        ("thresholds", [{}]), ("thresholds/0/species", 5), ("seconds", "x"), ("", None),
     ],
 )  # fmt: skip
-def test_a_checkpoint_of_an_audit_of_another_shape_is_told_in_a_line(tmp_path, where, value):
-    from ase.build import bulk
-
-    from mdnum.workflow import audit_record
+def test_answers_of_an_audit_of_another_shape_are_named_in_a_line(tmp_path, where, value):
+    from mdnum.audit.record import kept
 
     folder = RunFolder.create(tmp_path / "run", world="audit")
-    question = {"checks": ["forces", "curl"], "temperature": None, "timestep": None, "steps": None}
-    state = json.loads(json.dumps({
-        "audit": "nosuch:X", "atoms": audit_record._told(bulk("Cu")), "question": question, "parts": [_PART],
-        "pairs": [], "cut": None, "files": [], "thresholds": [_THRESHOLD], "seconds": 1.0,
-    }))  # fmt: skip
+    state = _audit_state()
     if where:
         _put(state, where, value)
-    folder.checkpoint(state, force=True)
-    folder.close()
-
-    class Loaded(Exception):
-        pass
-
-    def load(words):
-        raise Loaded
-
-    with pytest.raises(FolderError if where else Loaded, match=r"checkpoint\.npz: " if where else None):
-        audit_record.open_again(folder.path, None, load)
+    atomic.write_text(folder.path / "answers.json", json.dumps(state))
+    if not where:
+        assert kept(folder).left == ["curl"]
+        return
+    with pytest.raises(FolderError, match=r"answers\.json: "):
+        kept(folder)
 
 
 def test_tables_that_are_written_anew_leave_no_rows_of_an_end_that_was_killed(tmp_path):
@@ -464,7 +462,7 @@ def test_scripts_of_a_person_stay(tmp_path):
     ("world", "state", "advice"),
     [
         ("fork", None, "Nothing of it was kept: give the `mdnum fork` command again"),
-        ("audit", "checkpoint.npz", "Continue it with `mdnum audit --resume"),
+        ("audit", "answers.json", "Continue it with `mdnum audit --resume"),
         ("conform", "answers.json", "Continue it with `mdnum conform --resume"),
     ],
 )

@@ -1,21 +1,17 @@
-"""What every check of a calculator is given, and what it gives back."""
+"""What every check of a calculator gives back, and how much it may ask."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any, Protocol
-
-import numpy as np
-from ase import Atoms
-from jaxtyping import Float
+from typing import Any, Literal
 
 from mdnum.deadline import Deadline
 
 #: (done, of how many, {"phase": words}) now and then.
 Progress = Callable[[int, int, dict[str, Any]], None]
-
+Severity = Literal["info", "warning", "error"]
 
 #: Why something was not asked that would have been.
 TIME_UP = "the time was up"
@@ -31,10 +27,6 @@ class Meter:
 
     Evidence is counted in calls, so that it does not depend on the load of a machine; a deadline cuts it
     short.
-
-    Attributes:
-        calls: so far.
-        deadline: a person's; by default there is none.
     """
 
     calls: int = 0
@@ -53,11 +45,7 @@ class Meter:
 
     @contextmanager
     def limited(self) -> Iterator[None]:
-        """One way of many is asked here: no call is made after the deadline.
-
-        Raises:
-            TimeUp: the deadline has passed, now or before the end.
-        """
+        """One way of many is asked here: no call is made after the deadline, which raises `TimeUp`."""
         if self.deadline.passed:
             raise TimeUp
         self._limited += 1
@@ -67,111 +55,72 @@ class Meter:
             self._limited -= 1
 
 
-def meter_of(subject: Subject) -> Meter:
-    """A subject's meter; of one that has none, one that counts nothing."""
-    return getattr(subject, "meter", None) or Meter()
-
-
-def again(
-    subject: Subject,
-    atoms: Atoms,
-    energy: float | None = None,
-    forces: Float[np.ndarray, "atoms 3"] | None = None,
-) -> bool:
-    """Whether a subject that is asked again gives another answer; one that cannot tell gives the same."""
-    ask = getattr(subject, "again", None)
-    return ask is not None and ask(atoms, energy, forces)
-
-
-class Subject(Protocol):
-    """The calculator under audit, and the structure it is asked about.
+@dataclass(frozen=True)
+class Observed:
+    """What a check found: a code, and values for its sentences in mdnum/workflow/audit.toml.
 
     Attributes:
-        name: what the person called it.
-        atoms: the structure, without a calculator; copy it before changing it.
-        kT: energy that a jump is compared with, eV.
+        code: short stable name.
+        severity: info (nothing to do), warning (look at it), error (the numbers are wrong).
+        variants: of its sentences.
+        values: their fields; of a code without sentences `title`, `text` and `remedy`.
     """
 
-    name: str
-    atoms: Atoms
-    kT: float
+    code: str
+    severity: Severity
+    variants: list[str] = field(default_factory=list)
+    values: dict[str, Any] = field(default_factory=dict)
 
-    def energy(self, atoms: Atoms) -> float:
-        """Potential energy in eV.
 
-        Raises:
-            CalculatorError: the calculator raised, or answered with nan; the structure has been saved.
-        """
-        ...
-
-    def forces(self, atoms: Atoms) -> Float[np.ndarray, "atoms 3"]:
-        """Forces in eV/Å; raises as `energy` does."""
-        ...
-
-    def fresh(self) -> Subject:
-        """The same with a calculator object of its own, which remembers nothing."""
-        ...
+def finding(code: str, severity: Severity, *variants: str | None, **values: Any) -> Observed:
+    """What was found, with those of its variants that are not None."""
+    return Observed(code, severity, [one for one in variants if one], values)
 
 
 @dataclass(frozen=True)
-class Curve:
+class Chart:
     """Something drawn against something.
 
     Attributes:
-        title: what is seen.
-        x_label: with its unit.
-        y_label: with its unit.
         x: shared by all lines.
         lines: values by label.
-        marks: places on x with a word each (a threshold that was found, say).
+        marks: places on x by their label (a threshold, say).
         log_y: whether y spans decades.
     """
 
     title: str
     x_label: str
     y_label: str
-    x: Float[np.ndarray, "points"]
-    lines: Mapping[str, Float[np.ndarray, "points"]]
-    marks: Mapping[str, float] = field(default_factory=dict)
+    x: list[float]
+    lines: dict[str, list[float]]
+    marks: dict[str, float] = field(default_factory=dict)
     log_y: bool = False
 
 
 @dataclass(frozen=True)
-class Part:
-    """What one check found.
+class CheckResult:
+    """What one check found; all of it plain values, in eV and Å.
 
     Attributes:
-        name: a word, "smoothness" say.
-        title: a heading.
-        says: one sentence in words, with its numbers.
-        findings: dictionaries as `mdnum.references.findings.finding` makes them.
+        says: its summary: names of sentences, and values for all of them.
         tables: records by title.
-        curves: what to draw.
-        numbers: figures for summary.json, plain values.
-        skipped: (what, why) of what was not looked at.
-        seconds: time it took.
+        numbers: figures by name.
+        skipped: (what, why) of what was not asked.
         asked: ways of asking that were gone, those on which the calculator failed included.
         possible: ways that there are in all; more than asked where the time was up.
+        recorded: columns of further tables, by name of the table.
+        name, title, seconds: of the check, filled in by it.
     """
 
-    name: str
-    title: str
-    says: str
-    findings: Sequence[Mapping[str, str]] = ()
-    tables: Mapping[str, Sequence[Mapping[str, Any]]] = field(default_factory=dict)
-    curves: Sequence[Curve] = ()
-    numbers: Mapping[str, Any] = field(default_factory=dict)
-    skipped: Sequence[tuple[str, str]] = ()
-    seconds: float = 0.0
+    says: tuple[list[str], dict[str, Any]]
+    findings: list[Observed] = field(default_factory=list)
+    tables: dict[str, list[dict[str, Any]]] = field(default_factory=dict)
+    charts: list[Chart] = field(default_factory=list)
+    numbers: dict[str, Any] = field(default_factory=dict)
+    skipped: list[tuple[str, str]] = field(default_factory=list)
     asked: int = 1
     possible: int = 1
-
-
-class Check(Protocol):
-    """One question to a calculator."""
-
-    name: str
-
-    def __call__(self, subject: Subject, progress: Progress | None = None) -> Part:
-        """Ask it."""
-        ...
+    recorded: dict[str, dict[str, list[Any]]] = field(default_factory=dict)
+    name: str = ""
+    title: str = ""
+    seconds: float = 0.0

@@ -1,20 +1,55 @@
-"""Energy and force along one coordinate: scatter of rounding, one-sided derivatives, neighboring doubles."""
+"""Where a curve jumps or has a kink: found by scanning and zooming, located to neighboring doubles, measured.
+
+A curve is an energy and the force along one coordinate. Each value is predicted from the points on its left
+and, independently, from those on its right. Across a smooth stretch the two predictions meet with the fourth
+power of the spacing; across a jump they never do, and across a kink only with the first power: so how fast
+the mismatch falls while one zooms in tells what is there, whatever the curve looks like elsewhere.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 
 #: One-sided first derivative from five points, error fourth power of the spacing.
 _SLOPE = np.array([-25.0, 48.0, -36.0, 16.0, -3.0]) / 12.0
-
+#: Spacings (relative) at which scatter is measured: a float32 calculator is constant over the first.
 _CLOSER = (3e-9, 1e-7, 1e-6, 1e-5)
-"""Spacings (relative) at which scatter is looked for: a float32 calculator is constant over the first."""
-
+#: Spacings from which a one-sided slope is taken; the one with the smallest error is kept.
 _WIDTHS = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2)
-"""Spacings from which a one-sided slope is taken; the one with the smallest error is kept."""
+#: A value is predicted half a spacing beyond the last of four points (Lagrange's cubic).
+_EXTRAPOLATE = np.array([-0.3125, 1.3125, -2.1875, 2.1875])
+#: How much each zoom narrows: four of the divisions are kept.
+_DIVISIONS, _NARROWER = 24, 6
+_LEVELS = 10
+#: A mismatch this many times those around it is a suspect.
+_OUTLIER = 4.0
+#: The same of an eighth difference, which may be all rounding: the largest of some hundred is five times the
+#: median.
+_STANDS_OUT = 10.0
+#: A step so many times what stands out of a scan is also located, wherever it is in its interval.
+_TOLD = 3.0
+_EIGHTH = np.array([1.0, -8.0, 28.0, -56.0, 70.0, -56.0, 28.0, -8.0, 1.0])
+#: A step of 1 makes the two eighth differences whose middle is beside it so large.
+_OF_A_STEP = 35.0
+#: How near to 2 the power is with which a mismatch falls where a second derivative jumps.
+_SQUARE = 0.15
+#: Times the mismatch of the others at which one of them is alone.
+_ALONE = 6.0
+#: Zooms at which it does so, at least; what cannot be resolved does for one or two.
+_SEEN = 3
+#: Of a force a little before an end: below, its decay tells nothing.
+_FELT = 1e-13
+#: A power above which two places are enough to tell that no low derivative jumps.
+_STEEPEST = 8.0
+#: A jump this many times what rounding and truncation could make of nothing is one.
+_SURE = 6.0
+
+#: Order given to a threshold at which neither energy, force nor curvature jumps, and no more is known.
+SMOOTH = 3
 
 
 class Curve:
@@ -40,19 +75,14 @@ class Curve:
         return np.array([self(float(x)) for x in places]).T
 
 
-def bisect(told: Callable[[float], bool], low: float, high: float) -> tuple[float, float]:
-    """Neighboring doubles between which an answer changes.
-
-    Args:
-        told: the question; its answers at low and at high differ.
-        low, high: low < high.
-    """
-    before = told(low)
+def bisect(question: Callable[[float], bool], low: float, high: float) -> tuple[float, float]:
+    """Neighboring doubles between which an answer changes; it differs at low and at high."""
+    before = question(low)
     while True:
         middle = low + 0.5 * (high - low)
         if not low < middle < high:
             return low, high
-        if told(middle) == before:
+        if question(middle) == before:
             low = middle
         else:
             high = middle
@@ -96,15 +126,350 @@ def slope(curve: Curve, start: float, sign: int, room: float, noise: float) -> t
     return best
 
 
-def bend(curve: Curve, start: float, sign: int, room: float) -> float:
+def _bend(curve: Curve, start: float, sign: int, room: float) -> float:
     """|second derivative of the force| to one side, roughly."""
     width = min(1e-3 * max(abs(start), 1.0), room / 4)
     force = curve.many(start + sign * width * np.arange(3))[1]
     return abs(float(force[0] - 2 * force[1] + force[2])) / width**2
 
 
-def close(curve: Curve, start: float, toward: float) -> Float[np.ndarray, "2 points"]:
+def _close(curve: Curve, start: float, toward: float) -> Float[np.ndarray, "2 points"]:
     places = [start]
     for _ in range(3):
         places.append(float(np.nextafter(places[-1], toward)))
     return curve.many(places)
+
+
+@dataclass(frozen=True)
+class Jump:
+    """A place where the curve or one of its derivatives jumps.
+
+    Attributes:
+        low: the last coordinate before it.
+        high: the first one after it; the next double after low where `exact`.
+        energy: energy after minus energy before.
+        force: the same of the force.
+        curvature: the same of the second derivative of the energy.
+        doubt: how large each of the three could look where nothing jumps.
+        order: 0 where the energy jumps, 1 the force, 2 the curvature; 3 where none of them does beyond doubt.
+        exact: whether low and high are neighbors among the doubles.
+        third: the same of the third derivative of the energy, where that is the lowest that jumps; else 0.
+    """
+
+    low: float
+    high: float
+    energy: float
+    force: float
+    curvature: float
+    doubt: tuple[float, float, float]
+    order: int
+    exact: bool
+    third: float = 0.0
+
+    @property
+    def at(self) -> float:
+        """Where it is."""
+        return self.low if self.exact else 0.5 * (self.low + self.high)
+
+
+def find_jumps(
+    curve: Curve,
+    low: float,
+    high: float,
+    step: float,
+    most: int = 24,
+    expected: Sequence[float] = (),
+    calls: float = np.inf,
+) -> tuple[list[Jump], int]:
+    """Every jump of energy, force, curvature or third derivative that stands out of a scan.
+
+    How small a jump that is depends on how the curve bends; `smallest_steps` tells it of a force. Measured at
+    a spacing of 0.025 Å, 40 steps of the force of each size at random places of five laws (Lennard-Jones of
+    ε = 0.01 and 0.4 eV, Morse, Buckingham, a soft one): of 1e-3, 1e-4 and 1e-5 eV/Å all are found, of 1e-6
+    199 of 200, the other on a wall. Steps of the energy are found down to 3e-6 eV on a Lennard-Jones wall of
+    ε = 1 eV and down to 1e-8 eV on a soft one.
+
+    Args:
+        curve: must be defined a little beyond both ends.
+        low, high: where to look.
+        step: spacing of the scan. Two thresholds closer together than this may be taken for one.
+        most: how many places are zoomed into, those that stand out most.
+        expected: places that are known to stand out and are left out.
+        calls: places at which the curve may be asked; after them only the place that stands out most is
+            zoomed into.
+
+    Returns:
+        (jumps by coordinate, how many places that stood out were left out).
+    """
+    suspects = [
+        one
+        for one in _outliers(curve, grid(low, high, step))[0]
+        if not any(one[1] - 2.5 * step < place < one[2] + 2.5 * step for place in expected)
+    ]
+    found: list[Jump] = []
+    done = 0
+    for _, left, right in suspects[:most]:
+        if done and len(curve.known) > calls:
+            break
+        done += 1
+        # a third derivative that jumps stands out of the intervals beside its own as well
+        margins = (3 * step if jump.order == SMOOTH else 0.0 for jump in found)
+        if any(
+            jump.low >= left - margin and jump.high <= right + margin
+            for jump, margin in zip(found, margins, strict=True)
+        ):
+            continue
+        for jump in _zoom(curve, left, right):
+            if not any(abs(jump.at - other.at) <= _same(jump, other) for other in found):
+                found.append(jump)
+    return sorted(found, key=lambda jump: jump.at), len(suspects) - done
+
+
+def measure(curve: Curve, low: float, high: float, room: float, exact: bool, curved: bool = True) -> Jump:
+    """The jumps between low and high, and how large they could look where there are none.
+
+    Energy and force are taken at the last representable coordinates on either side (medians of four, so that
+    one unlucky rounding does not decide), the curvature from one-sided differences of the force.
+
+    Args:
+        low, high: the two sides.
+        room: how far to either side the curve can be used, coordinate.
+        exact: whether low and high are neighboring doubles.
+        curved: whether the curvature is asked for too; nan if not.
+    """
+    left, right = _close(curve, low, -np.inf), _close(curve, high, np.inf)
+    values = np.median(right, axis=1) - np.median(left, axis=1)
+    floor = scatter(curve, low, high, room).max(axis=0)
+    spread = np.maximum(np.ptp(left, axis=1), np.ptp(right, axis=1)) + 4 * floor
+    curvature, doubt = np.nan, np.inf
+    if curved or not exact:
+        before, doubt_before = slope(curve, low, -1, room, floor[1])
+        after, doubt_after = slope(curve, high, 1, room, floor[1])
+        if not exact:  # between the two sides the curve goes its smooth way too
+            force = abs(curve(low)[1]) + abs(curve(high)[1])
+            spread = spread + (high - low) * np.array([force, max(abs(before), abs(after))])
+        if curved:
+            curvature, doubt = before - after, doubt_before + doubt_after  # E'' is -F'
+            if not exact:
+                doubt += (high - low) * (_bend(curve, low, -1, room) + _bend(curve, high, 1, room))
+    jumps, doubts = (*values, curvature), (*spread, doubt)
+    order = next((k for k in range(3) if abs(jumps[k]) > _SURE * doubts[k]), SMOOTH)
+    return Jump(
+        low, high, float(jumps[0]), float(jumps[1]), float(jumps[2]),
+        (float(doubts[0]), float(doubts[1]), float(doubts[2])), order, exact,
+    )  # fmt: skip
+
+
+def decay_power(curve: Curve, edge: float, room: float) -> float | None:
+    """Power with which the force vanishes toward an edge beyond which it is zero; None where unclear.
+
+    Args:
+        edge: where it ends, approached from below.
+        room: how far below the edge the curve has no other threshold.
+    """
+    distances = room * 0.5 ** np.arange(2, 14)
+    forces = np.abs(curve.many(edge - distances)[1])
+    floor = max(float(scatter(curve, edge - room / 3, edge, room / 3)[0, 1]), 1e-300)
+    # far below what is felt a law may fall to the smallest numbers there are, with no power at all
+    good = forces > max(1e3 * floor, _FELT * float(forces.max()))
+    if good.sum() < 2:
+        return None
+    slopes = np.diff(np.log(forces[good])) / np.diff(np.log(distances[good]))
+    if good.sum() < 4:
+        return float(slopes.min()) if slopes.min() > _STEEPEST else None
+    return float(np.median(slopes[-4:]))
+
+
+def smallest_steps(
+    curve: Curve, low: float, high: float, step: float
+) -> tuple[Float[np.ndarray, "intervals"], Float[np.ndarray, "intervals"]]:
+    """Where `find_jumps` looked, and how large a step of the force has to be there to be found.
+
+    Args are those that `find_jumps` was given; what that asked is known to the curve.
+
+    Returns:
+        (middles of the intervals that are compared with others, eV/Å at each).
+
+    Error:
+        A step that stands out alone is found where it is this large: of 125 planted in five laws of force,
+        125; of those a third as large, half.
+    """
+    places = grid(low, high, step)
+    seen = _outliers(curve, places)[1]
+    compared = np.isfinite(seen)
+    return (0.5 * (places[:-1] + places[1:]))[compared], _TOLD * seen[compared]
+
+
+def _outliers(
+    curve: Curve, places: Float[np.ndarray, "points"]
+) -> tuple[list[tuple[float, float, float]], Float[np.ndarray, "intervals"]]:
+    """Intervals that do not join their two sides as those around them do.
+
+    Returns:
+        (how far it stands out, left, right) of each, the worst first; and the smallest step of the force that
+        stands out, by interval: infinite at both ends, which nothing is compared with.
+    """
+    middle = places[len(places) // 2]
+    noise = scatter(curve, middle, middle, places[-1] - places[0]).min(axis=0)
+    sums = np.array([*noise, 2 * noise[0] + (places[1] - places[0]) * noise[1]])
+    # (row, interval of its first value, what rounding leaves of it, times the usual that stand out)
+    rows = [(row, 3, 64 * least, _OUTLIER) for row, least in zip(_mismatch(curve, places), sums, strict=True)]
+    rows += [
+        (row, 4, 900 * least, _STANDS_OUT) for row, least in zip(_eighth(curve, places), noise, strict=True)
+    ]
+    kept: dict[int, float] = {}
+    smallest = np.full(len(places) - 1, np.inf)
+    for number, (row, first, least, times) in enumerate(rows):
+        for k, value in enumerate(row):
+            around = np.concatenate([row[max(k - 12, 0) : max(k - 3, 0)], row[k + 4 : k + 13]])
+            usual = max(float(np.median(around)) if len(around) else 0.0, float(least), 1e-300)
+            if number == len(rows) - 1:
+                smallest[first + k] = times * usual / _OF_A_STEP
+            if value >= row[max(k - 3, 0) : k + 4].max() and value > times * usual:
+                kept[first + k] = max(kept.get(first + k, 0.0), value / usual)
+    ranked = sorted(((ratio, k) for k, ratio in kept.items()), reverse=True)
+    return [(ratio, float(places[k]), float(places[k + 1])) for ratio, k in ranked], smallest
+
+
+def _eighth(curve: Curve, places: Float[np.ndarray, "points"]) -> Float[np.ndarray, "2 intervals"]:
+    """Eighth differences of energy and force: of the two whose middles are an interval's ends, the smaller.
+
+    On a wall they are a hundredth of how badly two cubics meet, and a step is as much larger in them as
+    rounding is.
+    """
+    differences = np.abs(np.lib.stride_tricks.sliding_window_view(curve.many(places), 9, axis=1) @ _EIGHTH)
+    return np.minimum(differences[:, :-1], differences[:, 1:])
+
+
+def _mismatch(curve: Curve, places: Float[np.ndarray, "points"]) -> Float[np.ndarray, "3 intervals"]:
+    """How badly each interval joins its two sides: energy, force, and energy against the force's work.
+
+    The first two are |prediction from the left minus prediction from the right| in its middle, the third is
+    the change of the energy without the integral of the force (fifth power of the spacing where smooth),
+    which shows an energy that jumps on its own far sooner.
+    """
+    values = curve.many(places)
+    windows = np.lib.stride_tricks.sliding_window_view(values, 4, axis=1)
+    ends = np.abs((windows @ _EXTRAPOLATE)[:, :-4] - (windows @ _EXTRAPOLATE[::-1])[:, 4:])
+    width = places[1] - places[0]
+    work = width / 24 * (windows[1] @ np.array([-1.0, 13.0, 13.0, -1.0]))
+    unexplained = np.abs(np.diff(values[0])[1:-1] + work)
+    return np.vstack([ends, unexplained[2:-2]])
+
+
+def _zoom(curve: Curve, left: float, right: float) -> list[Jump]:
+    """The jumps between left and right, down to neighboring doubles where a value jumps."""
+    room = right - left
+    left, right = left - 1.5 * room, right + 1.5 * room
+    noise = np.maximum(scatter(curve, left, right, room).max(axis=0), 1e-300)
+    history: list[np.ndarray] = []
+    clear: list[np.ndarray] = []
+    seconds, place = 0, (left, right)
+    for _ in range(_LEVELS):
+        width = (right - left) / _DIVISIONS
+        mismatch = _mismatch(curve, np.linspace(left - 4 * width, right + 4 * width, _DIVISIONS + 9))
+        floor = np.array([*noise, 2 * noise[0] + width * noise[1]])
+        usual = np.maximum(floor, np.median(mismatch, axis=1))
+        best = int(np.argmax((mismatch / usual[:, None]).max(axis=0)))
+        history.append(mismatch[:, best])
+        clear.append(mismatch[:, best] > 30 * floor)
+        # a jump shows more in the intervals beside it than in its own
+        left, right = left + (best - 2.5) * width, left + (best + 1.5) * width
+        if not clear[-1].any():
+            break
+        if len(history) < 2:
+            continue
+        falls = history[-1] / np.maximum(history[-2], 1e-300)
+        # a force whose second derivative jumps: its mismatch falls with the square of the spacing, exactly,
+        # and there alone; at the points of a table it does so everywhere
+        alone = mismatch[1, best] > _ALONE * usual[1]
+        if clear[-1][1] and alone and abs(np.log(max(falls[1], 1e-300)) / np.log(_NARROWER) + 2) < _SQUARE:
+            seconds, place = seconds + 1, (left, right)
+        for row in (1, 0):
+            jumped = abs(_level(curve, row, left, right)(right) - curve(left)[row])
+            now = history[-1][row]
+            if clear[-1][row] and 0.8 < falls[row] < 1.3 and 0.7 * jumped < now < 1.4 * jumped:
+                jump = measure(curve, *locate(curve, row, left, right), room, exact=True)
+                if jump.order < 2:
+                    return [jump]
+        if len(history) > 2 and (falls < _NARROWER**-2.5).all():
+            break
+    bends = [row[1] for row, yes in zip(history, clear, strict=True) if yes[1]]
+    if len(bends) < 2 or bends[-1] < bends[-2] / _NARROWER**1.6:
+        return _third(curve, *place, room) if seconds >= _SEEN else []
+    return _kink(curve, left, right, room)
+
+
+def locate(curve: Curve, row: int, left: float, right: float) -> tuple[float, float]:
+    """Neighboring doubles between which a value goes from that at left to that at right.
+
+    Args:
+        row: 0 for the energy (without the work done on the way), 1 for the force.
+        left, right: two sides of a jump, so near that the value changes by little else.
+    """
+    level = _level(curve, row, left, right)
+    middle = 0.5 * (level(left) + level(right))
+    rising = level(right) > level(left)
+    return bisect(lambda x: (level(x) > middle) == rising, left, right)
+
+
+def _level(curve: Curve, row: int, left: float, right: float) -> Callable[[float], float]:
+    """The force without its slope before left, or the energy without the work done from there: only jumps."""
+    if row == 1:
+        back = left - (right - left)
+        slope_before = (curve(left)[1] - curve(back)[1]) / (left - back)
+        return lambda x: curve(x)[1] - slope_before * (x - left)
+    return lambda x: curve(x)[0] + 0.5 * (x - left) * (curve(left)[1] + curve(x)[1])
+
+
+def _kink(curve: Curve, left: float, right: float, room: float) -> list[Jump]:
+    """A place where the force bends: where its continuations from both sides meet."""
+    width = min(room / 8, 1e-3)
+    middle, reach = 0.5 * (left + right), max(0.5 * (right - left), width / 8)
+    roots = np.roots(-_pieces(curve, middle, reach, width, 3))
+    real = roots[np.abs(roots.imag) < 1e-9].real
+    near = real[np.abs(real) <= 2 * reach]
+    if len(near):
+        middle, reach = middle + float(near[np.argmin(np.abs(near))]), min(reach, 1e-7)
+    jump = measure(curve, middle - reach, middle + reach, room, exact=False)
+    return [jump] if jump.order < SMOOTH else []
+
+
+def _pieces(curve: Curve, middle: float, reach: float, width: float, degree: int) -> np.ndarray:
+    """Polynomial of the force after a place minus that before, from seven points on either side."""
+    steps = reach + width * np.arange(7)
+    before = np.polyfit(-steps, curve.many(middle - steps)[1], degree)
+    return np.polyfit(steps, curve.many(middle + steps)[1], degree) - before
+
+
+def _third(curve: Curve, left: float, right: float, room: float) -> list[Jump]:
+    """A place where the third derivative of the energy jumps, by the force's second from both sides.
+
+    Of several widths of the two pieces, the one at which half of it agrees best counts.
+    """
+    noise = float(scatter(curve, left, right, room)[:, 1].max())
+    reach = 0.5 * (right - left)
+    widths = [room / part for part in (6, 12, 24, 48) if room / part > 4 * reach]
+    middle = 0.5 * (left + right)
+    if widths:
+        # both pieces touch where they meet
+        square, line, _ = _pieces(curve, middle, reach, widths[-1], 4)[-3:]
+        shift = -0.5 * line / square if square else np.inf
+        if abs(shift) < 4 * reach:
+            middle += float(shift)
+    values = []
+    for width in widths:
+        whole, half = (2 * float(_pieces(curve, middle, reach, part, 4)[-3]) for part in (width, width / 2))
+        values.append((whole, abs(whole - half) + 40 * noise / width**2))
+    if not values:
+        return []
+    bent, error = min(values, key=lambda one: one[1])
+    if abs(bent) <= _SURE * error:
+        return []
+    found = measure(curve, middle - reach, middle + reach, room, exact=False)
+    return [replace(found, order=SMOOTH, third=-bent)]
+
+
+def _same(one: Jump, other: Jump) -> float:
+    """How near two places are that are one."""
+    return 1e-9 * max(abs(one.at), 1.0) if one.exact and other.exact else 2e-4

@@ -8,40 +8,130 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from ase import Atoms
 from ase.neighborlist import neighbor_list
+from jaxtyping import Float, Int
 
-from mdnum.audit.base import TIME_UP, Progress, Subject, TimeUp, meter_of
-from mdnum.audit.jumps import SMOOTH, Jump, find_jumps, locate, measure
-from mdnum.audit.probes import Pair, molecules, whole
-from mdnum.audit.routes import Crossing, Route
-from mdnum.audit.subject import CalculatorError
-from mdnum.audit.threshold import Threshold
-from mdnum.audit.thresholds import STEP, STEPS, walk_pairs
+from mdnum.audit.base import Progress
+from mdnum.audit.check import ask_each
+from mdnum.audit.curve import SMOOTH, Curve, Jump, find_jumps, locate, measure
+from mdnum.audit.pairs import Pair, molecules, whole
+from mdnum.audit.subject import CalculatorError, CalculatorSubject
+from mdnum.audit.thresholds import STEP, STEPS, PairThreshold, walk_pairs
 
+#: Half the stretch around an expected crossing in which it is located, length.
 _SIDE = 1e-7
-"""Half the stretch around an expected crossing in which it is located, length."""
-
+#: Crossings of one threshold that are measured, each by another atom.
 _MOST_CROSSINGS = 2
-"""Crossings of one threshold that are measured, each by another atom."""
-
+#: Crossings of known thresholds in the structure that are measured, by 170 calls or so each.
 _CROSSINGS = 4
-"""Crossings of known thresholds in the structure that are measured, by 170 calls or so each."""
-
+#: Through the structure, scanned for unknown thresholds by 430 calls or so each.
 _ROUTES = 2
-"""Through the structure, scanned for unknown thresholds by 430 calls or so each."""
-
-_CUT_OUT = 40
-"""Atoms of the structure that are kept where there are many."""
-
-_MANY = 500
-"""Atoms from which a part of the structure is walked through, and not all of it."""
-
+#: Of a structure of more atoms than the second, so many are kept to be walked through.
+_CUT_OUT, _MANY = 40, 500
 _MOST_TRIPLES = 4
+#: Of a route through the structure, length.
 _LENGTH = 0.6
-"""Of a route through the structure, length."""
+#: Two distances this near to one another are tied, length.
+_TIED = 1e-6
+
+
+@dataclass(frozen=True)
+class RouteCrossing:
+    """A place on a route at which a distance passes a threshold.
+
+    Attributes:
+        at: along the route, length.
+        other: the atom whose distance it is.
+    """
+
+    at: float
+    other: int
+    threshold: PairThreshold
+
+
+@dataclass(frozen=True)
+class Route:
+    """A structure in which some atoms move along a line.
+
+    Attributes:
+        atoms: the structure at 0.
+        moving: atoms that move together.
+        lead: the one of them whose distances are watched.
+        direction: unit vector.
+    """
+
+    name: str
+    atoms: Atoms
+    moving: Int[np.ndarray, "moving"]
+    lead: int
+    direction: Float[np.ndarray, "3"]
+
+    def at(self, along: float) -> Atoms:
+        """The structure with those atoms moved."""
+        atoms = self.atoms.copy()
+        atoms.positions[self.moving] += along * self.direction
+        return atoms
+
+    def curve(self, subject: CalculatorSubject) -> Curve:
+        """Energy, and force along the line on what moves."""
+
+        def at(along: float) -> tuple[float, float]:
+            atoms = self.at(along)
+            energy = subject.energy(atoms)
+            return energy, float((subject.forces(atoms)[self.moving] @ self.direction).sum())
+
+        return Curve(at)
+
+    def crossings(self, thresholds: Sequence[PairThreshold], low: float, high: float) -> list[RouteCrossing]:
+        """Every place between low and high at which the lead's distance to an atom passes a threshold.
+
+        The distance along a line is a hyperbola, so the places are roots of a quadratic.
+        """
+        found: list[RouteCrossing] = []
+        symbols = self.atoms.get_chemical_symbols()
+        for threshold in thresholds:
+            reach = threshold.radius + max(abs(low), abs(high))
+            for other, vector in self._others(reach):
+                if sorted((symbols[self.lead], symbols[other])) != sorted(threshold.species):
+                    continue
+                toward = float(vector @ self.direction)
+                rest = toward**2 - float(vector @ vector) + threshold.radius**2
+                if rest <= 0:
+                    continue
+                for root in (toward - np.sqrt(rest), toward + np.sqrt(rest)):
+                    if low < root < high:
+                        found.append(RouteCrossing(float(root), other, threshold))
+        return sorted(found, key=lambda one: one.at)
+
+    def _others(self, reach: float) -> list[tuple[int, Float[np.ndarray, "3"]]]:
+        """(atom, vector from the lead to it or an image) within reach, without those that move along."""
+        atoms = self.atoms
+        counts = [0, 0, 0]
+        if atoms.pbc.any():
+            heights = 1.0 / np.linalg.norm(np.linalg.inv(np.asarray(atoms.cell.complete())), axis=0)
+            counts = [
+                int(np.ceil(reach / h)) + 1 if yes else 0 for h, yes in zip(heights, atoms.pbc, strict=True)
+            ]
+        shifts = np.array(list(product(*(range(-n, n + 1) for n in counts)))) @ atoms.cell.array
+        rest = np.setdiff1d(np.arange(len(atoms)), self.moving)
+        vectors = atoms.positions[rest][:, None] - atoms.positions[self.lead] + shifts[None]
+        near = np.linalg.norm(vectors, axis=2) < reach
+        return [(int(rest[a]), vectors[a, b]) for a, b in np.argwhere(near)]
+
+    def ties(self, along: float) -> list[tuple[int, int]]:
+        """(atom, k) where, at a place, an atom's k-th and (k+1)-th neighbors are equally far."""
+        atoms = self.at(along)
+        found: list[tuple[int, int]] = []
+        for center, row in enumerate(atoms.get_all_distances(mic=bool(atoms.pbc.any()))):
+            others = np.sort(np.delete(row, center))
+            for k in np.flatnonzero(np.diff(others) < _TIED):
+                if center == self.lead or abs(others[k] - row[self.lead]) < _TIED:
+                    found.append((center, int(k) + 1))
+        return found
 
 
 @dataclass(frozen=True)
@@ -62,22 +152,20 @@ class Event:
     at: float
     jump: Jump
     force: float
-    threshold: Threshold | None
+    threshold: PairThreshold | None
     distance: float
     ties: tuple[tuple[int, int], ...]
 
 
 @dataclass(frozen=True)
-class Surroundings:
-    """What walks through surroundings told.
+class EnvironmentWalks:
+    """What walks through surroundings found.
 
     Attributes:
         events: places at which something jumps.
         measured: crossings of known thresholds that were measured.
         routes: names of routes that were scanned for unknown ones.
-        expected: crossings of known thresholds on those routes.
         skipped: (what, why).
-        atoms: in the structure that was walked through; a part of the subject's where that has many.
         asked: crossings and routes that were walked, those on which the calculator failed included.
         possible: all of them.
     """
@@ -85,93 +173,70 @@ class Surroundings:
     events: tuple[Event, ...]
     measured: int
     routes: tuple[str, ...]
-    expected: int
     skipped: tuple[tuple[str, str], ...]
-    atoms: int
     asked: int = 0
     possible: int = 0
 
+    @property
+    def unexplained(self) -> list[Event]:
+        """Events that no pair threshold explains and that jump beyond doubt."""
+        return [one for one in self.events if one.threshold is None and one.jump.order < SMOOTH]
+
 
 def walk_surroundings(
-    subject: Subject, progress: Progress | None = None, crossings: int = _CROSSINGS, routes: int = _ROUTES
-) -> Surroundings:
-    """Walk triples, and atoms of the structure, through the known thresholds and look for unknown ones.
+    subject: CalculatorSubject, progress: Progress, crossings: int = _CROSSINGS, routes: int = _ROUTES
+) -> EnvironmentWalks:
+    """Walk triples, and atoms of the structure, through the known thresholds and search for unknown ones.
 
     Args:
-        subject: the calculator and its structure.
-        progress: called now and then.
         crossings: of known thresholds in the structure that are measured.
-        routes: through the structure on which others are looked for.
+        routes: through the structure on which others are searched.
     """
     walks = walk_pairs(subject).walks
     thresholds = [one for walk in walks for one in walk.thresholds if one.order < SMOOTH or one.dies]
     quantum = max((one.quantum for one in walks), default=(0.0, 0.0))
     single = bool(walks) and walks[0].pair.moves == "atom"
     atoms = subject.atoms
-    groups = _groups(atoms, single)
     subject.forces(atoms)
-    events: list[Event] = []
     skipped: list[tuple[str, str]] = []
     if len(atoms) > _MANY and walks:
-        atoms = _cut_out(atoms, groups, walks[0].pair)
-        groups = _groups(atoms, single)
+        atoms = _cut_out(atoms, _groups(atoms, single), walks[0].pair)
         try:
             subject.forces(atoms)
         except CalculatorError as error:
             skipped.append((f"{_CUT_OUT} atoms cut out of the structure", error.message))
-            atoms, groups = subject.atoms, _groups(subject.atoms, single)
+            atoms = subject.atoms
+    groups = _groups(atoms, single)
     targeted = _targeted(atoms, thresholds, groups)
     if len(targeted) > crossings:
         more = len(targeted) - crossings
         skipped.append((f"{more} more crossings of known thresholds", f"{crossings} were measured"))
         targeted = targeted[:crossings]
     triples = _triples(subject) if single else []
-    random = _random(atoms, groups, routes)
-    total = len(targeted) + len(triples) + len(random)
-    asked = 0
-    for k, (route, crossing) in enumerate(targeted):
-        if progress:
-            progress(k, total, {"phase": "walking through the structure", "unit": "ways"})
-        try:
-            with meter_of(subject).limited():
-                event = _at_crossing(subject, route, crossing)
-            events += [] if _rounded(event, quantum) else [event]
-        except CalculatorError as error:
-            skipped.append((route.name, error.message))
-        except TimeUp:
-            skipped.append((route.name, TIME_UP))
-            continue
-        asked += 1
-    measured = asked
-    scanned: list[str] = []
-    expected = 0
-    for k, (route, low, high) in enumerate([*triples, *random]):
-        if progress:
-            progress(len(targeted) + k, total, {"phase": route.name, "unit": "ways"})
-        try:
-            with meter_of(subject).limited():
-                found, known = _scanned(subject, route, thresholds, low, high)
-        except TimeUp:
-            skipped.append((route.name, TIME_UP))
-            continue
-        except CalculatorError as error:
-            skipped.append((route.name, error.message))
-            asked += 1
-            continue
-        asked += 1
-        scanned.append(route.name)
-        events += [one for one in found if not _rounded(one, quantum)]
-        expected += known
-    return Surroundings(
-        tuple(events), measured, tuple(scanned), expected, tuple(skipped), len(atoms), asked, total
+    scans = [*triples, *_random(atoms, groups, routes)]
+    ways = [(route.name, lambda way=(route, hit): [_at_crossing(subject, *way)]) for route, hit in targeted]
+    ways += [(scan[0].name, lambda scan=scan: _scanned(subject, thresholds, *scan)) for scan in scans]
+    failed: set[int] = set()
+
+    def note(place: int, error: CalculatorError) -> None:
+        failed.add(place)
+        skipped.append((ways[place][0], error.message))
+
+    found = ask_each(subject, ways, progress, "walking through the structure", skipped, failed=note)
+    asked = {*found, *failed}
+    return EnvironmentWalks(
+        tuple(one for events in found.values() for one in events if not _rounded(one, quantum)),
+        sum(place < len(targeted) for place in asked),
+        tuple(ways[place][0] for place in found if place >= len(targeted)),
+        tuple(skipped),
+        len(asked),
+        len(ways),
     )
 
 
 def _groups(atoms: Atoms, single: bool) -> list[np.ndarray]:
     """What moves together: single atoms, or molecules where the calculator takes nothing less."""
-    if single:
-        return [np.array([k]) for k in range(len(atoms))]
-    return molecules(atoms)
+    return [np.array([k]) for k in range(len(atoms))] if single else molecules(atoms)
 
 
 def _cut_out(atoms: Atoms, groups: Sequence[np.ndarray], pair: Pair) -> Atoms:
@@ -180,12 +245,10 @@ def _cut_out(atoms: Atoms, groups: Sequence[np.ndarray], pair: Pair) -> Atoms:
     offsets = atoms.get_distances(center, np.arange(len(atoms)), mic=bool(atoms.pbc.any()), vector=True)
     nearest = np.argsort([np.linalg.norm(offsets[_lead(atoms, group)]) for group in groups])
     count = max(_CUT_OUT // max(len(groups[0]), 1), 4)
-    chosen = [groups[k] for k in sorted(nearest[:count])]
-    parts = [whole(atoms, group) for group in chosen]
-    for part, group in zip(parts, chosen, strict=True):
-        part.positions += offsets[_lead(atoms, group)] + pair.box / 2
     cut = Atoms(cell=[pair.box] * 3 if pair.box else None, pbc=pair.periodic)
-    for part in parts:
+    for group in (groups[k] for k in sorted(nearest[:count])):
+        part = whole(atoms, group)
+        part.positions += offsets[_lead(atoms, group)] + pair.box / 2
         cut += part
     return cut
 
@@ -195,12 +258,12 @@ def _lead(atoms: Atoms, group: np.ndarray) -> int:
 
 
 def _targeted(
-    atoms: Atoms, thresholds: Sequence[Threshold], groups: Sequence[np.ndarray]
-) -> list[tuple[Route, Crossing]]:
+    atoms: Atoms, thresholds: Sequence[PairThreshold], groups: Sequence[np.ndarray]
+) -> list[tuple[Route, RouteCrossing]]:
     """For each threshold, a few pairs of the structure near it, moved through it along their line."""
     of_lead = {_lead(atoms, group): group for group in groups}
     symbols = np.array(atoms.get_chemical_symbols())
-    ranked: list[tuple[int, Route, Crossing]] = []
+    ranked: list[tuple[int, Route, RouteCrossing]] = []
     for threshold in thresholds:
         first, second, distance, vector = neighbor_list("ijdD", atoms, threshold.radius + 1.0)
         one, other = threshold.species
@@ -211,20 +274,19 @@ def _targeted(
             if not fits[k] or int(first[k]) in used or abs(distance[k] - threshold.radius) > 1.0:
                 continue
             used.add(int(first[k]))
-            direction = vector[k] / distance[k]
             route = Route(
                 f"atom {first[k]} ({one}) toward {second[k]} ({other})",
-                atoms, of_lead[int(first[k])], int(first[k]), direction,
+                atoms, of_lead[int(first[k])], int(first[k]), vector[k] / distance[k],
             )  # fmt: skip
-            crossing = Crossing(float(distance[k] - threshold.radius), int(second[k]), threshold)
-            ranked.append((len(used), route, crossing))
+            at = float(distance[k] - threshold.radius)
+            ranked.append((len(used), route, RouteCrossing(at, int(second[k]), threshold)))
             if len(used) == _MOST_CROSSINGS:
                 break
     # the first of every threshold before the second of any
     return [(route, crossing) for _, route, crossing in sorted(ranked, key=lambda one: one[0])]
 
 
-def _at_crossing(subject: Subject, route: Route, crossing: Crossing) -> Event:
+def _at_crossing(subject: CalculatorSubject, route: Route, crossing: RouteCrossing) -> Event:
     """What jumps where a known threshold is crossed, to the last representable place if a value does."""
     curve = route.curve(subject)
     low, high = crossing.at - _SIDE, crossing.at + _SIDE
@@ -235,7 +297,9 @@ def _at_crossing(subject: Subject, route: Route, crossing: Crossing) -> Event:
     return _event(subject, route, jump, crossing)
 
 
-def _event(subject: Subject, route: Route, jump: Jump, crossing: Crossing | None) -> Event:
+def _event(
+    subject: CalculatorSubject, route: Route, jump: Jump, crossing: RouteCrossing | None = None
+) -> Event:
     change = subject.forces(route.at(jump.high)) - subject.forces(route.at(jump.low))
     return Event(
         route.name, jump.at, jump, float(np.linalg.norm(change, axis=1).max()),
@@ -246,53 +310,49 @@ def _event(subject: Subject, route: Route, jump: Jump, crossing: Crossing | None
 
 
 def _scanned(
-    subject: Subject, route: Route, thresholds: Sequence[Threshold], low: float, high: float
-) -> tuple[list[Event], int]:
-    """Unknown thresholds on a route, and how many known ones it crosses."""
+    subject: CalculatorSubject, thresholds: Sequence[PairThreshold], route: Route, low: float, high: float
+) -> list[Event]:
+    """Unknown thresholds on a route."""
     curve = route.curve(subject)
     crossings = route.crossings(thresholds, low - 1.0, high + 1.0)
-    inside = [one for one in crossings if low <= one.at <= high]
+    inside = sum(low <= one.at <= high for one in crossings)
     # crowded routes in finer steps, so that what lies between two crossings is seen
-    step = float(np.clip((high - low) / (10 * len(inside) + 1), STEP / 10, STEP))
+    step = float(np.clip((high - low) / (10 * inside + 1), STEP / 10, STEP))
     jumps, _ = find_jumps(curve, low, high, step, most=6, expected=[one.at for one in crossings])
-    unknown = [
-        jump for jump in jumps if jump.order < SMOOTH and not any(_explains(one, jump) for one in crossings)
+
+    def explains(crossing: RouteCrossing, jump: Jump) -> bool:
+        near = max(1e-6, 10 * crossing.threshold.located, jump.high - jump.low)
+        return abs(jump.at - crossing.at) < near
+
+    return [
+        _event(subject, route, jump)
+        for jump in jumps
+        if jump.order < SMOOTH and not any(explains(one, jump) for one in crossings)
     ]
-    return [_event(subject, route, jump, None) for jump in unknown], len(inside)
 
 
-def _explains(crossing: Crossing, jump: Jump) -> bool:
-    near = max(1e-6, 10 * crossing.threshold.located, jump.high - jump.low)
-    return abs(jump.at - crossing.at) < near
-
-
-def _triples(subject: Subject) -> list[tuple[Route, float, float]]:
+def _triples(subject: CalculatorSubject) -> list[tuple[Route, float, float]]:
     """A third atom brought toward one of a bonded pair, beside their line: (route, from, to)."""
     found: list[tuple[Route, float, float]] = []
     for walk in walk_pairs(subject).walks[:_MOST_TRIPLES]:
-        lowest = int(np.argmin(walk.energy))
-        bond = float(walk.distance[lowest])
+        bond = float(walk.distance[int(np.argmin(walk.energy))])
         end = min((walk.cutoff or 8.0) + bond, 12.0)
         one, other = walk.pair.species
         side = np.radians(110.0)
-        atoms = Atoms(
-            [one, other, other],
-            [(0, 0, 0), (bond * np.cos(side), bond * np.sin(side), 0), (0, 0, 0)],
-        )
+        beside = (bond * np.cos(side), bond * np.sin(side), 0)
+        atoms = Atoms([one, other, other], [(0, 0, 0), beside, (0, 0, 0)])
         if walk.pair.box:
             atoms.set_cell([walk.pair.box] * 3)
             atoms.positions += walk.pair.box / 2  # what lies outside of a box may be lost
         atoms.pbc = walk.pair.periodic
-        route = Route(
-            f"a third atom ({other}) toward {one}-{other}", atoms, np.array([2]), 2, np.array([1.0, 0.0, 0.0])
-        )
-        low = max(float(walk.distance[0]), 0.8 * bond) + 6 * STEP
-        found.append((route, low, end))
+        name = f"a third atom ({other}) toward {one}-{other}"
+        route = Route(name, atoms, np.array([2]), 2, np.array([1.0, 0.0, 0.0]))
+        found.append((route, max(float(walk.distance[0]), 0.8 * bond) + 6 * STEP, end))
     return found
 
 
 def _random(atoms: Atoms, groups: Sequence[np.ndarray], count: int) -> list[tuple[Route, float, float]]:
-    """Routes of so many atoms in arbitrary directions."""
+    """Routes of some atoms in arbitrary directions."""
     rng = np.random.default_rng(0)
     found: list[tuple[Route, float, float]] = []
     for k in rng.permutation(len(groups))[:count]:
@@ -304,15 +364,9 @@ def _random(atoms: Atoms, groups: Sequence[np.ndarray], count: int) -> list[tupl
     return found
 
 
-def unexplained(events: Sequence[Event]) -> list[Event]:
-    """Events that no pair threshold explains and that jump beyond doubt."""
-    return [one for one in events if one.threshold is None and one.jump.order < SMOOTH]
-
-
 def _rounded(event: Event, quantum: tuple[float, float]) -> bool:
     """Whether an event is no more than a step of answers that are rounded to decimals."""
     if not any(quantum):
         return False
-    return event.jump.order > 1 or (
-        abs(event.jump.energy) <= STEPS * quantum[0] and event.force <= STEPS * quantum[1]
-    )
+    small = abs(event.jump.energy) <= STEPS * quantum[0] and event.force <= STEPS * quantum[1]
+    return event.jump.order > 1 or small

@@ -1,17 +1,18 @@
-"""How far a calculator's answers scatter for reasons of rounding alone: measured, not assumed."""
+"""How far a calculator's answers scatter and how many digits they carry: measured, not assumed."""
 
 from __future__ import annotations
 
+import contextlib
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from ase import Atoms
 from jaxtyping import Float
 
-from mdnum.audit.base import Subject, again
-from mdnum.audit.ledger import no_rounding
-from mdnum.audit.subject import CalculatorError
+from mdnum.audit.base import Observed, finding
+from mdnum.audit.subject import CalculatorError, CalculatorSubject, no_rounding
 
 #: Å between the points of the line along which noise is measured: a smooth function's fourth difference over
 #: it is below 1e-16 eV for any chemistry, while even single precision tells neighboring points apart.
@@ -21,21 +22,33 @@ _POINTS = 9
 RATTLE = 0.03
 #: Atoms below which symmetry may hide the noise.
 FEW = 8
-#: Å between the points of the line along which steps are looked for, the wider ones where nothing moves.
+#: Å between the points of the line along which steps are searched, the wider ones where nothing moves.
 _STEP_SPACINGS = (1e-4, 1.6e-3, 2.5e-2)
 _STEP_POINTS = 17
 #: Places at which a value stays what it was, from which one that moves elsewhere goes in steps; and the share
 #: of the forces that do, from which forces do.
 _STAYS, _STAIRS = 3, 0.1
-
 #: Of an energy: noise that rounding explains, of doubles and of numbers of single precision.
 _QUIET, _QUIET_SINGLE = 1e-11, 1e-6
 #: A line that is so much quieter than another has no threshold on it; rounding differs by less between lines.
 _QUIETER = 1e-3
+#: Decimals of a number that are taken for rounding, at most: a double of more is too near to its own.
+_MOST_DECIMALS = 9
+#: Different answers, 0 aside, from which is judged.
+_FEWEST = 4
+#: Noise, in units of the rounding of a double, above which fewer digits are reported.
+_NOISY = 1e5
+#: Of the root mean square force: half a step of forces above is one that a run and a derivative feel.
+_SMALL = 1e-4
+#: Of kT: what an energy in single precision may be rounded to.
+_SMALL_ENERGY = 1e-2
+#: Bits of a significand by the name of the format, the narrowest first.
+_HALF = 11
+_FORMATS = ((8, "bfloat16"), (_HALF, "half precision"), (24, "single precision"))
 
 
 @dataclass(frozen=True)
-class Noise:
+class NoiseFloor:
     """What an answer may differ by without anything being wrong.
 
     Attributes:
@@ -48,12 +61,17 @@ class Noise:
     force: float
     typical: float = 0.0
 
+    def louder(self, other: NoiseFloor) -> NoiseFloor:
+        """The larger of two, each part by itself."""
+        return NoiseFloor(
+            max(self.energy, other.energy), max(self.force, other.force), max(self.typical, other.typical)
+        )
 
-def along_a_line(subject: Subject, atoms: Atoms, rng: np.random.Generator) -> Noise:
+
+def along_a_line(subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator) -> NoiseFloor:
     """Noise from differences of high order over equally spaced points: what is smooth drops out of them.
 
     Args:
-        subject: the calculator.
         atoms: where; no threshold nearby.
         rng: picks the line.
 
@@ -62,29 +80,27 @@ def along_a_line(subject: Subject, atoms: Atoms, rng: np.random.Generator) -> No
     """
     line = direction(len(atoms), rng)
     places = [displaced(atoms, (at - _POINTS // 2) * _SPACING * line) for at in range(_POINTS)]
-    energies, forces = [], []
-    for there in places:
-        energies.append(subject.energy(there))
-        forces.append(subject.forces(there))
-    energy = float(_scatter(np.array(energies)[:, None])[0])
-    scatters = _scatter(np.array(forces).reshape(_POINTS, -1))
+    answers = [(subject.energy(place), subject.forces(place)) for place in places]
+    energies, forces = np.array([energy for energy, _ in answers]), [force for _, force in answers]
+    columns = np.array(forces).reshape(_POINTS, -1)
+    energy = float(_scatter(energies[:, None])[0])
+    scatters = _scatter(columns)
     force = float(np.max(scatters))
-    if no_rounding(energy, energies[0], force, np.array(forces), subject.kT):
+    if no_rounding(energy, energies[0], force, columns, subject.kT):
         # by chance, or by a threshold: the point that sticks out is asked again
-        worst = np.array(forces).reshape(_POINTS, -1)[:, np.argmax(scatters)]
-        for at in {_odd_one(np.array(energies)), _odd_one(worst)}:
-            again(subject, places[at], energies[at], forces[at])
+        for at in {_odd_one(energies), _odd_one(columns[:, np.argmax(scatters)])}:
+            subject.again(places[at], float(energies[at]), forces[at])
     # values that round to the same number at every point still carry the rounding of one operation
     floor = np.finfo(float).eps
-    return Noise(
-        max(energy, floor * max(abs(value) for value in energies)),
-        max(force, floor * float(np.max(np.abs(forces)))),
+    return NoiseFloor(
+        max(energy, floor * float(np.max(np.abs(energies)))),
+        max(force, floor * float(np.max(np.abs(columns)))),
         float(np.median(scatters)),
     )
 
 
 @dataclass(frozen=True)
-class Steps:
+class Staircase:
     """Whether answers go in steps, along a line on which smooth ones change from point to point.
 
     Attributes:
@@ -92,8 +108,8 @@ class Steps:
         force: of a force component, eV/Å.
         share: of force components that go in steps, of those that change at all.
         length: of the line, Å.
-        energies: eV.
-        forces: eV/Å.
+        energies: at its points, eV.
+        forces: at its points, eV/Å.
     """
 
     energy: float
@@ -104,20 +120,18 @@ class Steps:
     forces: Float[np.ndarray, "points components"]
 
 
-def steps(subject: Subject, atoms: Atoms) -> Steps:
+def steps(subject: CalculatorSubject, atoms: Atoms) -> Staircase:
     """Steps of energies and forces: values that stay the same to the last bit and then change.
 
     A double, or a number of single precision, of something smooth is another one 1e-4 Å further on. Points
     at which nothing at all has changed do not count: a calculator that has kept an answer looks like that.
 
     Args:
-        subject: the calculator.
         atoms: where the line begins.
     """
-    known = getattr(subject, "known", {})
     key = ("steps", atoms.positions.tobytes(), atoms.cell.array.tobytes())
-    if key in known:
-        return known[key]
+    if key in subject.known:
+        return subject.known[key]
     line = direction(len(atoms), np.random.default_rng(len(atoms)))
     for spacing in _STEP_SPACINGS:
         there = [displaced(atoms, k * spacing * line) for k in range(_STEP_POINTS)]
@@ -137,22 +151,21 @@ def steps(subject: Subject, atoms: Atoms) -> Steps:
     stays = np.sum(climbs == 0) >= _STAYS and climbs.any()
     energy = float(np.median(climbs[climbs > 0])) if stays else 0.0
     if not np.ptp(energies):
-        # as large as what the forces say it should have changed by, at least
+        # as large as the change that the forces predict, at least
         along = forces @ line.ravel()
         work = spacing * np.cumsum(0.5 * (along[1:] + along[:-1]))
         energy = float(np.ptp(np.append(work, 0.0)))
     length = (_STEP_POINTS - 1) * spacing
-    known[key] = Steps(energy, force, share, length, energies, forces)
-    return known[key]
+    subject.known[key] = Staircase(energy, force, share, length, energies, forces)
+    return subject.known[key]
 
 
 def _scatter(values: Float[np.ndarray, "points columns"]) -> Float[np.ndarray, "columns"]:
     """Standard deviation of the noise in each column, the middle one of three orders of difference."""
     found = []
     for order in (4, 5, 6):
-        difference = np.diff(values, n=order, axis=0)
         weight = math.factorial(order) ** 2 / math.factorial(2 * order)
-        found.append(np.sqrt(weight * np.mean(difference**2, axis=0)))
+        found.append(np.sqrt(weight * np.mean(np.diff(values, n=order, axis=0) ** 2, axis=0)))
     return np.median(found, axis=0)
 
 
@@ -169,35 +182,34 @@ def _odd_one(values: Float[np.ndarray, "points"]) -> int:
 
 
 def under_jitter(
-    subject: Subject, atoms: Atoms, size: float, rng: np.random.Generator, draws: int = 4
-) -> Noise:
+    subject: CalculatorSubject, atoms: Atoms, size: float, rng: np.random.Generator, draws: int = 4
+) -> NoiseFloor:
     """The largest change of energy and of a force component when all atoms are moved by `size` at random.
 
     Rounding coordinates of another image or of a turned structure moves atoms like this.
 
     Args:
-        subject: the calculator.
         atoms: where.
         size: Å, of the order of an ulp of the largest coordinate.
         rng: draws the moves.
         draws: how many are tried.
     """
     energy, forces = subject.energy(atoms), subject.forces(atoms)
-    worst_energy = worst_force = 0.0
+    worst = NoiseFloor(0.0, 0.0)
     for _ in range(draws):
         there = displaced(atoms, size * rng.uniform(-1, 1, (len(atoms), 3)))
-        found, felt = subject.energy(there), subject.forces(there)
-        change, force = abs(found - energy), float(np.max(np.abs(felt - forces), initial=0.0))
+        moved, felt = subject.energy(there), subject.forces(there)
+        change, force = abs(moved - energy), float(np.max(np.abs(felt - forces), initial=0.0))
         # either answer may be the one that sticks out
-        if no_rounding(change, energy, force, forces, subject.kT) and not again(subject, there, found, felt):
-            again(subject, atoms, energy, forces)
-        worst_energy, worst_force = max(worst_energy, change), max(worst_force, force)
-    return Noise(worst_energy, worst_force)
+        if no_rounding(change, energy, force, forces, subject.kT) and not subject.again(there, moved, felt):
+            subject.again(atoms, energy, forces)
+        worst = worst.louder(NoiseFloor(change, force))
+    return worst
 
 
 def settled(
-    subject: Subject, rng: np.random.Generator, tries: int = 5, at_least: int = 1
-) -> tuple[Atoms, Noise]:
+    subject: CalculatorSubject, rng: np.random.Generator, tries: int = 5, at_least: int = 1
+) -> tuple[Atoms, NoiseFloor]:
     """The structure with its atoms moved a little, away from any threshold, and the noise there.
 
     In a perfect crystal a whole shell of neighbors can sit on a cutoff; a check that is not about
@@ -205,19 +217,17 @@ def settled(
     of a few draws is taken.
 
     Args:
-        subject: the calculator.
         rng: draws the moves.
-        tries: how many structures are looked at.
+        tries: how many structures are tried.
         at_least: atoms; a smaller cell is repeated, where it repeats.
     """
     given = roomy(subject.atoms, at_least)
-    # several checks ask with the same seed: what the first was told is known
-    known = getattr(subject, "known", {})
+    # several checks ask with the same seed: the answer to the first is known
     key = ("settled", tries, len(given), str(rng.bit_generator.state))
-    if key in known:
-        there, noise, rng.bit_generator.state = known[key]
+    if key in subject.known:
+        there, noise, rng.bit_generator.state = subject.known[key]
         return there.copy(), noise
-    best: tuple[Atoms, Noise] | None = None
+    best: tuple[Atoms, NoiseFloor] | None = None
     for _ in range(tries):
         there = displaced(given, RATTLE * rng.uniform(-1, 1, (len(given), 3)))
         noise = along_a_line(subject, there, rng)
@@ -230,11 +240,16 @@ def settled(
             break
     assert best is not None
     there, noise = best
-    noise = louder(noise, _of_more_atoms(subject, there, rng))
+    if len(there) < FEW and there.pbc.any():
+        # of few atoms, terms that cancel by symmetry leave no trace
+        many = roomy(there, FEW)
+        many.positions += RATTLE * rng.uniform(-1, 1, many.positions.shape)
+        with contextlib.suppress(CalculatorError):
+            noise = noise.louder(along_a_line(subject, many, rng))
     # what goes in steps may not move at all on so short a line
     stairs = steps(subject, there)
-    noise = louder(noise, Noise(0.5 * stairs.energy, 0.5 * stairs.force))
-    known[key] = there.copy(), noise, rng.bit_generator.state
+    noise = noise.louder(NoiseFloor(0.5 * stairs.energy, 0.5 * stairs.force))
+    subject.known[key] = there.copy(), noise, rng.bit_generator.state
     return there, noise
 
 
@@ -246,28 +261,6 @@ def roomy(atoms: Atoms, at_least: int) -> Atoms:
     return atoms.repeat(np.where(atoms.pbc, times, 1))
 
 
-def of_all_kinds(count: int) -> list[int]:
-    """Numbers below count in an order in which a few tell of the beginning, the middle and the end."""
-    return [place for first in range(4) for place in range(first, count, 4)]
-
-
-def louder(one: Noise, other: Noise) -> Noise:
-    """The larger of two, each part by itself."""
-    return Noise(max(one.energy, other.energy), max(one.force, other.force), max(one.typical, other.typical))
-
-
-def _of_more_atoms(subject: Subject, atoms: Atoms, rng: np.random.Generator) -> Noise:
-    """Noise of a supercell where there are few atoms: terms that cancel by symmetry leave no trace."""
-    if len(atoms) >= FEW or not atoms.pbc.any():
-        return Noise(0.0, 0.0)
-    many = roomy(atoms, FEW)
-    many.positions += RATTLE * rng.uniform(-1, 1, many.positions.shape)
-    try:
-        return along_a_line(subject, many, rng)
-    except CalculatorError:
-        return Noise(0.0, 0.0)
-
-
 def direction(atoms: int, rng: np.random.Generator) -> Float[np.ndarray, "atoms 3"]:
     """A random displacement of all atoms, the furthest by 1."""
     drawn = rng.standard_normal((atoms, 3))
@@ -275,12 +268,117 @@ def direction(atoms: int, rng: np.random.Generator) -> Float[np.ndarray, "atoms 
 
 
 def displaced(atoms: Atoms, by: Float[np.ndarray, "atoms 3"]) -> Atoms:
-    """A copy with every atom moved.
-
-    Args:
-        atoms: left as it is.
-        by: Å.
-    """
+    """A copy with every atom moved by Å."""
     there = atoms.copy()
     there.positions += by
     return there
+
+
+@dataclass(frozen=True)
+class Digits:
+    """What all of some numbers share.
+
+    Attributes:
+        decimals: they are rounded to; None where to none.
+        bits: of their significands, at most; 53 for a double that is used in full.
+    """
+
+    decimals: int | None
+    bits: int
+
+    @property
+    def quantum(self) -> float:
+        """Step between two numbers that are rounded to decimals; 0 for others."""
+        return 0.0 if self.decimals is None else 10.0**-self.decimals
+
+    @property
+    def format(self) -> str | None:
+        """Name of the narrow format that the bits fit into."""
+        return next((name for most, name in _FORMATS if self.bits <= most), None)
+
+
+def digits(values: np.ndarray) -> Digits:
+    """Decimals and bits of numbers; in full where there are too few different ones to tell."""
+    found = np.unique(np.asarray(values, dtype=np.float64))
+    found = found[np.isfinite(found) & (found != 0.0)]
+    if len(found) < _FEWEST:
+        return Digits(None, 53)
+    whole = np.abs(np.ldexp(np.frexp(found)[0], 53)).astype(np.int64)
+    bits = 53 - int(np.log2((whole & -whole).astype(np.float64)).min())
+    for decimals in range(_MOST_DECIMALS + 1):
+        if all(float(f"{value:.{decimals}f}") == value for value in found):
+            return Digits(decimals, bits)
+    return Digits(None, bits)
+
+
+def precision(subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor) -> Iterator[Observed]:
+    """A finding where answers carry fewer digits than a double: QUANTIZED, or LOW_PRECISION.
+
+    Whether answers go in steps is measured along a line, whatever the numbers look like: forces that were
+    rounded before they were multiplied by a unit, or that come from rounded positions, are doubles in full.
+
+    Args:
+        atoms: a line through this structure is walked.
+        noise: of the answers there.
+    """
+    stairs = steps(subject, atoms)
+    size, typical = float(np.max(np.abs(stairs.energies))), float(np.sqrt(np.mean(stairs.forces**2)))
+    if not size or not typical:
+        return
+    read = {"energy": digits(stairs.energies), "forces": digits(stairs.forces)}
+    sizes = {
+        word: one.quantum or step
+        for (word, one), step in zip(read.items(), (stairs.energy, stairs.force), strict=True)
+    }
+    # few bits show where a value has no room for steps on the line
+    coarse = [
+        word
+        for word, one in read.items()
+        if one.bits <= _HALF or (sizes[word] and not (one.bits <= 24 and not one.quantum))
+    ]
+    if coarse:
+        yield _quantized(coarse, sizes, read, stairs, typical)
+        return
+    share, eps = noise.force / typical, np.finfo(np.float64).eps
+    ulps = noise.energy / np.spacing(size)
+    both = Digits(None, max(one.bits for one in read.values())).format
+    narrow = {"answers": both, "energies": read["energy"].format, "forces": read["forces"].format}
+    whose = next((word for word, name in narrow.items() if name), None)
+    if whose is None and not (ulps > _NOISY and share > _NOISY * eps):
+        return
+    yield finding(
+        "LOW_PRECISION",
+        "warning" if noise.energy > _SMALL_ENERGY * subject.kT > 0 else "info",
+        "format" if whose else None,
+        whose=whose,
+        format=narrow[whose] if whose else None,
+        energy=noise.energy,
+        ulps=float(ulps),
+        digits=round(max(-np.log10(max(share, eps)), 0)),
+    )
+
+
+def _quantized(
+    coarse: list[str], sizes: dict[str, float], read: dict[str, Digits], stairs: Staircase, typical: float
+) -> Observed:
+    bound, variants, values = 0.0, [], {}
+    for word in coarse:
+        one = read[word]
+        how = "decimals" if one.quantum else "format" if one.format else None
+        variants += [f"{word}_{how}" if how else None, f"{word}_step" if sizes[word] else None]
+        values |= {
+            f"{word}_decimals": one.decimals, f"{word}_format": one.format, f"{word}_step": sizes[word],
+        }  # fmt: skip
+    if "forces" in coarse:
+        bound = 0.5 * sizes["forces"] or 2.0 ** -read["forces"].bits * typical
+        values["forces_share"] = sizes["forces"] / typical
+    return finding(
+        "QUANTIZED",
+        "error" if bound > _SMALL * typical else "warning",
+        *variants,
+        **values,
+        length=stairs.length,
+        points=len(stairs.energies),
+        different=len(np.unique(stairs.energies)),
+        share=stairs.share,
+    )

@@ -1,42 +1,142 @@
-"""The structure a calculator is asked about: a file's, or one built for the elements it knows."""
+"""What is asked about: a calculator by its words, and a structure from a file or built for the calculator."""
 
 from __future__ import annotations
 
 import os
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from ase import Atoms
 
-from mdnum.audit.load import Loaded
-from mdnum.audit.probes import FARTHEST, Pair, pairs
+from mdnum.audit.pairs import FARTHEST, Pair, pairs
 from mdnum.audit.subject import CalculatorError, CalculatorSubject, only_trying
 from mdnum.audit.thresholds import rough
 from mdnum.errors import InputError
+from mdnum.references.load import described, place
+from mdnum.units import METAL, Units
 
+_WAYS = (
+    "Give package.module:Class(argument=value), the path of a Python file that makes a calculator, "
+    "or a system such as argon/liquid-864 (`mdnum systems` lists them)"
+)
 #: Tried in this order, and then every other element: argon where anything goes.
 _FIRST = ("Ar", "Cu", "Si", "C", "O", "Al", "Fe", "Na")
 _LAST_ELEMENT = 95
-
-_MOST_ATOMS = 500
-_FEWEST_ATOMS = 32
+_MOST_ATOMS, _FEWEST_ATOMS = 500, 32
+#: Molecules along an edge: some calculators want a box of two cutoffs.
 _WATER_EDGES = (4, 5, 6, 8)
-"""Molecules along an edge: some calculators want a box of two cutoffs."""
-
+#: Factors on a lattice constant at which a crystal is tried: a calculator may fail where nothing is near.
 _DENSITIES = (1.0, 0.85, 0.72, 0.6, 0.5, 1.2)
-"""Factors on a lattice constant at which a crystal is tried: a calculator may fail where nothing is near."""
-
+#: A nearest distance above the first part of the cutoff is made to be the second part of it.
 _BARELY, _PRESSED = 0.9, 0.6
-"""A nearest distance above this part of the cutoff is made to be that part of it."""
-
+#: Seconds of processor time of a calculation above which the crystal is made smaller.
 _SLOW = 0.15
-"""Seconds of processor time of a calculation above which the crystal is made smaller."""
-
+#: Standard deviation, of the nearest distance: in a perfect crystal forces are zero and distances tie.
 _RATTLE = 0.02
-"""Standard deviation, of the nearest distance: in a perfect crystal forces are zero and distances tie."""
+
+
+@dataclass(frozen=True)
+class LoadedCalculator:
+    """A calculator by name.
+
+    Attributes:
+        name: what the person wrote.
+        stem: a short word for a folder's name.
+        make: makes a calculator object that remembers nothing of another.
+        atoms: the structure that comes with it (a system of mdnum has one), or None.
+        kT: energy of its temperature where it has one, eV; None otherwise.
+        units: of its lengths and energies: those of ASE, or reduced ones for some systems of mdnum.
+    """
+
+    name: str
+    stem: str
+    make: Callable[[], Any]
+    atoms: Atoms | None = None
+    kT: float | None = None
+    units: Units = METAL
+
+
+def load_calculator(words: str) -> LoadedCalculator:
+    """Find what words name, and make it once so that mistakes show here.
+
+    A file is run again for each calculator, so that no two share a buffer.
+
+    Args:
+        words: `package.module:Class(argument=value)` with literals as arguments; a Python file in which
+            `calculator`, `calc` or `make()` is a calculator, or `file.py:name` or `file.py:Class(a=1)`; or
+            the name or path of a system of mdnum.
+
+    Raises:
+        InputError: nothing by that name, arguments that are not literals, or making it failed; with what to
+            write instead.
+    """
+    text = words.strip()
+    if not text:
+        raise InputError("no calculator named", remedy=_WAYS)
+    spot = place(text)
+    if spot is None:
+        return _of_system(text)
+
+    def make() -> Any:
+        value = spot.find(("calculator", "calc", "make"), anew=True)
+        if (isinstance(value, type) or not _is_calculator(value)) and callable(value):
+            try:
+                value = value()
+            except Exception as error:  # whatever a constructor raises
+                remedy = "Give the arguments it needs: Class(argument=value)"
+                raise InputError(
+                    f"making it failed: {described(error)}", where=text, remedy=remedy
+                ) from error
+        return value
+
+    made = make()
+    if isinstance(made, type) or not _is_calculator(made):
+        raise InputError(
+            f"that is a {type(made).__name__}, not an ASE calculator (an object with get_potential_energy "
+            "and get_forces)",
+            where=text,
+            remedy=_WAYS,
+        )
+    return LoadedCalculator(text, Path(spot.home).stem if spot.is_file else spot.name, make)
+
+
+def _is_calculator(value: Any) -> bool:
+    # atoms pass the question on to their calculator
+    methods = ("get_potential_energy", "get_forces")
+    return all(hasattr(value, one) for one in methods) and not hasattr(value, "get_positions")
+
+
+def _of_system(text: str) -> LoadedCalculator:
+    from mdnum import systems
+
+    try:
+        system = systems.load(text, None, world="md")
+    except InputError as error:
+        if "." in text and "/" not in text and not text.endswith(".toml"):
+            module, _, last = text.rpartition(".")
+            raise InputError(
+                f"{text!r} is no system of mdnum",
+                remedy=f"For a class, put a colon before its name: {module}:{last}",
+            ) from error
+        raise InputError(
+            f"{error.message}; nor is it a class or a Python file",
+            where=error.where,
+            remedy=f"{error.remedy}. {_WAYS}" if error.remedy else _WAYS,
+        ) from error
+
+    def make() -> Any:
+        from mdnum.references.calculator import MdnumCalculator
+
+        return MdnumCalculator(system)
+
+    temperature = getattr(system.spec.dynamics, "temperature", None)
+    kT = float(temperature) * system.units.k_B if temperature else None
+    stem = Path(text).stem.removesuffix(".toml")
+    return LoadedCalculator(text, stem, make, system.atoms.copy(), kT, system.units)
 
 
 def read_structure(words: str | Path) -> Atoms:
@@ -59,11 +159,9 @@ def read_structure(words: str | Path) -> Atoms:
         )
     try:
         found = ase.io.read(path, index=which)
-    except Exception as error:
-        # ase's readers raise whatever their parsing meets; every one of them means the same to the reader
-        detail = " ".join(str(error).split()) or "no more detail"
+    except Exception as error:  # ASE's readers raise whatever their parsing meets
         raise InputError(
-            f"cannot be read as a structure ({type(error).__name__}: {detail})",
+            f"cannot be read as a structure ({described(error)})",
             where=text,
             remedy="Check that `ase.io.read` opens it; extxyz is the safest format",
         ) from error
@@ -83,23 +181,23 @@ def read_structure(words: str | Path) -> Atoms:
         raise InputError(
             f"{what} has a number that is not finite", where=text, remedy="Correct the structure"
         )
-    return _told(atoms, f"{len(atoms)} atoms, {atoms.get_chemical_formula()}, from {text}")
+    return _labeled(atoms, f"{len(atoms)} atoms, {atoms.get_chemical_formula()}, from {text}")
 
 
-def default_structure(loaded: Loaded) -> Atoms:
+def default_structure(loaded: LoadedCalculator) -> Atoms:
     """A structure for a calculator: its own, or a crystal of an element it takes, or rigid water.
 
     The crystal is the element's, with the lattice at the calculator's own least energy, repeated until two
-    cutoffs fit in (at most 500 atoms), its atoms displaced a little. `info["origin"]` says so in words. A
-    calculator that fails on atoms without neighbors is looked for a denser crystal: that it fails is a
-    finding, and no reason not to look.
+    cutoffs fit in (at most 500 atoms), its atoms displaced a little. `info["origin"]` describes it. For a
+    calculator that fails on atoms without neighbors a denser crystal is built: that it fails is a finding,
+    and no reason to stop.
 
     Raises:
         InputError: the calculator answers for no element and not for water; where it was asked about water,
             that is saved.
     """
     if loaded.atoms is not None:
-        return _told(loaded.atoms, f"{len(loaded.atoms)} atoms of {loaded.name}")
+        return _labeled(loaded.atoms, f"{len(loaded.atoms)} atoms of {loaded.name}")
     calculator = loaded.make()
 
     def about(atoms: Atoms) -> CalculatorSubject:
@@ -116,12 +214,10 @@ def default_structure(loaded: Loaded) -> Atoms:
         except CalculatorError as error:
             why, saved = error.message, error.structure
         else:
-            return _told(subject.atoms, f"{edge**3} molecules of water, on a grid, turned at random")
-    if made is None:
-        made = _first_crystal(about, others)
-    if made is None:
-        # after water, since a calculator of molecules may take any atoms in threes for them
-        made = _first_crystal(about, likely, paired=False)
+            return _labeled(subject.atoms, f"{edge**3} molecules of water, on a grid, turned at random")
+    made = made or _first_crystal(about, others)
+    # after water, since a calculator of molecules may take any atoms in threes for them
+    made = made or _first_crystal(about, likely, paired=False)
     if made is not None:
         return made
     raise InputError(
@@ -145,9 +241,9 @@ def _first_crystal(
     return None
 
 
-def _told(atoms: Atoms, says: str) -> Atoms:
+def _labeled(atoms: Atoms, origin: str) -> Atoms:
     copy = atoms.copy()
-    copy.info["origin"] = says
+    copy.info["origin"] = origin
     return copy
 
 
@@ -192,47 +288,40 @@ def _crystal(subject: CalculatorSubject, pair: Pair | None, symbol: str) -> Atom
     if start is None:
         return None
     scale, relaxed = _least_energy(subject, cell, least, start)
-    for factor, least_energy in ((scale, relaxed), (start, False)):
-        made = _filled(cell, lattice, factor, least_energy, cutoff, symbol)
-        if _answers(subject, made):
-            return _affordable(subject, made, (cell, lattice, factor, least_energy, cutoff, symbol))
+    for factor, at_least in ((scale, relaxed), (start, False)):
+        made = _filled(cell, lattice, factor, at_least, cutoff, symbol)
+        if not _answers(subject, made):
+            continue
+        took = _processor_time(subject, made)
+        small = _filled(cell, lattice, factor, at_least, cutoff, symbol, few=True)
+        # it is asked hundreds of times; narrower than two cutoffs, which not every calculator takes
+        if took <= _SLOW or len(small) >= len(made) or not _answers(subject, small):
+            return made
+        why = f"; of {len(made)} atoms, for two cutoffs, one calculation takes {took:.2g} s of a processor"
+        return _labeled(small, small.info["origin"] + why)
     return None
 
 
-def _affordable(subject: CalculatorSubject, made: Atoms, how: tuple[Any, ...]) -> Atoms:
-    """A crystal that is asked about hundreds of times: a small one where a calculation takes long."""
-    took = _took(subject, made)
-    if took <= _SLOW:
-        return made
-    small = _filled(*how, few=True)
-    # narrower than two cutoffs, which not every calculator takes
-    if len(small) >= len(made) or not _answers(subject, small):
-        return made
-    why = f"; of {len(made)} atoms, for two cutoffs, one calculation takes {took:.2g} s of a processor"
-    return _told(small, small.info["origin"] + why)
-
-
-def _took(subject: CalculatorSubject, atoms: Atoms) -> float:
+def _processor_time(subject: CalculatorSubject, atoms: Atoms) -> float:
     """Seconds of processor time of energy and forces, after the first; the less of two.
 
     Programs that a calculator starts and ends count. What other programs do at the time does not, so that
     the same structure is asked about whatever the load.
     """
+
+    def clock() -> float:
+        children = os.times()
+        return time.process_time() + children.children_user + children.children_system
+
     took = []
     for _ in range(2):
         atoms = atoms.copy()
         atoms.positions[0, 0] += 1e-4
-        began = _processor_time()
+        began = clock()
         subject.energy(atoms)
         subject.forces(atoms)
-        took.append(_processor_time() - began)
+        took.append(clock() - began)
     return min(took)
-
-
-def _processor_time() -> float:
-    """Seconds of this process and of those that it has waited for."""
-    children = os.times()
-    return time.process_time() + children.children_user + children.children_system
 
 
 def _felt(subject: CalculatorSubject, pair: Pair) -> tuple[float | None, float | None]:
@@ -250,12 +339,7 @@ def _felt(subject: CalculatorSubject, pair: Pair) -> tuple[float | None, float |
 
 
 def _answers(subject: CalculatorSubject, atoms: Atoms) -> bool:
-    try:
-        subject.energy(atoms)
-        subject.forces(atoms)
-    except CalculatorError:
-        return False
-    return True
+    return not isinstance(subject.try_both(atoms), CalculatorError)
 
 
 def _filled(
@@ -269,7 +353,8 @@ def _filled(
 ) -> Atoms:
     """The crystal with its lattice scaled, repeated to two cutoffs or a few atoms, and displaced a little."""
     cell = cell.copy()
-    at = "at the calculator's own least energy" if relaxed else _tabulated(scale)
+    tabulated = "at its tabulated lattice constant" + ("" if scale == 1.0 else f" times {scale:.4g}")
+    at = "at the calculator's own least energy" if relaxed else tabulated
     if cutoff and scale * _nearest_distance(cell) > _BARELY * cutoff:
         # nothing holds it together: a crystal in which nothing is felt would tell nothing
         scale, at = _PRESSED * cutoff / _nearest_distance(cell), "nothing binds it, so pressed together"
@@ -281,7 +366,7 @@ def _filled(
     atoms = cell.repeat(repeat)
     nearest = _nearest_distance(cell)
     atoms.rattle(_RATTLE * nearest, seed=0)
-    return _told(
+    return _labeled(
         atoms,
         f"{len(atoms)} atoms of {symbol}, {lattice}, nearest distance {nearest:.4g} Å ({at}), "
         f"displaced by {_RATTLE * nearest:.2g} Å",
@@ -302,8 +387,7 @@ def _unit_cell(symbol: str) -> tuple[Atoms, str]:
 
 def _nearest_distance(cell: Atoms) -> float:
     """Smallest distance between two atoms of a crystal, images included."""
-    large = cell.repeat(2)
-    distances = large.get_all_distances(mic=True)
+    distances = cell.repeat(2).get_all_distances(mic=True)
     return float(distances[distances > 1e-6].min())
 
 
@@ -318,19 +402,17 @@ def _least_energy(
         except CalculatorError:
             return np.inf
 
-    scale, factor = start, 1.03
     if least is not None and abs(energy(1.01) - energy(1.0)) < 1e-9:
-        scale = least / _nearest_distance(cell)  # too far apart to feel one another: start at two atoms' own
-    here = energy(scale)
-    start = scale
-    for direction in (factor, 1 / factor):
+        start = least / _nearest_distance(cell)  # too far apart to feel one another: start at two atoms' own
+    scale, here = start, energy(start)
+    for direction in (1.03, 1 / 1.03):
         for _ in range(60):
             there = energy(scale * direction)
             if not there < here:
                 break
             scale, here = scale * direction, there
     ended = np.isfinite(here) and 0.2 < scale / start < 5.0
-    return (scale, True) if ended and np.isfinite(here) else (start, False)
+    return (scale, True) if ended else (start, False)
 
 
 def _small(cell: Atoms, scale: float) -> Atoms:
@@ -338,7 +420,3 @@ def _small(cell: Atoms, scale: float) -> Atoms:
     small = cell.repeat(max(int(np.ceil((_FEWEST_ATOMS / len(cell)) ** (1 / 3))), 1))
     small.set_cell(np.asarray(small.cell) * scale, scale_atoms=True)
     return small
-
-
-def _tabulated(scale: float) -> str:
-    return "at its tabulated lattice constant" + ("" if scale == 1.0 else f" times {scale:.4g}")

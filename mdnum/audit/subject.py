@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,19 +15,28 @@ import numpy as np
 from ase import Atoms
 from jaxtyping import Float
 
-from mdnum.audit.base import Meter
-from mdnum.audit.ledger import Ledger, differ
+from mdnum.audit.base import Meter, Observed, finding
 from mdnum.errors import MdnumError
 from mdnum.store.atomic import write_text
 from mdnum.units import METAL, Units
 
 #: A calculator that fails is asked hundreds of times; this many structures are kept.
 _MOST_SAVED = 20
+#: k_B times 300 K, eV.
+_ROOM_TEMPERATURE = 0.025852
+#: Of two energies of one structure: differences of their difference that rounding explains, of doubles and of
+#: numbers of single precision.
+_ROUNDING, _ROUNDING_SINGLE = 1e-11, 1e-5
+#: Of the root mean square force, of kT, and of the energy itself, which may be one of single precision:
+#: answers to one question that differ by more are no rounding.
+_LARGE, _LARGE_ENERGY, _LARGE_SHARE = 1e-4, 1e-3, 1e-6
+#: Answers that stick out are asked for again, in one audit no more often than this.
+_MOST_AGAIN = 100
 
 _objects = itertools.count()
-
-_ROOM_TEMPERATURE = 0.025852
-"""k_B times 300 K, eV."""
+Forces = Float[np.ndarray, "atoms 3"]
+#: Energy, eV, and forces, eV/Å; None where they were not asked for.
+EnergyForces = tuple[float, Forces | None]
 
 
 class CalculatorError(MdnumError):
@@ -46,8 +57,160 @@ class CalculatorError(MdnumError):
         cause: BaseException | None = None,
     ):
         super().__init__(message, remedy=remedy, where=where)
-        self.structure = structure
-        self.cause = cause
+        self.structure, self.cause = structure, cause
+
+
+@dataclass
+class RepeatCounts:
+    """Questions that were asked more than once, to the last bit of the structure.
+
+    Attributes:
+        times: answers that could be compared with an earlier one.
+        differ: of them, those that are not the same to the last bit.
+        energy: the largest difference, eV.
+        force: the largest difference of all forces together (a norm, estimated from one projection), eV/Å.
+        typical: root mean square force where forces were compared last, eV/Å.
+    """
+
+    times: int = 0
+    differ: int = 0
+    energy: float = 0.0
+    force: float = 0.0
+    typical: float = 0.0
+
+
+@dataclass
+class EnergyOffset:
+    """By how much the two energies of a calculator differ for one composition.
+
+    Attributes:
+        first: energy minus free energy where it was asked for first, eV.
+        change: the largest change of it that rounding does not explain, eV; signed.
+    """
+
+    formula: str
+    first: float
+    change: float = 0.0
+
+
+class Repeats:
+    """A few numbers of each answer of all objects of a calculator, compared where a question recurs.
+
+    Attributes:
+        new: what new objects answered to the first question they were asked: nothing can be remembered there.
+        chance: answers that stuck out, asked for again of the same object; of those that differ, the ones
+            that rounding does not explain, and the largest difference of a force component.
+        offsets: the difference of two energies by composition.
+    """
+
+    def __init__(self):
+        self.new, self.chance = RepeatCounts(), RepeatCounts()
+        self.offsets: dict[bytes, EnergyOffset] = {}
+        self._known: dict[tuple[bytes, str], tuple[float, tuple[int, int]]] = {}
+        self._projections: dict[int, np.ndarray] = {}
+
+    def energy(
+        self, atoms: Atoms, value: float, other: float | None, question: tuple[int, int], new: bool
+    ) -> None:
+        """Takes note of the energy that forces belong to, and of the one that a run logs."""
+        self._compare(atoms, "energy", value, question, new)
+        if other is None:
+            return
+        key = np.sort(atoms.numbers).tobytes()
+        kept = self.offsets.setdefault(key, EnergyOffset(atoms.get_chemical_formula(), other - value))
+        single = float(np.float32(value)) == value and float(np.float32(other)) == other
+        rounding = (_ROUNDING_SINGLE if single else _ROUNDING) * max(abs(value), abs(other))
+        change = other - value - kept.first
+        if abs(change) > max(rounding, abs(kept.change)):
+            kept.change = change
+
+    def forces(self, atoms: Atoms, values: Forces, question: tuple[int, int], new: bool) -> None:
+        """Takes note of forces."""
+        if values.size not in self._projections:
+            self._projections[values.size] = np.random.default_rng(values.size).standard_normal(values.size)
+        if new:
+            self.new.typical = rms(values)
+        along = float(np.sum(self._projections[values.size] * values.ravel()))
+        self._compare(atoms, "forces", along, question, new)
+
+    @property
+    def asks_again(self) -> bool:
+        """Whether one more answer that sticks out is to be asked for again: few are, and one is enough."""
+        return self.chance.times < _MOST_AGAIN and not self.chance.differ
+
+    def note(self, before: EnergyForces, now: EnergyForces) -> None:
+        """Takes note of two answers of one object to one question, where the one before stood alone."""
+        chance = self.chance
+        chance.differ += 1
+        chance.energy = max(chance.energy, abs(now[0] - before[0]))
+        if before[1] is not None and now[1] is not None:
+            chance.force = max(chance.force, float(np.max(np.abs(now[1] - before[1]), initial=0.0)))
+            chance.typical = rms(now[1])
+
+    def findings(self, kT: float) -> list[Observed]:
+        """That one question has two answers, where that has come up and is no rounding."""
+        for seen, who in ((self.chance, "same"), (self.new, "new")):
+            if seen.differ:
+                told = not_repeatable(
+                    f"{who}_object", seen.energy, seen.force, seen.typical, kT,
+                    differ=seen.differ, times=seen.times,
+                )  # fmt: skip
+                # what differs in a last bit is told where repeats are the question
+                return [told] if told.severity == "error" else []
+        return []
+
+    def _compare(self, atoms: Atoms, what: str, value: float, question: tuple[int, int], new: bool) -> None:
+        if not new:
+            return
+        bits = hashlib.blake2b(digest_size=16)
+        for array in _bits(atoms):
+            bits.update(np.ascontiguousarray(array).tobytes())
+            bits.update(b"|")
+        before, asked = self._known.setdefault((bits.digest(), what), (value, question))
+        if asked == question:
+            return
+        self.new.times += 1
+        if value != before:
+            self.new.differ += 1
+            size = max(abs(value - before), getattr(self.new, "energy" if what == "energy" else "force"))
+            setattr(self.new, "energy" if what == "energy" else "force", size)
+
+
+def no_rounding(change: float, energy: float, force: float, forces: np.ndarray | None, kT: float) -> bool:
+    """Whether answers that ought to be one differ by more than any rounding.
+
+    Args:
+        change: of the energy, eV.
+        force: change of a force component, eV/Å.
+        forces: eV/Å; None where forces are not compared.
+    """
+    return change > max(_LARGE_ENERGY * kT, _LARGE_SHARE * abs(energy)) or (
+        forces is not None and force > _LARGE * rms(forces)
+    )
+
+
+def _differ(before: EnergyForces, now: EnergyForces, kT: float) -> bool:
+    force = 0.0
+    if before[1] is not None and now[1] is not None:
+        force = float(np.max(np.abs(now[1] - before[1]), initial=0.0))
+    return no_rounding(abs(now[0] - before[0]), before[0], force, before[1], kT)
+
+
+def not_repeatable(
+    how: str, energy: float, force: float, typical: float, kT: float, **values: Any
+) -> Observed:
+    """The finding that one question has two answers: an error where they differ by no rounding.
+
+    Args:
+        how: it came up, a variant of the sentences.
+        energy: by which answers differ, eV.
+        force: by which they differ, eV/Å.
+        typical: root mean square force, eV/Å.
+    """
+    values |= {"energy": energy, "force": force, "typical": typical}
+    if force > _LARGE * typical or energy > _LARGE_ENERGY * kT:
+        return finding("NOT_REPEATABLE", "error", how, **values)
+    return finding("NOT_BIT_IDENTICAL", "warning", how, **values)
 
 
 class CalculatorSubject:
@@ -67,6 +230,14 @@ class CalculatorSubject:
         folder: where structures are saved on which the calculator fails; a new temporary one if None.
         units: what lengths and energies are in; "eV" and "Å" below are ε and σ for a calculator in reduced
             units.
+
+    Attributes:
+        known: what checks have worked out about the calculator and its structure; shared by all objects.
+        repeats: what was answered to each question, by all objects.
+        meter: counts the calls of all objects.
+        forgets: drop what a calculator's own test for changes calls unchanged, where a bit has changed.
+        renews: make a new object after one that raised: some are of no use afterwards.
+        saving: save structures on which the calculator fails.
     """
 
     def __init__(
@@ -79,27 +250,16 @@ class CalculatorSubject:
         folder: str | Path | None = None,
         units: Units = METAL,
     ):
-        self.units = units
-        #: What checks have worked out about the calculator and its structure; new objects know it too.
-        self.known: dict[Any, Any] = {}
-        #: What was answered to each question, by all objects of this audit.
-        self.ledger = Ledger()
-        #: Drop what a calculator's own test for changes calls unchanged, where a bit has changed.
-        self.forgets = True
-        self.name = name
-        self.atoms = _bare(atoms)
-        self.kT = kT
+        self.name, self.atoms, self.kT, self.units = name, _bare(atoms), kT, units
         self.folder = None if folder is None else Path(folder)
-        #: Counts the calls of all objects of the calculator.
-        self.meter = Meter()
-        self.saving = True
-        #: Make a new object after one that raised: some are of no use afterwards.
-        self.renews = True
+        self.known: dict[Any, Any] = {}
+        self.repeats, self.meter = Repeats(), Meter()
+        self.forgets = self.renews = self.saving = True
         self._make = make
         self._calculator: Any = None
         self._last: tuple[np.ndarray, ...] | None = None
         self._saved = 0
-        #: Which object it is, and how many structures it has been asked about.
+        # which object it is, and how many structures it has been asked about
         self._object, self._seen = 0, 0
 
     @property
@@ -116,14 +276,13 @@ class CalculatorSubject:
             self.name, self._make, self.atoms, kT=self.kT, folder=self.folder, units=self.units
         )
         other._saved, other.saving, other.known = self._saved, self.saving, self.known
-        other.meter, other.ledger = self.meter, self.ledger
+        other.meter, other.repeats = self.meter, self.repeats
         return other
 
-    def about(self, atoms: Atoms) -> CalculatorSubject:
-        """The same calculator object asked about another structure."""
+    def used(self) -> CalculatorSubject:
+        """As `fresh`, and left alone: what it takes for unchanged and does after a failure are questions."""
         other = self.fresh()
-        other.atoms, other._calculator, other._last = _bare(atoms), self.calculator, self._last
-        other.known, other._object, other._seen = {}, self._object, self._seen
+        other.forgets = other.renews = False
         return other
 
     def forget(self) -> None:
@@ -145,7 +304,7 @@ class CalculatorSubject:
         return self.energies(atoms)[0]
 
     def energies(self, atoms: Atoms) -> tuple[float, float | None]:
-        """(the energy that forces belong to, the one that a run is told), eV.
+        """(the energy that forces belong to, the one that a run logs), eV.
 
         ASE calls the first `free_energy` and the second `energy`; None where the calculator knows one alone.
 
@@ -154,25 +313,12 @@ class CalculatorSubject:
         """
         asked = self._ask(atoms)
         both = self._answer(lambda: self._energies(asked), asked, "energy")
-        energy, told = (value if value is None else self._number(value, asked) for value in both)
+        energy, other = (value if value is None else self._number(value, asked) for value in both)
         assert energy is not None
-        self.ledger.energy(asked, energy, told, *self._asked_as())
-        return energy, told
+        self.repeats.energy(asked, energy, other, (self._object, self._seen), self._seen == 1)
+        return energy, other
 
-    def _asked_as(self) -> tuple[tuple[int, int], bool]:
-        """(what tells this question from others, whether it is the first that this object was asked)."""
-        return (self._object, self._seen), self._seen == 1
-
-    def _number(self, value: Any, atoms: Atoms) -> float:
-        try:
-            energy = float(np.asarray(value, dtype=np.float64).reshape(()))
-        except (TypeError, ValueError):
-            raise self._failed(atoms, f"gave {value!r} as an energy, not one number") from None
-        if not np.isfinite(energy):
-            raise self._failed(atoms, f"gave an energy of {energy}")
-        return energy
-
-    def forces(self, atoms: Atoms) -> Float[np.ndarray, "atoms 3"]:
+    def forces(self, atoms: Atoms) -> Forces:
         """Forces in eV/Å.
 
         Raises:
@@ -189,13 +335,19 @@ class CalculatorSubject:
             raise self._failed(
                 asked, f"gave a force of {forces[first].tolist()} on atom {first} ({asked.symbols[first]})"
             )
-        self.ledger.forces(asked, forces, *self._asked_as())
+        self.repeats.forces(asked, forces, (self._object, self._seen), self._seen == 1)
         return forces
 
-    def again(
-        self, atoms: Atoms, energy: float | None = None, forces: Float[np.ndarray, "atoms 3"] | None = None
-    ) -> bool:
-        """Asks this object a question that it has answered, of which the ledger takes note.
+    def try_both(self, atoms: Atoms) -> tuple[float, Forces] | CalculatorError:
+        """Energy and forces, or why there are none, where either is of interest; no structure is saved."""
+        try:
+            with only_trying(self):
+                return self.energy(atoms), self.forces(atoms)
+        except CalculatorError as error:
+            return error
+
+    def again(self, atoms: Atoms, energy: float | None = None, forces: Forces | None = None) -> bool:
+        """Asks this object a question that it has answered, of which `repeats` takes note.
 
         Only an answer that stands alone is one of chance: where the object that is asked again answers
         otherwise than a new one does, what it has seen since may be why.
@@ -211,18 +363,18 @@ class CalculatorSubject:
         Raises:
             CalculatorError: as for `energy`.
         """
-        if not self.ledger.asks_again:
+        if not self.repeats.asks_again:
             return False
         self.forget()
-        told = self.energy(atoms), None if forces is None else self.forces(atoms)
-        before = told[0] if energy is None else energy, forces
-        self.ledger.chance.times += 1
-        if not differ(before, told, self.kT):
+        now = self.energy(atoms), None if forces is None else self.forces(atoms)
+        before = now[0] if energy is None else energy, forces
+        self.repeats.chance.times += 1
+        if not _differ(before, now, self.kT):
             return False
         new = self.fresh()
-        if differ(told, (new.energy(atoms), None if forces is None else new.forces(atoms)), self.kT):
+        if _differ(now, (new.energy(atoms), None if forces is None else new.forces(atoms)), self.kT):
             return False
-        self.ledger.note(before, told)
+        self.repeats.note(before, now)
         return True
 
     def writes(self, atoms: Atoms) -> list[str]:
@@ -235,12 +387,8 @@ class CalculatorSubject:
         asked = self._ask(atoms)
         self._answer(lambda: self._energies(asked), asked, "energy")
         self._answer(lambda: asked.get_forces(), asked, "forces")
-        words = ("positions", "numbers", "cell", "periods")
-        return [
-            word
-            for word, before, after in zip(words, _bits(atoms), _bits(asked), strict=True)
-            if before.tobytes() != after.tobytes()
-        ]
+        both = zip(("positions", "numbers", "cell", "periods"), _bits(atoms), _bits(asked), strict=True)
+        return [word for word, before, after in both if before.tobytes() != after.tobytes()]
 
     def _ask(self, atoms: Atoms) -> Atoms:
         asked = _bare(atoms)
@@ -282,9 +430,18 @@ class CalculatorSubject:
         except PropertyNotImplementedError:
             return consistent, None
 
+    def _number(self, value: Any, atoms: Atoms) -> float:
+        try:
+            energy = float(np.asarray(value, dtype=np.float64).reshape(()))
+        except (TypeError, ValueError):
+            raise self._failed(atoms, f"gave {value!r} as an energy, not one number") from None
+        if not np.isfinite(energy):
+            raise self._failed(atoms, f"gave an energy of {energy}")
+        return energy
+
     def _answer(self, question: Callable[[], Any], atoms: Atoms, what: str) -> Any:
         try:
-            # a calculator that divides by zero has said so in its answer, which is looked at
+            # a calculator that divides by zero shows it in its answer, which is checked
             with np.errstate(all="ignore"):
                 return question()
         except Exception as error:  # whatever a calculator raises means the same here
@@ -320,17 +477,13 @@ class CalculatorSubject:
 
 
 @contextmanager
-def only_trying(subject: object) -> Iterator[None]:
+def only_trying(subject: CalculatorSubject) -> Iterator[None]:
     """Failures are expected here (does it take two atoms without a cell?): no structure is saved."""
-    before = getattr(subject, "saving", None)
-    if before is None:  # another implementation, which may save as it likes
-        yield
-        return
-    subject.saving = False  # pyright: ignore[reportAttributeAccessIssue]
+    before, subject.saving = subject.saving, False
     try:
         yield
     finally:
-        subject.saving = before  # pyright: ignore[reportAttributeAccessIssue]
+        subject.saving = before
 
 
 def exact_extxyz(atoms: Atoms) -> str:
@@ -339,21 +492,23 @@ def exact_extxyz(atoms: Atoms) -> str:
     Args:
         atoms: any; of its arrays, symbols, positions, initial charges and initial magnetic moments are kept.
     """
-    columns, rows = ["species:S:1", "pos:R:3"], [[symbol] for symbol in atoms.get_chemical_symbols()]
-    for row, position in zip(rows, atoms.positions, strict=True):
-        row.extend(repr(float(x)) for x in position)
+    columns, arrays = ["species:S:1", "pos:R:3"], [atoms.positions]
     for name in ("initial_charges", "initial_magmoms"):
-        values = atoms.arrays.get(name)
-        if values is not None:
-            flat = np.asarray(values, dtype=np.float64).reshape(len(atoms), -1)
-            columns.append(f"{name}:R:{flat.shape[1]}")
-            for row, more in zip(rows, flat, strict=True):
-                row.extend(repr(float(x)) for x in more)
-    lattice = " ".join(repr(float(x)) for x in np.asarray(atoms.cell).ravel())
+        if name in atoms.arrays:
+            arrays.append(np.asarray(atoms.arrays[name], np.float64).reshape(len(atoms), -1))
+            columns.append(f"{name}:R:{arrays[-1].shape[1]}")
+    lattice = " ".join(repr(float(x)) for x in atoms.cell.array.ravel())
     periodic = " ".join("T" if yes else "F" for yes in atoms.pbc)
-    cell = f'Lattice="{lattice}" ' if np.asarray(atoms.cell).any() else ""
-    head = f'{cell}Properties={":".join(columns)} pbc="{periodic}"'
-    return "\n".join([str(len(atoms)), head, *(" ".join(row) for row in rows)]) + "\n"
+    cell = f'Lattice="{lattice}" ' if atoms.cell.array.any() else ""
+    lines = [str(len(atoms)), f'{cell}Properties={":".join(columns)} pbc="{periodic}"']
+    for symbol, row in zip(atoms.get_chemical_symbols(), np.hstack(arrays), strict=True):
+        lines.append(" ".join([symbol, *(repr(float(x)) for x in row)]))
+    return "\n".join(lines) + "\n"
+
+
+def rms(forces: np.ndarray) -> float:
+    """Root mean square of force components."""
+    return float(np.sqrt(np.mean(forces**2))) if forces.size else 0.0
 
 
 def _bits(atoms: Atoms) -> tuple[np.ndarray, ...]:

@@ -1,51 +1,125 @@
-"""Where a calculator's interactions change their program: found from its answers, never asked for."""
+"""Where a calculator's pair interactions change their program: found from its answers, never asked for.
+
+Two of each species are walked from far apart to as near as 1000 kT lets them. What only shows among many (an
+angle's own cutoff, a cap on neighbors) is for the walks through whole environments.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations_with_replacement
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from jaxtyping import Float
+from numpy.polynomial import chebyshev
 
-from mdnum.audit.base import TIME_UP, Progress, Subject, TimeUp, meter_of
-from mdnum.audit.beyond import Beyond, beyond
-from mdnum.audit.curve import Curve, grid, scatter
-from mdnum.audit.digits import digits
-from mdnum.audit.ends import end_of, with_end
-from mdnum.audit.jumps import SMOOTH, find_jumps, smallest_steps
-from mdnum.audit.probes import FARTHEST, Pair, pairs
-from mdnum.audit.subject import CalculatorError, only_trying
-from mdnum.audit.threshold import SMOOTHEST, Threshold, at_jump
+from mdnum.audit.base import TIME_UP, Progress, TimeUp
+from mdnum.audit.curve import (
+    SMOOTH,
+    Curve,
+    Jump,
+    bisect,
+    decay_power,
+    find_jumps,
+    grid,
+    measure,
+    scatter,
+    slope,
+    smallest_steps,
+)
+from mdnum.audit.noise import digits
+from mdnum.audit.pairs import FARTHEST, Pair, pairs
+from mdnum.audit.subject import CalculatorError, CalculatorSubject, only_trying
 
+#: Spacing of a scan, in the unit of length. Two thresholds closer than this may be taken for one.
 STEP = 0.025
-"""Spacing of a scan, in the unit of length. Two thresholds closer than this may be told as one."""
-
-_CALLS = 20_000
-"""For walking all pairs, each of which has its share: some 600 go into a scan, 100 to 300 into each place
-that stands out of it."""
-
-_FEWEST_CALLS = 1500
-"""A pair whose share is less is not walked."""
-
+#: For walking all pairs, each of which has its share: some 600 go into a scan, 100 to 300 into each place
+#: that stands out of it. A pair whose share is less than the fewest is not walked.
+_CALLS, _FEWEST_CALLS = 20_000, 1500
+#: Of answers that are rounded to decimals: a jump of so many steps is more than rounding.
 STEPS = 2.5
-"""Of answers that are rounded to decimals: a jump of so many steps is more than rounding."""
-
-_NEAREST = 0.3
-_COSTLY = 1000.0
-"""Distances are walked down to where two particles cost this many kT."""
-
+#: Distances are walked from the first down to where two particles cost so many kT.
+_NEAREST, _COSTLY = 0.3, 1000.0
+#: So near to a threshold that was found a second one may be hidden, length: what a scan compares with.
 BESIDE = 0.35
-"""So near to a threshold that was found a second one may be hidden, length: what a scan compares with."""
-
+#: Of the energy of two particles of several atoms, and of all forces on them: what rounding may change.
 _ROUNDING = 1e-15
-"""Of the energy of two particles of several atoms, and of all forces on them: what rounding may change."""
-
+#: More jumps of a third derivative than these are the knots of a table.
 _KNOTS = 3
-"""More jumps of a third derivative than these are the knots of a table."""
+#: Orders above this are reported as this one: that smooth or smoother.
+SMOOTHEST = 6
+#: So near to its end a smooth force may be lost in rounding, length.
+_LOST = 0.01
+#: Of a distance: a force that would be 0 so little further on is no jump where it ends.
+_HAIR = 3e-8
+#: Past the scan: ratio of the two ends of an interval, and how many intervals.
+_RATIO, _MOST = 1.15, 20
+#: Within a cell the search does not go further, in the unit of length: the cell has to have room.
+_WIDEST = 120.0
+#: Places in an interval of -1 to 1 (Chebyshev-Lobatto): its ends are shared with the next.
+_NODES = np.cos(np.pi * np.arange(8, -1, -1) / 8)
+#: Of the force, and of the energy's change: the highest terms of a smooth decay are far below (1e-10).
+_SMOOTH_TERMS = 1e-6
+#: An interval in which something lies is halved to this width, and then scanned.
+_NARROW = 0.6
+#: Of kT: where no more than this is left to be lost, the search ends.
+_NOTHING = 1e-7
+
+
+@dataclass(frozen=True)
+class PairThreshold:
+    """A distance at which the energy or one of its derivatives jumps, or beyond which nothing is left.
+
+    Attributes:
+        radius: the distance, length.
+        species: of the two atoms (of the reference atoms of two molecules).
+        order: the lowest derivative of the energy that jumps: 0 the energy, 1 the force, 2 the curvature, 3
+            the third derivative, and so on; 6 stands for 6 or smoother.
+        jumps: of energy (eV), force along the line (eV/Å) and curvature (eV/Å²): beyond minus before.
+        doubt: how large each of them could look where nothing jumps.
+        inside: the last distance before it that gives another answer.
+        outside: the first one beyond it; the next double where a value jumps.
+        dies: whether the two do not interact beyond it.
+        located: error of radius, length.
+        third: jump of the third derivative, eV/Å³, where that is the lowest and was measured; else 0.
+    """
+
+    radius: float
+    species: tuple[str, str]
+    order: int
+    jumps: tuple[float, float, float]
+    doubt: tuple[float, float, float]
+    inside: float
+    outside: float
+    dies: bool
+    located: float
+    third: float = 0.0
+
+
+@dataclass(frozen=True)
+class Beyond:
+    """What was found past the scan.
+
+    Attributes:
+        thresholds: changes and the end, by distance.
+        edge: (last distance at which the two feel one another, next one), None without an end.
+        reached: the farthest distance that was asked about, length.
+        force: there, eV/Å.
+        left: energy that is lost beyond it, as it decays there, eV; inf where it does not decay.
+        nodes: distances asked about in all intervals.
+        energies, forces: there, eV and eV/Å.
+    """
+
+    thresholds: tuple[PairThreshold, ...]
+    edge: tuple[float, float] | None
+    reached: float
+    force: float
+    left: float
+    nodes: Float[np.ndarray, "nodes"]
+    energies: Float[np.ndarray, "nodes"]
+    forces: Float[np.ndarray, "nodes"]
 
 
 @dataclass(frozen=True)
@@ -53,27 +127,26 @@ class PairWalk:
     """Two particles brought from far apart to as near as they come.
 
     Attributes:
-        pair: who they are.
         thresholds: by distance.
         distance: those of the scan, length.
         energy: against far apart, eV.
         force: that drives them apart, eV/Å.
         cutoff: distance beyond which they do not interact; None if they still do at the farthest.
-        left_out: places that stood out of the scan and were not looked at closely.
+        left_out: places that stood out of the scan and were not zoomed into.
         calls: places at which the calculator was asked.
+        quantum: of energies (eV) and forces (eV/Å) that are rounded to decimals; 0 where they are not. No
+            jump below a few of them is reported.
         knots: places at which the third derivative jumps, where they are so many that they are no thresholds
             (a table with cubic splines between its points); else 0.
-        quantum: of energies (eV) and forces (eV/Å) that are rounded to decimals; 0 where they are not. No
-            jump below a few of them is told.
-        further: what was found past the scan, where the two still feel one another at its end.
-        scanned: the farthest distance of the scan, length.
         steps: (from, to, half, all) of the scan within the range: between these distances, length, but not
             beside thresholds, a step of the force above `all`, eV/Å, is found, and one above `half` at half
             of them; None without a scan.
+        further: what was found past the scan, where the two still feel one another at its end.
+        scanned: the farthest distance of the scan, length.
     """
 
     pair: Pair
-    thresholds: tuple[Threshold, ...]
+    thresholds: tuple[PairThreshold, ...]
     distance: Float[np.ndarray, "points"]
     energy: Float[np.ndarray, "points"]
     force: Float[np.ndarray, "points"]
@@ -89,7 +162,7 @@ class PairWalk:
 
 @dataclass(frozen=True)
 class PairWalks:
-    """What walking pairs told.
+    """What walking pairs found.
 
     Attributes:
         walks: one for each pair that was walked.
@@ -107,71 +180,69 @@ class PairWalks:
     left: int = 0
 
 
-_known: WeakKeyDictionary[Any, PairWalks] = WeakKeyDictionary()
-
-
-def find_thresholds(subject: Subject) -> list[Threshold]:
+def find_thresholds(subject: CalculatorSubject) -> list[PairThreshold]:
     """Every distance at which a pair interaction of the calculator changes its program.
 
-    Found by walking two of each species from far apart to as near as 1000 kT lets them. What only shows
-    among many (an angle's own cutoff, a cap on neighbors) is for the walks through whole environments.
-
-    Args:
-        subject: the calculator; asked once, remembered afterwards.
-
     Returns:
-        thresholds by pair of species and distance.
+        thresholds by pair of species and distance; the calculator is asked once.
     """
-    return [one for walk in walk_pairs(subject).walks for one in walk.thresholds]
+    if "thresholds" not in subject.known:  # a resumed audit knows them without a walk
+        subject.known["thresholds"] = [one for walk in walk_pairs(subject).walks for one in walk.thresholds]
+    return subject.known["thresholds"]
 
 
-def walk_pairs(subject: Subject, progress: Progress | None = None) -> PairWalks:
+def walk_pairs(subject: CalculatorSubject, progress: Progress | None = None) -> PairWalks:
     """Walk every pair of species through its distances; remembered for the subject."""
-    if subject not in _known:
-        found, skipped = pairs(subject)
-        walks = []
-        # those beyond the most frequent ones are told so already
-        calls, left = _CALLS, sum(what.startswith("pair ") for what, _ in skipped)
-        possible = len(found) + left
-        for k, pair in enumerate(found):
-            share = max(calls // (len(found) - k), _FEWEST_CALLS)
-            if calls < _FEWEST_CALLS:
-                left += 1
-                skipped.append((f"pair {pair.name}", f"{_CALLS:,} calls were used up by other pairs"))
-                continue
-            if progress:
-                progress(k, len(found), {"phase": f"walking {pair.name}", "unit": "pairs"})
-            try:
-                with meter_of(subject).limited():
-                    walks.append(walk(subject, pair, calls=share))
-                calls -= walks[-1].calls
-            except CalculatorError as error:
-                skipped.append((f"pair {pair.name}", error.message))
-            except TimeUp:
-                skipped.append((f"pair {pair.name}", TIME_UP))
-                left += 1
-        _known[subject] = PairWalks(tuple(walks), tuple(skipped), _not_walked(subject, walks), possible, left)
-        getattr(subject, "known", {})["walks"] = _known[subject]
-    return _known[subject]
-
-
-def known_walks(subject: Subject) -> tuple[PairWalk, ...]:
-    """Walks of pairs that were made for an earlier question; none where none was."""
-    found = getattr(subject, "known", {}).get("walks")
-    return found.walks if found else ()
-
-
-def _not_walked(subject: Subject, walks: Sequence[PairWalk]) -> tuple[str, ...]:
-    """Pairs of species of the structure that no walk was about."""
-    if any(one.pair.moves == "molecule" for one in walks):
-        return ()
+    if "walks" in subject.known:
+        return subject.known["walks"]
+    found, skipped = pairs(subject)
+    walks: list[PairWalk] = []
+    # those beyond the most frequent ones are skipped already
+    calls, left = _CALLS, sum(what.startswith("pair ") for what, _ in skipped)
+    possible = len(found) + left
+    for k, pair in enumerate(found):
+        share = max(calls // (len(found) - k), _FEWEST_CALLS)
+        if calls < _FEWEST_CALLS:
+            left += 1
+            skipped.append((f"pair {pair.name}", f"{_CALLS:,} calls were used up by other pairs"))
+            continue
+        if progress:
+            progress(k, len(found), {"phase": f"walking {pair.name}", "unit": "pairs"})
+        try:
+            with subject.meter.limited():
+                walks.append(walk(subject, pair, calls=share))
+            calls -= walks[-1].calls
+        except CalculatorError as error:
+            skipped.append((f"pair {pair.name}", error.message))
+        except TimeUp:
+            skipped.append((f"pair {pair.name}", TIME_UP))
+            left += 1
     walked = {frozenset(one.pair.species) for one in walks}
-    species = sorted(set(subject.atoms.get_chemical_symbols()))
-    both = combinations_with_replacement(species, 2)
-    return tuple("-".join(two) for two in both if frozenset(two) not in walked)
+    species = combinations_with_replacement(sorted(set(subject.atoms.get_chemical_symbols())), 2)
+    not_walked = tuple("-".join(two) for two in species if frozenset(two) not in walked)
+    if any(one.pair.moves == "molecule" for one in walks):
+        not_walked = ()
+    subject.known["walks"] = PairWalks(tuple(walks), tuple(skipped), not_walked, possible, left)
+    return subject.known["walks"]
 
 
-def rough(subject: Subject, pair: Pair) -> tuple[float | None, float | None]:
+def _coarse(subject: CalculatorSubject, curve: Curve) -> tuple[Float[np.ndarray, "points"], float]:
+    """Distances from where the calculator first answers to the farthest."""
+    places = np.concatenate([np.arange(_NEAREST, 3.0, 0.1), np.arange(3.0, FARTHEST + 0.1, 0.25)])
+    first = len(places)
+    for k in range(len(places) - 1, -1, -1):
+        try:
+            with only_trying(subject):
+                curve(float(places[k]))
+        except CalculatorError:
+            break
+        first = k
+    if first > len(places) - 4:
+        curve(float(places[-4]))  # says why
+    return places[first:], float(places[-1])
+
+
+def rough(subject: CalculatorSubject, pair: Pair) -> tuple[float | None, float | None]:
     """(where a pair stops interacting, where its energy is least), to within a coarse scan; None if never."""
     curve = pair.curve(subject)
     coarse, far = _coarse(subject, curve)
@@ -184,14 +255,12 @@ def rough(subject: Subject, pair: Pair) -> tuple[float | None, float | None]:
     return cutoff, least
 
 
-def walk(subject: Subject, pair: Pair, step: float = STEP, calls: float = np.inf) -> PairWalk:
+def walk(subject: CalculatorSubject, pair: Pair, step: float = STEP, calls: float = np.inf) -> PairWalk:
     """Walk one pair.
 
     Args:
-        subject: the calculator.
-        pair: who is walked.
         step: of the scan.
-        calls: after so many, only the place that stands out most of the scan is looked at closely.
+        calls: after so many, only the place that stands out most of the scan is zoomed into.
 
     Raises:
         CalculatorError: the calculator fails at distances at which it had answered before.
@@ -211,19 +280,18 @@ def walk(subject: Subject, pair: Pair, step: float = STEP, calls: float = np.inf
 
     costs = np.abs(curve.many(coarse)[0] - energy_far) > _COSTLY * kT
     near = float(coarse[np.flatnonzero(costs)[-1] + 1]) if costs[:-1].any() else float(coarse[0])
-    edge = None if alive(far) else end_of(coarse, alive)
+    edge = None if alive(far) else _end_of(coarse, alive)
     if edge is None and not alive(float(coarse[-2])):
         end = near  # nothing anywhere
     else:
         end = edge[1] if edge else min(far, 15.0)
-    thresholds: list[Threshold] = []
-    left_out = 0
-    smallest = None
+    thresholds: list[PairThreshold] = []
+    left_out, smallest = 0, None
     margin = 8 * step
     distance = np.append(coarse[coarse >= near][:12], near + margin)
     if end > near + 12 * step:
         jumps, left_out = find_jumps(curve, near + margin, end + margin, step, calls=calls)
-        thresholds = [at_jump(pair, jump) for jump in jumps]
+        thresholds = [_at_jump(pair, jump) for jump in jumps]
         smallest = smallest_steps(curve, near + margin, end + margin, step)
         scanned = grid(near + margin, end + margin, step)
         distance = np.append(coarse[(coarse >= near) & (coarse < near + margin)], scanned)
@@ -232,10 +300,10 @@ def walk(subject: Subject, pair: Pair, step: float = STEP, calls: float = np.inf
     if knots:
         thresholds, left_out = [one for one in thresholds if one.order < SMOOTH], 0
     if edge is not None:
-        thresholds = with_end(pair, curve, edge, thresholds, near)
+        thresholds = _with_end(pair, curve, edge, thresholds, near)
     further = None
     if edge is None and alive(far):
-        further = beyond(subject, pair, end + margin, noise, step, calls)
+        further = _beyond(subject, pair, end + margin, noise, step, calls)
     if further:
         thresholds += further.thresholds
     thresholds = [
@@ -246,10 +314,11 @@ def walk(subject: Subject, pair: Pair, step: float = STEP, calls: float = np.inf
     if further:
         distance = np.append(distance, further.nodes)
         values = np.hstack([values, np.array([further.energies, further.forces])])
-    quantum = _quantum(values, len(pair.second))
+    # forces are sums over the atoms of a particle
+    quantum = digits(values[0]).quantum, len(pair.second) * digits(values[1]).quantum
     if any(quantum):
         # nearly all that stands out of such a curve is a step of rounding
-        thresholds, left_out = [kept for one in thresholds if (kept := _beyond(one, quantum))], 0
+        thresholds, left_out = [kept for one in thresholds if (kept := _above(one, quantum))], 0
     ended = edge is not None or (further is not None and further.edge is not None)
     known = [one.radius for one in thresholds]
     seen = None if smallest is None else _seen(*smallest, end, STEPS * quantum[1], known)
@@ -257,6 +326,14 @@ def walk(subject: Subject, pair: Pair, step: float = STEP, calls: float = np.inf
         pair, tuple(sorted(thresholds, key=lambda one: one.radius)), distance, values[0] - energy_far,
         values[1], thresholds[-1].radius if ended and thresholds else None, left_out, len(curve.known),
         quantum, knots, seen, further, float(reach),
+    )  # fmt: skip
+
+
+def _at_jump(pair: Pair, jump: Jump) -> PairThreshold:
+    return PairThreshold(
+        jump.high if jump.exact else jump.at, pair.species, jump.order,
+        (jump.energy, jump.force, jump.curvature), jump.doubt, jump.low, jump.high, False,
+        jump.high - jump.low, jump.third,
     )  # fmt: skip
 
 
@@ -277,42 +354,214 @@ def _seen(
         felt &= np.abs(places - radius) > BESIDE
     if not felt.any():
         return None
-    told = np.maximum(steps[felt], rounding)
-    return float(places[felt][0]), float(places[felt][-1]), float(np.median(told)), float(told.max())
+    visible = np.maximum(steps[felt], rounding)
+    return float(places[felt][0]), float(places[felt][-1]), float(np.median(visible)), float(visible.max())
 
 
-def _quantum(values: Float[np.ndarray, "2 points"], summed: int) -> tuple[float, float]:
-    """Steps of energies and of forces that are sums over so many atoms."""
-    return digits(values[0]).quantum, summed * digits(values[1]).quantum
-
-
-def _beyond(threshold: Threshold, quantum: tuple[float, float]) -> Threshold | None:
+def _above(threshold: PairThreshold, quantum: tuple[float, float]) -> PairThreshold | None:
     """A threshold at which more jumps than the rounding of answers; of the last one, that it is there."""
-    energy, force, _ = threshold.jumps
-    rounding = STEPS * quantum[0], STEPS * quantum[1]
-    if threshold.order <= 1 and (abs(energy) > rounding[0] or abs(force) > rounding[1]):
+    large = any(abs(jump) > STEPS * size for jump, size in zip(threshold.jumps[:2], quantum, strict=True))
+    if threshold.order <= 1 and large:
         return threshold
     return replace(threshold, order=SMOOTHEST, jumps=(0.0, 0.0, 0.0)) if threshold.dies else None
 
 
-def _of_others(pair: Pair, threshold: Threshold, thresholds: Sequence[Threshold]) -> bool:
+def _of_others(pair: Pair, threshold: PairThreshold, thresholds: Sequence[PairThreshold]) -> bool:
     """Whether it is companions of the two that pass another threshold there."""
     others = pair.others(threshold.radius)
     radii = [one.radius for one in thresholds if one is not threshold]
     return any(np.abs(others - radius).min() < 1e-5 for radius in radii) if len(others) else False
 
 
-def _coarse(subject: Subject, curve: Curve) -> tuple[Float[np.ndarray, "points"], float]:
-    """Distances from where the calculator first answers to the farthest."""
-    places = np.concatenate([np.arange(_NEAREST, 3.0, 0.1), np.arange(3.0, FARTHEST + 0.1, 0.25)])
-    first = len(places)
-    for k in range(len(places) - 1, -1, -1):
+# -- the end of an interaction ---------------------------------------------------------------------
+
+
+def _end_of(
+    coarse: Float[np.ndarray, "points"], alive: Callable[[float], bool]
+) -> tuple[float, float] | None:
+    """Neighboring distances, the last at which anything is felt and the next; None where nothing ever is.
+
+    A smooth switch may be lost in rounding, here and there, before it ends: whatever is felt beyond what
+    was found moves the search outward.
+    """
+    last = next((k for k in range(len(coarse) - 2, -1, -1) if alive(float(coarse[k]))), None)
+    if last is None:
+        return None
+    low, high = float(coarse[last]), float(coarse[last + 1])
+    top = high
+    for _ in range(20):
+        low, high = bisect(alive, low, high)
+        beyond = [low + (top - low) * 0.5**power for power in range(1, 40)]
+        felt = [place for place in beyond if place > high and alive(place)]
+        if not felt:
+            return low, high
+        low, high = max(felt), top
+    return low, high
+
+
+def _with_end(
+    pair: Pair, curve: Curve, edge: tuple[float, float], found: list[PairThreshold], near: float
+) -> list[PairThreshold]:
+    """The thresholds with the one beyond which nothing is left, measured as such."""
+    inner = [one.radius for one in found if one.radius < edge[0] - 1e-3]
+    room = min(edge[0] - max([near, *inner]), 0.5)
+    jump = measure(curve, *edge, room, exact=True)
+    if jump.order == 1:
+        # where a switch is left out once it rounds to 0, that is the square root of a rounding before its end
+        steepness, error = slope(curve, jump.low, -1, room, 0.0)
+        left = abs(jump.force / steepness) if abs(steepness) > error else np.inf
+        if left < _HAIR * max(abs(jump.low), 1.0):
+            jump = replace(jump, order=2, force=0.0)
+    order, radius = jump.order, edge[1]
+    power = decay_power(curve, edge[1], room) if order >= 2 else None
+    if power is not None:
+        order = int(np.clip(round(power) + 1, 2, SMOOTHEST))
+        if order > SMOOTH - 1:  # it may have been lost in rounding before its end
+            radius = max(_root(curve, edge[1], room, round(power)), edge[1])
+    jumps = (jump.energy, jump.force, jump.curvature if order <= SMOOTH - 1 else 0.0)
+    located = max(radius - edge[0], edge[1] - edge[0])
+    # what the scan took for a threshold of its own there is this one
+    same = [one for one in found if abs(one.radius - edge[1]) <= 1e-3]
+    third = 0.0
+    if order >= SMOOTH:
+        # of a third derivative that jumps it knows the place better: the force was lost in rounding before
+        better = [one for one in found if one.order == SMOOTH and -1e-3 < one.radius - edge[1] < _LOST]
+        same += better
+        if better:
+            order, third = SMOOTH, better[-1].third
+        if better and better[-1].radius - edge[1] > better[-1].located:
+            radius, located = better[-1].radius, better[-1].located
+    last = PairThreshold(radius, pair.species, order, jumps, jump.doubt, *edge, True, located, third)
+    return [one for one in found if one not in same] + [last]
+
+
+def _root(curve: Curve, edge: float, room: float, power: int) -> float:
+    """Where a force that falls with this power of the distance to its end would vanish.
+
+    The edge itself where it is no further off than the error of such an extrapolation: it falls to the power
+    only in the limit, while the edge is known to the last bit unless the force was lost in rounding.
+    """
+    places = edge - room * np.array([0.02, 0.01, 0.005])
+    far, near, nearer = np.abs(curve.many(places)[1]) ** (1.0 / power)
+    if not far > near > nearer:
+        return edge
+    first = places[1] + near * (places[1] - places[0]) / (far - near)
+    root = places[2] + nearer * (places[2] - places[1]) / (near - nearer)
+    if abs(root - edge) <= 3 * abs(root - first):
+        return edge
+    return float(root) if abs(root - edge) < 1e-3 * max(room, 1.0) else edge
+
+
+# -- past the scan: a few places in each of some geometric intervals tell a smooth decay, through which the
+# force is a polynomial to many digits and its work what the energy changes by, from one that breaks off
+
+
+def _beyond(
+    subject: CalculatorSubject,
+    pair: Pair,
+    start: float,
+    noise: Float[np.ndarray, "2"],
+    step: float,
+    calls: float,
+) -> Beyond | None:
+    """Look outward from a distance, as far as something is left that could be lost at a cutoff.
+
+    None where no place could be asked about: in a periodic cell, where images of the two come near, or where
+    the calculator fails.
+    """
+    if pair.periodic:
+        return None
+    curve = (replace(pair, box=2.5 * _WIDEST) if pair.box else pair).curve(subject)
+    farthest = min(start * _RATIO**_MOST, _WIDEST) if pair.box else start * _RATIO**_MOST
+    low, found, asked = start, [], [np.array([])]
+    edge: tuple[float, float] | None = None
+    left, force = np.inf, 0.0
+    while low * _RATIO <= farthest:
+        high = low * _RATIO
+        nodes = _at(low, high)
         try:
             with only_trying(subject):
-                curve(float(places[k]))
+                forces = curve.many(nodes)[1]
+                gone = curve(_RATIO * high)[0]
+
+                def alive(distance: float, gone: float = gone) -> bool:
+                    energy, force = curve(distance)
+                    return abs(force) > noise[1] or abs(energy - gone) > noise[0]
+
+                ended = not alive(high) and not alive(_RATIO * high)
+                if ended and alive(float(nodes[0])):
+                    edge = _end_of(nodes, alive)
+                for one, other in _rough(curve, low, (edge[0] if edge else low) if ended else high, noise):
+                    jumps, _ = find_jumps(curve, one - 4 * step, other + 4 * step, step, calls=calls)
+                    found += [_at_jump(pair, jump) for jump in jumps]
+                if ended:
+                    break
         except CalculatorError:
             break
-        first = k
-    if first > len(places) - 4:
-        curve(float(places[-4]))  # says why
-    return places[first:], float(places[-1])
+        asked.append(nodes)
+        low, force = high, float(forces[-1])
+        left = _left(nodes, forces)
+        if left < _NOTHING * subject.kT:
+            break
+    if low == start and edge is None:
+        return None
+    reached = low
+    if edge is not None:
+        reached = edge[1]
+        # a decay that gets lost in rounding has no end there
+        if _expected(curve, edge[0]) > 4 * noise[1]:
+            found = _with_end(pair, curve, edge, found, max(low - 0.5, start))
+        else:
+            edge, left = None, 0.0
+    nodes = np.unique(np.concatenate(asked))[1:]
+    energies, forces = curve.many(nodes) if len(nodes) else np.zeros((2, 0))
+    return Beyond(tuple(found), edge, reached, force, left, nodes, energies, forces)
+
+
+def _at(low: float, high: float) -> Float[np.ndarray, "nodes"]:
+    nodes = 0.5 * (low + high) + 0.5 * (high - low) * _NODES
+    nodes[0], nodes[-1] = low, high
+    return nodes
+
+
+def _rough(
+    curve: Curve, low: float, high: float, noise: Float[np.ndarray, "2"]
+) -> Iterator[tuple[float, float]]:
+    """Narrow parts of an interval in which the force is no smooth decay, or the energy is not its work."""
+    if high <= low or _smooth(curve, low, high, noise):
+        return
+    if high - low < _NARROW:
+        yield low, high
+        return
+    middle = 0.5 * (low + high)
+    yield from _rough(curve, low, middle, noise)
+    yield from _rough(curve, middle, high, noise)
+
+
+def _smooth(curve: Curve, low: float, high: float, noise: Float[np.ndarray, "2"]) -> bool:
+    energies, forces = curve.many(_at(low, high))
+    terms = chebyshev.chebfit(_NODES, forces, len(_NODES) - 1)
+    if np.abs(terms[-3:]).max() > _SMOOTH_TERMS * np.abs(terms).max() + 4 * noise[1]:
+        return False
+    integral: Any = chebyshev.chebint(terms)
+    work = 0.5 * (high - low) * float(chebyshev.chebval(1.0, integral) - chebyshev.chebval(-1.0, integral))
+    change = float(energies[-1] - energies[0])
+    return abs(change + work) <= _SMOOTH_TERMS * max(abs(change), abs(work)) + 4 * noise[0]
+
+
+def _left(nodes: Float[np.ndarray, "nodes"], forces: Float[np.ndarray, "nodes"]) -> float:
+    """Energy that a power of the distance loses from the last place on; inf where it falls too slowly."""
+    first, last = abs(float(forces[0])), abs(float(forces[-1]))
+    if not last or not first:
+        return np.inf
+    power = -np.log(last / first) / np.log(nodes[-1] / nodes[0]) - 1.0
+    return float(last * nodes[-1] / power) if power > 0.05 else np.inf
+
+
+def _expected(curve: Curve, place: float) -> float:
+    """The force at a place by the power of the distance with which it falls a little before."""
+    near, far = place - 0.5, place - 0.25
+    first, last = (abs(curve(one)[1]) for one in (near, far))
+    if not first or not last:
+        return 0.0
+    return last * (last / first) ** (np.log(place / far) / np.log(far / near))

@@ -1,22 +1,22 @@
-"""Other ways to write down the same structure: energy and forces must not tell them apart."""
+"""Other ways to write down the same structure: energy and forces must not differ between them."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from ase import Atoms
 from jaxtyping import Float, Int
 
-from mdnum.audit.probes import molecules
+from mdnum.audit.pairs import molecules
 
 #: Coordinates that should be 0 and are not quite: a denormal-like displacement that was seen to cost 5 eV,
 #: one that is lost when it is added to a cell's length, and half an ulp of 1.
 _TINY = (1e-52, 1e-17, 2.0**-53)
-
+#: Atoms of which distances to all others are computed.
 _MANY = 500
-"""Atoms of which distances to all others are looked at."""
 
 
 @dataclass(frozen=True)
@@ -24,8 +24,8 @@ class Same:
     """A structure that is the same as another, written down otherwise.
 
     Attributes:
-        what: in words.
-        code: of the finding when the calculator tells it apart.
+        what: how it differs.
+        code: of the finding when the calculator gives it another answer.
         atoms: the other way.
         copies: how many times the structure it holds.
         order: atom of the structure that each of its atoms is.
@@ -42,6 +42,11 @@ class Same:
     turn: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))
     rounding: float = 0.0
     before: Atoms | None = None
+
+
+def _same(code: str, base: Atoms, what: str, there: Atoms, factor: float = 1.0, **more) -> Same:
+    """The atoms of a structure in its order, rounded like its coordinates."""
+    return Same(what, code, there, np.arange(len(there)), **{"rounding": factor * ulp(there, base), **more})
 
 
 def all_of(atoms: Atoms, given: Atoms, rng: np.random.Generator) -> Iterator[Same]:
@@ -66,81 +71,62 @@ def all_of(atoms: Atoms, given: Atoms, rng: np.random.Generator) -> Iterator[Sam
 
 def translated(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
     """All atoms moved together, by lattice vectors and by anything."""
-    every = np.arange(len(atoms))
+    same = partial(_same, "TRANSLATION", atoms)
     if atoms.pbc.any():
-        for count in (1, -3):
+        for count, words in ((1, "one lattice vector"), (-3, "three lattice vectors back")):
             by = count * atoms.cell.array[atoms.pbc].sum(axis=0)
-            words = "one lattice vector" if count == 1 else "three lattice vectors back"
-            yield _moved(f"all atoms moved by {words} along each periodic axis", "TRANSLATION", atoms, by)
+            yield same(f"all atoms moved by {words} along each periodic axis", _moved(atoms, by))
         for _ in range(2):
             share = rng.uniform(0, 1, 3) * atoms.pbc
-            there = _moved(
+            there, what = (
+                _moved(atoms, share @ atoms.cell),
                 "all atoms moved by fractions of the lattice vectors",
-                "TRANSLATION",
-                atoms,
-                share @ atoms.cell,
             )
-            yield there
-            folded = there.atoms.copy()
-            folded.wrap(eps=0)
-            what = "all atoms moved by fractions of the lattice vectors and wrapped"
-            yield Same(what, "IMAGES", folded, every, rounding=_ulp(folded, there.atoms))
+            yield same(what, there)
+            yield _same("IMAGES", there, f"{what} and wrapped", _wrapped(there))
     free = ~atoms.pbc
     if free.any():
+        axes = "the free axes" if atoms.pbc.any() else "x, y, z"
         for length in (7.3, -250.0):
-            by = np.zeros(3)
-            by += length * _outward(atoms, free)
-            what = (
-                f"all atoms moved by {length:g} Å along {'the free axes' if atoms.pbc.any() else 'x, y, z'}"
-            )
-            yield _moved(what, "TRANSLATION", atoms, by)
+            there = _moved(atoms, length * _outward(atoms, free))
+            yield same(f"all atoms moved by {length:g} Å along {axes}", there)
 
 
 def imaged(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
     """Each atom in a box of its own choice: unwrapped trajectories look like this."""
     if not atoms.pbc.any():
         return
-    every = np.arange(len(atoms))
-    folded = atoms.copy()
-    folded.wrap(eps=0)
-    yield Same("atoms wrapped into the cell", "IMAGES", folded, every, rounding=_ulp(folded, atoms))
+    same = partial(_same, "IMAGES", atoms)
+    yield same("atoms wrapped into the cell", _wrapped(atoms))
     for most in (1, 3, 20):
         boxes = rng.integers(-most, most + 1, (len(atoms), 3)) * atoms.pbc
-        there = atoms.copy()
-        there.positions += boxes @ atoms.cell.array
-        what = f"each atom moved by lattice vectors of its own, up to {most} of them"
-        yield Same(what, "IMAGES", there, every, rounding=_ulp(there, atoms))
+        there = _moved(atoms, boxes @ atoms.cell.array)
+        yield same(f"each atom moved by lattice vectors of its own, up to {most} of them", there)
 
 
 def on_a_face(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
     """One atom on the face of the cell, a hair outside, and on the opposite face."""
     if not atoms.pbc.any():
         return
-    every = np.arange(len(atoms))
-    axes = np.flatnonzero(atoms.pbc)
+    axes, cell = np.flatnonzero(atoms.pbc), atoms.cell.array
+    corner = cell[axes].sum(axis=0)
     for who in dict.fromkeys((0, int(rng.integers(len(atoms))))):
-        base = atoms.copy()
-        base.positions -= atoms.positions[who]
-        base.positions[who] = 0.0
-        slack = _ulp(base, atoms)
-        yield Same(f"atom {who} at 0", "FACES", base, every, rounding=slack)
-        there = base.copy()
-        there.positions[who] = atoms.cell.array[axes].sum(axis=0)
-        yield Same(f"atom {who} at L on every periodic axis", "FACES", there, every, rounding=slack)
+        base = _moved(atoms, -atoms.positions[who])
+
+        def placed(where: str, position: object, extra: float = 0.0, base: Atoms = base, who: int = who):
+            there = base.copy()
+            there.positions[who] = position
+            return _same("FACES", atoms, f"atom {who} {where}", there, rounding=ulp(base, atoms) + extra)
+
+        zero = np.zeros(3)
+        yield placed("at 0", zero)
+        yield placed("at L on every periodic axis", corner)
         for axis in axes:
-            there = base.copy()
-            there.positions[who] = atoms.cell.array[axis]
-            yield Same(f"atom {who} at L along {'abc'[axis]}", "FACES", there, every, rounding=slack)
-        there = base.copy()
-        there.positions[who] = np.nextafter(atoms.cell.array[axes].sum(axis=0), 0.0)
-        yield Same(f"atom {who} one ulp short of L", "FACES", there, every, rounding=slack)
+            yield placed(f"at L along {'abc'[axis]}", cell[axis])
+        yield placed("one ulp short of L", np.nextafter(corner, 0.0))
         for tiny in _TINY:
-            there = base.copy()
-            there.positions[who, axes] = -tiny
-            yield Same(f"atom {who} at {-tiny:.0e} Å", "FACES", there, every, rounding=slack + tiny)
-        there = base.copy()
-        there.positions[who, axes] = -0.0
-        yield Same(f"atom {who} at -0", "FACES", there, every, rounding=slack)
+            yield placed(f"at {-tiny:.0e} Å", np.where(atoms.pbc, -tiny, zero), extra=tiny)
+        yield placed("at -0", np.where(atoms.pbc, -0.0, zero))
 
 
 def permuted(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
@@ -173,10 +159,8 @@ def images_by_molecule(atoms: Atoms, rng: np.random.Generator) -> Same | None:
     if size is None or not atoms.pbc.any():
         return None
     boxes = rng.integers(-2, 3, (len(atoms) // size, 3)) * atoms.pbc
-    there = atoms.copy()
-    there.positions += np.repeat(boxes, size, axis=0) @ atoms.cell.array
-    what = f"molecules of {size} atoms moved by lattice vectors of their own"
-    return Same(what, "IMAGES", there, np.arange(len(atoms)), rounding=_ulp(there, atoms))
+    there = _moved(atoms, np.repeat(boxes, size, axis=0) @ atoms.cell.array)
+    return _same("IMAGES", atoms, f"molecules of {size} atoms moved by lattice vectors of their own", there)
 
 
 def group(atoms: Atoms) -> int | None:
@@ -201,18 +185,13 @@ def by_an_ulp(atoms: Atoms, given: Atoms) -> Iterator[Same]:
     """The cell an ulp larger and smaller, atoms where they were."""
     if not atoms.pbc.any():
         return
-    every = np.arange(len(atoms))
     for what, base in (("", atoms), (", of the structure as it was given", given)):
+        cell = base.cell.array
+        rounding = 2 * float(np.spacing(np.max(np.abs(cell))))
         for toward, word in ((np.inf, "larger"), (0.0, "smaller")):
-            there = base.copy()
-            cell = base.cell.array
             # away from zero, whatever the sign, and zeros stay zeros
-            target = np.copysign(toward, cell)
-            there.set_cell(np.where(cell == 0, cell, np.nextafter(cell, target)))
-            yield Same(
-                f"cell one ulp {word}{what}", "CELL_ULP", there, every,
-                rounding=2 * float(np.spacing(np.max(np.abs(cell)))), before=base,
-            )  # fmt: skip
+            there = _in_cell(base, np.where(cell == 0, cell, np.nextafter(cell, np.copysign(toward, cell))))
+            yield _same("CELL_ULP", base, f"cell one ulp {word}{what}", there, rounding=rounding, before=base)
 
 
 def repeated(atoms: Atoms) -> Iterator[Same]:
@@ -225,7 +204,7 @@ def repeated(atoms: Atoms) -> Iterator[Same]:
         copies = len(there) // len(atoms)
         order = np.tile(np.arange(len(atoms)), copies)
         what = f"{' x '.join(map(str, counts))} supercell"
-        yield Same(what, "EXTENSIVE", there, order, copies=copies, rounding=_ulp(there, atoms))
+        yield Same(what, "EXTENSIVE", there, order, copies=copies, rounding=ulp(there, atoms))
 
 
 def narrow(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
@@ -245,41 +224,27 @@ def narrow(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
     # wider by the most that two atoms may approach, so that none is nearer than in the structure
     places = 1.1 * places + 0.02 * nearest * rng.uniform(-1, 1, (4, 3))
     few = Atoms([atoms.symbols[0]] * 4, places, cell=[1.1 * edge] * 3, pbc=True)
-    there = few.repeat(3)
+    there, order = few.repeat(3), np.tile(np.arange(4), 27)
     what = f"a cell of four atoms, {1.1 * edge:.3g} Å wide, repeated three times along each axis"
-    yield Same(
-        what,
-        "NARROW_CELL",
-        there,
-        np.tile(np.arange(4), 27),
-        copies=27,
-        rounding=_ulp(there, few),
-        before=few,
-    )
+    yield Same(what, "NARROW_CELL", there, order, copies=27, rounding=ulp(there, few), before=few)
 
 
 def skewed(atoms: Atoms) -> Iterator[Same]:
-    """The same lattice from other lattice vectors."""
+    """The same lattice from other lattice vectors, a left-handed cell among them."""
     if not atoms.pbc.all():
         return
-    every = np.arange(len(atoms))
     for what, matrix in (
         ("b replaced by a + b", [[1, 0, 0], [1, 1, 0], [0, 0, 1]]),
         ("c replaced by c - a + b", [[1, 0, 0], [0, 1, 0], [-1, 1, 1]]),
         ("a, b, c replaced by b, c, a", [[0, 1, 0], [0, 0, 1], [1, 0, 0]]),
+        ("a and b exchanged", [[0, 1, 0], [1, 0, 0], [0, 0, 1]]),
     ):
-        there = atoms.copy()
-        there.set_cell(np.array(matrix) @ atoms.cell.array)
-        yield Same(f"the same lattice, {what}", "LATTICE", there, every, rounding=_ulp(there, atoms))
-    # the other hand: a left-handed cell is as good as any
-    there = atoms.copy()
-    there.set_cell(atoms.cell.array[[1, 0, 2]])
-    yield Same("the same lattice, a and b exchanged", "LATTICE", there, every, rounding=_ulp(there, atoms))
+        there = _in_cell(atoms, np.array(matrix) @ atoms.cell.array)
+        yield _same("LATTICE", atoms, f"the same lattice, {what}", there)
 
 
 def turned(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
     """Structure and cell turned together, by anything, by axes, and mirrored."""
-    every = np.arange(len(atoms))
     q, r = np.linalg.qr(rng.standard_normal((3, 3)))
     anyhow = q * np.sign(np.diag(r))
     anyhow *= np.sign(np.linalg.det(anyhow))
@@ -289,33 +254,41 @@ def turned(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
         ("x, y, z exchanged in a cycle", "ROTATION", cyclic),
         ("structure and cell mirrored", "MIRROR", np.diag([-1.0, 1.0, 1.0])),
     ):
-        there = atoms.copy()
-        there.set_cell(atoms.cell.array @ turn.T)
+        there = _in_cell(atoms, atoms.cell.array @ turn.T)
         there.positions = atoms.positions @ turn.T
-        yield Same(what, code, there, every, turn=turn, rounding=4 * _ulp(there, atoms))
+        yield _same(code, atoms, what, there, factor=4, turn=turn)
 
 
 def without_periods(atoms: Atoms) -> Iterator[Same]:
     """A cluster in cells that do not repeat: what is written in them must not matter."""
-    every = np.arange(len(atoms))
-    base = atoms.copy()
+    base = _in_cell(atoms, np.zeros((3, 3)))
     base.pbc = False
-    base.set_cell(np.zeros((3, 3)))
     span = np.ptp(base.positions, axis=0).max() + 30.0
     for what, cell in (
         ("a large one", np.diag([span] * 3)),
         ("one shorter than the cluster", np.diag([2.0, 3.0, 4.0])),
         ("a skewed one", np.array([[5.0, 0.0, 0.0], [4.0, 3.0, 0.0], [1.0, 2.0, 6.0]])),
     ):
-        there = base.copy()
-        there.set_cell(cell)
-        yield Same(f"without periods, in {what}", "DUMMY_CELL", there, every, before=base)
+        what = f"without periods, in {what}"
+        yield _same("DUMMY_CELL", base, what, _in_cell(base, cell), rounding=0.0, before=base)
 
 
-def _moved(what: str, code: str, atoms: Atoms, by: Float[np.ndarray, "3"]) -> Same:
+def _moved(atoms: Atoms, by: np.ndarray) -> Atoms:
     there = atoms.copy()
     there.positions += by
-    return Same(what, code, there, np.arange(len(atoms)), rounding=_ulp(there, atoms))
+    return there
+
+
+def _wrapped(atoms: Atoms) -> Atoms:
+    there = atoms.copy()
+    there.wrap(eps=0)
+    return there
+
+
+def _in_cell(atoms: Atoms, cell: np.ndarray) -> Atoms:
+    there = atoms.copy()
+    there.set_cell(cell)
+    return there
 
 
 def _outward(atoms: Atoms, free: np.ndarray) -> np.ndarray:
@@ -329,10 +302,14 @@ def _outward(atoms: Atoms, free: np.ndarray) -> np.ndarray:
     return basis[-1]
 
 
-def _ulp(*structures: Atoms) -> float:
+def ulp(*structures: Atoms) -> float:
     """An ulp of the largest coordinate or cell entry of some structures, Å."""
-    largest = max(
-        max(np.max(np.abs(one.positions), initial=0.0), np.max(np.abs(one.cell.array), initial=0.0))
-        for one in structures
+    return float(
+        np.spacing(
+            max(
+                np.max(np.abs(part), initial=0.0)
+                for one in structures
+                for part in (one.positions, one.cell.array)
+            )
+        )
     )
-    return float(np.spacing(largest))

@@ -1,155 +1,114 @@
-"""What the checks add up to: safe to run, safe to differentiate, and why not."""
+"""What the checks add up to: safe to run, safe to differentiate, and which findings may be one."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Literal
 
-from mdnum.audit.base import Part
-from mdnum.audit.causes import grouped
+from mdnum.audit.base import CheckResult
+from mdnum.audit.check import needed_to
 
 Answer = Literal["yes", "as far as asked", "with care", "no", "not asked"]
 
-#: Checks without which a question has no answer.
-_NEEDED = {
-    "run": ("invariance", "forces", "state", "dynamics"),
-    "differentiate": ("smoothness", "forces", "curl"),
-}
 #: Codes that do not bear on a question, whatever their severity: where only the force jumps a run keeps its
 #: energy, and what a run loses to its time step takes nothing from a derivative.
 _APART = {
     "run": ("FORCE_JUMP", "CURVATURE_JUMP", "CURVATURE_JUMP_AMONG_MANY"),
     "differentiate": ("DRIFT", "TIMESTEP"),
 }
+QUESTIONS = tuple(_APART)
 #: Of the ways of a check: from here on it counts as asked.
 _NEARLY = 0.9
 
+_IMAGES = (
+    "IMAGES", "LATTICE", "EXTENSIVE", "TRANSLATION", "NARROW_CELL", "FACES", "CELL_ULP", "ROTATION",
+)  # fmt: skip
+_FORCES = ("FORCES_NOT_GRADIENT", "CURL", "NET_FORCE", "NET_TORQUE")
+_RUN = ("NOT_CONSERVED", "HIDDEN_JUMPS", "DRIFT")
+_AMONG_MANY = ("JUMP_AMONG_MANY", "CURVATURE_JUMP_AMONG_MANY")
 
-@dataclass(frozen=True)
-class Judgment:
-    """The two answers.
+#: What each mistake brings about as well, the deepest first: neighbors that are lost by their place in a list
+#: make every other way of writing a structure down another structure; images that are lost have no forces; a
+#: force that is no gradient does not keep the energy of a run.
+_BRINGS: dict[str, tuple[str, ...]] = {
+    "NOT_REPEATABLE": (
+        "STALE_STATE", "STALE_DYNAMICS", "ORDER", "TOPOLOGY_BY_ORDER", *_IMAGES, "MIRROR", "DUMMY_CELL",
+        *_AMONG_MANY, *_FORCES, *_RUN, "ENERGY_STEP", "NOISE_FLOOR", "LOW_PRECISION", "QUANTIZED",
+        "NOT_BIT_IDENTICAL",
+    ),
+    "STALE_STATE": ("STALE_DYNAMICS", *_RUN),
+    "NEIGHBOR_CAP_BY_ORDER": ("NEIGHBOR_CAP", "ORDER", *_IMAGES, *_AMONG_MANY, *_FORCES, *_RUN),
+    "NEIGHBOR_CAP": ("ORDER", *_IMAGES, *_AMONG_MANY, *_FORCES, *_RUN),
+    "ORDER": (*_IMAGES, *_AMONG_MANY, *_FORCES, *_RUN),
+    **{code: (*_IMAGES[k + 1 :], *_AMONG_MANY, *_FORCES, *_RUN) for k, code in enumerate(_IMAGES)},
+    "FORCES_NOT_GRADIENT": ("CURL", "NET_FORCE", "NET_TORQUE", "NOT_CONSERVED", "DRIFT"),
+    "CURL": ("NOT_CONSERVED", "DRIFT"),
+    "ENERGY_JUMP": ("FLIPS_CHANGE_ENERGY", "ENERGY_STEP"),
+    "JUMP_AMONG_MANY": ("CURVATURE_JUMP_AMONG_MANY", "HIDDEN_JUMPS"),
+}  # fmt: skip
+_SEVERITIES = ("info", "warning", "error")
 
-    Attributes:
-        run: may a simulation be run with it?
-        differentiate: may a derivative be taken through it?
-        headline: both in one sentence.
-        evidence: what each check says, a sentence or two each.
-    """
 
-    run: Answer
-    differentiate: Answer
-    headline: str
-    evidence: tuple[str, ...]
-
-
-def judge(name: str, parts: Sequence[Part], wanted: Sequence[str] | None = None) -> Judgment:
-    """Both answers from the parts of an audit.
+def answers(results: Sequence[CheckResult], wanted: Sequence[str]) -> Mapping[str, Answer]:
+    """An answer to each question ("run", "differentiate").
 
     Args:
-        name: of the calculator.
-        parts: as the checks gave them.
-        wanted: checks that were to be made; those of the parts if None.
+        wanted: checks that were to be made.
     """
-    names = [part.name for part in parts]
-    left = [one for one in wanted or () if one not in names]
-    answers: dict[str, Answer] = {
-        question: _answer(question, parts, [*names, *left]) for question in ("run", "differentiate")
+    return {question: _answer(question, results, wanted) for question in QUESTIONS}
+
+
+def _answer(question: str, results: Sequence[CheckResult], wanted: Sequence[str]) -> Answer:
+    severities = {
+        one.severity for result in results for one in result.findings if one.code not in _APART[question]
     }
-    return Judgment(
-        answers["run"],
-        answers["differentiate"],
-        _headline(name, answers, parts, left),
-        tuple(part.says for part in parts),
-    )
-
-
-def _answer(question: str, parts: Sequence[Part], wanted: Sequence[str]) -> Answer:
-    bearing = [
-        finding for part in parts for finding in part.findings if finding["code"] not in _APART[question]
-    ]
-    severities = {finding["severity"] for finding in bearing}
     if "error" in severities:
         return "no"
     if "warning" in severities:
         return "with care"
-    if not set(wanted).issuperset(_NEEDED[question]):
+    needed, begun = needed_to(question), {result.name for result in results}
+    if not needed <= set(wanted) or not needed <= begun:
         return "not asked"
-    begun = {part.name for part in parts}
-    if not begun.issuperset(_NEEDED[question]):
-        return "not asked"
-    asked = {part.name for part in parts if not _largely_unasked(part)}
-    return "yes" if asked.issuperset(_NEEDED[question]) else "as far as asked"
+    asked = {result.name for result in results if not largely_unasked(result)}
+    return "yes" if needed <= asked else "as far as asked"
 
 
-def _largely_unasked(part: Part) -> bool:
-    return part.asked < _NEARLY * part.possible
+def largely_unasked(result: CheckResult) -> bool:
+    """Whether the time was up before most ways of a check were asked."""
+    return result.asked < _NEARLY * result.possible
 
 
-def _headline(name: str, answers: Mapping[str, Answer], parts: Sequence[Part], left: Sequence[str]) -> str:
-    head = _said(name, answers["run"], answers["differentiate"])
-    wanted = {part.name for part in parts}.union(left)
-    # of checks that do not make up an answer, none is to come
-    to_come = any(wanted.issuperset(needed) and set(left).intersection(needed) for needed in _NEEDED.values())
-    if parts and not head and to_come:
-        return _nothing_yet(name, parts, left)
-    unasked = [
-        f"{part.asked:,} of {part.possible:,} ways of {part.name}" for part in parts if _largely_unasked(part)
-    ]
-    unasked += [f"{one} not asked" for one in left]
-    head = head or name
-    if unasked:
-        # whatever the answers are, what they do not rest on is said beside them
-        far = "" if "as far as asked" in head else "as far as asked: "
-        head += f" ({far}{', '.join(unasked)})"
-    told = [finding for part in parts for finding in part.findings]
-    alone = [one for one, _ in grouped(told, [(one["code"], one["severity"]) for one in told])]
-    titles = [
-        finding["title"]
-        for severity in ("error", "warning")
-        # where one question has two answers, no other finding of its severity is worth as much
-        for finding in sorted(alone, key=lambda one: one["code"] != "NOT_REPEATABLE")
-        if finding["severity"] == severity
-    ]
-    if not titles:
-        return (
-            f"{head}: nothing was asked."
-            if not parts
-            else f"{head}: {_counted(len(parts), 'check')} found nothing."
+def to_come(results: Sequence[CheckResult], wanted: Sequence[str]) -> bool:
+    """Whether a check is left of those that make up an answer; of others, none is to come."""
+    left = set(wanted) - {result.name for result in results}
+    needs = [needed_to(question) for question in QUESTIONS]
+    return any(needed <= set(wanted) and left & needed for needed in needs)
+
+
+def heads(findings: Sequence[tuple[str, str]]) -> list[int]:
+    """For each finding the place of the one that it goes below, its own where it is listed by itself.
+
+    It goes below the deepest mistake found that brings it about and is no less severe, and below the first
+    finding of its own code. That it has the same cause is likely and not known: correct the one above, and
+    ask again.
+
+    Args:
+        findings: code and severity of each, in the order in which they were found.
+    """
+    ranks = [_SEVERITIES.index(severity) for _, severity in findings]
+    first: dict[str, int] = {}
+    for place, (code, _) in enumerate(findings):
+        if code not in first or ranks[place] > ranks[first[code]]:
+            first[code] = place
+    found = []
+    for place, (code, _) in enumerate(findings):
+        above = (
+            first[cause]
+            for cause, brought in _BRINGS.items()
+            if cause in first and code in brought and ranks[first[cause]] >= max(ranks[place], 1)
         )
-    shown = list(dict.fromkeys(titles))
-    if len(shown) > 3:
-        shown[2:] = [f"and {len(shown) - 2} more findings"]
-    return f"{head}: {'; '.join(shown)}."
-
-
-def _nothing_yet(name: str, parts: Sequence[Part], left: Sequence[str]) -> str:
-    """What is said where a check that both answers need has not begun, and nothing was found so far."""
-    ways = [f"{part.asked:,} of {part.possible:,} ways of {part.name}" for part in parts]
-    return f"{name}: nothing can be said yet ({', '.join(ways)} asked; {', '.join(left)} not asked)."
-
-
-def _said(name: str, run: Answer, differentiate: Answer) -> str:
-    """Both answers as a clause; empty where neither was asked for."""
-    if run == differentiate:
-        return {
-            "yes": f"{name} is safe to run and to differentiate",
-            "as far as asked": f"{name} is safe as far as asked",
-            "with care": f"Use {name} with care, to run and to differentiate",
-            "no": f"Neither run nor differentiate {name} as it is",
-            "not asked": "",
-        }[run]
-    words = {
-        "yes": "safe to {verb}", "as far as asked": "safe as far as asked to {verb}",
-        "with care": "to be {done} with care", "no": "not safe to {verb}",
-    }  # fmt: skip
-    said = [
-        words[answer].format(verb=verb, done=done)
-        for answer, verb, done in ((run, "run", "run"), (differentiate, "differentiate", "differentiated"))
-        if answer != "not asked"
-    ]
-    return f"{name} is {', and '.join(said)}"
-
-
-def _counted(number: int, noun: str) -> str:
-    return f"{number} {noun}{'' if number == 1 else 's'}"
+        found.append(next(above, first[code]))
+    # of what goes below one that goes below another, the top
+    for _ in found:
+        found = [found[place] for place in found]
+    return found

@@ -15,9 +15,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from mdnum.ball.solver import iterate, no_solve
 from mdnum.ball.state import Solve
-from mdnum.ball.stopping import Maximum, StopRule
+from mdnum.ball.stopping import Maximum, StopRule, iterate, no_solve
 from mdnum.precision.exact import fence
 from mdnum.precision.policy import RolePrecision
 
@@ -45,14 +44,14 @@ class Push(NamedTuple):
         judge: the contact decision at a height.
         pull: acceleration from height, velocity and the decision.
         policy: dtype by role.
-        told: iterations that an implicit scheme makes instead of its own number.
+        imposed: iterations that an implicit scheme makes instead of its own number.
         history: whether residuals are kept.
     """
 
     judge: Callable[[Balls], Bool[Array, "balls"]]
     pull: Callable[[Balls, Balls, Bool[Array, "balls"]], Balls]
     policy: RolePrecision
-    told: Int[Array, "..."] | None
+    imposed: Int[Array, "..."] | None
     history: bool
 
 
@@ -67,7 +66,7 @@ class Pushed(NamedTuple):
     solve: Solve
 
 
-class Integrator(Protocol):
+class Scheme(Protocol):
     """The contract of a scheme.
 
     Attributes:
@@ -118,7 +117,7 @@ class SemiImplicitEuler(eqx.Module):
         return Pushed(*self.fly(y, v, a, r), a, y, contact, no_solve(push.policy.dtype("decision")))
 
 
-class VelocityVerlet(eqx.Module):
+class BallVerlet(eqx.Module):
     """Half kick, drift, force, half kick. Order 2 between events, symplectic; stable for h sqrt(k) < 2."""
 
     h: Any
@@ -187,11 +186,11 @@ class ImplicitMidpoint(eqx.Module):
             lambda a: jnp.abs(self.h * defect(a, judge(middle(a)[0]))),
             push.policy,
             r.zero,
-            told=push.told,
+            imposed=push.imposed,
             history=push.history,
         )
         contact = judge(middle(found)[0])
-        # the same iterations under the decision that was reached: what a step told its decisions does too
+        # the same iterations under the decision that was reached: as a step under imposed decisions
         count = solve.iterations
 
         def body(carry):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import Any
 
 import ml_dtypes
@@ -77,9 +76,3 @@ def _stuck(name: str, gain: float) -> float:
         # of n grains the iteration takes gain * n, which rounds to none up to one half
         return (math.floor(0.5 / gain) + 1) * smallest(name)
     return smallest(name) / min(gain, 1.0)
-
-
-def strictest(usable: Mapping[str, float]) -> tuple[str, float]:
-    """The role that asks for the largest tolerance, and that tolerance."""
-    role = max(usable, key=lambda one: usable[one])
-    return role, usable[role]

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Protocol
 
 import equinox as eqx
 import jax
@@ -12,17 +12,76 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from mdnum.ball.losses import FinalHeight, Loss
 from mdnum.ball.rollout import BallRun, simulate
-from mdnum.ball.state import Decisions
+from mdnum.ball.state import BallDecisions, BallRecord, BallState
 from mdnum.ball.world import World
 
 #: Parameters of the start rather than of the world; a value moves the whole batch.
 START = ("y0", "v0")
 
 
+class BallLoss(Protocol):
+    """A sum over steps and a term of the end; both shape (), in the dtype they are given."""
+
+    def step(self, state: BallState, record: BallRecord, dtype: Any) -> Float[Array, ""]:
+        """What the step that made this state adds."""
+        ...
+
+    def end(self, state: BallState, steps: int, total: Float[Array, ""]) -> Float[Array, ""]:
+        """The loss, from the sum over steps and the last state."""
+        ...
+
+
+class FinalHeight(eqx.Module):
+    """Mean height at the end, m; with a target the mean squared distance to it, m²."""
+
+    target: float | None = eqx.field(static=True, default=None)
+
+    def step(self, state, record, dtype):
+        """Nothing."""
+        return jnp.zeros((), dtype)
+
+    def end(self, state, steps, total):
+        """The mean over the batch."""
+        y = state.y.astype(total.dtype)
+        if self.target is None:
+            return jnp.mean(y, dtype=total.dtype)
+        return jnp.mean((y - self.target) ** 2, dtype=total.dtype)
+
+
+class MeanHeight(eqx.Module):
+    """Height averaged over balls and steps, m."""
+
+    def step(self, state, record, dtype):
+        """The mean over the batch."""
+        return jnp.mean(state.y.astype(dtype), dtype=dtype)
+
+    def end(self, state, steps, total):
+        """Divided by the number of steps."""
+        return total / max(steps, 1)
+
+
+class ResidualPenetration(eqx.Module):
+    """What the contact model leaves of the penetration, summed over steps, averaged over balls.
+
+    Attributes:
+        power: 2 for squares, m²; 1 for the penetration itself, m.
+    """
+
+    power: int = eqx.field(static=True, default=2)
+
+    def step(self, state, record, dtype):
+        """The mean of |p|^power over the batch."""
+        left = record.left.astype(dtype)
+        return jnp.mean(left if self.power == 1 else left**self.power, dtype=dtype)
+
+    def end(self, state, steps, total):
+        """The sum over steps."""
+        return total
+
+
 @dataclass(frozen=True)
-class Problem:
+class BallProblem:
     """A world, a start, a number of steps and a loss.
 
     Attributes:
@@ -37,9 +96,9 @@ class Problem:
     y0: Any
     v0: Any = 0.0
     steps: int = 100
-    loss: Loss = field(default_factory=FinalHeight)
+    loss: BallLoss = field(default_factory=FinalHeight)
 
-    def with_values(self, values: Mapping[str, Any]) -> Problem:
+    def with_values(self, values: Mapping[str, Any]) -> BallProblem:
         """The same problem with other values of named parameters, start values included."""
         start = {name: values[name] for name in START if name in values}
         rest = {name: value for name, value in values.items() if name not in START}
@@ -60,41 +119,27 @@ class Problem:
         """The loss."""
         return float(_loss(self._bare(), self.world, *self._start(), dict(overrides or {}), None))
 
-    def function(self, names: Sequence[str]) -> Callable[[Mapping[str, Any]], Float[Array, ""]]:
-        """The loss as a function of the named parameters, to be traced, differentiated and jitted by JAX.
-
-        The world's other numbers are constants of the function. Inside a jit of your own pass them as
-        arguments instead (`loss_of`), or the compiler folds the fences away.
-        """
-        self.values(names)
-        bare, world, start = self._bare(), self.world, self._start()
-
-        def loss(values: Mapping[str, Any]) -> Float[Array, ""]:
-            return _loss(bare, world, *start, dict(values), None)
-
-        return loss
-
     def value_and_grad(
-        self, names: Sequence[str], told: Decisions | None = None
+        self, names: Sequence[str], imposed: BallDecisions | None = None
     ) -> tuple[float, dict[str, float]]:
         """Loss and derivative along each named parameter, through the iterations that ran.
 
         Args:
             names: a batch moves as a whole along y0 and v0.
-            told: decisions of every step to act on instead of its own, leading axis steps.
+            imposed: decisions of every step to act on instead of its own, leading axis steps.
 
         Error: rounding of the reverse pass in the dtypes of the policy.
         """
         values = {name: jnp.zeros((), jnp.float64) for name in names if name in START}
         values |= {name: jnp.asarray(self.world.value(name)) for name in names if name not in START}
-        loss, slopes = _value_and_grad(self._bare(), values, self.world, *self._start(), told)
+        loss, slopes = _value_and_grad(self._bare(), values, self.world, *self._start(), imposed)
         return float(loss), {name: float(slope) for name, slope in slopes.items()}
 
     def run(self, **options: Any) -> BallRun:
         """Simulate it; see `simulate`."""
         return simulate(self.world, self.world.start(self.y0, self.v0), self.steps, **options)
 
-    def _bare(self) -> tuple[int, Loss]:
+    def _bare(self) -> tuple[int, BallLoss]:
         return self.steps, self.loss
 
     def _start(self) -> tuple[Array, Array]:
@@ -108,13 +153,13 @@ def loss_of(
     y0: Float[Array, "balls"],
     v0: Float[Array, "..."],
     steps: int,
-    loss: Loss,
-    told: Decisions | None = None,
+    loss: BallLoss,
+    imposed: BallDecisions | None = None,
 ) -> Float[Array, ""]:
     """The loss of a rollout, traceable; every argument but steps and loss may be differentiated.
 
     Args:
-        told: decisions of every step, leading axis steps; its own when None.
+        imposed: decisions of every step, leading axis steps; its own when None.
 
     Returns:
         the loss in the dtype of its role.
@@ -123,15 +168,15 @@ def loss_of(
 
     def step(carry, given):
         state, total = carry
-        state, record = world.advance(state, told=given)
+        state, record = world.advance(state, imposed=given)
         return (state, total + loss.step(state, record, dtype)), None
 
     start = (world.start(y0, v0), jnp.zeros((), dtype))
-    (state, total), _ = lax.scan(step, start, told, length=steps)
+    (state, total), _ = lax.scan(step, start, imposed, length=steps)
     return loss.end(state, steps, total)
 
 
-def _apply(bare, world, y0, v0, values, told, shifts=False):
+def _apply(bare, world, y0, v0, values, imposed, shifts=False):
     steps, loss = bare
     rest = {name: value for name, value in values.items() if name not in START}
     world = world.with_values(rest)
@@ -141,14 +186,33 @@ def _apply(bare, world, y0, v0, values, told, shifts=False):
             old = y0 if name == "y0" else v0
             new = old + value.astype(old.dtype) if shifts else value.astype(old.dtype)
             y0, v0 = (new, v0) if name == "y0" else (y0, new)
-    return loss_of(world, jnp.atleast_1d(y0), v0, steps, loss, told)
+    return loss_of(world, jnp.atleast_1d(y0), v0, steps, loss, imposed)
 
 
 @eqx.filter_jit
-def _loss(bare, world, y0, v0, values, told):
-    return _apply(bare, world, y0, v0, values, told)
+def _loss(bare, world, y0, v0, values, imposed):
+    return _apply(bare, world, y0, v0, values, imposed)
 
 
 @eqx.filter_jit
-def _value_and_grad(bare, values, world, y0, v0, told):
-    return jax.value_and_grad(lambda given: _apply(bare, world, y0, v0, given, told, shifts=True))(values)
+def _value_and_grad(bare, values, world, y0, v0, imposed):
+    return jax.value_and_grad(lambda given: _apply(bare, world, y0, v0, given, imposed, shifts=True))(values)
+
+
+def arrive(world: World, y0: Float[Array, "balls"], steps: int, name: str) -> tuple[Array, Array]:
+    """Heights after a number of steps and the derivative of the program by a parameter, by forward mode.
+
+    One compilation serves all step sizes and numbers of steps.
+    """
+    return _arrive(world, y0, jnp.asarray(steps), name)
+
+
+@eqx.filter_jit
+def _arrive(world: World, y0: Array, steps: Array, name: str) -> tuple[Array, Array]:
+    def run(value):
+        here = world if name in ("y0", "v0") else world.with_values({name: value})
+        start = here.start(y0 + value if name == "y0" else y0, value if name == "v0" else 0.0)
+        return lax.fori_loop(0, steps, lambda _, state: here.advance(state)[0], start).y
+
+    value = jnp.zeros(()) if name in ("y0", "v0") else jnp.asarray(world.value(name))
+    return jax.jvp(run, (value,), (jnp.ones_like(value),))

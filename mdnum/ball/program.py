@@ -5,20 +5,19 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, NamedTuple
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from mdnum.ball.bounds import height_bound, residual_bound
-from mdnum.ball.compare import counts_alike
+from mdnum.ball.compare import CrossDecision, cross_decisions, overridden
 from mdnum.ball.contacts import Projection
 from mdnum.ball.limits import spacing
-from mdnum.ball.problem import START, Problem
+from mdnum.ball.problem import START, BallProblem
 from mdnum.ball.rollout import BallRun, simulate
-from mdnum.ball.state import Decisions
+from mdnum.ball.state import BallDecisions
 from mdnum.errors import InputError
 from mdnum.events.ledger import Ledger
 from mdnum.program import Decision, DecisionHistory, Differing, Number, PairRows
@@ -46,35 +45,6 @@ class ImposedDecision:
     value: int
 
 
-class CrossDecision(NamedTuple):
-    """A decision that two runs made differently.
-
-    Attributes:
-        step: from 1.
-        channel: "contact" or "stop".
-        ball: whose; -1 for a count that all balls share.
-        a, b: what each run decided: whether the ball touches, or how many iterations.
-        margin_a, margin_b: minus the height, or tolerance minus residual at the decision at which one run
-            stopped and the other did not; NaN where a run made no such decision.
-        bound_a, bound_b: on the rounding error of what was compared.
-    """
-
-    step: int
-    channel: str
-    ball: int
-    a: int
-    b: int
-    margin_a: float
-    margin_b: float
-    bound_a: float
-    bound_b: float
-
-    @property
-    def run(self) -> str:
-        """The run that decided yes: in which the ball touches, or the solver stops first."""
-        return "A" if (self.a > self.b) == (self.channel == "contact") else "B"
-
-
 @dataclass(frozen=True)
 class BallProgram:
     """World, start and steps of a ball, and how they are compared with another's.
@@ -86,7 +56,7 @@ class BallProgram:
         pins: decisions that are imposed on it.
     """
 
-    problem: Problem
+    problem: BallProblem
     name: str = "ball"
     order: tuple[int, ...] | None = None
     pins: tuple[ImposedDecision, ...] = ()
@@ -149,7 +119,7 @@ class BallProgram:
                 f"{self.size} balls and {other.size}", remedy="Compare programs of the same number of balls"
             )
 
-    def run(self, steps: int, decisions: Decisions | None = None) -> BallRun:
+    def run(self, steps: int, decisions: BallDecisions | None = None) -> BallRun:
         """A rollout, its balls in the order of the other program.
 
         Args:
@@ -166,14 +136,14 @@ class BallProgram:
         else:
             counts = decisions.iterations
             counts = counts[:, index] if counts.ndim == 2 else counts
-            imposed = Decisions(decisions.contact[:, index], counts)
-        run = simulate(problem.world, problem.world.start(problem.y0, problem.v0), steps, told=imposed)
+            imposed = BallDecisions(decisions.contact[:, index], counts)
+        run = simulate(problem.world, problem.world.start(problem.y0, problem.v0), steps, imposed=imposed)
         run = run if index is None else _reordered(run, np.asarray(index))
         if decisions is None:
             self._runs[steps] = run
         return run
 
-    def _pinned(self, steps: int) -> Decisions | None:
+    def _pinned(self, steps: int) -> BallDecisions | None:
         """The pins, -1 wherever the program decides by itself; None where there are none."""
         if not self.pins:
             return None
@@ -192,7 +162,7 @@ class BallProgram:
                 iterations[pin.step - 1] = pin.value
             else:
                 iterations[pin.step - 1, pin.ball] = pin.value
-        return Decisions(contact, iterations)  # type: ignore[arg-type]
+        return BallDecisions(contact, iterations)  # type: ignore[arg-type]
 
     def lockstep(
         self, other: BallProgram, last: int, *, forward: bool, back: bool, guard: float | None
@@ -208,13 +178,13 @@ class BallProgram:
         overridden_count: dict[str, np.ndarray] = {}
         furthest: dict[str, np.ndarray] = {}
         if forward:
-            runs["B|A"] = other.run(asked, a.told())
+            runs["B|A"] = other.run(asked, a.decisions())
             overridden_count["B|A"], furthest["B|A"] = overridden(runs["B|A"], last)
             separation["B|A"] = _guarded(_apart(a, runs["B|A"], last), furthest["B|A"], guard)
             from_b = _apart(b, runs["B|A"], last)
             separation["B|A from B"] = np.where(np.isnan(separation["B|A"]), np.nan, from_b)
         if back:
-            runs["A|B"] = self.run(asked, b.told())
+            runs["A|B"] = self.run(asked, b.decisions())
             separation["A|B"] = _apart(b, runs["A|B"], last)
             separation["A|B from A"] = _apart(a, runs["A|B"], last)
         steps = np.array([flip.step for flip in flips], np.int64)
@@ -244,7 +214,7 @@ class BallProgram:
         a = self.run(steps)
         found = []
         for other in others:
-            under = other.run(steps, a.told())
+            under = other.run(steps, a.decisions())
             separation = _guarded(_apart(a, under, last), overridden(under, last)[1], guard)
             found.append((_apart(a, other.run(steps), last), separation))
         return found
@@ -316,7 +286,7 @@ class BallProgram:
             for touches, count in zip(contact, counts, strict=True)
         ]
         digest = hashlib.blake2b(contact.tobytes() + run.iterations.tobytes(), digest_size=16).hexdigest()
-        value, _ = problem.value_and_grad([], jax.tree.map(jnp.asarray, run.told()))
+        value, _ = problem.value_and_grad([], jax.tree.map(jnp.asarray, run.decisions()))
         x = run.y[-1].astype(np.float64)
         every = np.frombuffer(b"".join(marks), np.uint64)
         return DecisionHistory(every, digest, x, value, float("nan"), "", first=1)
@@ -335,68 +305,10 @@ class BallProgram:
             flips[0] = first._replace(margin_a=margins[0], margin_b=margins[1])
         name = self.number(key).key
         gradients = tuple(
-            problem.value_and_grad([name], jax.tree.map(jnp.asarray, run.told()))[1][name]
+            problem.value_and_grad([name], jax.tree.map(jnp.asarray, run.decisions()))[1][name]
             for problem, run in zip(problems, runs, strict=True)
         )
         return Differing(self.decision(other, flips, float("nan")), gradients)
-
-
-def cross_decisions(a: BallRun, b: BallRun, last: int | None = None) -> list[CrossDecision]:
-    """Every decision that two runs of equal size make differently, contacts of a step before its stops.
-
-    Args:
-        a, b: with every state kept.
-        last: the last step to compare; default all.
-    """
-    rows = a.steps if last is None else last
-    row, ball = np.nonzero(a.contact[:rows] != b.contact[:rows])
-    columns: list[Any] = [row + 1, np.full(len(row), "contact"), ball]
-    columns += [run.contact[row, ball].astype(np.int64) for run in (a, b)]
-    columns += [-run.height[row, ball].astype(np.float64) for run in (a, b)]
-    columns += [height_bound(run.world, run.y[row, ball], run.v[row, ball]) for run in (a, b)]
-    found = [CrossDecision(*values) for values in zip(*(column.tolist() for column in columns), strict=True)]
-    if counts_alike(a, b):
-        found += _stops(a, b, rows)
-    return sorted(found, key=lambda flip: (flip.step, flip.channel == "stop", flip.ball))
-
-
-def _stops(a: BallRun, b: BallRun, rows: int) -> list[CrossDecision]:
-    """Solves whose iterations differ."""
-    shared = a.iterations.ndim == b.iterations.ndim == 1
-    if shared:
-        row = np.flatnonzero(a.iterations[:rows] != b.iterations[:rows])
-        ball = np.full(len(row), -1)
-    else:
-        counts = [run.iterations.reshape(run.steps, -1)[:rows] for run in (a, b)]
-        unequal = np.broadcast_to(counts[0] != counts[1], (rows, a.balls))
-        row, ball = np.nonzero(unequal & (_solving(a, rows) | _solving(b, rows)))
-    made = [_at(run.iterations, row, ball).astype(np.int64) for run in (a, b)]
-    fewer = np.minimum(*made)
-    margins, bounds = [], []
-    for run, count in zip((a, b), made, strict=True):
-        stopped, before, residual = (
-            _at(values, row, ball).astype(np.float64) for values in (run.margin, run.before, run.residual)
-        )
-        # the decision at which one went on and the other did not is on record in the run that stopped, and
-        # in the other if it stopped at the next
-        margin = np.where(count == fewer, stopped, np.where(count == fewer + 1, before, np.nan))
-        margins.append(margin)
-        compared = np.abs(residual + stopped - margin)
-        terms = 1 if run.iterations.ndim == 2 else run.balls
-        bounds.append(residual_bound(run.world, np.where(np.isfinite(compared), compared, 0.0), terms))
-    columns = (row + 1, np.full(len(row), "stop"), ball, *made, *margins, *bounds)
-    return [CrossDecision(*values) for values in zip(*(column.tolist() for column in columns), strict=True)]
-
-
-def _solving(run: BallRun, rows: int) -> np.ndarray:
-    """Whether iterations move each ball: where a shared rule goes on, balls that do not touch stay put."""
-    if isinstance(run.world.contact, Projection):
-        return run.contact[:rows]
-    return np.ones((rows, run.balls), bool)
-
-
-def _at(values: np.ndarray, row: np.ndarray, ball: np.ndarray) -> np.ndarray:
-    return values[row] if values.ndim == 1 else values[row, ball]
 
 
 def _stop_margin(run: BallRun, row: int, iteration: int, margin: float) -> float:
@@ -406,41 +318,6 @@ def _stop_margin(run: BallRun, row: int, iteration: int, margin: float) -> float
     rule = run.world.contact.stop
     first = jnp.asarray(run.history[row, 0])
     return float(rule.threshold(first, jnp.asarray(iteration))) - float(run.history[row, iteration])
-
-
-def overridden(
-    run: BallRun, last: int | None = None
-) -> tuple[Int[np.ndarray, "times"], Float[np.ndarray, "times"]]:
-    """How many imposed decisions a run would have made otherwise, and how far it was from them.
-
-    Args:
-        run: under imposed decisions.
-        last: the last step to compare; default all.
-
-    Returns:
-        the number at each step 0..last, and the largest |height - threshold| of its contacts, m, 0 for none.
-    """
-    rows = run.steps if last is None else last
-    # as it is compared: in the dtype of decisions
-    height = run.height[:rows].astype(run.world.policy.dtype("decision")).astype(np.float64)
-    before = np.vstack([np.asarray(run.y[:1] < 0), run.contact[:rows][:-1]]) if rows else run.contact[:0]
-    lift = 0.0 if run.world.lift is None else float(run.world.lift)
-    threshold = np.where(before, lift, 0.0)
-    own = np.where(before & (lift > 0), height <= lift, height < 0)
-    against = own != run.contact[:rows]
-    far = np.where(against, np.abs(height - threshold), 0.0)
-    margin, earlier = run.margin[:rows].astype(np.float64), run.before[:rows].astype(np.float64)
-    # it would have stopped just where it was made to if it went on before and stops there
-    solved = np.isfinite(run.residual[:rows].astype(np.float64))
-    held = (margin > 0) & (earlier <= 0)
-    world = run.world
-    rule = getattr(world.contact, "stop", None) or getattr(world.integrator, "stop", None)
-    if rule is not None:
-        held |= (run.iterations[:rows] >= rule.max_iter) & (earlier <= 0)
-    if solved.ndim == 2:
-        solved &= _solving(run, rows)
-    stops = (solved & ~held).reshape(rows, -1).sum(axis=1)
-    return np.r_[0, against.sum(axis=1) + stops], np.r_[0.0, far.max(axis=1, initial=0.0)]
 
 
 def _reordered(run: BallRun, order: Int[np.ndarray, "balls"]) -> BallRun:

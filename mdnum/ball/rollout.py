@@ -13,17 +13,15 @@ import numpy as np
 from jax import lax
 from jaxtyping import Bool, Float, Int
 
-from mdnum.ball.bounds import height_bound
 from mdnum.ball.contacts import Penalty
-from mdnum.ball.state import BallState, Decisions, Reason
+from mdnum.ball.state import BallDecisions, BallState, Reason
 from mdnum.ball.world import World
 from mdnum.errors import InputError
 from mdnum.events import Ledger, changes_in_time
+from mdnum.precision.bounds import gamma
 
 #: Balls times steps that leave the device at once.
 _CHUNK = 2**21
-#: Of the record, what is kept only with `keep`.
-_STATES = ("y", "v", "height")
 
 
 @dataclass(frozen=True)
@@ -82,11 +80,6 @@ class BallRun:
         return np.where(touched, self.contact.argmax(axis=0) + 1, -1)
 
     @property
-    def stop_margin(self) -> Float[np.ndarray, "steps ..."]:
-        """Threshold minus residual at the last stop decision of each step; NaN where nothing is solved."""
-        return self.margin
-
-    @property
     def final(self) -> tuple[np.ndarray, np.ndarray]:
         """Height and velocity at the end."""
         return self.y[-1], self.v[-1]
@@ -101,9 +94,9 @@ class BallRun:
         codes, counts = np.unique(self.reason, return_counts=True)
         return {Reason(code).word: int(n) for code, n in zip(codes, counts, strict=True)}
 
-    def told(self) -> Decisions:
-        """The decisions of all steps, to be told to another rollout."""
-        return Decisions(self.contact, self.iterations)  # type: ignore[arg-type]
+    def decisions(self) -> BallDecisions:
+        """The decisions of all steps, to be imposed on another rollout."""
+        return BallDecisions(self.contact, self.iterations)  # type: ignore[arg-type]
 
 
 def energy(world: World, y: np.ndarray, v: np.ndarray) -> Float[np.ndarray, "..."]:
@@ -125,7 +118,7 @@ def simulate(
     *,
     history: bool = False,
     keep: bool = True,
-    told: Decisions | None = None,
+    imposed: BallDecisions | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> BallRun:
     """Advance a batch of balls and record every decision.
@@ -136,7 +129,7 @@ def simulate(
         steps: steps to make.
         history: keep the residual of every stop decision too.
         keep: keep every state; otherwise the first and the last, and the flips.
-        told: decisions of every step to act on instead of the world's own, leading axis steps.
+        imposed: decisions of every step to act on instead of the world's own, leading axis steps.
         progress: called with the steps made and asked for.
 
     Returns:
@@ -149,60 +142,37 @@ def simulate(
         raise InputError(f"steps = {steps}; expected at least 1")
     balls = start.y.shape[0]
     chunk = max(1, min(steps, _CHUNK // max(balls, 1)))
-    parts: list[dict[str, np.ndarray]] = []
+    parts: list[dict[str, np.ndarray]] = [{"y": np.asarray(start.y)[None], "v": np.asarray(start.v)[None]}]
     ledgers: list[dict[str, np.ndarray]] = []
-    state, made = start, 0
-    before = np.asarray(start.touching)
-    y_rows, v_rows = [np.asarray(start.y)[None]], [np.asarray(start.v)[None]]
+    state, made, before = start, 0, np.asarray(start.touching)
     while made < steps:
         length = min(chunk, steps - made)
-        given = None if told is None else jax.tree.map(lambda x: x[made : made + length], told)  # noqa: B023
+        given = None if imposed is None else jax.tree.map(lambda x: x[made : made + length], imposed)  # noqa: B023
         state, out = _chunk(world, state, given, length, history)
         rows = {name: np.asarray(value) for name, value in out.items()}
-        ledgers.append(_flips(world, made, before, y_rows[-1][-1], v_rows[-1][-1], rows))
+        ledgers.append(_flips(world, made, before, parts[-1]["y"][-1], parts[-1]["v"][-1], rows))
         before = rows["contact"][-1]
-        last = slice(None) if keep else slice(-1, None)
-        y_rows.append(rows["y"][last])
-        v_rows.append(rows["v"][last])
-        parts.append({name: value for name, value in rows.items() if keep or name not in _STATES})
+        if not keep:
+            rows |= {"y": rows["y"][-1:], "v": rows["v"][-1:], "height": rows["height"][:0]}
+        parts.append(rows)
         made += length
         if progress is not None:
             progress(made, steps)
+    whole: dict[str, Any] = {
+        name: np.concatenate([part[name] for part in parts if name in part]) for name in parts[-1]
+    }
     if not keep:
-        y_rows, v_rows = [y_rows[0], y_rows[-1]], [v_rows[0], v_rows[-1]]
-
-    def whole(name: str) -> np.ndarray:
-        return np.concatenate([part[name] for part in parts])
-
-    return BallRun(
-        world=world,
-        steps=steps,
-        balls=balls,
-        y=np.concatenate(y_rows),
-        v=np.concatenate(v_rows),
-        height=whole("height") if keep else np.zeros((0, balls), y_rows[0].dtype),
-        contact=whole("contact"),
-        iterations=whole("iterations"),
-        reason=whole("reason"),
-        residual=whole("residual"),
-        margin=whole("margin"),
-        before=whole("before"),
-        history=whole("history") if history else None,
-        contacts=Ledger(
-            channel="contact",
-            **{name: np.concatenate([one[name] for one in ledgers]) for name in _LEDGER},
-            extra={"velocity": np.concatenate([one["velocity"] for one in ledgers])},
-        ),
-    )
-
-
-_LEDGER = ("step", "subject", "entered", "margin", "bound", "jump")
+        whole |= {name: whole[name][[0, -1]] for name in ("y", "v")}
+    flips = {name: np.concatenate([one[name] for one in ledgers]) for name in ledgers[0]}
+    velocity = flips.pop("velocity")
+    contacts = Ledger(channel="contact", **flips, extra={"velocity": velocity})
+    return BallRun(world=world, steps=steps, balls=balls, **{"history": None, **whole}, contacts=contacts)
 
 
 @eqx.filter_jit
-def _chunk(world: World, state: BallState, told: Any, length: int, history: bool) -> Any:
+def _chunk(world: World, state: BallState, imposed: Any, length: int, history: bool) -> Any:
     def step(state, given):
-        after, record = world.advance(state, told=given, history=history)
+        after, record = world.advance(state, imposed=given, history=history)
         solve = record.solve
         row = {
             "y": after.y,
@@ -217,7 +187,7 @@ def _chunk(world: World, state: BallState, told: Any, length: int, history: bool
         }
         return after, row | ({"history": solve.history} if history else {})
 
-    return lax.scan(step, state, told, length=length)
+    return lax.scan(step, state, imposed, length=length)
 
 
 def _flips(
@@ -262,3 +232,32 @@ def _flips(
         "jump": np.where(resets, jump, 0.0),
         "velocity": v_old,
     }
+
+
+def height_bound(
+    world: World, y: Float[np.ndarray, "..."], v: Float[np.ndarray, "..."]
+) -> Float[np.ndarray, "..."]:
+    """Bound on |computed - exact| of the height that a contact decision compares, m.
+
+    Four roundings on the way from the state before, none of which cancels more than the sum of its parts.
+
+    Args:
+        world: the program.
+        y, v: height (m) and velocity (m/s) of the state before.
+    """
+    y, v = np.asarray(y, np.float64), np.asarray(v, np.float64)
+    h, free = float(world.integrator.h), abs(float(world.gravity))
+    return gamma(4, world.policy.dtype("arithmetic")) * (np.abs(y) + h * np.abs(v) + h * h * free)
+
+
+def residual_bound(world: World, residual: Any, terms: int) -> Any:
+    """Bound on |computed - exact| of a residual, in its own unit.
+
+    All terms of a residual have one sign, so the error of their sum is at most gamma times the sum.
+
+    Args:
+        world: the program.
+        residual: what a stop decision compares.
+        terms: balls that it is a residual of; 1 where each has its own.
+    """
+    return gamma(max(terms - 1, 1), world.policy.dtype("accumulate")) * residual

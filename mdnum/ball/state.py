@@ -26,15 +26,15 @@ class BallState(NamedTuple):
     touching: Bool[Array, "balls"]
 
 
-class Decisions(NamedTuple):
-    """Everything that a step decides; or what a step is told to act on, in part or in whole.
+class BallDecisions(NamedTuple):
+    """Everything that a step decides; or what is imposed on a step, in part or in whole.
 
     Attributes:
-        contact: whether each ball is in contact, shape (balls,). A step may be told integers instead: 0 or 1,
-            and a negative number where it is to decide by itself.
-        iterations: how often the step's solver went on, shape () where one rule stops it for all balls,
-            (balls,) where each ball has its own; impacts located in the step for an event-located one. Told,
-            a negative number leaves it to the step.
+        contact: whether each ball is in contact, shape (balls,). Integers may be imposed instead: 0 or 1,
+            and a negative number where the step is to decide by itself.
+        iterations: iterations of the step's solver, shape () where one rule stops it for all balls,
+            (balls,) where each ball has its own; impacts located in the step for an event-located one. A
+            negative number, imposed, leaves it to the step.
     """
 
     contact: Bool[Array, "balls"] | Int[Array, "balls"]
@@ -78,7 +78,7 @@ class Solve(NamedTuple):
     history: Float[Array, "decisions"]
 
 
-class Record(NamedTuple):
+class BallRecord(NamedTuple):
     """What a step leaves.
 
     Attributes:
@@ -94,6 +94,6 @@ class Record(NamedTuple):
     solve: Solve
 
     @property
-    def decisions(self) -> Decisions:
-        """What the step decided, to be told to another step."""
-        return Decisions(self.contact, self.solve.iterations)
+    def decisions(self) -> BallDecisions:
+        """What the step decided, to be imposed on another."""
+        return BallDecisions(self.contact, self.solve.iterations)

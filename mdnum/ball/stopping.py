@@ -1,24 +1,30 @@
-"""When an iterative solver stops: rules as objects, each a threshold on a residual.
+"""Iterative solvers: rules that say when to stop, the loop they stop, and its derivatives.
 
-A rule turns the terms of a residual (one per ball) into the quantity that is compared. A sum over the batch
-couples balls that have nothing to do with one another, and its last bits depend on the order of summation;
-a rule per ball does neither.
+A rule turns the terms of a residual (one per ball) into the quantity that is compared with a threshold. A sum
+over the batch couples balls that have nothing to do with one another, and its last bits depend on the order
+of summation; a rule per ball does neither.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float, Int
 
+from mdnum.ball.state import Reason, Solve
 from mdnum.events import Threshold
+from mdnum.precision.policy import RolePrecision
 from mdnum.precision.reductions import Pairwise, Reduction
 
-#: Recorded for a rule that compares nothing.
-_NO_THRESHOLD = np.inf
+#: function(inputs, rest) -> (outputs, record); inputs and outputs are tuples of arrays of shape (balls,).
+Map = Callable[[tuple, Any], tuple[tuple, Any]]
 
 
 class StopRule(Protocol):
@@ -46,7 +52,7 @@ def stops(threshold: Float[Array, "..."], residual: Float[Array, "..."]) -> Bool
     return Threshold(threshold, "<", "residual").decide(residual)
 
 
-class _Tolerance(eqx.Module):
+class _ToleranceRule(eqx.Module):
     """A rule with one tolerance.
 
     Attributes:
@@ -62,8 +68,8 @@ class _Tolerance(eqx.Module):
         return jnp.broadcast_to(jnp.asarray(self.tol).astype(first.dtype), first.shape)
 
 
-class GlobalSum(_Tolerance):
-    """One residual for the batch: the sum of all terms, in the order that a reduction says."""
+class GlobalSum(_ToleranceRule):
+    """One residual for the batch: the sum of all terms, in the order of a reduction."""
 
     reduction: Reduction = eqx.field(static=True, default=Pairwise())
 
@@ -72,7 +78,7 @@ class GlobalSum(_Tolerance):
         return self.reduction(terms.astype(accumulate), zero).astype(decision)
 
 
-class PerInstance(_Tolerance):
+class PerInstance(_ToleranceRule):
     """A residual for each ball: a ball stops when its own is low enough, whatever the others do."""
 
     def measure(self, terms, accumulate, decision, zero):
@@ -80,7 +86,7 @@ class PerInstance(_Tolerance):
         return terms.astype(decision)
 
 
-class Maximum(_Tolerance):
+class Maximum(_ToleranceRule):
     """One residual for the batch: the largest term. No sum, so no order of summation."""
 
     def measure(self, terms, accumulate, decision, zero):
@@ -99,7 +105,7 @@ class Relative(GlobalSum):
         return jnp.where(first == 0, jnp.asarray(least, first.dtype), scaled)
 
 
-class Hysteresis(eqx.Module):
+class HysteresisStop(eqx.Module):
     """A rule with a gap: the solver starts only above one threshold, and then runs to below another.
 
     Attributes:
@@ -107,7 +113,7 @@ class Hysteresis(eqx.Module):
         enter: a residual below this starts no solve; at least the rule's tolerance.
     """
 
-    rule: _Tolerance
+    rule: _ToleranceRule
     enter: Any
 
     @property
@@ -125,8 +131,8 @@ class Hysteresis(eqx.Module):
         return jnp.where(iteration == 0, enter, self.rule.threshold(first, iteration))
 
 
-class Fixed(eqx.Module):
-    """So many iterations, whatever the residual: no decision, and no decision that could flip.
+class FixedCount(eqx.Module):
+    """A fixed number of iterations, whatever the residual: no decision, and none that could flip.
 
     Attributes:
         count: iterations; also the cap.
@@ -146,4 +152,150 @@ class Fixed(eqx.Module):
     def threshold(self, first, iteration):
         """Stops when the count is reached, and not before."""
         reached = jnp.broadcast_to(iteration >= self.count, first.shape)
-        return jnp.where(reached, _NO_THRESHOLD, -_NO_THRESHOLD).astype(first.dtype)
+        return jnp.where(reached, np.inf, -np.inf).astype(first.dtype)
+
+
+def iterate(
+    rule: StopRule,
+    start: Any,
+    update: Callable[[Any], Any],
+    terms: Callable[[Any], Float[Array, "balls"]],
+    policy: RolePrecision,
+    zero: Int[Array, ""],
+    *,
+    imposed: Int[Array, "..."] | None = None,
+    history: bool = False,
+) -> tuple[Any, Solve]:
+    """Update until the rule stops it, its cap ends it, or the imposed number of iterations is reached.
+
+    Args:
+        rule: when to stop.
+        start: a pytree of arrays of shape (balls,).
+        update: one iteration.
+        terms: of the residual, one per ball.
+        policy: dtypes of sums and decisions.
+        zero: runtime zero for fenced sums.
+        imposed: iterations to make instead of the rule's own; a negative number leaves it to the rule.
+        history: whether to keep the residual of every decision.
+
+    Returns:
+        where it ended, and the record.
+    """
+    accumulate, decision = policy.dtype("accumulate"), policy.dtype("decision")
+
+    def measure(x):
+        return lax.stop_gradient(rule.measure(terms(x), accumulate, decision, zero))
+
+    def goes_on(stopped, iterations):
+        own = ~stopped & (iterations < rule.max_iter)
+        return own if imposed is None else jnp.where(imposed < 0, own, iterations < imposed)
+
+    def note(kept, iterations, residual):
+        if not history:
+            return kept
+        # with a count per ball the loop has made as many rounds as its busiest ball has iterations
+        return kept.at[jnp.max(iterations)].set(jnp.max(residual))
+
+    first = measure(start)
+    if imposed is not None:
+        # one rule for the batch may be given a count for each ball
+        first = jnp.broadcast_to(first, jnp.broadcast_shapes(first.shape, imposed.shape))
+    none = jnp.zeros(first.shape, jnp.int32)
+    threshold = rule.threshold(first, none)
+    kept = jnp.full(rule.max_iter + 1 if history else 0, jnp.nan, decision)
+
+    def body(carry):
+        x, iterations, residual, margin, before, stopped, kept = carry
+        on = goes_on(stopped, iterations)
+        x = jax.tree.map(lambda new, old: jnp.where(on, new, old), update(x), x)
+        iterations = iterations + on.astype(jnp.int32)
+        now = measure(x)
+        threshold = rule.threshold(first, iterations)
+        return (
+            x,
+            iterations,
+            jnp.where(on, now, residual),
+            jnp.where(on, threshold - now, margin),
+            jnp.where(on, margin, before),
+            jnp.where(on, stops(threshold, now), stopped),
+            note(kept, iterations, now),
+        )
+
+    before = jnp.full(first.shape, -jnp.inf, decision)
+    carry = (start, none, first, threshold - first, before, stops(threshold, first), note(kept, none, first))
+    x, iterations, residual, margin, before, stopped, kept = lax.while_loop(
+        lambda carry: jnp.any(goes_on(carry[5], carry[1])), body, carry
+    )
+    met = Reason.FIXED if isinstance(rule, FixedCount) else Reason.TOLERANCE
+    reason = jnp.where(stopped, met.value, Reason.CAP.value)
+    reason = jnp.where(jnp.isfinite(residual), reason, Reason.NOT_FINITE.value).astype(jnp.int8)
+    return x, Solve(iterations, reason, residual, margin, before, kept)
+
+
+def no_solve(dtype: Any) -> Solve:
+    """The record of a step without a solver."""
+    none, nan = jnp.zeros((), jnp.int32), jnp.asarray(jnp.nan, dtype)
+    return Solve(none, jnp.asarray(Reason.NONE.value, jnp.int8), nan, nan, nan, jnp.zeros(0, dtype))
+
+
+def elementwise(function: Map) -> Map:
+    """A map with both derivative modes, for a function of each ball alone that contains a while_loop.
+
+    A `while_loop` has no reverse mode in JAX, because its tape would have no fixed size. A map that treats
+    each ball by itself has a diagonal Jacobian, though, whatever decides when its loop ends: a few tangents
+    carried along in the same loop give all of it, and nothing is stored per iteration. The derivative is that
+    of the iterations which ran, with every decision held fixed. The record, and whatever is in `rest`,
+    carries none.
+
+    Args:
+        function: output b of every output depends on input b of every input only (and on `rest`).
+
+    Returns:
+        the same function, forward and reverse differentiable.
+
+    Error: tangents are propagated in the dtype of the inputs, a rounding per operation.
+    """
+
+    @jax.custom_jvp
+    def apply(inputs, rest):
+        return function(inputs, rest)
+
+    def rule(primals, tangents):
+        inputs, rest = primals
+        # an input that nothing differentiated depends on needs no tangent of its own in the loop
+        moving = [k for k, rate in enumerate(tangents[0]) if not isinstance(rate, SymbolicZero)]
+
+        def outputs(*given):
+            every = list(inputs)
+            for k, value in zip(moving, given, strict=True):
+                every[k] = value
+            return function(tuple(every), rest)
+
+        varied = tuple(inputs[k] for k in moving)
+        if not moving:
+            made, record = outputs()
+            return (made, record), (jax.tree.map(jnp.zeros_like, made), jax.tree.map(_no_tangent, record))
+        basis = tuple(
+            jnp.stack([jnp.full_like(x, row == column) for row in range(len(moving))])
+            for column, x in enumerate(varied)
+        )
+
+        def along(direction):
+            return jax.jvp(outputs, varied, direction, has_aux=True)
+
+        made, jacobian, record = jax.vmap(along, out_axes=(None, 0, None))(basis)
+        slopes = [tangents[0][k] for k in moving]
+        rates = tuple(
+            sum((rows[k] * slopes[k] for k in range(1, len(moving))), rows[0] * slopes[0])
+            for rows in jacobian
+        )
+        return (made, record), (rates, jax.tree.map(_no_tangent, record))
+
+    apply.defjvp(rule, symbolic_zeros=True)
+    return apply
+
+
+def _no_tangent(leaf: Any) -> Any:
+    if jnp.issubdtype(leaf.dtype, jnp.floating):
+        return jnp.zeros_like(leaf)
+    return np.zeros(leaf.shape, jax.dtypes.float0)

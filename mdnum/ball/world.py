@@ -1,7 +1,8 @@
-"""The bouncing ball as a program: decide outside, act inside (the contract of mdnum.dynamics)."""
+"""The bouncing ball as a program: decide outside, act inside."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -11,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
 
-from mdnum.ball import checks
-from mdnum.ball.contacts import Contact, Motion
-from mdnum.ball.integrators import Balls, Integrator, Rounding
-from mdnum.ball.state import BallState, Decisions, Record
+from mdnum.ball import limits, stopping
+from mdnum.ball.contacts import Contact, Impact, Motion, Penalty, Projection
+from mdnum.ball.integrators import Balls, EventLocated, Rounding, Scheme
+from mdnum.ball.state import BallDecisions, BallRecord, BallState
 from mdnum.errors import InputError
 from mdnum.events import Hysteresis, Threshold
 from mdnum.precision.exact import zero_bits
@@ -37,6 +38,8 @@ _PLACES: Mapping[str, tuple[tuple[str, ...], ...]] = {
 }
 #: Compared in the dtype of decisions, so not rounded to the dtype of arithmetic before.
 _DECIDING = ("tol", "enter")
+#: Iterations are counted in 32 bits.
+_MOST_ITERATIONS = 2**31 - 1
 
 
 class World(eqx.Module):
@@ -56,7 +59,7 @@ class World(eqx.Module):
     """
 
     contact: Contact
-    integrator: Integrator
+    integrator: Scheme
     gravity: Any
     control: Any
     lift: Any
@@ -67,7 +70,7 @@ class World(eqx.Module):
     def create(
         cls,
         contact: Contact,
-        integrator: Integrator,
+        integrator: Scheme,
         gravity: float = 9.81,
         control: Any = None,
         policy: RolePrecision | None = None,
@@ -86,7 +89,7 @@ class World(eqx.Module):
             InputError: a number out of range, or parts that do not go together.
         """
         policy = RolePrecision() if policy is None else policy
-        checks.check(contact, integrator, gravity, control, policy, hysteresis)
+        _check(contact, integrator, gravity, control, policy, hysteresis)
         world = cls(
             contact, integrator, gravity, control, hysteresis, Rounding(zero_bits(np.float64)), policy
         )
@@ -156,14 +159,6 @@ class World(eqx.Module):
         leave = Threshold(self.lift.astype(height.dtype), "<=", "height")
         return jnp.asarray(Hysteresis(enter, leave).decide(height, before))
 
-    def margins(self, state: BallState) -> Balls:
-        """Signed distances to contact, m: minus the height that the coming step decides on."""
-        return -self.advance(state)[1].height
-
-    def decide(self, state: BallState) -> Decisions:
-        """What the coming step decides."""
-        return self.advance(state)[1].decisions
-
     # -- act -------------------------------------------------------------------------------------------
 
     def start(self, y: Any, v: Any = 0.0) -> BallState:
@@ -183,18 +178,14 @@ class World(eqx.Module):
         )
         return BallState(step, y, v, a, touching)
 
-    def step(self, state: BallState, decisions: Decisions) -> BallState:
-        """The next state, acting on the decisions it is told."""
-        return self.advance(state, told=decisions)[0]
-
     def advance(
-        self, state: BallState, *, told: Decisions | None = None, history: bool = False
-    ) -> tuple[BallState, Record]:
-        """Decide and act: the bits of `step` with the decisions of `decide`.
+        self, state: BallState, *, imposed: BallDecisions | None = None, history: bool = False
+    ) -> tuple[BallState, BallRecord]:
+        """Decide and act.
 
         Args:
             state: at this step.
-            told: decisions to act on instead of its own, or instead of some of them (see `Decisions`).
+            imposed: decisions to act on instead of its own, or instead of some of them (see `BallDecisions`).
             history: whether a solver keeps the residual of every decision.
 
         Returns:
@@ -207,8 +198,8 @@ class World(eqx.Module):
                 v=state.v.astype(arithmetic),
                 carried=state.a.astype(arithmetic),
                 free=self._free(state.step, state.y.shape),
-                judge=self._judge(state, told),
-                told=None if told is None else told.iterations,
+                judge=self._judge(state, imposed),
+                imposed=None if imposed is None else imposed.iterations,
                 integrator=self.integrator,
                 policy=self.policy,
                 rounding=self.rounding,
@@ -220,10 +211,12 @@ class World(eqx.Module):
         record = jax.tree.map(jax.lax.stop_gradient, moved.record)._replace(left=moved.record.left)
         return BallState(step, y, v, moved.a, moved.record.contact), record
 
-    def _judge(self, state: BallState, told: Decisions | None) -> Callable[[Balls], Bool[Array, "balls"]]:
-        if told is None:
+    def _judge(
+        self, state: BallState, imposed: BallDecisions | None
+    ) -> Callable[[Balls], Bool[Array, "balls"]]:
+        if imposed is None:
             return lambda height: self.touches(height, state.touching)
-        contact = told.contact
+        contact = imposed.contact
         if contact.dtype == bool:
             return lambda _: contact
         return lambda height: jnp.where(contact < 0, self.touches(height, state.touching), contact > 0)
@@ -247,3 +240,94 @@ def _get(node: Any, path: tuple[str, ...]) -> Any:
     for part in path:
         node = getattr(node, part)
     return node
+
+
+def _check(
+    contact: Any, integrator: Any, gravity: Any, control: Any, policy: RolePrecision, lift: Any
+) -> None:
+    """Refuse numbers out of range and parts that do not go together, before anything runs."""
+    _in_range("timestep h", integrator.h, above=0.0)
+    _in_range("gravity", gravity, least=-np.inf)
+    if lift is not None and not float(lift) >= 0:
+        raise InputError(f"hysteresis = {lift}; a contact ends at a height of 0 or more")
+    if control is not None and not np.all(np.isfinite(np.asarray(control, np.float64))):
+        raise InputError("the control holds a number that is not finite")
+    if isinstance(integrator, EventLocated):
+        if not isinstance(contact, Impact):
+            raise InputError(
+                "an event-located step needs an impact",
+                remedy="A penalty or a projection has no instant of contact; choose another integrator",
+            )
+        _count("max_impacts", integrator.max_impacts)
+    if isinstance(contact, Penalty):
+        _in_range("stiffness k", contact.k, above=0.0)
+        _in_range("damping", contact.damping)
+        if contact.smooth:
+            _in_range("softplus width eps", contact.eps, above=0.0)
+    else:
+        _in_range("restitution", contact.restitution, most=1.0)  # type: ignore[union-attr]
+    if isinstance(contact, Impact):
+        _in_range("rest_speed", contact.rest_speed)
+    if isinstance(contact, Projection):
+        _in_range("gain k", contact.k, above=0.0)
+        _in_range("alpha", contact.alpha, above=0.0)
+        gain = float(contact.alpha) * float(contact.k)
+        if gain >= 2:
+            raise InputError(
+                f"alpha * k = {gain:g}: each iteration leaves {abs(1 - gain):g} of the penetration,"
+                " so the projection cannot converge",
+                remedy="Choose alpha * k below 2; at 1 one iteration is enough",
+            )
+        _check_stop(contact.stop, policy, gain)
+    stop = getattr(integrator, "stop", None)
+    if stop is not None:
+        _check_stop(stop, policy, 1.0)
+
+
+def _check_stop(rule: Any, policy: RolePrecision, gain: float) -> None:
+    """Refuse a stopping rule out of range, or with a tolerance that the dtypes can never meet."""
+    _count("max_iter", rule.max_iter)
+    if isinstance(rule, stopping.FixedCount):
+        return
+    if isinstance(rule, stopping.HysteresisStop):
+        _check_stop(rule.rule, policy, gain)
+        if not float(rule.enter) >= float(rule.rule.tol):
+            raise InputError(
+                f"enter = {rule.enter} is below tol = {rule.rule.tol}",
+                remedy="The solver starts above enter and stops below tol: enter is the larger one",
+            )
+        return
+    tol = float(rule.tol)
+    _in_range("tolerance tol", tol, above=0.0)
+    relative, summed = isinstance(rule, stopping.Relative), isinstance(rule, stopping.GlobalSum)
+    kind = "relative" if relative else "sum" if summed else "term"
+    usable = limits.smallest_tolerance(policy, gain, kind)
+    role = max(usable, key=lambda one: usable[one])
+    if tol < usable[role]:
+        raise InputError(
+            f"tol = {tol:g} cannot be met with {role} in {getattr(policy, role)}",
+            remedy=f"The smallest usable tolerance is {usable[role]:.3g}",
+        )
+    limit = limits.largest(policy.decision)
+    if tol > limit:
+        raise InputError(f"tol = {tol:g} is beyond the largest {policy.decision}, {limit:g}")
+
+
+def _count(name: str, value: int) -> None:
+    if not 1 <= value <= _MOST_ITERATIONS:
+        raise InputError(f"{name} = {value}; expected a number from 1 to {_MOST_ITERATIONS}")
+
+
+def _in_range(
+    name: str, value: Any, *, least: float = 0.0, most: float = math.inf, above: float | None = None
+) -> None:
+    x = float(value)
+    if math.isfinite(x) and least <= x <= most and (above is None or x > above):
+        return
+    if above is not None:
+        expected = f"finite number above {above:g}"
+    elif most < math.inf:
+        expected = f"number from {least:g} to {most:g}"
+    else:
+        expected = "finite number" + (f", {least:g} or more" if least > -math.inf else "")
+    raise InputError(f"{name} = {value}; expected a {expected}")

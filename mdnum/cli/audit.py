@@ -7,8 +7,13 @@ from pathlib import Path
 import typer
 
 from mdnum.cli import output
-from mdnum.cli.audit_print import by_cause, print_rows
 from mdnum.cli.progress import watched
+
+
+def _names() -> str:
+    from mdnum.audit.checks import CHECKS
+
+    return ", ".join(CHECKS)
 
 
 def audit(
@@ -24,11 +29,7 @@ def audit(
         metavar="FILE[@N]",
         help="A structure, the N-th of a file's (from 0; the last by default); one is built by default.",
     ),
-    checks: list[str] | None = typer.Option(
-        None,
-        metavar="WORD,WORD",
-        help="Only these: invariance, smoothness, forces, curl, state, dynamics.",
-    ),
+    checks: list[str] | None = typer.Option(None, metavar="NAME,NAME", help=f"Only these: {_names()}."),
     temperature: float | None = typer.Option(
         None, min=0.0, metavar="KELVIN", help="For kT and for the run; 300 K by default."
     ),
@@ -37,7 +38,7 @@ def audit(
     ),
     steps: int | None = typer.Option(None, min=16, help="Of the run; 200 by default."),
     time: float | None = typer.Option(
-        None, metavar="MINUTES", help="Ask nothing more after that; what was not asked is told."
+        None, metavar="MINUTES", help="Ask nothing more after that; what was not asked is listed."
     ),
     out: Path | None = typer.Option(
         None, "-o", "--out", metavar="DIR", help="The audit folder; runs/audit-NAME-N by default."
@@ -48,7 +49,7 @@ def audit(
     no_report: bool = typer.Option(False, "--no-report", help="Do not write report.html."),
     as_json: bool = output.JSON_OPTION,
 ) -> int:
-    """Ask any ASE calculator: is it smooth, invariant, conservative, forgetful, and does it keep energy?
+    """Ask any ASE calculator: is it smooth, invariant, conservative, free of memory, does it keep energy?
 
     Runs the Python that makes the calculator, with --resume what the folder names. No other verb but
     `conform` runs Python that it is given.
@@ -59,31 +60,19 @@ def audit(
     stopped = False
     folder = resume or out
 
-    def go_on() -> str | None:
-        begun = folder is not None and (folder / "checkpoint.npz").exists()
+    def remedy() -> str | None:
+        begun = folder is not None and (folder / "answers.json").exists()
         return f"Continue with `mdnum audit --resume {folder}`" if begun else None
 
     notes = output.noted(resume)
-    with watched(go_on) as progress:
+    with watched(remedy) as progress:
         try:
-            result = ask(
-                calculator,
-                structure,
-                checks=checks or None,
-                temperature=temperature,
-                timestep=timestep,
-                steps=steps,
-                time=time,
-                out=out,
-                resume=resume,
-                report=not no_report,
-                progress=progress,
-            )
+            outcome = ask(
+                calculator, structure, checks=checks or None, temperature=temperature, timestep=timestep,
+                steps=steps, time=time, out=out, resume=resume, report=not no_report, progress=progress,
+            )  # fmt: skip
         except AuditStopped as stop:
-            result, stopped = stop.result, True
+            outcome, stopped = stop.outcome, True
     output.print_lines(notes)
-    summary = result.summary if as_json else by_cause(result.summary)
-    code = output.answer(result.folder, summary, print_rows, as_json=as_json)
-    if result.summary["status"] != "complete" and not as_json:
-        typer.echo(f"ask the rest, and anew what was cut short: mdnum audit --resume {result.folder}")
+    code = output.print_outcome(outcome, as_json=as_json)
     return output.EXIT_STOPPED if stopped else code

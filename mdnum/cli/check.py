@@ -1,9 +1,6 @@
-"""`mdnum check`: a system against ASE and against other pair finders."""
+"""`mdnum check`: a system against ASE and against other neighbor searches."""
 
 from __future__ import annotations
-
-import importlib
-from typing import Any
 
 import typer
 
@@ -18,7 +15,7 @@ def energy(
     as_json: bool = output.JSON_OPTION,
 ) -> int:
     """Compare energy, forces and stress with ASE."""
-    return _check("check_energy", "energy, forces and stress against ASE", system, settings, as_json)
+    return _check("energy", "energy, forces and stress against ASE", system, settings, as_json)
 
 
 def pairs(
@@ -26,8 +23,8 @@ def pairs(
     settings: list[str] | None = output.SET_OPTION,
     as_json: bool = output.JSON_OPTION,
 ) -> int:
-    """Compare every pair finder with brute force."""
-    return _check("check_pairs", "pair sets against brute force", system, settings, as_json)
+    """Compare every neighbor search with brute force."""
+    return _check("pairs", "pair sets against brute force", system, settings, as_json)
 
 
 def dynamics(
@@ -36,18 +33,18 @@ def dynamics(
     as_json: bool = output.JSON_OPTION,
 ) -> int:
     """Compare 100 NVE steps with ASE's VelocityVerlet."""
-    return _check("check_dynamics", "100 NVE steps against ASE", system, settings, as_json)
+    return _check("dynamics", "100 NVE steps against ASE", system, settings, as_json)
 
 
-def _check(function: str, title: str, name: str, settings: list[str] | None, as_json: bool) -> int:
+def _check(question: str, title: str, name: str, settings: list[str] | None, as_json: bool) -> int:
     from mdnum import systems
+    from mdnum.workflow.check import check
 
-    system = systems.load(name, output.parse_overrides(settings), world="md")
-    report: Any = getattr(importlib.import_module("mdnum.references.check"), function)(system)
+    checked = check(question, systems.load(name, output.parse_overrides(settings), world="md"))
     if as_json:
-        output.print_json({"ok": report.ok, **report.to_dict()})
+        output.print_json(checked.summary)
     else:
-        output.print_records(f"{system.name}: {title}", report.rows())
-        output.print_findings(report.findings)
-        output.say("agrees" if report.ok else "does not agree")
-    return output.exit_code(report.findings, ok=report.ok)
+        output.print_records(f"{name}: {title}", checked.report.rows())
+        output.print_findings(checked.verdict.findings)
+        output.say(checked.verdict.headline)
+    return output.exit_code(checked.verdict.findings, ok=checked.report.ok)

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import typer
 
 from mdnum.cli import output
 from mdnum.cli.progress import watched
-from mdnum.errors import InputError
 
 
 def conform(
@@ -41,10 +38,10 @@ def conform(
     ),
     no_large: bool = typer.Option(False, "--no-large", help="Leave out 5,000 and 100,000 atoms."),
     time: float | None = typer.Option(
-        None, metavar="MINUTES", help="Begin no case after that; what was not asked is told."
+        None, metavar="MINUTES", help="Begin no case after that; what was not asked is reported."
     ),
     resume: Path | None = typer.Option(
-        None, metavar="DIR", help="Go on with the examination in this folder, with its options."
+        None, metavar="DIR", help="Resume the examination in this folder, with its options."
     ),
     out: Path | None = typer.Option(
         None, "-o", "--out", metavar="DIR", help="The folder; runs/conform-NAME-N by default."
@@ -60,18 +57,20 @@ def conform(
     if pairs is None and resume is None:
         return _names(as_json)
     if resume is not None:
-        _refuse_beside_resume(
-            {
-                "LIST": pairs, "--cases": cases, "--seed": seed, "--full": full, "--precision": precision,
-                "--superset": superset, "--limits": limits, "--no-large": no_large, "--out": out,
-            }
-        )  # fmt: skip
+        from mdnum.workflow import frame
+
+        given = {
+            "LIST": pairs, "--cases": cases, "--seed": seed, "--full": full, "--precision": precision,
+            "--superset": superset, "--limits": limits, "--no-large": no_large, "--out": out,
+        }  # fmt: skip
+        asked = {name: value not in (None, False, 0) for name, value in given.items()}
+        frame.refuse(asked, "of a new examination", "Leave it out beside --resume, or begin in a new folder")
     from mdnum.workflow.conform import conform as examine
 
     words = tuple(word.strip() for one in limits or () for word in one.split(",") if word.strip())
     notes = output.noted(resume)
     with watched(lambda: _to_go_on(resume or out)) as progress:
-        result = examine(
+        outcome = examine(
             pairs,
             cases=cases,
             seed=seed,
@@ -87,23 +86,13 @@ def conform(
             progress=progress,
         )
     output.print_lines(notes)
-    return output.answer(result.folder, result.summary, _print, as_json=as_json)
-
-
-def _refuse_beside_resume(given: Mapping[str, Any]) -> None:
-    """Raises InputError for what a folder that is gone on with has already."""
-    told = [word for word, value in given.items() if value not in (None, False, 0)]
-    if told:
-        raise InputError(
-            f"--resume goes on with the list and the options of its folder, so {told[0]} cannot be given",
-            remedy="Leave it out, or begin in a new folder",
-        )
+    return output.print_outcome(outcome, as_json=as_json)
 
 
 def _to_go_on(folder: Path | None) -> str:
     """What to do after control-C."""
     name = folder or "DIR, which is the newest runs/conform-NAME-N"
-    return f"What was found is in the folder; go on with `mdnum conform --resume {name}`"
+    return f"What was found is in the folder; resume it with `mdnum conform --resume {name}`"
 
 
 def _names(as_json: bool) -> int:
@@ -111,7 +100,8 @@ def _names(as_json: bool) -> int:
     from mdnum.references.conformance.loading import known
 
     rows = [
-        {"list": one.name, "version": one.version, "kept": one.kept, "what": one.about} for one in known()
+        {"list": one.name, "version": one.version, "kept": one.kept, "what": one.description}
+        for one in known()
     ]
     if as_json:
         output.print_json({"lists": rows})
@@ -126,30 +116,3 @@ def _names(as_json: bool) -> int:
     output.say("a class with allocate(positions, cell, pbc, r_cut, skin) and update(positions, cell) is a")
     output.say("list that is kept.")
     return output.EXIT_FINE
-
-
-def _print(summary: Mapping[str, Any]) -> None:
-    """A row for each area, and the scripts."""
-    output.print_table(
-        "",
-        ("area", "asked", "right", "wrong", "no answer", "refused", "not asked", "about"),
-        [
-            (
-                row["area"],
-                row["asked"],
-                row["passed"],
-                row["failed"] - row["silent"] or None,
-                row["silent"] or None,
-                row["refused"] or None,
-                row["skipped"] or None,
-                row["about"],
-            )
-            for row in summary["areas"]
-        ],
-    )
-    if summary["failures"]:
-        output.print_table(
-            "reproduced without mdnum by",
-            ("script", "atoms", "steps", "what is wrong"),
-            [(row["script"], row["atoms"], row["steps"], row["text"]) for row in summary["failures"]],
-        )

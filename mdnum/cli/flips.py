@@ -7,7 +7,6 @@ from pathlib import Path
 import typer
 
 from mdnum.cli import output
-from mdnum.cli.flips_print import print_comparison, print_rows
 from mdnum.cli.progress import watched
 
 
@@ -17,7 +16,7 @@ def flips(
         help="A file that MDAnalysis or ASE reads, or the folder of a run; frames behind an @: run.xtc@100:",
     ),
     other: str | None = typer.Argument(
-        None, metavar="[OTHER]", help="A second trajectory of the same atoms: where do the two part?"
+        None, metavar="[OTHER]", help="A second trajectory of the same atoms: where do the two diverge?"
     ),
     topology: Path | None = typer.Option(
         None, "-s", "--topology", metavar="FILE", help="What the atoms are, for xtc, trr, dcd, netcdf, ..."
@@ -47,7 +46,7 @@ def flips(
         help='Pairs with one atom in each selection (MDAnalysis\'s language), "name OW" "protein".',
     ),
     window: int = typer.Option(
-        5, "--window", min=1, metavar="FRAMES", help="A flip taken back within so many frames is chatter."
+        5, "--window", min=1, metavar="FRAMES", help="A flip reversed within so many frames is chatter."
     ),
     format: str | None = typer.Option(
         None, "--format", metavar="WORD", help="The file's format, where its name does not tell."
@@ -77,6 +76,5 @@ def flips(
             report=not no_report,
             progress=progress,
         )
-    rows = print_rows if other is None else print_comparison
-    code = output.answer(result.folder, result.summary, rows, as_json=as_json)
-    return output.EXIT_STOPPED if result.summary.get("interrupted") else code
+    code = output.print_outcome(result, as_json=as_json)
+    return output.EXIT_STOPPED if result.summary["interrupted"] else code

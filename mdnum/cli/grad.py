@@ -7,7 +7,6 @@ from pathlib import Path
 import typer
 
 from mdnum.cli import output
-from mdnum.cli.grad_print import print_rows
 from mdnum.cli.progress import watched
 
 
@@ -52,7 +51,7 @@ def grad(
     from mdnum.workflow import grad as differentiate
 
     with watched() as progress:
-        result = differentiate(
+        outcome = differentiate(
             system,
             of,
             wrt or (),
@@ -66,4 +65,4 @@ def grad(
             report=not no_report,
             progress=progress,
         )
-    return output.answer(result.folder, result.summary, print_rows, as_json=as_json)
+    return output.print_outcome(outcome, as_json=as_json)

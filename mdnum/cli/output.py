@@ -218,7 +218,11 @@ def print_outcome(outcome: Outcome, *, as_json: bool) -> int:
                     out.print(f"  {part}", markup=False)
                 elif type(part).__name__ == "Table":
                     _print_part(part)
-    print_findings(finding for finding in outcome.verdict.findings if not finding.cause)
+    for head in (finding for finding in outcome.verdict.findings if not finding.cause):
+        print_findings([head])
+        below = dict.fromkeys(one.title for one in outcome.verdict.findings if one.cause == head.code)
+        if below:
+            out.print(f"  What may follow from it: {'; '.join(below)}.", markup=False)
     report = outcome.folder / "report.html"
     out.print(f"wrote {report if report.exists() else outcome.folder}", markup=False)
     return code

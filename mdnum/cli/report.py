@@ -14,12 +14,9 @@ def report(
     as_json: bool = output.JSON_OPTION,
 ) -> int:
     """Write the report of a run folder again."""
-    from mdnum.report import write
-    from mdnum.store import RunFolder
     from mdnum.workflow import frame
 
-    opened = RunFolder.open(folder)
-    written = frame.finish(opened).folder / "report.html" if frame.on_frame(opened) else write(folder)
+    written = frame.finish(folder).folder / "report.html"
     output.print_notes(folder)
     if as_json:
         output.print_json({"folder": folder, "report": written})

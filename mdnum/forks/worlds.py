@@ -54,13 +54,14 @@ def varied(system: Any, values: Mapping[str, Any], name: str | None = None) -> A
 
         name = name or ", ".join(values)
         return replace(system, spec=vary(name, values, system.spec, f"--vary {name}").spec, variants=())
-    from mdnum.systems import overrides, structures, toml
+    from mdnum.systems import structures, toml
+    from mdnum.systems.grammar import apply_overrides
     from mdnum.systems.load import GRAMMAR
     from mdnum.systems.schema import SystemSpec
 
     data = system.spec.model_dump(mode="python", exclude_none=True)
     keys = {toml.dotted(key): value for key, value in values.items()}
-    overrides.apply(data, keys, GRAMMAR)
+    apply_overrides(data, keys, GRAMMAR)
     try:
         spec = SystemSpec.model_validate(data)
     except ValidationError as error:

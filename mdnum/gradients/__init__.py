@@ -1,11 +1,10 @@
-"""Gradients of long rollouts that can be trusted, and that say how far.
+"""Gradients of long rollouts, and how far each can be trusted.
 
 A rollout is differentiated at the states and decisions that it recorded; what the flips on the way add is a
-term of its own. Each way of doing it is an object behind one contract (`mdnum.gradients.base`).
+term of its own. Each way of doing it is a `Method`, each number that can be differentiated a `Loss`.
 """
 
 from mdnum.gradients.api import differentiable, value_and_grad
-from mdnum.gradients.base import Gradient, Method, Problem
-from mdnum.gradients.registry import METHODS, by_word
+from mdnum.gradients.problem import METHODS, Gradient, Method, Problem, method
 
-__all__ = ["METHODS", "Gradient", "Method", "Problem", "by_word", "differentiable", "value_and_grad"]
+__all__ = ["METHODS", "Gradient", "Method", "Problem", "differentiable", "method", "value_and_grad"]

@@ -19,13 +19,11 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from mdnum.errors import InputError
-from mdnum.gradients import conservative
 from mdnum.gradients.crossings import Crossings, crossings, onto_crossings
-from mdnum.gradients.loops import over_rows
-from mdnum.gradients.losses import Frame
-from mdnum.gradients.pairs import FORCE, MODEL, SCALE, pull_back
+from mdnum.gradients.forces import FORCE, MODEL, SCALE, pull_back
+from mdnum.gradients.losses import LossFrame
 from mdnum.gradients.parameters import Cotangents, quantities
-from mdnum.gradients.tape import Stretch, Tape, frame_of, rows_of, unsorted
+from mdnum.gradients.tape import RunTape, TapeStretch, frame_of, over_rows, unsorted
 from mdnum.md.integrators import Integrator
 from mdnum.md.manyforce import ManyBodyForce
 from mdnum.md.pairforce import PairForce
@@ -34,7 +32,7 @@ from mdnum.md.pairforce import PairForce
 ALL = frozenset((MODEL, SCALE, FORCE))
 
 
-class Carry(NamedTuple):
+class AdjointCarry(NamedTuple):
     """What the reverse pass carries from step to step.
 
     Attributes:
@@ -66,9 +64,9 @@ class Trace(NamedTuple):
     Attributes:
         x, v: cotangents of positions and velocities, in the order of the stretch's list, shape
             (room, 3, atoms).
-        model, integrator, scale, r_cut: as in `Carry`, with a leading axis of rows: what the steps from here
-            to the end have added.
-        frame: as in `Carry`, each of shape (room,).
+        model, integrator, scale, r_cut: as in `AdjointCarry`, with a leading axis of rows: what the steps
+            from here to the end have added.
+        frame: as in `AdjointCarry`, each of shape (room,).
     """
 
     x: Float[Array, "room 3 atoms"]
@@ -81,13 +79,13 @@ class Trace(NamedTuple):
 
 
 def reverse(
-    tape: Tape,
+    tape: RunTape,
     *,
     wanted: frozenset[str] = ALL,
     saltation: bool = False,
     guard: float = 0.0,
     progress: Callable[[int, int], None] | None = None,
-    watch: Callable[[Stretch, Trace], None] | None = None,
+    watch: Callable[[TapeStretch, Trace], None] | None = None,
 ) -> tuple[Cotangents, list[Crossings]]:
     """Derivatives of a tape's loss by everything that the run is made of.
 
@@ -108,7 +106,7 @@ def reverse(
     Error: of the order of a rounding error times the growth of the adjoint; none of truncation, for the
     program as it ran.
     """
-    back = Backward(tape, wanted, guard if saltation else None)
+    back = StretchReversal(tape, wanted, guard if saltation else None)
     found: list[Crossings] = []
     for stretch in tape.backward():
         weights, trace = back.through(stretch, traced=watch is not None)
@@ -121,7 +119,7 @@ def reverse(
     return back.cotangents(), found
 
 
-class Backward:
+class StretchReversal:
     """A reverse pass on its way, from the end of a tape to its start.
 
     Args:
@@ -137,7 +135,7 @@ class Backward:
         InputError: a many-body potential with its flips.
     """
 
-    def __init__(self, tape: Tape, wanted: frozenset[str], guard: float | None):
+    def __init__(self, tape: RunTape, wanted: frozenset[str], guard: float | None):
         simulation = tape.simulation
         force = simulation.force
         if guard is not None and not isinstance(force, PairForce):
@@ -151,7 +149,7 @@ class Backward:
         nothing = jnp.zeros((3, simulation.atoms), simulation.policy.dtype("state"))
         numbers, _ = eqx.partition(simulation.integrator, _is_number)
         self.met: Crossings | None = None
-        self.carry = Carry(
+        self.carry = AdjointCarry(
             nothing,
             nothing,
             jax.tree.map(jnp.zeros_like, quantities(force)),
@@ -162,7 +160,7 @@ class Backward:
             (jnp.zeros((), jnp.float64), jnp.zeros((), jnp.float64)),
         )
 
-    def arguments(self, stretch: Stretch, traced: bool) -> tuple[Any, ...]:
+    def arguments(self, stretch: TapeStretch, traced: bool) -> tuple[Any, ...]:
         """What `transposed` is called with for a stretch, from where the pass stands."""
         simulation, order = self.tape.simulation, stretch.table.order
         self.met = None
@@ -176,7 +174,7 @@ class Backward:
             simulation.integrator,
             simulation.masses[order],
             simulation.tables(stretch.table),
-            rows_of(stretch),
+            stretch.columns,
             stretch.bits,
             stretch.rows,
             self.tape.seen(stretch),
@@ -188,7 +186,7 @@ class Backward:
         )
 
     def through(
-        self, stretch: Stretch, *, traced: bool = False
+        self, stretch: TapeStretch, *, traced: bool = False
     ) -> tuple[Float[np.ndarray, "room most"], Trace | None]:
         """Carry everything through a stretch: the weights of its crossings, and what each step carried."""
         self.carry, (weights, trace) = transposed(*self.arguments(stretch, traced))
@@ -220,7 +218,7 @@ def transposed(
     seen,
     looking,
     crossed,
-    carry: Carry,
+    carry: AdjointCarry,
     wanted: frozenset[str],
     traced: bool,
 ):
@@ -231,7 +229,6 @@ def transposed(
     carry = carry._replace(x=carry.x[:, order], v=carry.v[:, order])
     dtype = rows[1].dtype
     mass_row = masses.astype(dtype)
-    transpose: Any = pull_back if isinstance(force, PairForce) else conservative.pull_back
     # the noise of a thermostat belongs to the atom, and its size to the length that atoms are measured in
     numbers, rest = eqx.partition(integrator, _is_number)
 
@@ -250,7 +247,7 @@ def transposed(
             )
             frame = frame_of(at, order, around.matrix)
             scaled = frame._replace(x=frame.x * length.astype(dtype), v=frame.v * length.astype(dtype))
-            start = Frame(
+            start = LossFrame(
                 origin_step, origin[0] * length.astype(dtype), origin[1] * length.astype(dtype), nan, nan
             )
             return loss.observe(scaled, start, here)
@@ -271,7 +268,7 @@ def transposed(
             jnp.zeros((), jnp.float64),
         )
 
-    def step(carry: Carry, given):
+    def step(carry: AdjointCarry, given):
         row, told, see, met = given
         number, x, v = row[0], row[1], row[2]
         half = (0.5 * integrator.timestep).astype(dtype)
@@ -285,7 +282,7 @@ def transposed(
         )
         onto_v = onto_kicked + loss_v
         w = (half * onto_kicked + second * onto_v) / mass_row
-        made = transpose(force, x, tables, told, w, onto_potential, onto_virial, wanted)
+        made = pull_back(force, x, tables, told, w, onto_potential, onto_virial, wanted)
         model, numbers_bar, scale = carry.model, carry.integrator, carry.scale
         if MODEL in wanted:
             model = jax.tree.map(jnp.add, model, made.model)
@@ -307,7 +304,7 @@ def transposed(
             scale = scale + by_scale.astype(scale.dtype)
         if SCALE in wanted:
             scale = scale + made.scale + onto_length.astype(scale.dtype)
-        after = Carry(
+        after = AdjointCarry(
             onto_x + loss_x + made.x,
             onto_v,
             model,

@@ -2,7 +2,7 @@
 
 The run is made on the host, list by list, so that it is the run `mdnum run` makes; a transformation that
 would trace it as one program (jit, vmap) cannot. Differentiating can: the rollout is a function with a
-reverse rule of its own, and whatever stands before or behind it is differentiated by JAX.
+reverse rule of its own, and whatever is before or behind it is differentiated by JAX.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from jax.core import Tracer
 
 from mdnum.errors import InputError
 from mdnum.gradients import parameters
-from mdnum.gradients.base import Gradient, Method, Problem, check
-from mdnum.gradients.registry import by_word
+from mdnum.gradients.problem import Gradient, Method, Problem
+from mdnum.gradients.problem import method as by_name
 
 #: Parameters by name, each of the shape of its value in the simulation.
 Values = Mapping[str, Any]
@@ -33,7 +33,7 @@ def value_and_grad(
     Args:
         problem: the loss of a rollout.
         names: parameters to differentiate by, full or short names.
-        method: a method, or its word.
+        method: a method, or its name.
         has_aux: whether to return the whole `Gradient` too, as `(value, gradient)` does in JAX.
 
     Returns:
@@ -49,8 +49,8 @@ def value_and_grad(
 
     Error: that of the method.
     """
-    method = by_word(method) if isinstance(method, str) else method
-    full = check(method, problem, names)
+    method = by_name(method) if isinstance(method, str) else method
+    full = method.check(problem, names)
     asked = {parameters.resolve(problem.simulation, [name])[0]: name for name in reversed(names)}
 
     def function(values: Values | None = None):
@@ -66,7 +66,7 @@ def differentiable(
     problem: Problem,
     names: Sequence[str],
     method: Method | str = "event-aware",
-    told: Callable[[Gradient], None] | None = None,
+    watch: Callable[[Gradient], None] | None = None,
 ) -> Callable[[Values], jax.Array]:
     """The loss as a function that JAX can differentiate in reverse mode.
 
@@ -76,8 +76,8 @@ def differentiable(
     Args:
         problem: the loss of a rollout.
         names: parameters to differentiate by.
-        method: a method, or its word.
-        told: called with the whole gradient each time that one is worked out.
+        method: a method, or its name.
+        watch: called with the whole gradient each time that one is worked out.
 
     Returns:
         values by name to the loss, a float64 scalar. It runs outside of `jit` and `vmap`.
@@ -87,8 +87,8 @@ def differentiable(
 
     Error: that of the method.
     """
-    method = by_word(method) if isinstance(method, str) else method
-    full = check(method, problem, names)
+    method = by_name(method) if isinstance(method, str) else method
+    full = method.check(problem, names)
 
     def at(values: Values) -> Problem:
         for leaf in jax.tree.leaves(values):
@@ -106,8 +106,8 @@ def differentiable(
     def forward(values: Values):
         found = method(at(values), full)
         _warn(found)
-        if told is not None:
-            told(found)
+        if watch is not None:
+            watch(found)
         by_name = {}
         for name, value in values.items():
             derivative = found.gradient[parameters.resolve(problem.simulation, [name])[0]]
@@ -122,7 +122,7 @@ def differentiable(
 
 
 def _warn(found: Gradient) -> None:
-    """Say of a derivative that is exactly zero why it is: a training loop would not look at notes."""
+    """Warn of a derivative that is exactly zero why it is: a training loop would not look at notes."""
     for name, value in found.gradient.items():
         if not np.any(np.asarray(value)):
             note = found.notes.get(name, "exactly 0 in this run")

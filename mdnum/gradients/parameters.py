@@ -1,24 +1,27 @@
-"""Parameters by name: what a rollout can be differentiated by, and where it sits in a simulation."""
+"""Parameters by name: what a rollout can be differentiated by, and where it is in a simulation.
+
+Each kind of parameter is one class: its value, the simulation with another value, the derivative by it from
+the derivatives by all that a rollout is made of, and what of a rollout moves with it, for tangents.
+"""
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from mdnum.errors import InputError
 from mdnum.md.cell import Cell
 from mdnum.md.integrators import Integrator, Langevin
 from mdnum.md.manyforce import ManyBodyForce
 from mdnum.md.pairforce import PairForce
-from mdnum.md.potentials import CutPotential
+from mdnum.registry import nearest
 from mdnum.systems.build import Simulation
 
 #: Other words for a parameter.
@@ -33,6 +36,12 @@ _INTEGERS = {
     "dynamics.steps": "it is a whole number",
     "neighbors.skin": "it changes which list is used, and no force",
 }
+#: Units by the last word of a name.
+_UNITS = {
+    "sigma": "{length}", "epsilon": "{energy}", "depth": "{energy}", "r0": "{length}",
+    "radius": "{length}", "onset": "{length}", "timestep": "{time}", "temperature": "{temperature}",
+    "friction": "1/{time}", "scale": "", "positions": "{length}", "velocities": "√({energy}/{mass})",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -42,9 +51,9 @@ class Cotangents:
     Attributes:
         model: by the quantities of the force (`quantities`).
         integrator: by the leaves of the integrator that are numbers.
-        x, v: by the positions and velocities of step 0, user's order, shape (3, atoms).
+        x, v: by the positions and velocities of step 0, user's order.
         scale: by a common factor of the box and all positions, at 1.
-        r_cut: by the cutoffs through the times of the flips alone, shape (types,); 0 without saltation.
+        r_cut: by the cutoffs through the times of the flips alone; 0 without saltation.
     """
 
     model: Any
@@ -53,6 +62,25 @@ class Cotangents:
     v: Float[np.ndarray, "3 atoms"]
     scale: float
     r_cut: Float[np.ndarray, "types"]
+
+
+class Direction(NamedTuple):
+    """Derivatives of everything that a rollout is made of by one number, or by several along a first axis.
+
+    Attributes:
+        x, v: of the positions and velocities of step 0, user's order.
+        model: of the quantities of the force.
+        integrator: of the numbers of the integrator; None where a leaf is no number.
+        matrix: of the lattice vectors.
+        r_cut: of the cutoffs at which pairs cross.
+    """
+
+    x: Float[Array, "*columns 3 atoms"]
+    v: Float[Array, "*columns 3 atoms"]
+    model: Any
+    integrator: Any
+    matrix: Float[Array, "*columns 3 3"]
+    r_cut: Float[Array, "*columns types"]
 
 
 def quantities(force: PairForce | ManyBodyForce) -> Any:
@@ -97,6 +125,229 @@ def _with_quantities(potential: Any, values: Mapping[str, Any]) -> Any:
     return out
 
 
+@dataclass(frozen=True)
+class Parameter:
+    """One quantity of a simulation; its value is a scalar, or has an entry for each pair type, atom or so."""
+
+    simulation: Simulation
+    name: str
+
+    @property
+    def key(self) -> str:
+        """The name behind its table."""
+        return self.name.partition(".")[2]
+
+    def value(self) -> Float[np.ndarray, "..."]:
+        """In units of the system file, but velocities are length per internal time."""
+        raise NotImplementedError
+
+    def changed(self, new: np.ndarray) -> Simulation:
+        """The simulation with another value."""
+        raise NotImplementedError
+
+    def gradient(self, parts: Cotangents) -> Float[np.ndarray, "..."]:
+        """The derivative by it, of the shape of the value."""
+        raise NotImplementedError
+
+    def moved(self, still: Direction, index: tuple[int, ...]) -> Direction:
+        """What moves with one entry, per unit of the value, where nothing else does."""
+        raise NotImplementedError
+
+
+class _PairQuantity(Parameter):
+    """An array of the cut pair potential with an entry for each pair type."""
+
+    def of(self, model):
+        return getattr(model.potential, self.key)
+
+    def value(self):
+        return _plain(self.of(self.simulation.model))
+
+    def changed(self, new):
+        model = eqx.tree_at(self.of, self.simulation.model, jnp.asarray(np.atleast_1d(new), jnp.float64))
+        return replace(self.simulation, model=model)
+
+    def gradient(self, parts):
+        return _plain(self.of(parts.model))
+
+    def moved(self, still, index):
+        entry = np.zeros(self.simulation.pair_types)
+        entry[index[0] if index else 0] = 1.0
+        leaf = jnp.asarray(entry, self.of(still.model).dtype)
+        return still._replace(model=eqx.tree_at(self.of, still.model, leaf))
+
+
+class _Onset(_PairQuantity):
+    def of(self, model):
+        return model.r_onset
+
+
+class _Radius(_PairQuantity):
+    """The cutoff; of one that does not switch the onset goes with it, and the times of the flips do."""
+
+    def of(self, model):
+        return model.r_cut
+
+    @property
+    def onset(self) -> Parameter | None:
+        return None if self.simulation.model.cutoff.switches else _Onset(self.simulation, "cutoff.onset")
+
+    def changed(self, new):
+        radii = tuple(float(r) for r in np.atleast_1d(new))
+        changed = super().changed(new)
+        if self.onset:
+            changed = replace(self.onset, simulation=changed).changed(new)
+        return replace(changed, decider=replace(self.simulation.decider, r_cut=radii))
+
+    def gradient(self, parts):
+        onset = np.asarray(parts.model.r_onset) if self.onset else 0.0
+        return _plain(np.asarray(parts.model.r_cut) + onset + parts.r_cut)
+
+    def moved(self, still, index):
+        moved = super().moved(still, index)
+        if self.onset:
+            moved = self.onset.moved(moved, index)
+        return moved._replace(r_cut=moved.model.r_cut.astype(jnp.float64))
+
+
+class _Constant(Parameter):
+    """An array or constant of a many-body potential."""
+
+    def value(self):
+        return np.array(_quantities_of(self.simulation.model)[self.key], np.float64)
+
+    def changed(self, new):
+        constant = self.key not in _leaves_by_path(self.simulation.model)
+        value = float(new) if constant else jnp.asarray(new)
+        model: Any = _with_quantities(self.simulation.model, {self.key: value})
+        # its radius may follow
+        decider = replace(self.simulation.decider, r_cut=(float(model.r_cut),))
+        return replace(self.simulation, model=model, decider=decider)
+
+    def gradient(self, parts):
+        return np.array(parts.model[self.key], np.float64)
+
+    def moved(self, still, index):
+        leaf = still.model[self.key]
+        return still._replace(model=still.model | {self.key: leaf.at[index].set(1.0)})
+
+
+class _Number(Parameter):
+    """A time of the integrator."""
+
+    def inside(self, number):
+        """In the integrator's unit of time."""
+        return number * self.simulation.units.time_factor
+
+    def value(self):
+        number = float(getattr(self.simulation.integrator, self.key))
+        return np.asarray(number / self.simulation.units.time_factor)
+
+    def changed(self, new):
+        return _integrated(self.simulation, self.key, self.inside(new))
+
+    def gradient(self, parts):
+        return np.asarray(self.inside(float(getattr(parts.integrator, self.key))))
+
+    def moved(self, still, index):
+        return still._replace(integrator=_moved(still.integrator, self.key, self.inside(1.0)))
+
+
+class _Rate(_Number):
+    """One over a time."""
+
+    def inside(self, number):
+        return number / self.simulation.units.time_factor
+
+    def value(self):
+        number = float(getattr(self.simulation.integrator, self.key))
+        return np.asarray(number * self.simulation.units.time_factor)
+
+
+class _Temperature(Parameter):
+    """It scales the velocities of step 0 with its root, and is that of a thermostat."""
+
+    def value(self):
+        return np.asarray(float(self.simulation.system.spec.dynamics.temperature))
+
+    def changed(self, new):
+        old, simulation = self.value(), self.simulation
+        if not float(new) > 0 or not float(old) > 0:
+            raise InputError(
+                f"temperature {float(old):g} to {float(new):g}; expected both above 0", where="dynamics"
+            )
+        dynamics = simulation.system.spec.dynamics.model_copy(update={"temperature": float(new)})
+        spec = simulation.system.spec.model_copy(update={"dynamics": dynamics})
+        simulation = replace(
+            simulation,
+            system=replace(simulation.system, spec=spec),
+            velocities=simulation.velocities * np.sqrt(float(new) / float(old)),
+        )
+        if isinstance(simulation.integrator, Langevin):
+            simulation = _integrated(simulation, "kT", simulation.units.k_B * new)
+        return simulation
+
+    def gradient(self, parts):
+        by_start = float(np.sum(parts.v * self.simulation.velocities.T)) / (2 * float(self.value()))
+        bath, k_B = parts.integrator, self.simulation.units.k_B
+        return np.asarray(by_start + (float(bath.kT) * k_B if isinstance(bath, Langevin) else 0.0))
+
+    def moved(self, still, index):
+        v = self.simulation.velocities.T / (2 * float(self.value()))
+        moved = still._replace(v=jnp.asarray(v, still.v.dtype))
+        if isinstance(self.simulation.integrator, Langevin):
+            moved = moved._replace(integrator=_moved(still.integrator, "kT", self.simulation.units.k_B))
+        return moved
+
+
+class _Start(Parameter):
+    """Positions or velocities of step 0, shape (atoms, 3)."""
+
+    def value(self):
+        return np.array(getattr(self.simulation, self.key))
+
+    def changed(self, new):
+        return replace(self.simulation, **{self.key: new})
+
+    def gradient(self, parts):
+        return (parts.v if self.key == "velocities" else parts.x).T.copy()
+
+    def moved(self, still, index):
+        one = jnp.zeros_like(still.x).at[index[1], index[0]].set(1.0)
+        return still._replace(**{"v" if self.key == "velocities" else "x": one})
+
+
+class _Scale(Parameter):
+    """A common factor of the box and all positions."""
+
+    def value(self):
+        return np.asarray(1.0)
+
+    def changed(self, new):
+        simulation = self.simulation
+        cell = Cell.create(np.asarray(simulation.cell.matrix) * float(new), simulation.pbc)
+        return replace(simulation, positions=simulation.positions * float(new)).with_cell(cell)
+
+    def gradient(self, parts):
+        return np.asarray(parts.scale)
+
+    def moved(self, still, index):
+        x = jnp.asarray(self.simulation.positions.T, still.x.dtype)
+        return still._replace(x=x, matrix=jnp.asarray(np.asarray(self.simulation.cell.matrix), jnp.float64))
+
+
+_KINDS: dict[str, type[Parameter]] = {
+    "cutoff.radius": _Radius, "cutoff.onset": _Onset, "dynamics.timestep": _Number,
+    "dynamics.friction": _Rate, "dynamics.temperature": _Temperature, "initial.positions": _Start,
+    "initial.velocities": _Start, "box.scale": _Scale,
+}  # fmt: skip
+
+
+def parameter(simulation: Simulation, name: str) -> Parameter:
+    """The parameter of a full name."""
+    return _KINDS.get(name, _PairQuantity if simulation.pairwise else _Constant)(simulation, name)
+
+
 def names(simulation: Simulation) -> tuple[str, ...]:
     """Parameters that a simulation has."""
     if simulation.pairwise:
@@ -123,7 +374,7 @@ def resolve(simulation: Simulation, words: Sequence[str]) -> tuple[str, ...]:
     """
     known = names(simulation)
     short = {name.rpartition(".")[2]: name for name in known}
-    # a simulation need not have what a short word stands for
+    # a simulation need not have what a short word means
     short |= {word: name for word, name in _ALIASES.items() if name in known}
     out = []
     for word in words:
@@ -132,8 +383,8 @@ def resolve(simulation: Simulation, words: Sequence[str]) -> tuple[str, ...]:
             whole = next((key for key in _INTEGERS if word in (key, key.rpartition(".")[2])), None)
             if whole is not None:
                 raise InputError(f"nothing is differentiable by {whole}: {_INTEGERS[whole]}", where=word)
-            close = difflib.get_close_matches(word, [*known, *short], n=1)
-            hint = f"Did you mean {close[0]}? " if close else ""
+            close = nearest(word, [*known, *short])
+            hint = f"Did you mean {close}? " if close else ""
             raise InputError(f"no parameter {word!r}", remedy=f"{hint}There are {', '.join(known)}")
         if name not in out:
             out.append(name)
@@ -143,95 +394,88 @@ def resolve(simulation: Simulation, words: Sequence[str]) -> tuple[str, ...]:
 
 
 def value(simulation: Simulation, name: str) -> Float[np.ndarray, "..."]:
-    """The value of a parameter: a scalar where the simulation has one pair type, else one for each.
-
-    Units are those of the system file, but velocities are length per internal time.
-    """
-    units = simulation.units
-    model = simulation.model
-    if name.startswith("potential."):
-        key = name.partition(".")[2]
-        if not simulation.pairwise:
-            return np.array(_quantities_of(model)[key], np.float64)
-        return _plain(getattr(model.potential, key))
-    if name == "cutoff.radius":
-        return _plain(model.r_cut)
-    if name == "cutoff.onset":
-        return _plain(model.r_onset)
-    if name == "dynamics.timestep":
-        return np.asarray(float(simulation.integrator.timestep) / units.time_factor)
-    if name == "dynamics.temperature":
-        return np.asarray(float(simulation.system.spec.dynamics.temperature))
-    if name == "dynamics.friction":
-        assert isinstance(simulation.integrator, Langevin)
-        return np.asarray(float(simulation.integrator.friction) * units.time_factor)
-    if name == "initial.positions":
-        return np.array(simulation.positions)
-    if name == "initial.velocities":
-        return np.array(simulation.velocities)
-    assert name == "box.scale", name
-    return np.asarray(1.0)
+    """The value of a parameter: a scalar where the simulation has one pair type, else one for each."""
+    return parameter(simulation, name).value()
 
 
 def with_values(simulation: Simulation, values: Mapping[str, Any]) -> Simulation:
     """The simulation with other values of some parameters.
 
-    A temperature scales the velocities of step 0 with its root and sets that of a thermostat. A radius is a
-    static part of compiled programs, so each new one compiles anew.
+    A radius is a static part of compiled programs, so each new one compiles again.
 
     Raises:
         InputError: a value that is not finite, or of another shape.
     """
     for name, given in values.items():
-        new = np.asarray(given, np.float64)
-        old = value(simulation, name)
-        if new.shape != old.shape or not np.isfinite(new).all():
+        one, new = parameter(simulation, name), np.asarray(given, np.float64)
+        if new.shape != one.value().shape or not np.isfinite(new).all():
             raise InputError(
                 f"{name}: shape {new.shape}, finite: {bool(np.isfinite(new).all())}; expected finite numbers "
-                f"of shape {old.shape}"
+                f"of shape {one.value().shape}"
             )
-        simulation = _changed(simulation, name, new)
+        simulation = one.changed(new)
     return simulation
 
 
-def _changed(simulation: Simulation, name: str, new: np.ndarray) -> Simulation:
-    time = simulation.units.time_factor
-    if name.startswith("potential.") and not simulation.pairwise:
-        return _bound(simulation, name.partition(".")[2], new)
-    if name.startswith("potential."):
-        return _modelled(simulation, lambda m: getattr(m.potential, name.partition(".")[2]), new)
-    if name == "cutoff.radius":
-        radii = tuple(float(r) for r in np.atleast_1d(new))
-        changed = _modelled(simulation, lambda m: m.r_cut, new)
-        if not changed.model.cutoff.switches:
-            changed = _modelled(changed, lambda m: m.r_onset, new)
-        return replace(changed, decider=replace(simulation.decider, r_cut=radii))
-    if name == "cutoff.onset":
-        return _modelled(simulation, lambda m: m.r_onset, new)
-    if name == "dynamics.timestep":
-        return _integrated(simulation, "timestep", new * time)
-    if name == "dynamics.friction":
-        return _integrated(simulation, "friction", new / time)
-    if name == "dynamics.temperature":
-        return _heated(simulation, value(simulation, name), new)
-    if name == "initial.positions":
-        return replace(simulation, positions=new)
-    if name == "initial.velocities":
-        return replace(simulation, velocities=new)
-    cell = Cell.create(np.asarray(simulation.cell.matrix) * float(new), simulation.pbc)
-    return replace(simulation, positions=simulation.positions * float(new)).with_cell(cell)
+def gradient(simulation: Simulation, parts: Cotangents, name: str) -> Float[np.ndarray, "..."]:
+    """The derivative by a named parameter, of the shape of its value."""
+    return parameter(simulation, name).gradient(parts)
 
 
-def _modelled(simulation: Simulation, where: Callable[[CutPotential], Any], new: np.ndarray) -> Simulation:
-    return replace(simulation, model=eqx.tree_at(where, simulation.model, _leaf(new)))
+def unit(simulation: Simulation, name: str) -> str:
+    """The unit of a parameter: "" for none, its own name in brackets where none is known."""
+    short = name.rpartition(".")[2]
+    return _UNITS.get(short, f"[{short}]").format_map(vars(simulation.units))
 
 
-def _bound(simulation: Simulation, key: str, new: np.ndarray) -> Simulation:
-    """A many-body potential with another constant or array; its radius may follow."""
-    constant = key not in _leaves_by_path(simulation.model)
-    model = _with_quantities(simulation.model, {key: float(new) if constant else jnp.asarray(new)})
-    decider = replace(simulation.decider, r_cut=(float(model.r_cut),))
-    return replace(simulation, model=model, decider=decider)
+@dataclass(frozen=True)
+class ParameterEntry:
+    """One number among the parameters.
+
+    Attributes:
+        name: full name of the parameter.
+        index: which of its entries; empty for a scalar.
+    """
+
+    name: str
+    index: tuple[int, ...] = ()
+
+    def __str__(self) -> str:
+        return f"{self.name}[{', '.join(map(str, self.index))}]" if self.index else self.name
+
+
+def columns_of(simulation: Simulation, names: Sequence[str]) -> tuple[ParameterEntry, ...]:
+    """The numbers that some parameters consist of, in order."""
+    return tuple(
+        ParameterEntry(name, tuple(int(k) for k in index))
+        for name in names
+        for index in np.ndindex(value(simulation, name).shape)
+    )
+
+
+def gathered(
+    simulation: Simulation, names: Sequence[str], values: Float[np.ndarray, "columns"]
+) -> dict[str, Float[np.ndarray, "..."]]:
+    """A value for each column, put back into the shapes of the parameters."""
+    shapes = {name: value(simulation, name).shape for name in names}
+    ends = np.cumsum([int(np.prod(shape)) for shape in shapes.values()])
+    parts = np.split(np.asarray(values, np.float64), ends[:-1])
+    return {name: part.reshape(shapes[name]) for name, part in zip(names, parts, strict=True)}
+
+
+def directions(simulation: Simulation, columns: Sequence[ParameterEntry]) -> Direction:
+    """What each column moves, stacked along a first axis; per unit of the parameter's own value."""
+    nothing = jnp.zeros((3, simulation.atoms), simulation.policy.dtype("state"))
+    still = Direction(
+        nothing,
+        nothing,
+        jax.tree.map(jnp.zeros_like, quantities(simulation.force)),
+        jax.tree.map(jnp.zeros_like, eqx.filter(simulation.integrator, eqx.is_inexact_array)),
+        jnp.zeros((3, 3), jnp.float64),
+        jnp.zeros(simulation.pair_types, jnp.float64),
+    )
+    each = [parameter(simulation, column.name).moved(still, column.index) for column in columns]
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
 
 
 def _plain(leaf) -> Float[np.ndarray, "..."]:
@@ -239,59 +483,12 @@ def _plain(leaf) -> Float[np.ndarray, "..."]:
     return array.reshape(()) if array.shape == (1,) else array
 
 
-def _leaf(array: np.ndarray):
-    return jnp.asarray(np.atleast_1d(array), jnp.float64)
-
-
 def _integrated(simulation: Simulation, name: str, new) -> Simulation:
-    changed = eqx.tree_at(
-        lambda one: getattr(one, name), simulation.integrator, jnp.asarray(new, jnp.float64)
-    )
+    number = jnp.asarray(new, jnp.float64)
+    changed = eqx.tree_at(lambda one: getattr(one, name), simulation.integrator, number)
     return replace(simulation, integrator=changed)
 
 
-def _heated(simulation: Simulation, old, new) -> Simulation:
-    if not float(new) > 0 or not float(old) > 0:
-        raise InputError(
-            f"temperature {float(old):g} to {float(new):g}; expected both above 0", where="dynamics"
-        )
-    dynamics = simulation.system.spec.dynamics.model_copy(update={"temperature": float(new)})
-    spec = simulation.system.spec.model_copy(update={"dynamics": dynamics})
-    simulation = replace(
-        simulation,
-        system=replace(simulation.system, spec=spec),
-        velocities=simulation.velocities * np.sqrt(float(new) / float(old)),
-    )
-    if isinstance(simulation.integrator, Langevin):
-        simulation = _integrated(simulation, "kT", simulation.units.k_B * new)
-    return simulation
-
-
-def gradient(simulation: Simulation, parts: Cotangents, name: str) -> Float[np.ndarray, "..."]:
-    """The derivative by a named parameter, from the derivatives by what a rollout is made of; of the shape
-    that the parameter's value has."""
-    units = simulation.units
-    if name.startswith("potential.") and not simulation.pairwise:
-        return np.array(parts.model[name.partition(".")[2]], np.float64)
-    if name.startswith("potential."):
-        return _plain(getattr(parts.model.potential, name.partition(".")[2]))
-    if name == "cutoff.radius":
-        onset = 0.0 if simulation.model.cutoff.switches else np.asarray(parts.model.r_onset)
-        return _plain(np.asarray(parts.model.r_cut) + onset + parts.r_cut)
-    if name == "cutoff.onset":
-        return _plain(parts.model.r_onset)
-    if name == "dynamics.timestep":
-        return np.asarray(float(parts.integrator.timestep) * units.time_factor)
-    if name == "dynamics.friction":
-        assert isinstance(parts.integrator, Langevin)
-        return np.asarray(float(parts.integrator.friction) / units.time_factor)
-    if name == "dynamics.temperature":
-        by_start = float(np.sum(parts.v * simulation.velocities.T)) / (2 * float(value(simulation, name)))
-        bath = parts.integrator
-        return np.asarray(by_start + (float(bath.kT) * units.k_B if isinstance(bath, Langevin) else 0.0))
-    if name == "initial.positions":
-        return parts.x.T.copy()
-    if name == "initial.velocities":
-        return parts.v.T.copy()
-    assert name == "box.scale", name
-    return np.asarray(parts.scale)
+def _moved(integrator: Any, name: str, by: float) -> Any:
+    number = jnp.asarray(by, getattr(integrator, name).dtype)
+    return eqx.tree_at(lambda one: getattr(one, name), integrator, number)

@@ -20,18 +20,23 @@ from jaxtyping import Array, Float
 
 from mdnum.errors import InputError
 from mdnum.gradients.crossings import Crossings, Met, crossings, push_through
-from mdnum.gradients.directions import Column, Direction, columns_of, directions
-from mdnum.gradients.loops import over_rows
-from mdnum.gradients.losses import Frame
-from mdnum.gradients.parameters import quantities, with_quantities
-from mdnum.gradients.tape import Stretch, Tape, frame_of, rows_of, unsorted
+from mdnum.gradients.losses import LossFrame
+from mdnum.gradients.parameters import (
+    Direction,
+    ParameterEntry,
+    columns_of,
+    directions,
+    quantities,
+    with_quantities,
+)
+from mdnum.gradients.tape import RunTape, TapeStretch, frame_of, over_rows, unsorted
 from mdnum.md.decide import Tables
 from mdnum.md.integrators import Integrator
 from mdnum.md.manyforce import ManyBodyForce
 from mdnum.md.pairforce import Forces, PairForce
 
 
-class Carry(NamedTuple):
+class TangentCarry(NamedTuple):
     """Tangents between two steps, user's order, one for each column.
 
     Attributes:
@@ -48,7 +53,7 @@ class Carry(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Tangents:
+class StretchTangents:
     """Tangents along one stretch of a run.
 
     Attributes:
@@ -62,8 +67,8 @@ class Tangents:
         total: of the sums of the loss up to here.
     """
 
-    stretch: Stretch
-    columns: tuple[Column, ...]
+    stretch: TapeStretch
+    columns: tuple[ParameterEntry, ...]
     x: Float[np.ndarray, "rows columns 3 atoms"] | None
     v: Float[np.ndarray, "rows columns 3 atoms"] | None
     crossings: Crossings | None
@@ -73,14 +78,14 @@ class Tangents:
 
 
 def tangents(
-    tape: Tape,
+    tape: RunTape,
     names: Sequence[str],
     *,
     saltation: bool = False,
     guard: float = 0.0,
     states: bool = False,
     progress: Callable[[int, int], None] | None = None,
-) -> Iterator[Tangents]:
+) -> Iterator[StretchTangents]:
     """Tangents by named parameters along a recorded run, stretch by stretch, first one first.
 
     With the weights of a reverse pass (derivatives of the loss by the cutoff of each crossing) the sum of
@@ -104,7 +109,7 @@ def tangents(
     force = simulation.force
     columns = columns_of(simulation, names)
     along = directions(simulation, columns)
-    carry = Carry(along.x, along.v, _empty(tape.total, len(columns)), jnp.zeros((len(columns), 2)))
+    carry = TangentCarry(along.x, along.v, _empty(tape.total, len(columns)), jnp.zeros((len(columns), 2)))
     for stretch in tape.forward():
         order = stretch.table.order
         met = None
@@ -119,7 +124,7 @@ def tangents(
             simulation.integrator,
             jnp.asarray(simulation.masses[order]),
             simulation.tables(stretch.table),
-            rows_of(stretch),
+            stretch.columns,
             stretch.bits,
             stretch.rows,
             tape.seen(stretch),
@@ -134,12 +139,12 @@ def tangents(
         x, v = (np.asarray(part)[: stretch.rows] for part in by_row) if states else (None, None)
         moved = None if met is None else met.gathered(np.moveaxis(np.asarray(dr), 1, 2))
         cuts = None if met is None else np.asarray(along.r_cut).T[met.kind]
-        yield Tangents(stretch, columns, x, v, met, moved, cuts, carry.total)
+        yield StretchTangents(stretch, columns, x, v, met, moved, cuts, carry.total)
         if progress is not None:
             progress(stretch.first + stretch.rows - 1, tape.steps)
 
 
-def by_column(tape: Tape, total: Any) -> Float[np.ndarray, "columns"]:
+def by_column(tape: RunTape, total: Any) -> Float[np.ndarray, "columns"]:
     """The derivatives of the loss, from the tangents of its sums at the end."""
 
     def one(tangent):
@@ -174,7 +179,7 @@ def _stretch(
     seen,
     looking,
     crossed: Met | None,
-    carry: Carry,
+    carry: TangentCarry,
     along: Direction,
     jumps: Float[Array, ""],
     states: bool,
@@ -207,7 +212,7 @@ def _stretch(
         frame = frame_of(row, order, around.matrix)
         whole = frame._replace(x=unsorted(x, order), v=unsorted(v, order))
         moving = whole._replace(step=_still(frame.step), potential=potential, virial=virial)
-        start = Frame(_still(origin.step), along.x, along.v, jnp.zeros(()), jnp.zeros(()))
+        start = LossFrame(_still(origin.step), along.x, along.v, jnp.zeros(()), jnp.zeros(()))
         # of a cube with the box: the volume goes with the trace of what moves the lattice vectors
         stretch = jnp.trace(jnp.linalg.solve(_whole(matrix), along.matrix))
         here = jax.tree.map(jnp.zeros_like, around)._replace(
@@ -216,7 +221,7 @@ def _stretch(
         _, seen = jax.jvp(loss.observe, (frame, origin, around), (moving, start, here))
         return jax.tree.map(jnp.add, total, seen)
 
-    def push(row, told, see, met, carry: Carry, along: Direction):
+    def push(row, told, see, met, carry: TangentCarry, along: Direction):
         """One column through one step."""
         number, x, v = row[0], row[1], row[2]
         dx, dv = carry.x, carry.v
@@ -244,7 +249,7 @@ def _stretch(
             (x, v + half * acceleration, numbers),
             (dx, dv + kick, along.integrator),
         )
-        return Carry(after_x, after_v, total, waiting), (dx, dv), dr
+        return TangentCarry(after_x, after_v, total, waiting), (dx, dv), dr
 
     def step(carry, given):
         row, told, see, met = given

@@ -1,12 +1,14 @@
 """The forward run as a gradient needs it: every stretch of steps, last first, and the sums of the loss.
 
-Stretches are kept as they were recorded while memory lasts, and made again from their first states where it
-does not. Made again they have the same bits: the same compiled program, started from the same state, with
-the same list.
+Stretches are kept as they were recorded while memory lasts, and run again from their first states where it
+does not: the same compiled program from the same state with the same list has the same bits. A run with a
+fixed-point integer state need not be kept at all: it is reversed, step by step, and must arrive at its start
+bit for bit.
 """
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -19,9 +21,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mdnum.errors import NumericalError
 from mdnum.events import Ledger
-from mdnum.gradients.loops import over_rows
-from mdnum.gradients.losses import Frame, Loss, Surroundings
+from mdnum.gradients.losses import Loss, LossContext, LossFrame
+from mdnum.md.latticestep import LatticeLangevin
 from mdnum.md.verlet import PairTable
+from mdnum.rollout.backward import BackwardRun, Stretched
 from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, first_state, resume_point
 from mdnum.rollout.flips import PairRecorder
 from mdnum.systems.build import Simulation
@@ -30,20 +33,20 @@ from mdnum.systems.build import Simulation
 KEPT = 2**29
 #: Fewest rows that a stretch is kept with.
 _LEAST_ROOM = 16
+#: States of which a reversed run remembers a fingerprint, so that one that goes astray is found where it did.
+_FINGERPRINTS = 256
 
 
 @dataclass(frozen=True)
-class Stretch:
+class TapeStretch:
     """Some steps of one list, in the order of its atoms.
 
     Attributes:
-        first, rows: its first step and how many there are.
-        x, v: wrapped positions and velocities, shape (room, 3, atoms); rows beyond the used ones are void.
-        images: lattice vectors taken off so far, same shape.
-        bits: decisions, shape (room, words, atoms).
-        before: decisions of this list at the step before, shape (words, atoms).
-        x_before: positions of the step before, shape (3, atoms).
-        potential, virial: shape (room,).
+        first, rows: its first step and the number of rows in use; those beyond are void.
+        x, v: wrapped positions and velocities. images: lattice vectors taken off so far.
+        bits: decisions. before: decisions of this list at the step before.
+        x_before: positions of the step before.
+        potential, virial: by row.
         table: the list.
         ledger: its flips; None where they were not asked for.
     """
@@ -72,37 +75,36 @@ class Stretch:
         """Step of each row."""
         return self.first + np.arange(len(self.x))
 
+    @property
+    def columns(self):
+        """Columns as a loss needs them: step, x, v, images, potential, virial."""
+        return (self.steps, self.x, self.v, self.images, self.potential, self.virial)
 
-def stretch_of(segment: Segment, start: Start, ledger: Ledger | None = None) -> Stretch:
-    """A copy of what a segment recorded; the segment's own record is used again.
 
-    Args:
-        segment: as the engine hands it out.
-        start: where it began.
-        ledger: its flips.
-    """
+def stretch_of(segment: Segment, start: Start, ledger: Ledger | None = None) -> TapeStretch:
+    """A copy of what a segment recorded from a start; the segment's own record is used again."""
     record, order = segment.record, segment.table.order
     assert segment.before is not None
     # the record has room for the longest stretch; powers of two, so that not every length is compiled for
     room = min(len(record.x), max(_LEAST_ROOM, 1 << (segment.rows - 1).bit_length()))
 
-    def kept(column) -> np.ndarray:
-        whole = np.asarray(column)
+    def kept(name: str) -> np.ndarray:
+        whole = np.asarray(getattr(record, name))
         copy = np.zeros((room, *whole.shape[1:]), whole.dtype)
         copy[: segment.rows] = whole[: segment.rows]
         return copy
 
-    return Stretch(
+    return TapeStretch(
         segment.first,
         segment.rows,
-        kept(record.x),
-        kept(record.v),
-        kept(record.images),
-        kept(record.bits),
+        kept("x"),
+        kept("v"),
+        kept("images"),
+        kept("bits"),
         np.array(segment.before),
         np.asarray(start.state.x_before)[:, order],
-        kept(record.potential),
-        kept(record.virial),
+        kept("potential"),
+        kept("virial"),
         segment.table,
         ledger,
     )
@@ -128,22 +130,22 @@ class Pace(NamedTuple):
 
 
 def pace_of(loss: Loss, steps: int) -> Pace:
-    """How often a loss looks at a run of so many steps."""
+    """How often a loss looks at a run of this many steps."""
     seen = np.flatnonzero(loss.looks_at(np.arange(steps + 1), steps))
-    apart = np.unique(np.diff(seen))
-    between = int(apart[0]) if len(apart) == 1 else 0
+    spacings = np.unique(np.diff(seen))
+    between = int(spacings[0]) if len(spacings) == 1 else 0
     return Pace(jnp.asarray(between), jnp.asarray(int(seen[0]) if len(seen) else 0))
 
 
-class Tape:
+class RunTape:
     """A run that has been made, and its loss.
 
     Args:
-        simulation: the system as objects, with a pair potential.
+        simulation: the system as objects.
         loss: what is evaluated along the way.
         steps: last step.
         flips: whether to write the ledger too.
-        budget: bytes of recorded stretches that are kept; the rest is made again when it is asked for.
+        budget: bytes of recorded stretches that are kept; the rest is run again when it is asked for.
         each: called with every stretch when it has been made.
         progress: called with the step reached and the last step.
 
@@ -159,58 +161,65 @@ class Tape:
         *,
         flips: bool = False,
         budget: int = KEPT,
-        each: Callable[[Stretch], None] | None = None,
+        each: Callable[[TapeStretch], None] | None = None,
         progress: Callable[[int, int], None] | None = None,
     ):
-        self.simulation, self.loss, self.steps = simulation, loss, steps
+        self.simulation, self.loss, self.steps, self.flips = simulation, loss, steps, flips
+        self.budget, self._each = budget, each
         self.start = first_state(simulation)
         self.around = surroundings(simulation)
         self.pace = pace_of(loss, steps)
         self.origin = frame_of_start(self.start, simulation)
-        recorder = PairRecorder(simulation) if flips else None
+        self.total: Any = None
+        self.frames = self.held = 0
+        self._recorder = PairRecorder(simulation) if flips else None
         self._starts: list[Start] = []
         self._ledgers: list[Ledger | None] = []
-        self._kept: dict[int, Stretch] = {}
+        self._kept: dict[int, TapeStretch] = {}
         self._engine = Engine(simulation, steps, start=self.start)
-        self.total: Any = None
-        self.frames = 0
-        start, held = self.start, 0
+        self._begin()
         for segment in self._engine.segments():
-            self._starts.append(start)
             if segment.closes in FAILURES:
                 raise NumericalError(
                     f"the run ended in a {segment.closes} at step {segment.last}",
                     remedy="Use a smaller time step, or a start without overlapping atoms",
                 )
-            if segment.closes == "displacement" and segment.moved > simulation.rule.skin:
-                raise NumericalError(
-                    f"a list missed pairs at step {segment.last}: an atom moved {segment.moved:.3g} since it "
-                    f"was built, and the skin is {simulation.rule.skin:.3g}",
-                    remedy="Use a smaller time step if one step moves atoms that far, else a wider skin",
-                )
-            self._ledgers.append(None if recorder is None else recorder.flips(segment))
-            stretch = stretch_of(segment, start, self._ledgers[-1])
-            self._observe(stretch)
-            if each is not None:
-                each(stretch)
-            if held + stretch.nbytes <= budget:
-                self._kept[len(self._starts) - 1] = stretch
-                held += stretch.nbytes
-            start = resume_point(segment)
+            self._add(segment)
             if progress is not None:
                 progress(segment.last, steps)
-        self.held = held
         self.value = float(self.loss.value(self.total, self.frames))
+
+    def _begin(self) -> None:
+        self._next = self.start
+
+    def _add(self, segment: Segment) -> None:
+        skin = self.simulation.rule.skin
+        if segment.closes == "displacement" and segment.moved > skin:
+            raise NumericalError(
+                f"a list missed pairs at step {segment.last}: an atom moved {segment.moved:.3g} since it "
+                f"was built, and the skin is {skin:.3g}",
+                remedy="Use a smaller time step if one step moves atoms that far, else a wider skin",
+            )
+        self._starts.append(self._next)
+        self._ledgers.append(None if self._recorder is None else self._recorder.flips(segment))
+        stretch = stretch_of(segment, self._next, self._ledgers[-1])
+        self._observe(stretch)
+        if self._each is not None:
+            self._each(stretch)
+        if self.held + stretch.nbytes <= self.budget:
+            self._kept[len(self._starts) - 1] = stretch
+            self.held += stretch.nbytes
+        self._next = resume_point(segment)
 
     @property
     def replayed(self) -> int:
-        """Stretches that are made again in a reverse pass."""
+        """Stretches that are run again in a reverse pass."""
         return len(self._starts) - len(self._kept)
 
     @property
     def jumps_unseen(self) -> bool:
         """Whether the loss looks at energy or virial in single frames: where they jump with a flip, so does
-        the loss, and no slope stands for that. In frames at equal times it is part of the average."""
+        the loss, and no slope has that. In frames at equal times it is part of the average."""
         if int(self.pace.between) > 0:
             return False
 
@@ -224,26 +233,26 @@ class Tape:
     def __len__(self) -> int:
         return len(self._starts)
 
-    def backward(self) -> Iterator[Stretch]:
-        """The stretches, last first."""
-        for k in reversed(range(len(self._starts))):
-            yield self._kept[k] if k in self._kept else self._again(k)
-
-    def forward(self) -> Iterator[Stretch]:
-        """The stretches, first one first."""
-        for k in range(len(self._starts)):
-            yield self._kept[k] if k in self._kept else self._again(k)
-
-    def _again(self, k: int) -> Stretch:
+    def __getitem__(self, k: int) -> TapeStretch:
+        if k in self._kept:
+            return self._kept[k]
         start = self._starts[k]
         return stretch_of(self._engine.again(start), start, self._ledgers[k])
 
-    def seen(self, stretch: Stretch) -> Bool[np.ndarray, "room"]:
+    def backward(self) -> Iterator[TapeStretch]:
+        """The stretches, last first."""
+        return (self[k] for k in reversed(range(len(self._starts))))
+
+    def forward(self) -> Iterator[TapeStretch]:
+        """The stretches, first one first."""
+        return (self[k] for k in range(len(self._starts)))
+
+    def seen(self, stretch: TapeStretch) -> Bool[np.ndarray, "room"]:
         """Rows that the loss looks at."""
         steps = stretch.steps
         return self.loss.looks_at(steps, self.steps) & (np.arange(len(steps)) < stretch.rows)
 
-    def _observe(self, stretch: Stretch) -> None:
+    def _observe(self, stretch: TapeStretch) -> None:
         seen = self.seen(stretch)
         self.frames += int(seen.sum())
         if self.total is None:
@@ -251,20 +260,133 @@ class Tape:
             self.total = jax.tree.map(lambda one: jnp.zeros(one.shape, one.dtype), shapes)
         if seen.any():
             self.total = _summed(
-                self.loss,
-                self.total,
-                rows_of(stretch),
-                stretch.rows,
-                seen,
-                self.origin,
-                self.around,
+                self.loss, self.total, stretch.columns, stretch.rows, seen, self.origin, self.around,
                 stretch.table.order,
-            )
+            )  # fmt: skip
 
 
-def rows_of(stretch: Stretch):
-    """Columns of a stretch as a loss needs them."""
-    return (stretch.steps, stretch.x, stretch.v, stretch.images, stretch.potential, stretch.virial)
+class ReversibleTape(RunTape):
+    """A run with a fixed-point integer state that has been made and is not kept, and its loss.
+
+    `backward` reverses the steps, with lists that it builds itself, and raises NumericalError where what
+    comes out is not the run that was made.
+
+    Attributes:
+        baths: what a thermostat's friction forgot, by step: the one thing that grows with the run.
+        stretches: of the way back, so far.
+
+    Args:
+        simulation, loss, steps, progress: as for `Tape`.
+    """
+
+    def _begin(self) -> None:
+        self.baths: dict[int, np.ndarray] = {}
+        self.stretches = 0
+        self._every = max(1, self.steps // _FINGERPRINTS)
+        self._prints: dict[int, bytes] = {}
+        self._end = self.start.state
+
+    def _add(self, segment: Segment) -> None:
+        steps = np.arange(segment.first, segment.last + 1)
+        if self.total is None or self.loss.looks_at(steps, self.steps).any():
+            self._observe(stretch_of(segment, self.start))
+        x, v, images = (segment.rows_of(name) for name in ("x", "v", "images"))
+        for row in np.flatnonzero(steps % self._every == 0):
+            self._prints[int(steps[row])] = fingerprint(x[row], v[row], images[row], segment.table.order)
+        state, scheme = segment.state, self.simulation.propagator
+        if isinstance(scheme, LatticeLangevin) and int(state.step) % int(scheme.period) == 0:
+            self.baths[int(state.step)] = np.array(state.bath)
+        self._end = state
+
+    def __len__(self) -> int:
+        return self.stretches
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that grows with the run: what friction forgot."""
+        return sum(bath.nbytes for bath in self.baths.values())
+
+    def forward(self) -> Iterator[TapeStretch]:
+        """A run that is not kept is run again."""
+        return RunTape(self.simulation, self.loss, self.steps, flips=self.flips).forward()
+
+    def backward(self) -> Iterator[TapeStretch]:
+        # the initial bath is empty
+        baths = {**self.baths, 0: np.zeros((3, self.simulation.atoms), np.int64)}
+        way = BackwardRun(self.simulation, self._end, baths)
+        self.stretches = 0
+        for made in way.stretches():
+            self._compare(made)
+            self.stretches += 1
+            yield self._stretch(made)
+        # the first state, every bit of it
+        for name in ("x", "v", "images"):
+            a, b = (np.asarray(getattr(state, name)) for state in (self.start.state, way.back))
+            if not np.array_equal(a, b):
+                self._astray(0, min(self._every, self.steps))
+
+    def _compare(self, made: Stretched) -> None:
+        """Hold the states that came out against the fingerprints of the run."""
+        for row in range(made.rows - 1, -1, -1):
+            step, record = made.first + row, made.record
+            if step % self._every:
+                continue
+            here = fingerprint(record.x[row], record.v[row], record.images[row], made.table.order)
+            if here != self._prints[step]:
+                self._astray(step, min(step + self._every, self.steps))
+
+    def _astray(self, step: int, last: int) -> None:
+        where = f"at step {step}" if last - step <= 1 else f"between steps {step} and {last}"
+        raise NumericalError(
+            f"reversed, the run is not the one that was made: the way back went astray {where}",
+            remedy="The run may have missed pairs: use a list that is rebuilt in time (neighbors.rebuild)",
+            where=self.simulation.system.name,
+        )
+
+    def _stretch(self, made: Stretched) -> TapeStretch:
+        record = made.record
+        x, v, images, bits, potential, virial = (
+            np.asarray(getattr(record, name)) for name in ("x", "v", "images", "bits", "potential", "virial")
+        )
+        before = np.zeros_like(bits[0])
+        return TapeStretch(
+            made.first, made.rows, x, v, images, bits, before, made.x_before, potential, virial, made.table
+        )
+
+
+def fingerprint(x, v, images, order) -> bytes:
+    """A digest of a state, in the user's order of atoms; a zero has no sign."""
+    digest = hashlib.blake2b(digest_size=8)
+    for part in map(np.asarray, (x, v, images)):
+        out = np.empty_like(part)
+        out[:, order] = part
+        digest.update((out + out.dtype.type(0)).tobytes())
+    return digest.digest()
+
+
+def over_rows(
+    step: Callable[[Any, Any], tuple[Any, Any]], carry: Any, rows: Any, used: Any, *, backward: bool = False
+) -> tuple[Any, Any]:
+    """As `jax.lax.scan`, but over the first `used` rows alone, last one first where it goes `backward`.
+
+    Every stretch has the room of the longest, so that one program serves all; a loop over that room would
+    spend most of its time on rows that hold nothing. Outputs of unused rows are zero.
+    """
+    first = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), rows)
+    _, out = jax.eval_shape(step, carry, first)
+    room = jax.tree.leaves(rows)[0].shape[0]
+    outputs = jax.tree.map(lambda leaf: jnp.zeros((room, *leaf.shape), leaf.dtype), out)
+
+    def body(k, both):
+        carry, outputs = both
+        at = used - 1 - k if backward else k
+        row = jax.tree.map(lambda leaf: lax.dynamic_index_in_dim(leaf, at, keepdims=False), rows)
+        carry, new = step(carry, row)
+        return carry, jax.tree.map(
+            lambda all, one: lax.dynamic_update_index_in_dim(all, one, at, 0), outputs, new
+        )
+
+    return lax.fori_loop(0, used, body, (carry, outputs))
 
 
 def unsorted(a: Float[Any, "*rest atoms"], order: Int[Any, "atoms"]) -> Float[Array, "*rest atoms"]:
@@ -272,11 +394,11 @@ def unsorted(a: Float[Any, "*rest atoms"], order: Int[Any, "atoms"]) -> Float[Ar
     return jnp.zeros_like(a).at[..., order].set(a)
 
 
-def frame_of(row, order: Int[Array, "atoms"], matrix: Float[Array, "3 3"]) -> Frame:
+def frame_of(row, order: Int[Array, "atoms"], matrix: Float[Array, "3 3"]) -> LossFrame:
     """A row in the user's order, without the faces of the box."""
     step, x, v, images, potential, virial = row
     whole = x + (matrix.T @ images.astype(matrix.dtype)).astype(x.dtype)
-    return Frame(step, unsorted(whole, order), unsorted(v, order), potential, virial)
+    return LossFrame(step, unsorted(whole, order), unsorted(v, order), potential, virial)
 
 
 @jax.jit
@@ -293,24 +415,21 @@ def _summed(loss, total, rows, used, seen, origin, around, order):
     return over_rows(step, total, (rows, seen), used)[0]
 
 
-def surroundings(simulation: Simulation) -> Surroundings:
+def surroundings(simulation: Simulation) -> LossContext:
     """Masses and box of a simulation."""
     cell = simulation.cell
     volume = cell.volume if all(simulation.pbc) else 0.0
-    return Surroundings(
-        jnp.asarray(simulation.masses, jnp.float64),
-        jnp.asarray(np.asarray(cell.matrix), jnp.float64),
-        jnp.asarray(volume, jnp.float64),
-        jnp.asarray(simulation.units.k_B, jnp.float64),
-        jnp.asarray(simulation.integrator.timestep, jnp.float64),
-        jnp.asarray(simulation.units.time_factor, jnp.float64),
-    )
+    parts = (
+        simulation.masses, np.asarray(cell.matrix), volume, simulation.units.k_B,
+        simulation.integrator.timestep, simulation.units.time_factor,
+    )  # fmt: skip
+    return LossContext(*(jnp.asarray(part, jnp.float64) for part in parts))
 
 
-def frame_of_start(start: Start, simulation: Simulation) -> Frame:
+def frame_of_start(start: Start, simulation: Simulation) -> LossFrame:
     """The frame of step 0; its energies are not known yet, and a loss has no use for them there."""
     state = start.state
     matrix = jnp.asarray(np.asarray(simulation.cell.matrix), jnp.float64)
     whole = state.x + (matrix.T @ state.images.astype(matrix.dtype)).astype(state.x.dtype)
     nan = jnp.full((), jnp.nan, jnp.float64)
-    return Frame(state.step, whole, state.v, nan, nan)
+    return LossFrame(state.step, whole, state.v, nan, nan)

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import DTypeLike
 
 from mdnum.errors import InputError
-from mdnum.precision.bounds import Reach
+from mdnum.numerics.rounding import Reach
 
 
 class Cell(eqx.Module):

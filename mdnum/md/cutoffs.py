@@ -2,16 +2,25 @@
 
 Every cutoff turns the value and slope of the bare potential, u and w = du/d(r²), into those of the cut
 one, for pairs inside. What a pair outside contributes (nothing) is decided elsewhere.
+
+One class is all that a cutoff needs: its formula `cut`, its name and how smooth it is. System files, the
+command line, jumps, comparisons with other codes and certificates take it from `CUTOFFS`. Where a formula is
+written a second time (`reference`) or in ball arithmetic (`enclose`), that is used; else both follow.
+
+Works on numpy and jax arrays alike, and imports neither jax nor a file of it.
 """
 
 from __future__ import annotations
 
-from abc import abstractmethod
-from typing import ClassVar, NamedTuple
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple
 
-import equinox as eqx
-import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Float
+
+from mdnum.registry import Registry
 
 
 class AtCutoff(NamedTuple):
@@ -23,14 +32,18 @@ class AtCutoff(NamedTuple):
         slope: du/dr at r_cut.
     """
 
-    r_cut: Float[Array, "..."]
-    r_onset: Float[Array, "..."]
-    energy: Float[Array, "..."]
-    slope: Float[Array, "..."]
+    r_cut: Float[Any, "..."]
+    r_onset: Float[Any, "..."]
+    energy: Float[Any, "..."]
+    slope: Float[Any, "..."]
 
 
-class Cutoff(eqx.Module):
-    """How a pair potential ends.
+class Undecided(Exception):
+    """A ball straddles a threshold: the decision is not proven at this precision."""
+
+
+class Cutoff(ABC):
+    """How a pair potential ends. The first line of a subclass's docstring describes it to people.
 
     Attributes:
         name: the word of system files.
@@ -43,7 +56,7 @@ class Cutoff(eqx.Module):
     switches: ClassVar[bool] = False
 
     @abstractmethod
-    def cut(self, r2, u, w, at: AtCutoff) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    def cut(self, r2, u, w, at: AtCutoff) -> tuple[Float[Any, "..."], Float[Any, "..."]]:
         """Energy and slope of the cut potential inside r_cut.
 
         Args:
@@ -57,15 +70,123 @@ class Cutoff(eqx.Module):
 
     def energy_jump(self, at: AtCutoff):
         """Energy that a pair brings when it enters: the limit of the cut energy at r_cut from inside."""
-        return jnp.zeros_like(at.energy)
+        return self._limits(at)[0] if self.smoothness < 0 else 0 * at.energy
 
     def force_jump(self, at: AtCutoff):
         """Radial force (positive: repulsive) that a pair brings when it enters, energy per length."""
-        return jnp.zeros_like(at.slope)
+        return -2 * at.r_cut * self._limits(at)[1] if self.smoothness < 1 else 0 * at.slope
+
+    def _limits(self, at: AtCutoff):
+        return self.cut(at.r_cut * at.r_cut, at.energy, at.slope / (at.r_cut + at.r_cut), at)
+
+    @property
+    def continuous(self) -> Cutoff:
+        """The cutoff with the same forces whose energy does not jump."""
+        return self if self.smoothness >= 0 else Level(self)
+
+    def reference(
+        self, r: Float[np.ndarray, "pairs"], u: Float[np.ndarray, "pairs"], du: Any, at: AtCutoff
+    ) -> tuple[Float[np.ndarray, "pairs"], Float[np.ndarray, "pairs"]]:
+        """Energy and its derivative by r a second time, in float64 on the host: the judge of `cut`.
+
+        Unless a cutoff writes it, the derivative is that of the energy of `cut`, found by jax, and not the
+        slope that `cut` returns.
+
+        Args:
+            r, u, du: distances, bare energy and its derivative by r.
+            at: constants at the cutoff, numbers.
+        """
+        import jax
+        import jax.numpy as jnp
+
+        given, along = (r * r, u), (2 * r, du)
+        energy, slope = jax.jvp(
+            lambda r2, u: self.cut(r2, u, jnp.zeros_like(u), at)[0],
+            tuple(map(jnp.asarray, given)),
+            tuple(map(jnp.asarray, along)),
+        )
+        return np.asarray(energy), np.asarray(slope)
+
+    def enclose(
+        self, pull: Callable[[Any], Any], energy: Callable[[Any], Any], at: AtCutoff
+    ) -> Callable[[Any], Any]:
+        """2 denergy/d(r²) of the cut potential in ball arithmetic, as a function of the ball r².
+
+        Unless a cutoff writes it, `cut` is run operation by operation.
+
+        Args:
+            pull, energy: 2 du/d(r²) and u of the bare potential, as functions of the ball r².
+            at: constants at the cutoff, balls.
+
+        Raises:
+            Undecided: by the function, where the ball lies on both sides of the onset.
+        """
+        from mdnum.numerics.enclosures import enclosed
+
+        cut = enclosed(lambda r2, u, w, *at: self.cut(r2, u, w, AtCutoff(*at))[1], 7)
+        return lambda r2: 2 * cut(r2, energy(r2), pull(r2) / 2, *at)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}()"
+
+    def __eq__(self, other: object) -> bool:
+        return type(self) is type(other) and vars(self) == vars(other)
+
+    def __hash__(self) -> int:
+        return hash((type(self), *vars(self).values()))
 
 
-class Hard(Cutoff):
-    """Truncated, unshifted: energy and force jump."""
+def check(cutoff: type[Cutoff] | Cutoff) -> None:
+    """That a cutoff is what it says: its slope that of its energy, its jumps those of its smoothness.
+
+    Tried on u = 1/r² with r_cut = 2, onset 1.6.
+
+    Raises:
+        ValueError: it is not; names the quantity and the distance.
+    """
+    made = cutoff if isinstance(cutoff, Cutoff) else cutoff()
+    if not isinstance(getattr(made, "name", None), str):
+        raise ValueError("it has no name")
+    at = AtCutoff(*map(np.float64, (2.0, 1.6, 0.25, -0.25)))
+    r = np.linspace(1.0, 2.0, 41)[:-1]
+    energy, slope = made.cut(r**2, r**-2, -(r**-4), at)
+    _, derivative = Cutoff.reference(made, r, r**-2, -2 * r**-3, at)
+    off = np.abs(2 * r * slope - derivative) > 1e-9
+    if off.any():
+        raise ValueError(
+            f"its slope is not the derivative of its energy at r = {r[off.argmax()]:g}, r_cut = 2"
+        )
+    limits = {"energy": made._limits(at)[0], "slope": made._limits(at)[1]}
+    for order, (name, limit) in enumerate(limits.items()):
+        if made.smoothness >= order and not abs(limit) < 1e-9:
+            raise ValueError(
+                f"its {name} at r_cut is {float(limit):g}, and its smoothness is {made.smoothness}"
+            )
+    if made.switches and not np.allclose(energy[r < 1.6], r[r < 1.6] ** -2, rtol=1e-12):
+        raise ValueError("it switches, and changes the energy below the onset")
+
+
+#: Every cutoff by its name; a package adds one by an entry point of this group.
+CUTOFFS: Registry[Cutoff] = Registry("cutoff", "mdnum.cutoffs", kind=Cutoff, check=check)
+
+
+def _shipped(cutoff: type[Cutoff]) -> type[Cutoff]:
+    return CUTOFFS.add(cutoff.name, cutoff)
+
+
+class _Truncated(Cutoff):
+    """The bare force up to the cutoff."""
+
+    def force_jump(self, at):
+        return -at.slope
+
+    def enclose(self, pull, energy, at):
+        return pull
+
+
+@_shipped
+class Hard(_Truncated):
+    """Truncated, not shifted: the energy jumps by u(radius) at every crossing."""
 
     name = "hard"
     smoothness = -1
@@ -73,15 +194,17 @@ class Hard(Cutoff):
     def cut(self, r2, u, w, at):
         return u, w
 
-    def energy_jump(self, at):
-        return at.energy
+    @property
+    def continuous(self):
+        return Shifted()
 
-    def force_jump(self, at):
-        return -at.slope
+    def reference(self, r, u, du, at):
+        return u, du
 
 
-class Shifted(Cutoff):
-    """u(r) - u(r_cut): the energy is continuous; the forces, hence the trajectory, are those of `hard`."""
+@_shipped
+class Shifted(_Truncated):
+    """Energy shifted to zero at the radius; forces, and so the trajectory, are those of `hard`."""
 
     name = "shifted"
     smoothness = 0
@@ -89,30 +212,71 @@ class Shifted(Cutoff):
     def cut(self, r2, u, w, at):
         return u - at.energy, w
 
-    def force_jump(self, at):
-        return -at.slope
+    def reference(self, r, u, du, at):
+        return u - at.energy, du
 
 
+@_shipped
 class ForceShifted(Cutoff):
-    """u(r) - u(r_cut) - (r - r_cut) u'(r_cut): energy and force are continuous, at every distance changed."""
+    """Energy and force shifted to zero at the radius: u(r) - u(r_cut) - (r - r_cut) u'(r_cut)."""
 
     name = "force-shifted"
     smoothness = 1
 
     def cut(self, r2, u, w, at):
-        r = jnp.sqrt(r2)
+        r = r2.__array_namespace__().sqrt(r2)
         return u - at.energy - (r - at.r_cut) * at.slope, w - at.slope / (r + r)
 
+    def reference(self, r, u, du, at):
+        return u - at.energy - (r - at.r_cut) * at.slope, du - at.slope
 
-class Switched(Cutoff):
-    """The C1 switch in r² of jax-md, HOOMD-blue and ASE's `smooth=True`.
+    def enclose(self, pull, energy, at):
+        return lambda r2: pull(r2) - at.slope / r2.sqrt()
+
+
+class _Switching(Cutoff):
+    """A factor s that goes from 1 at the onset to 0 at the cutoff."""
+
+    switches = True
+
+    def factor(self, r, at: AtCutoff):
+        """s(r) and ds/dr past the onset, in plain numpy: written a second time."""
+        raise NotImplementedError
+
+    def factor_of_ball(self, r2, at: AtCutoff):
+        """s and 2 ds/d(r²) past the onset, in ball arithmetic."""
+        raise NotImplementedError
+
+    def reference(self, r, u, du, at):
+        s, ds = self.factor(r, at)
+        beyond = r > at.r_onset
+        s, ds = np.where(beyond, s, 1.0), np.where(beyond, ds, 0.0)
+        return s * u, s * du + ds * u
+
+    def enclose(self, pull, energy, at):
+        onset = at.r_onset * at.r_onset
+
+        def switched(r2):
+            # the switch starts smoothly, but the side of the onset must be proven too
+            if r2 > onset:
+                s, ds = self.factor_of_ball(r2, at)
+                return pull(r2) * s + energy(r2) * ds
+            if r2 <= onset:
+                return pull(r2)
+            raise Undecided
+
+        return switched
+
+
+@_shipped
+class Switched(_Switching):
+    """The C1 switch in r² of jax-md, HOOMD-blue and ASE's smooth=True, from onset to radius.
 
     S = (rc² - r²)² (rc² + 2 r² - 3 ro²) / (rc² - ro²)³ beyond the onset.
     """
 
     name = "switched"
     smoothness = 1
-    switches = True
 
     def cut(self, r2, u, w, at):
         b, a = at.r_cut * at.r_cut, at.r_onset * at.r_onset
@@ -120,27 +284,49 @@ class Switched(Cutoff):
         s = (b - r2) * (b - r2) * (b + (r2 + r2) - (a + a + a)) / cube
         ds = 6 * (b - r2) * (a - r2) / cube
         beyond = r2 > a
-        return jnp.where(beyond, u * s, u), jnp.where(beyond, w * s + u * ds, w)
+        where = r2.__array_namespace__().where
+        return where(beyond, u * s, u), where(beyond, w * s + u * ds, w)
+
+    def factor(self, r, at):
+        x, a, b = r * r, at.r_onset**2, at.r_cut**2
+        width = (b - a) ** 3
+        return (b - x) ** 2 * (b + 2.0 * x - 3.0 * a) / width, 12.0 * r * (b - x) * (a - x) / width
+
+    def factor_of_ball(self, r2, at):
+        b, a = at.r_cut * at.r_cut, at.r_onset * at.r_onset
+        cube = (b - a) * (b - a) * (b - a)
+        return (b - r2) * (b - r2) * (b + 2 * r2 - 3 * a) / cube, 12 * (b - r2) * (a - r2) / cube
 
 
-class _SwitchedInDistance(Cutoff):
-    switches = True
+class _SwitchedInDistance(_Switching):
+    """A function of t, which goes from 0 at the onset to 1 at the cutoff."""
 
     @abstractmethod
-    def switch(self, t) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    def switch(self, t) -> tuple[Float[Any, "..."], Float[Any, "..."]]:
         """Switching function and its derivative for t in [0, 1] from onset to cutoff."""
 
+    def switch_of_ball(self, t):
+        """The same in ball arithmetic."""
+        return self.switch(t)
+
     def cut(self, r2, u, w, at):
-        r = jnp.sqrt(r2)
+        xp = r2.__array_namespace__()
+        r = xp.sqrt(r2)
         width = at.r_cut - at.r_onset
         t = (r - at.r_onset) / width
         s, ds = self.switch(t)
         beyond = t > 0
-        return jnp.where(beyond, u * s, u), jnp.where(beyond, w * s + u * ds / (width * (r + r)), w)
+        return xp.where(beyond, u * s, u), xp.where(beyond, w * s + u * ds / (width * (r + r)), w)
+
+    def factor_of_ball(self, r2, at):
+        r, width = r2.sqrt(), at.r_cut - at.r_onset
+        s, ds = self.switch_of_ball((r - at.r_onset) / width)
+        return s, ds / (width * r)
 
 
+@_shipped
 class Quintic(_SwitchedInDistance):
-    """The C2 switch 1 - 10 t³ + 15 t⁴ - 6 t⁵."""
+    """A C2 quintic switch from onset to radius: 1 - 10 t³ + 15 t⁴ - 6 t⁵."""
 
     name = "quintic"
     smoothness = 2
@@ -149,17 +335,45 @@ class Quintic(_SwitchedInDistance):
         rest = 1 - t
         return 1 - t * t * t * (10 - t * (15 - 6 * t)), -30 * t * t * rest * rest
 
+    def factor(self, r, at):
+        width = at.r_cut - at.r_onset
+        x = (r - at.r_onset) / width
+        return 1.0 - x**3 * (10.0 - 15.0 * x + 6.0 * x * x), -30.0 * x * x * (1.0 - x) ** 2 / width
 
+
+@_shipped
 class Cosine(_SwitchedInDistance):
-    """The C1 switch (1 + cos(pi t)) / 2, as in neural-network potentials."""
+    """A C1 cosine switch from onset to radius, (1 + cos(pi t)) / 2, as in neural-network potentials."""
 
     name = "cosine"
     smoothness = 1
 
     def switch(self, t):
-        return (1 + jnp.cos(jnp.pi * t)) / 2, -(jnp.pi / 2) * jnp.sin(jnp.pi * t)
+        xp = t.__array_namespace__()
+        return (1 + xp.cos(math.pi * t)) / 2, -(math.pi / 2) * xp.sin(math.pi * t)
+
+    def switch_of_ball(self, t):
+        return (1 + t.cos_pi()) / 2, -(type(t).pi() / 2) * t.sin_pi()
+
+    def factor(self, r, at):
+        phase = np.pi * (r - at.r_onset) / (at.r_cut - at.r_onset)
+        return 0.5 * (1.0 + np.cos(phase)), -0.5 * np.pi / (at.r_cut - at.r_onset) * np.sin(phase)
 
 
-BY_NAME: dict[str, Cutoff] = {
-    cutoff.name: cutoff for cutoff in (Hard(), Shifted(), ForceShifted(), Switched(), Quintic(), Cosine())
-}
+class Level(Cutoff):
+    """Another cutoff, its energy shifted so that it ends at zero; the forces stay."""
+
+    name = "level"
+    smoothness = 0
+
+    def __init__(self, inner: Cutoff):
+        self.inner = inner
+
+    @property
+    def switches(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """As the other."""
+        return self.inner.switches
+
+    def cut(self, r2, u, w, at):
+        energy, slope = self.inner.cut(r2, u, w, at)
+        return energy - self.inner.energy_jump(at), slope

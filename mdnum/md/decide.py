@@ -17,13 +17,12 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from mdnum.errors import InputError
-from mdnum.events import Threshold
 from mdnum.md.cell import Cell
+from mdnum.md.neighbors import SLOTS
 from mdnum.md.potentials import of_type
-from mdnum.md.verlet import SLOTS
-from mdnum.precision import Reach, distance_bound, squared_distance_bound
-from mdnum.precision.exact import squared_norm
-from mdnum.precision.ulp import unit_roundoff
+from mdnum.numerics import Reach, Threshold, distance_bound, squared_distance_bound
+from mdnum.numerics.exact import squared_norm
+from mdnum.numerics.rounding import unit_roundoff
 
 # slots that the loops over a list take at a time: half a byte of decisions. Measured in float64 on one core,
 # ms a force: 1.4 for N = 4,000 and 59 for 108,000; with 8 at a time 2.2 and 78 (the compiler then gives up

@@ -15,6 +15,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+import mdnum.numerics  # noqa: F401 (float64 must be on before the first array exists)
+
 
 class Integrator(eqx.Module):
     """How positions and half-kicked velocities get to the next force evaluation."""

@@ -1,17 +1,11 @@
-"""The one door to jax-md: displacement, neighbor lists and pair search, with its traps held off.
-
-jax-md 0.2.29 has defects that pass without an error (float32 thresholds, pairs dropped outside the box,
-inverted flags). They are worked around here and nowhere else; tests/md/test_jaxmd_traps.py asserts that
-each defect is still there, so that a work-around can be dropped the day it is not.
-
-jax_md takes seconds to import, so it is imported inside the functions that need it.
-"""
+"""Minimum-image displacement in real coordinates, orthorhombic or triclinic, periodic per axis."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
 from functools import lru_cache
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal
@@ -19,11 +13,100 @@ from typing import TYPE_CHECKING, Any, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
-import mdnum.precision  # noqa: F401  (switches float64 on before the first array exists)
+import mdnum.numerics  # noqa: F401  (switches float64 on before the first array exists)
 from mdnum.errors import CapacityError, InputError, NumericalError
-from mdnum.md.displacement import Displacement, complete, displacement, widths
+from mdnum.md.cell import complete
+
+Displacement = Callable[..., Array]
+
+
+def widths(cell: Float[np.ndarray, "3 3"], pbc: Bool[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    """Perpendicular widths of the cell along each axis, infinite where it is not periodic.
+
+    Raises:
+        InputError: the periodic vectors do not span a volume.
+    """
+    full = complete(cell, pbc)
+    volume = abs(np.linalg.det(full))
+    if not np.isfinite(volume) or volume < 1e-12 * np.prod(np.linalg.norm(full, axis=1)):
+        raise InputError(
+            "the periodic cell vectors are linearly dependent", remedy="give three independent vectors"
+        )
+    return np.where(np.asarray(pbc, bool), 1.0 / np.linalg.norm(np.linalg.inv(full), axis=0), np.inf)
+
+
+def _dual(cell: Float[Array, "3 3"], periodic: tuple[int, ...]) -> Float[Array, "3 axes"]:
+    """Columns that turn a vector into its fractional coordinates along the periodic axes alone."""
+    if len(periodic) == 3:
+        a, b, c = cell
+        dual = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=1)
+        return dual / jnp.sum(a * dual[:, 0])
+    rows = cell[jnp.asarray(periodic)]
+    return rows.T @ jnp.linalg.inv(rows @ rows.T)
+
+
+def displacement(
+    cell: Float[Array | np.ndarray, "3 3"], pbc: tuple[bool, bool, bool] = (True, True, True)
+) -> Displacement:
+    """Minimum-image displacement in real coordinates, in the form every jax-md energy function takes.
+
+    The image is chosen by rounding fractional coordinates and subtracted as whole lattice vectors, so a
+    pair that needs no image keeps the exact difference of its coordinates, positions may leave the box, and
+    derivatives with respect to the cell (stress by strain) are those of the chosen image.
+
+    Args:
+        cell: lattice vectors as rows, length; orthorhombic or triclinic.
+        pbc: which axes are periodic; the others are free and their rows are ignored.
+
+    Returns:
+        `fn(Ra, Rb, cell=None, perturbation=None) -> Ra - Rb`, (3,) arrays. `cell=` replaces the cell of the
+        call, also under jit and grad; `perturbation=` is jax-md's linear map of the result. Other keywords
+        are ignored, because jax-md hands every function all of them.
+
+    Error:
+        the minimum image is the nearest one only below half the smallest perpendicular width; builders here
+        refuse a longer list. jax-md's own spaces ignore the question (no flag).
+    """
+    periodic = tuple(axis for axis in range(3) if pbc[axis])
+    base = jnp.asarray(cell)
+
+    def fn(
+        Ra: Array, Rb: Array, cell: Array | None = None, perturbation: Array | None = None, **_: Any
+    ) -> Array:
+        if Ra.shape != (3,) or Rb.shape != (3,):
+            # jax-md probes with one and two dimensions and moves on at a ValueError
+            raise ValueError(f"displacement of two points in 3 dimensions; got {Ra.shape} and {Rb.shape}")
+        vector = Ra - Rb
+        if periodic:
+            lattice = jnp.asarray(base if cell is None else cell, vector.dtype)
+            dual = jax.lax.stop_gradient(_dual(lattice, periodic))
+            held = jax.lax.stop_gradient(vector)
+            for column, axis in enumerate(periodic):
+                # sums are written out: a dot of three numbers may run in reduced precision on an accelerator
+                along = held[0] * dual[0, column] + held[1] * dual[1, column] + held[2] * dual[2, column]
+                vector = vector - jnp.round(along) * lattice[axis]
+        if perturbation is not None:
+            vector = jnp.sum(perturbation * vector[None, :], axis=1)
+        return vector
+
+    return fn
+
+
+def neighbor_vectors(
+    positions: Float[Array, "atoms 3"],
+    idx: Int[Array, "atoms slots"],
+    cell: Float[Array, "3 3"],
+    pbc: tuple[bool, bool, bool],
+) -> Float[Array, "atoms slots 3"]:
+    """Minimum-image vectors from each atom to its listed neighbors; padded slots hold some finite vector."""
+    toward = displacement(cell, pbc)
+    others = positions[jnp.where(idx < positions.shape[0], idx, 0)]
+    return jax.vmap(lambda here, there: jax.vmap(lambda point: toward(point, here))(there))(positions, others)
+
+
+# --- the one door to jax-md: displacement, neighbor lists and pair search, with its traps held off ----
 
 if TYPE_CHECKING:
     from jax_md.partition import NeighborList
@@ -290,3 +373,112 @@ def dense_pairs(
 def _kept_search(rows: bytes, pbc: tuple[bool, bool, bool], r_list: float, multiplier: float) -> PairSearch:
     cell = np.frombuffer(rows, np.float64).reshape(3, 3)
     return PairSearch(cell, pbc, r_list, capacity_multiplier=multiplier)
+
+
+# --- going downhill to the nearest minimum with jax-md's FIRE, for preparing systems ------------------
+
+# FIRE adds 1e-6 to |F|² and so stops mixing below forces of 1e-3; forces and masses scaled by a power of
+# two give the same motion with that floor at 1e-9
+_FIRE_SCALE = 2.0**20
+
+
+@dataclass(frozen=True)
+class Relaxed:
+    """Where a relaxation ended.
+
+    Attributes:
+        positions: (atoms, 3), length; not folded back into the cell.
+        steps: FIRE steps taken.
+        force_max: largest force on an atom at the end, force.
+        converged: whether force_max is within the tolerance asked for.
+    """
+
+    positions: np.ndarray
+    steps: int
+    force_max: float
+    converged: bool
+
+
+def relax(
+    energy_or_force_fn: Callable[..., Array],
+    positions: Float[Array | np.ndarray, "atoms 3"],
+    *,
+    neighbors: Callable[[np.ndarray], Any] | None = None,
+    skin: float | None = None,
+    mass: float | np.ndarray = 1.0,
+    max_steps: int = 5_000,
+    force_tolerance: float = 1e-6,
+    dt_start: float = 0.1,
+    dt_max: float = 0.4,
+) -> Relaxed:
+    """Go downhill to the nearest minimum with jax-md's FIRE.
+
+    Args:
+        energy_or_force_fn: `fn(positions)`, or `fn(positions, neighbor=...)` where neighbors is given;
+            returns an energy (scalar) or forces (atoms, 3).
+        positions: start, length.
+        neighbors: builds a list from positions on the host, with the skin included.
+        skin: length; the list is rebuilt once an atom has moved half of it. Needed with neighbors.
+        mass: per atom or one for all; only the path depends on it.
+        max_steps: FIRE steps at most.
+        force_tolerance: stop when no atom feels more than this, force.
+        dt_start, dt_max: first and largest time step, internal time.
+
+    Raises:
+        InputError: neighbors without a positive skin.
+        NumericalError: forces are not finite.
+
+    Source: Bitzek et al., Phys. Rev. Lett. 97, 170201 (2006), as coded in jax_md.minimize.fire_descent.
+    """
+    minimize = upstream().minimize
+    if neighbors is not None and not (skin is not None and skin > 0):
+        raise InputError("a relaxation over a neighbor list needs a skin above 0", remedy="give skin=")
+
+    def scaled(points: Array, **kwargs: Any) -> Array:
+        return energy_or_force_fn(points, **kwargs) * _FIRE_SCALE
+
+    init, apply = minimize.fire_descent(scaled, lambda R, dR, **_: R + dR, dt_start=dt_start, dt_max=dt_max)
+
+    def largest(state: Any) -> Array:
+        return jnp.sqrt(jnp.max(jnp.sum(state.force**2, axis=-1))) / _FIRE_SCALE
+
+    @jax.jit
+    def start(points: Array, masses: Array, kwargs: dict[str, Any]) -> Any:
+        # FIRE stores its time step as float16 (the smallest type that "fits" 0.1) and would step in it
+        state = init(points, mass=masses, **kwargs)
+        return state.set(dt=jnp.asarray(dt_start, points.dtype), alpha=jnp.asarray(0.1, points.dtype))
+
+    @jax.jit
+    def epoch(state: Any, steps: Array, reference: Array, kwargs: dict[str, Any]) -> tuple[Any, Array]:
+        def going(carry: tuple[Any, Array]) -> Array:
+            now, done = carry
+            moved = jnp.max(jnp.sum((now.position - reference) ** 2, axis=-1))
+            fresh = True if skin is None else moved <= (0.5 * skin) ** 2
+            return (done < max_steps) & (largest(now) > force_tolerance) & fresh
+
+        def step(carry: tuple[Any, Array]) -> tuple[Any, Array]:
+            return apply(carry[0], **kwargs), carry[1] + 1
+
+        return jax.lax.while_loop(going, step, (state, steps))
+
+    points = jnp.asarray(positions, jnp.float64)
+    masses = jnp.broadcast_to(jnp.asarray(mass, jnp.float64) * _FIRE_SCALE, (len(points),))
+    kwargs = {} if neighbors is None else {"neighbor": neighbors(np.asarray(points))}
+    with standard_promotion():
+        state = start(points, masses, kwargs)
+        steps = jnp.zeros((), jnp.int32)
+        while True:
+            reference, before = state.position, int(steps)
+            state, steps = epoch(state, steps, reference, kwargs)
+            if neighbors is not None and int(steps) > before:
+                kwargs = {"neighbor": neighbors(np.asarray(state.position))}
+                # the step that used the skin up saw the old list; its force is taken again on the new one
+                state = state.set(force=start(state.position, masses, kwargs).force)
+            force_max = float(largest(state))
+            if not np.isfinite(force_max):
+                raise NumericalError(
+                    "forces are not finite during the relaxation", where=f"step {int(steps)}"
+                )
+            if force_max <= force_tolerance or int(steps) >= max_steps:
+                break
+    return Relaxed(np.asarray(state.position), int(steps), force_max, force_max <= force_tolerance)

@@ -24,8 +24,8 @@ from mdnum.md.decide import Decisions, SlotJudge, Tables, displacements, halves_
 from mdnum.md.lattice import REACH_BITS, Lattice, LatticeDecider
 from mdnum.md.pairforce import Forces, PairForce, other_than
 from mdnum.md.potentials import CutPotential, of_type
-from mdnum.precision.exact import fence, zero_bits
-from mdnum.precision.reproducible import reproducible
+from mdnum.numerics.exact import fence, zero_bits
+from mdnum.numerics.reproducible import reproducible
 
 # added to a double below 2^51 it leaves the nearest integer in the low bits
 _ROUND = 1.5 * 2**52
@@ -253,12 +253,7 @@ def _closest(model: CutPotential, lattice: Lattice) -> float:
 
 
 class _Reproducible(eqx.Module):
-    """A cut potential whose results do not depend on how it is compiled.
-
-    Attributes:
-        model: the potential, in float64.
-        zero: an integer zero that XLA must not know.
-    """
+    """A cut potential whose results do not depend on how it is compiled."""
 
     model: CutPotential
     zero: Array

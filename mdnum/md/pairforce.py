@@ -11,6 +11,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -29,10 +30,11 @@ from mdnum.md.decide import (
     halves_of,
     unpacked,
 )
+from mdnum.md.integrators import Integrator
 from mdnum.md.potentials import CutPotential
-from mdnum.precision import PrecisionPolicy
-from mdnum.precision.exact import fence, rounded, zero_bits
-from mdnum.precision.reductions import Reduction, Sequential
+from mdnum.numerics import PrecisionPolicy
+from mdnum.numerics.exact import fence, rounded, zero_bits
+from mdnum.numerics.reductions import Reduction, Sequential
 
 
 class Forces(NamedTuple):
@@ -204,12 +206,7 @@ def other_than(inside: Bool[Array, "4 atoms"], told: UInt8[Array, "atoms"]) -> B
 
 
 class _Rounded(eqx.Module):
-    """A cut potential whose results are rounded after every operation.
-
-    Attributes:
-        model: the potential, in sixteen bits.
-        zero: an integer zero that XLA must not know.
-    """
+    """A cut potential whose results are rounded after every operation."""
 
     model: CutPotential
     zero: Int[Array, ""]
@@ -222,3 +219,140 @@ class _Rounded(eqx.Module):
 
 
 _VOIGT = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
+
+
+# --- the general path: any energy function over a neighbor list, told which pairs are inside ----------
+
+
+class ManyBodyForce(eqx.Module):
+    """Forces of an energy function over a jax-md neighbor list, by automatic differentiation.
+
+    Attributes:
+        potential: energy(positions (atoms, 3), neighbor, cell (3, 3)) -> energy, with `format`.
+        cell, zero, decider, policy: as in PairForce. The energy itself is always float64.
+    """
+
+    potential: eqx.Module
+    cell: Cell
+    zero: Int[Array, ""]
+    decider: PairDecider = eqx.field(static=True)
+    policy: PrecisionPolicy = eqx.field(static=True)
+
+    @classmethod
+    def create(cls, potential, cell: Cell, decider: PairDecider, policy: PrecisionPolicy) -> ManyBodyForce:
+        """The box as jax arrays."""
+        return cls(
+            potential, cell.astype(np.float64), zero_bits(policy.dtype("decision")), decider.bare, policy
+        )
+
+    def decide(self, positions: Float[Array, "3 atoms"], tables: Tables) -> Decisions:
+        """The decisions of a list at given positions."""
+        return decide_table(self.decider, self.cell, self.zero, positions, tables)
+
+    def __call__(self, positions: Float[Array, "3 atoms"], tables: Tables, *, decisions: bool) -> Forces:
+        """Forces at wrapped positions; as PairForce, the whole energy counted on the first atom."""
+        made = self.decide(positions, tables)
+        total, slope, strain = self._differentiate(positions, tables, made)
+        return Forces(
+            -slope.T,
+            jnp.zeros(positions.shape[1], jnp.float64).at[0].set(total),
+            -jnp.trace(strain),
+            made if decisions else None,
+        )
+
+    def virial_tensor(self, positions: Float[Array, "3 atoms"], tables: Tables) -> Float[Array, "3 3"]:
+        """Minus the derivative of the energy by strain."""
+        _, _, strain = self._differentiate(positions, tables, self.decide(positions, tables))
+        return -0.5 * (strain + strain.T)
+
+    def neighbors(
+        self, positions: Float[Array, "3 atoms"], tables: Tables, bits: UInt8[Array, "words atoms"]
+    ) -> Any:
+        """The list that the energy function receives: the pairs that are decided to be inside, no others."""
+        from mdnum.md import jaxmd
+
+        words, slots, atoms = tables.index.shape
+        shifts = jnp.arange(slots, dtype=jnp.uint8)[None, :, None]
+        inside = (bits[:, None, :] >> shifts) & jnp.uint8(1) == 1
+        acted_on = jnp.where(inside, tables.index, atoms).reshape(words * slots, atoms).T
+        x = positions.T.astype(jnp.float64)
+        return jaxmd.as_neighbor_list(acted_on, x, self.potential.format)  # type: ignore[attr-defined]
+
+    def _differentiate(self, positions, tables: Tables, made: Decisions):
+        """Energy, and its derivatives by positions and by strain."""
+        neighbor = self.neighbors(lax.stop_gradient(positions), tables, made.bits)
+
+        # the table is in sorted order and so is everything the energy function sees
+        def energy(x, strain):
+            deform = jnp.eye(3, dtype=jnp.float64) + strain
+            return self.potential.energy(x @ deform, neighbor, self.cell.matrix @ deform)  # type: ignore[attr-defined]
+
+        x = positions.T.astype(jnp.float64)
+        total, (slope, strain) = jax.value_and_grad(energy, argnums=(0, 1))(x, jnp.zeros((3, 3), jnp.float64))
+        return total, slope, strain
+
+
+# --- one step of molecular dynamics that is told its decisions: the contract of mdnum.dynamics --------
+
+
+class MdState(NamedTuple):
+    """Between two force evaluations, in the order of the tables.
+
+    Attributes:
+        step: the step whose forces come next.
+        x: wrapped positions at that step, shape (3, atoms).
+        v: velocities after the first half kick (at step 0: the initial velocities), shape (3, atoms).
+    """
+
+    step: Int[Array, ""]
+    x: Float[Array, "3 atoms"]
+    v: Float[Array, "3 atoms"]
+
+
+class PairDynamics(eqx.Module):
+    """Pairs of a fixed list that flip when they are told to.
+
+    For replays (one run handed the decisions of another) and for gradients at fixed decisions. A rollout
+    does the same in its compiled epochs, where the decisions are the list's own.
+
+    Attributes:
+        force: the pair force.
+        integrator: between force evaluations.
+        masses: in the order of the tables, shape (atoms,).
+        tables: the list.
+    """
+
+    force: PairForce
+    integrator: Integrator
+    masses: Float[Array, "atoms"]
+    tables: Tables
+
+    def margins(self, state: MdState) -> Float[Array, "groups 4 atoms"]:
+        """Threshold minus quantity of every slot, positive inside; -inf for padding."""
+        judge = SlotJudge(self.force.decider, self.force.cell, self.force.zero, state.x)
+        index, types = self.tables.groups()
+
+        def margin(j, kinds):
+            _, quantity, _, threshold = judge.group(j, kinds)
+            return jnp.where(j < judge.atoms, threshold - quantity, -jnp.inf)
+
+        groups = [margin(index[g], None if types is None else types[g]) for g in range(index.shape[0])]
+        return jnp.stack(groups)
+
+    def decide(self, state: MdState) -> UInt8[Array, "words atoms"]:
+        """The list's own decisions."""
+        return self.force.decide(state.x, self.tables).bits
+
+    def step(self, state: MdState, decisions: UInt8[Array, "words atoms"]) -> MdState:
+        """Forces from the pairs that are decided to be inside, both half kicks, and the drift."""
+        dtype = state.x.dtype
+        made = self.force(state.x, self.tables, decisions=False, given=decisions)
+        acceleration = made.force.astype(dtype) / self.masses.astype(dtype)
+        half = (0.5 * self.integrator.timestep).astype(dtype)
+        mass_row = self.masses.astype(dtype)
+        second_half = jnp.where(state.step == 0, jnp.zeros((), dtype), half)
+        v = self.integrator.kick(state.v, second_half, acceleration, mass_row)
+        v = self.integrator.kick(v, half, acceleration, mass_row)
+        x, v, _ = self.integrator.drift(state.x, v, self.masses, state.step, self.tables.order)
+        wrapped, _ = self.force.cell.astype(dtype).wrap(*x)
+        return MdState(state.step + 1, jnp.stack(wrapped), v)

@@ -11,7 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Integer, Num
 
+import mdnum.numerics  # noqa: F401 (float64 must be on before the first array exists)
 from mdnum.md.cutoffs import AtCutoff, Cutoff
+from mdnum.registry import Registry
 
 
 def of_type(leaf: Num[Array, "types"], types: Integer[Array, "..."] | None) -> Num[Array, "..."]:
@@ -27,6 +29,20 @@ class PairPotential(eqx.Module):
     @abstractmethod
     def evaluate(self, r2: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """Energy u and du/d(r²) at squared distances, parameters broadcast against r2."""
+
+    @classmethod
+    def reference(
+        cls, r: Float[np.ndarray, "pairs"], **constants: float
+    ) -> tuple[Float[np.ndarray, "pairs"], Float[np.ndarray, "pairs"]]:
+        """u(r) and u'(r) on the host: the judge of `evaluate`, its slope the derivative of its energy.
+
+        Args:
+            r: distances, length.
+            constants: of the pair.
+        """
+        made = cls(**{name: jnp.asarray(value) for name, value in constants.items()})
+        energy, slope = jax.jvp(lambda r: made.evaluate(r * r)[0], (jnp.asarray(r),), (jnp.ones(len(r)),))
+        return np.asarray(energy), np.asarray(slope)
 
     def of(self, types: Integer[Array, "..."] | None) -> PairPotential:
         """The parameters of given pair types; types None means that there is only one."""
@@ -94,6 +110,13 @@ class SoftSphere(PairPotential):
         )
 
 
+#: Every pair potential by its name; a package adds one by an entry point of this group. Its fields are the
+#: constants of a pair, as system files give them.
+POTENTIALS: Registry[PairPotential] = Registry("potential", "mdnum.potentials", kind=PairPotential)
+for _potential in (LennardJones, Morse, SoftSphere):
+    POTENTIALS.add(_potential.name, _potential)
+
+
 class CutPotential(eqx.Module):
     """A pair potential with its cutoff: what the force loop evaluates.
 
@@ -105,7 +128,7 @@ class CutPotential(eqx.Module):
     """
 
     potential: PairPotential
-    cutoff: Cutoff
+    cutoff: Cutoff = eqx.field(static=True)
     r_cut: Float[Array, "types"]
     r_onset: Float[Array, "types"]
 

@@ -10,36 +10,34 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mdnum.references.calculator import MdnumCalculator
-    from mdnum.references.check import check_dynamics, check_energy, check_pairs
-    from mdnum.references.effective import effective_cutoff
-    from mdnum.references.finders import Finder
+    from mdnum.references.energy_check import check_dynamics, check_energy
     from mdnum.references.oracle import all_pairs
-    from mdnum.references.own import all_finders
+    from mdnum.references.pair_check import Search, all_searches, check_pairs, effective_cutoff
 
 __all__ = [
-    "Finder",
     "MdnumCalculator",
-    "all_finders",
+    "Search",
     "all_pairs",
+    "all_searches",
     "check_dynamics",
     "check_energy",
     "check_pairs",
     "effective_cutoff",
 ]
 
-_WHERE = {
-    "Finder": "finders",
+_HOMES = {
     "MdnumCalculator": "calculator",
+    "Search": "pair_check",
     "all_pairs": "oracle",
-    "check_dynamics": "check",
-    "check_energy": "check",
-    "check_pairs": "check",
-    "effective_cutoff": "effective",
-    "all_finders": "own",
+    "all_searches": "pair_check",
+    "check_dynamics": "energy_check",
+    "check_energy": "energy_check",
+    "check_pairs": "pair_check",
+    "effective_cutoff": "pair_check",
 }
 
 
 def __getattr__(name: str) -> Any:
-    if name in _WHERE:
-        return getattr(importlib.import_module(f"mdnum.references.{_WHERE[name]}"), name)
+    if name in _HOMES:
+        return getattr(importlib.import_module(f"mdnum.references.{_HOMES[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

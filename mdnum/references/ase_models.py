@@ -29,15 +29,18 @@ from typing import Any, cast
 import numpy as np
 from ase import Atoms
 from ase.calculators.calculator import Calculator, PropertyNotImplementedError, all_changes
+from ase.calculators.tersoff import Tersoff, TersoffParameters
+from ase.stress import voigt_6_to_full_3x3_stress
 from numpy import ndarray
 
-from mdnum.references.closed_forms import PairForm, pair_forms
 from mdnum.references.independent import (
     OnNeighborList,
+    PairForm,
     PairModel,
     StillingerWeberModel,
     TersoffModel,
     edges_of,
+    pair_forms,
 )
 from mdnum.systems import System
 
@@ -69,18 +72,21 @@ def reference(system: System) -> Reference:
     """
     kind = system.spec.potential.kind
     if kind == "eam":
-        return _eam(system)
+        (file,) = system.tables
+        return Reference("ASE EAM", True, "none", lambda: _short_listed_eam(file))
     if kind == "tersoff":
-        return _tersoff()
+        constants = TersoffParameters(**asdict(TersoffModel()))
+        return Reference(
+            "ASE Tersoff", True, "none", lambda: Tersoff({("Si", "Si", "Si"): constants}, skin=0.0)
+        )
     if kind == "stillinger-weber":
         return independent(system)
     species = system.species
     forms = pair_forms(system.spec, species)
     cutoff = forms[species[0], species[0]].cutoff
-    build = _ASE_PAIR.get((kind, cutoff))
-    if build is None:
+    if (kind, cutoff) not in _ASE_PAIR:
         return independent(system)
-    label, conversion = _WORDS[kind, cutoff]
+    label, conversion, build = _ASE_PAIR[kind, cutoff]
     if len(species) == 1:
         form = forms[species[0], species[0]]
         return Reference(label, True, conversion, lambda: build(form))
@@ -111,63 +117,32 @@ def independent(system: System) -> Reference:
     )
 
 
-def _steps_at_cutoff(form: PairForm, atoms: Atoms) -> tuple[np.ndarray, float]:
-    """Neighbors inside the cutoff of each atom, and the energy u(r_cut) that a pair of them steps by."""
-    edges = edges_of(atoms, form.r_cut)
-    inside = np.bincount(edges.i[form.inside(edges.r)], minlength=len(atoms))
-    return inside, float(form.bare(np.array([form.r_cut]))[0][0])
-
-
-class LennardJonesHard(Calculator):
-    """ASE's LennardJones with the energy shift taken out again: u(r_cut) for each pair inside.
+class StepAtCutoff(Calculator):
+    """One of ASE's calculators with a constant added for each pair inside the cutoff.
 
     Args:
-        form: constants, r_cut, and which pairs count as inside.
+        inner: the calculator.
+        form: which pairs count as inside.
+        step: energy of a pair.
     """
 
     implemented_properties = _PROPERTIES
     nolabel = True
 
-    def __init__(self, form: PairForm, **kwargs: Any):
+    def __init__(self, inner: Calculator, form: PairForm, step: float, **kwargs: Any):
         super().__init__(**kwargs)
-        self.form = form
-        self.shifted = _lennard_jones_shifted(form)
+        self.inner, self.form, self.step = inner, form, step
 
     def calculate(self, atoms=None, properties=None, system_changes=all_changes):
         """Evaluate (see ase.calculators.calculator.Calculator)."""
         super().calculate(atoms, properties or ["energy"], system_changes)
         atoms = cast(Atoms, self.atoms)
         # get_property, not calculate: it is what tells ASE's class that the atoms have changed
-        results = _results(self.shifted, atoms)
-        inside, at_cut = _steps_at_cutoff(self.form, atoms)
-        energies = results["energies"] + 0.5 * at_cut * inside
-        energy = results["energy"] + at_cut * (inside.sum() // 2)
-        self.results = {**results, "energy": energy, "free_energy": energy, "energies": energies}
-
-
-class MorseShifted(Calculator):
-    """ASE's MorsePotential without its switch, less u(r_cut) for each pair inside.
-
-    Args:
-        form: constants, r_cut, and which pairs count as inside.
-    """
-
-    implemented_properties = _PROPERTIES
-    nolabel = True
-
-    def __init__(self, form: PairForm, **kwargs: Any):
-        super().__init__(**kwargs)
-        self.form = form
-        self.hard = _morse_hard(form)
-
-    def calculate(self, atoms=None, properties=None, system_changes=all_changes):
-        """Evaluate (see ase.calculators.calculator.Calculator)."""
-        super().calculate(atoms, properties or ["energy"], system_changes)
-        atoms = cast(Atoms, self.atoms)
-        results = _results(self.hard, atoms)
-        inside, at_cut = _steps_at_cutoff(self.form, atoms)
-        energies = results["energies"] - 0.5 * at_cut * inside
-        energy = results["energy"] - at_cut * (inside.sum() // 2)
+        results = _results(self.inner, atoms, atoms.cell.rank == 3)
+        edges = edges_of(atoms, self.form.r_cut)
+        inside = np.bincount(edges.i[self.form.inside(edges.r)], minlength=len(atoms))
+        energy = results["energy"] + self.step * (inside.sum() // 2)
+        energies = results["energies"] + 0.5 * self.step * inside
         self.results = {**results, "energy": energy, "free_energy": energy, "energies": energies}
 
 
@@ -200,17 +175,13 @@ class SpeciesSum(Calculator):
             groups = (
                 [((symbols == a), 1.0)]
                 if a == b
-                else [
-                    ((symbols == a) | (symbols == b), 1.0),
-                    ((symbols == a), -1.0),
-                    ((symbols == b), -1.0),
-                ]
+                else [((symbols == a) | (symbols == b), 1.0), ((symbols == a), -1.0), ((symbols == b), -1.0)]
             )
             for chosen, sign in groups:
                 if not chosen.any():
                     continue
                 calculator.reset()
-                results = _results(calculator, atoms[chosen])
+                results = _results(calculator, atoms[chosen], "stress" in total)
                 total["energy"] += sign * results["energy"]
                 total["energies"][chosen] += sign * results["energies"]
                 total["forces"][chosen] += sign * results["forces"]
@@ -219,45 +190,32 @@ class SpeciesSum(Calculator):
         self.results = {**total, "free_energy": total["energy"]}
 
 
-def _results(calculator: Calculator, atoms: Atoms) -> dict[str, Any]:
-    """Everything the calculator knows about atoms; the stress only where the cell has a volume."""
+def _results(calculator: Calculator, atoms: Atoms, stress: bool) -> dict[str, Any]:
+    """energy, forces, energies where there are any and, as six numbers, stress of atoms."""
     bare = Atoms(numbers=atoms.numbers, positions=atoms.positions, cell=atoms.cell, pbc=atoms.pbc)
-    found: dict[str, Any] = {}
-    for name in ("energy", "energies", "forces", *(["stress"] if atoms.cell.rank == 3 else [])):
-        value = calculator.get_property(name, bare)
-        found[name] = np.array(value) if name != "energy" else float(np.asarray(value))
-    return found
+    results: dict[str, Any] = {"energy": float(np.asarray(calculator.get_property("energy", bare)))}
+    for name in ("energies", "forces", *(["stress"] if stress else [])):
+        try:
+            results[name] = np.array(calculator.get_property(name, bare))
+        except PropertyNotImplementedError:
+            if name != "energies":  # ASE's EAM has the total only
+                raise
+    return results
 
 
 def evaluate(calculator: Calculator, atoms: Atoms) -> dict[str, Any]:
     """energy, forces, stress (3, 3) and energies of atoms; None for what there is not."""
-    bare = Atoms(numbers=atoms.numbers, positions=atoms.positions, cell=atoms.cell, pbc=atoms.pbc)
-    found: dict[str, Any] = {
-        "energy": float(np.asarray(calculator.get_property("energy", bare))),
-        "forces": np.array(calculator.get_property("forces", bare)),
-    }
-    if bare.cell.rank == 3 and bare.pbc.all():  # ASE gives one for a molecule in a box, of the box's volume
-        xx, yy, zz, yz, xz, xy = np.array(calculator.get_property("stress", bare))
-        found["stress"] = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    else:
-        found["stress"] = None
-    try:
-        found["energies"] = np.array(calculator.get_property("energies", bare))
-    except PropertyNotImplementedError:
-        found["energies"] = None  # ASE's EAM has the total only
-    return found
+    # ASE gives a stress for a molecule in a box, of the box's volume
+    results = _results(calculator, atoms, atoms.cell.rank == 3 and bool(atoms.pbc.all()))
+    if "stress" in results:
+        results["stress"] = voigt_6_to_full_3x3_stress(results["stress"])
+    return {"energies": None, "stress": None, **results}
 
 
-def _lennard_jones_shifted(form: PairForm) -> Calculator:
+def _lennard_jones(form: PairForm, **options: Any) -> Calculator:
     from ase.calculators.lj import LennardJones
 
-    return LennardJones(**form.constants, rc=form.r_cut, smooth=False)
-
-
-def _lennard_jones_switched(form: PairForm) -> Calculator:
-    from ase.calculators.lj import LennardJones
-
-    return LennardJones(**form.constants, rc=form.r_cut, ro=form.r_onset, smooth=True)
+    return LennardJones(**form.constants, rc=form.r_cut, **options)
 
 
 def _inside_list(form: PairForm) -> Callable[..., Any]:
@@ -286,48 +244,39 @@ def _morse(form: PairForm, begin: float, end: float) -> Calculator:
     )
 
 
-def _morse_hard(form: PairForm) -> Calculator:
-    return _morse(form, 2.0 * form.r_cut, 3.0 * form.r_cut)
+def _at_cutoff(form: PairForm) -> float:
+    return float(form.bare(np.array([form.r_cut]))[0][0])
 
 
-def _morse_quintic(form: PairForm) -> Calculator:
-    return _morse(form, form.r_onset, form.r_cut)
-
-
-_ASE_PAIR: dict[tuple[str, str], Callable[[PairForm], Calculator]] = {
-    ("lennard-jones", "hard"): LennardJonesHard,
-    ("lennard-jones", "shifted"): _lennard_jones_shifted,
-    ("lennard-jones", "switched"): _lennard_jones_switched,
-    ("morse", "hard"): _morse_hard,
-    ("morse", "shifted"): MorseShifted,
-    ("morse", "quintic"): _morse_quintic,
-}
-_WORDS = {
+#: (label, conversion, calculator) by potential and cutoff.
+_ASE_PAIR: dict[tuple[str, str], tuple[str, str, Callable[[PairForm], Calculator]]] = {
     ("lennard-jones", "hard"): (
         "ASE LennardJones",
         "energy + u(r_cut) for each pair inside; forces as they are",
+        lambda form: StepAtCutoff(_lennard_jones(form), form, _at_cutoff(form)),
     ),
-    ("lennard-jones", "shifted"): ("ASE LennardJones", "none"),
-    ("lennard-jones", "switched"): ("ASE LennardJones (smooth)", "none: ro is the onset"),
-    ("morse", "hard"): ("ASE MorsePotential", "its own switch moved beyond the pairs listed"),
+    ("lennard-jones", "shifted"): ("ASE LennardJones", "none", lambda form: _lennard_jones(form)),
+    ("lennard-jones", "switched"): (
+        "ASE LennardJones (smooth)",
+        "none: ro is the onset",
+        lambda form: _lennard_jones(form, ro=form.r_onset, smooth=True),
+    ),
+    ("morse", "hard"): (
+        "ASE MorsePotential",
+        "its own switch moved beyond the pairs listed",
+        lambda form: _morse(form, 2.0 * form.r_cut, 3.0 * form.r_cut),
+    ),
     ("morse", "shifted"): (
         "ASE MorsePotential",
         "its own switch moved away; energy - u(r_cut) for each pair inside",
+        lambda form: StepAtCutoff(_morse(form, 2.0 * form.r_cut, 3.0 * form.r_cut), form, -_at_cutoff(form)),
     ),
-    ("morse", "quintic"): ("ASE MorsePotential", "rho0 = alpha r0, rcut1 = onset / r0, rcut2 = r_cut / r0"),
+    ("morse", "quintic"): (
+        "ASE MorsePotential",
+        "rho0 = alpha r0, rcut1 = onset / r0, rcut2 = r_cut / r0",
+        lambda form: _morse(form, form.r_onset, form.r_cut),
+    ),
 }
-
-
-def _tersoff() -> Reference:
-    from ase.calculators.tersoff import Tersoff, TersoffParameters
-
-    constants = TersoffParameters(**asdict(TersoffModel()))
-    return Reference("ASE Tersoff", True, "none", lambda: Tersoff({("Si", "Si", "Si"): constants}, skin=0.0))
-
-
-def _eam(system: System) -> Reference:
-    (file,) = system.tables
-    return Reference("ASE EAM", True, "none", lambda: _short_listed_eam(file))
 
 
 def _short_listed_eam(file: Path) -> Calculator:

@@ -167,7 +167,7 @@ def all_pairs(
 
 
 def _usable_cell(cell: ndarray, pbc: ndarray) -> ndarray:
-    """The cell with directions that are not periodic replaced by unit normals of the others."""
+    """The completed cell; every periodic direction has a vector."""
     lengths = np.linalg.norm(cell, axis=1)
     for axis in np.flatnonzero(pbc):
         if not lengths[axis] > 0.0:
@@ -176,13 +176,18 @@ def _usable_cell(cell: ndarray, pbc: ndarray) -> ndarray:
                 remedy="give the structure a cell, or set pbc to false along it",
                 where="pair oracle",
             )
+    return completed(cell, pbc)
+
+
+def completed(cell: Float[ndarray, "3 3"], pbc: Bool[ndarray, "3"]) -> Float[ndarray, "3 3"]:
+    """The cell with unit normals of the other vectors in place of those of axes that do not repeat."""
     if pbc.all():
         return cell
     free = np.flatnonzero(~pbc)
     basis = np.linalg.svd(np.vstack([cell[pbc], np.zeros((1, 3))]), full_matrices=True)[2]
-    completed = cell.copy()
-    completed[free] = basis[3 - len(free) :]
-    return completed
+    full = np.array(cell, np.float64)
+    full[free] = basis[3 - len(free) :]
+    return full
 
 
 def _images(positions: ndarray, cell: ndarray, pbc: ndarray, reach: float):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,14 +13,11 @@ from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup
 
 from mdnum.report import svg
-from mdnum.report.axes import PAGE_WIDTH, PHONE_WIDTH
 from mdnum.report.section import cell
-from mdnum.report.words import count, heading, many, number, percent, plain, typeset
+from mdnum.report.words import heading, many, typeset
 from mdnum.store.atomic import subfolder, write_text
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from mdnum.report.finding import Finding, Verdict
     from mdnum.report.section import Page
     from mdnum.store import RunFolder
@@ -53,7 +50,7 @@ def write(folder: RunFolder, page: Page, verdict: Verdict) -> Path:
     contents = [(each.title, anchors[each.title]) for each in page.sections if each.level == 2]
     names = sorted(each.name for each in folder.path.iterdir() if each.suffix in _LINKED)
     path = folder.path / "report.html"
-    text = render(
+    text = _render(
         "page.html.j2",
         page=page,
         verdict=verdict,
@@ -93,13 +90,7 @@ def _first(head: Finding, heads: list[Finding]) -> bool:
     return next(one for one in heads if one.code == head.code) is head
 
 
-def render(template: str, **content: Any) -> str:
-    """A page's text.
-
-    Args:
-        template: file in mdnum/report, "ball/run.html.j2" say; it extends base.html.j2.
-        content: what the template names.
-    """
+def _render(template: str, **content: Any) -> str:
     environment = Environment(
         loader=FunctionLoader(_text),
         autoescape=True,
@@ -107,7 +98,6 @@ def render(template: str, **content: Any) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"number": number, "count": count, "percent": percent, "plain": plain}
     environment.filters |= {"typeset": typeset, "heading": heading, "cell": cell}
     environment.filters |= {"kind": lambda part: type(part).__name__}
     environment.globals |= {
@@ -119,46 +109,6 @@ def render(template: str, **content: Any) -> str:
         "font": Markup(svg.FONT),
     }
     return environment.get_template(template).render(**content)
-
-
-def picture(folder: Path, name: str, title: str, draw: Callable[[float], Figure]) -> Markup:
-    """A figure for a wide and for a narrow screen; the wide one is also written to figures/<name>.svg.
-
-    Args:
-        folder: the page's own.
-        title: what a screen reader says.
-        draw: draws it at a width in inches.
-    """
-    page = svg.markup(draw(PAGE_WIDTH), name)
-    phone = svg.markup(draw(PHONE_WIDTH), f"{name}-phone")
-    write_text(subfolder(folder, "figures") / f"{name}.svg", svg.standalone(page))
-    return Markup(
-        f'<div class="wide">{svg.inline(page, title)}</div>'
-        f'<div class="narrow">{svg.inline(phone, title)}</div>'
-    )
-
-
-def publish(
-    folder: Path,
-    drawn: Iterable[tuple[str, str, Callable[[float], Figure], list[str]]],
-    render: Callable[[dict[str, Markup], dict[str, list[str]]], str],
-) -> Path:
-    """Draws the figures of a page into figures/, and writes report.html.
-
-    Args:
-        folder: the page's own.
-        drawn: name, title, what draws it at a width in inches, and what it cannot show, of every figure.
-        render: the page's text, from the markup and the notes of the figures by name.
-
-    Returns:
-        the path of report.html.
-    """
-    pictures, notes = {}, {}
-    for name, title, draw, said in drawn:
-        pictures[name], notes[name] = picture(folder, name, title, draw), said
-    path = folder / "report.html"
-    write_text(path, render(pictures, notes))
-    return path
 
 
 def in_words(table: Mapping[str, Any], units: Mapping[str, str] | None = None) -> str:

@@ -20,10 +20,10 @@ from jaxtyping import Array, Float, Int
 
 from mdnum.errors import InputError, NumericalError
 from mdnum.md.decide import Tables
-from mdnum.md.latticestep import LatticeLangevin
-from mdnum.md.verlet import PairTable, VerletList
+from mdnum.md.lattice import LatticeLangevin
+from mdnum.md.neighbors import PairTable, VerletList
 from mdnum.rollout.engine import Engine
-from mdnum.rollout.epoch import Program, Record, State, write_row
+from mdnum.rollout.epoch import EpochRecord, EpochState, Program, write_row
 from mdnum.systems.build import Simulation
 
 
@@ -58,14 +58,14 @@ class Stretched(NamedTuple):
 
     first: int
     rows: int
-    record: Record
+    record: EpochRecord
     table: PairTable
     x_before: np.ndarray
     back: Back
 
 
 @partial(jax.jit, static_argnames=("structure",))
-def _undrifted(leaves, structure, state: State) -> Back:
+def _undrifted(leaves, structure, state: EpochState) -> Back:
     """Where a rollout stood before the last drift."""
     program: Program = jax.tree.unflatten(structure, leaves)
     order = jnp.arange(state.x.shape[1])
@@ -84,7 +84,7 @@ def _before(program: Program, masses, order, back: Back) -> Back:
 
 
 @partial(jax.jit, static_argnames=("structure",), donate_argnames=("record",))
-def _run_back(leaves, structure, tables: Tables, back: Back, record: Record):
+def _run_back(leaves, structure, tables: Tables, back: Back, record: EpochRecord):
     """Undo steps until the skin is used up, the record is full or the bath is to be changed."""
     program: Program = jax.tree.unflatten(structure, leaves)
     order = tables.order
@@ -137,7 +137,7 @@ def _run_back(leaves, structure, tables: Tables, back: Back, record: Record):
     return Back(here.step, *unsorted), rows, here.x, record
 
 
-class Backward:
+class BackwardRun:
     """Takes a rollout on a lattice back.
 
     Args:
@@ -149,7 +149,9 @@ class Backward:
         InputError: the state is not in whole numbers.
     """
 
-    def __init__(self, simulation: Simulation, end: State, baths: Mapping[int, np.ndarray] | None = None):
+    def __init__(
+        self, simulation: Simulation, end: EpochState, baths: Mapping[int, np.ndarray] | None = None
+    ):
         if simulation.lattice is None:
             raise InputError(
                 "only steps in whole numbers can be taken back",
@@ -209,7 +211,7 @@ class Backward:
             )
 
 
-def _rolled(record: Record, rows: int) -> Record:
+def _rolled(record: EpochRecord, rows: int) -> EpochRecord:
     """The rows that were filled from the end, brought to the front; a copy on the host."""
     columns: list[Any] = [np.roll(np.asarray(column), rows, axis=0) for column in record]
-    return Record(*columns)
+    return EpochRecord(*columns)

@@ -21,10 +21,10 @@ from mdnum.errors import InputError
 from mdnum.md.cell import Cell
 from mdnum.md.decide import Decisions, PairDecider, Tables
 from mdnum.md.integrators import Langevin
+from mdnum.md.neighbors import check_radius
 from mdnum.md.pairforce import Forces, PairForce
-from mdnum.md.verlet import check_radius
 from mdnum.systems.build import Simulation
-from mdnum.systems.messages import nearest
+from mdnum.systems.grammar import nearest
 
 Turn = Callable[[Simulation, float], Simulation]
 _SHORT = {

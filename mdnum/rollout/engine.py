@@ -16,9 +16,8 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from mdnum.md.cell import wrap_positions
-from mdnum.md.verlet import PairTable, VerletList
-from mdnum.rollout.epoch import Outcome, Program, Record, State, empty_record, run_epoch
-from mdnum.rollout.pins import Pins
+from mdnum.md.neighbors import PairTable, VerletList
+from mdnum.rollout.epoch import EpochOutcome, EpochRecord, EpochState, Pins, Program, empty_record, run_epoch
 from mdnum.systems.build import Simulation
 
 # bytes that the rows of one epoch's record may take, and the most rows; both bound memory, not accuracy
@@ -53,7 +52,7 @@ class Segment:
 
     first: int
     rows: int
-    record: Record
+    record: EpochRecord
     before: UInt8[np.ndarray, "words atoms"] | None
     table: PairTable
     epoch: int
@@ -62,7 +61,7 @@ class Segment:
     closes: str | None
     due: bool
     moved: float
-    state: State
+    state: EpochState
     reference: Float[np.ndarray, "atoms 3"]
 
     @property
@@ -94,7 +93,7 @@ class Start:
         slots: its capacity; 0 lets the density decide.
     """
 
-    state: State
+    state: EpochState
     reference: Float[np.ndarray, "atoms 3"]
     built: int = 0
     epoch: int = 0
@@ -110,8 +109,8 @@ class Start:
     @classmethod
     def from_arrays(cls, arrays) -> Start:
         """The inverse of `to_arrays`, bit for bit."""
-        held = {name: f"state_{name}" for name in State._fields}
-        state = State(**{name: jnp.asarray(arrays[key]) for name, key in held.items() if key in arrays})
+        held = {name: f"state_{name}" for name in EpochState._fields}
+        state = EpochState(**{name: jnp.asarray(arrays[key]) for name, key in held.items() if key in arrays})
         return cls(
             state,
             np.asarray(arrays["reference"]),
@@ -129,7 +128,7 @@ def first_state(simulation: Simulation) -> Start:
     wrapped = wrapped.astype(dtype)
     x = jnp.asarray(wrapped.T)
     bath = jnp.zeros((3, simulation.atoms), jnp.int64) if simulation.has_bath else None
-    state = State(
+    state = EpochState(
         jnp.zeros((), jnp.int64),
         x,
         jnp.asarray(velocities.T, dtype),
@@ -183,7 +182,7 @@ class Engine:
         )
         leaves, self.structure = jax.tree.flatten(self.program)
         self.leaves = tuple(leaves)
-        self._records: list[Record | None] = [None, None]
+        self._records: list[EpochRecord | None] = [None, None]
 
     def _room(self, words: int) -> int:
         """Rows of a record: a power of two within the memory allowed."""
@@ -192,7 +191,7 @@ class Engine:
         # no list is expected to live longer than the run
         return min(1 << (rows.bit_length() - 1), 1 << max(1, int(self.last + 1).bit_length()))
 
-    def take(self, turn: int, words: int) -> Record:
+    def take(self, turn: int, words: int) -> EpochRecord:
         """The record buffer whose turn it is; it is donated to the epoch that fills it."""
         rows, held = self._room(words), self._records[turn]
         self._records[turn] = None
@@ -201,7 +200,7 @@ class Engine:
         dtype = self.simulation.policy.dtype("state")
         return empty_record(rows, words, self.simulation.atoms, dtype, self.record)
 
-    def give(self, turn: int, record: Record) -> None:
+    def give(self, turn: int, record: EpochRecord) -> None:
         """Return a record that nobody reads any more."""
         self._records[turn] = record
 
@@ -264,7 +263,15 @@ class Engine:
         return made
 
     def _advance(
-        self, table: PairTable, tables, state: State, home, first: int, built: int, look_back: bool, turn: int
+        self,
+        table: PairTable,
+        tables,
+        state: EpochState,
+        home,
+        first: int,
+        built: int,
+        look_back: bool,
+        turn: int,
     ):
         """Start the compiled loop on the device."""
         words = table.slots // 8
@@ -283,8 +290,8 @@ class Engine:
 
     def _segment(
         self,
-        outcome: Outcome,
-        record: Record,
+        outcome: EpochOutcome,
+        record: EpochRecord,
         before,
         table: PairTable,
         first,

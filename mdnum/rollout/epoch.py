@@ -1,24 +1,89 @@
-"""The life of one Verlet list: a jitted loop that advances with fixed pairs and records as it goes.
-
-The loop ends when the skin is used up, the record is full, the last step is done, or a number is not
-finite. The host then rebuilds the list and starts the next epoch.
-"""
+"""Decisions of single pairs that a run is told, while it makes all others itself."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from mdnum.md.cell import Cell
 from mdnum.md.decide import Tables
 from mdnum.md.integrators import Integrator
+from mdnum.md.neighbors import PairTable
 from mdnum.md.pairforce import Forces
+
+
+@dataclass(frozen=True)
+class Pin:
+    """What a run is told about one pair.
+
+    Attributes:
+        i, j: the pair, i < j.
+        first, last: steps at which it is told.
+        changes: steps at which what it is told changes, ascending.
+        inside: what it is told before the first of them.
+    """
+
+    i: int
+    j: int
+    first: int
+    last: int
+    changes: tuple[int, ...] = ()
+    inside: bool = False
+
+    def at(self, steps: Int[np.ndarray, "steps"]) -> Bool[np.ndarray, "steps"]:
+        """What it is told at given steps."""
+        turned = np.searchsorted(np.asarray(self.changes, np.int64), steps, side="right")
+        return (turned % 2 == 1) ^ self.inside
+
+
+@dataclass(frozen=True)
+class Pins:
+    """The pairs whose decisions a run is told."""
+
+    pins: Sequence[Pin]
+
+    def rows(
+        self, table: PairTable, first: int, count: int
+    ) -> tuple[UInt8[np.ndarray, "rows words atoms"], UInt8[np.ndarray, "rows words atoms"]]:
+        """Packed decisions and where they hold, for consecutive steps of one list.
+
+        A pair that the list does not hold is too far away to be inside, and cannot be told to be.
+
+        Args:
+            table: the list.
+            first: step of the first row.
+            count: number of rows.
+        """
+        atoms = len(table.order)
+        shape = (count, table.slots // 8, atoms)
+        told, where = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
+        place = np.argsort(table.order)
+        steps = np.arange(first, first + count)
+        index = table.index.reshape(-1, atoms)
+        for pin in self.pins:
+            held = (steps >= pin.first) & (steps <= pin.last)
+            if not held.any():
+                continue
+            inside = pin.at(steps)
+            for atom, other in ((pin.i, pin.j), (pin.j, pin.i)):
+                column = place[atom]
+                for slot in np.flatnonzero(index[:, column] == place[other]):
+                    bit = np.uint8(1 << (slot % 8))
+                    where[held, slot // 8, column] |= bit
+                    told[held & inside, slot // 8, column] |= bit
+        return told, where
+
+
+# --- the life of one Verlet list: a jitted loop that advances with fixed pairs and records as it goes -
 
 
 class Program(eqx.Module):
@@ -46,7 +111,7 @@ class Program(eqx.Module):
     record: bool = eqx.field(static=True)
 
 
-class State(NamedTuple):
+class EpochState(NamedTuple):
     """Where a rollout stands between two force evaluations, in the user's order of atoms.
 
     Attributes:
@@ -68,7 +133,7 @@ class State(NamedTuple):
     bath: Int[Array, "3 atoms"] | None = None
 
 
-class Record(NamedTuple):
+class EpochRecord(NamedTuple):
     """One row per step of an epoch, atoms in the order of its tables.
 
     Attributes:
@@ -94,7 +159,7 @@ class Record(NamedTuple):
 _NUMBERS = ("potential", "kinetic", "virial", "heat", "nearest", "moved")
 
 
-class Outcome(NamedTuple):
+class EpochOutcome(NamedTuple):
     """How an epoch's loop ended.
 
     Attributes:
@@ -108,16 +173,16 @@ class Outcome(NamedTuple):
             list; all no where they were not asked for. None without recording.
     """
 
-    state: State
+    state: EpochState
     flags: Int[Array, "4"]
     moved: Float[Array, ""]
     before: UInt8[Array, "words atoms"] | None
 
 
-def empty_record(rows: int, words: int, atoms: int, dtype, record: bool) -> Record:
+def empty_record(rows: int, words: int, atoms: int, dtype, record: bool) -> EpochRecord:
     """Room for the rows of an epoch; without recording only the per-step numbers have room."""
     shape = (rows, 3, atoms) if record else (rows, 3, 0)
-    return Record(
+    return EpochRecord(
         x=jnp.zeros(shape, dtype),
         v=jnp.zeros(shape, dtype),
         images=jnp.zeros(shape, jnp.int32),
@@ -126,7 +191,7 @@ def empty_record(rows: int, words: int, atoms: int, dtype, record: bool) -> Reco
     )
 
 
-def write_row(record: Record, row, **values) -> Record:
+def write_row(record: EpochRecord, row, **values) -> EpochRecord:
     """Write one row of the named columns."""
     return record._replace(
         **{
@@ -145,15 +210,15 @@ def run_epoch(
     leaves: tuple[Array, ...],
     structure: Any,
     tables: Tables,
-    state: State,
+    state: EpochState,
     reference: Float[Array, "3 atoms"],
     built: Int[Array, ""],
     last: Int[Array, ""],
     look_back: Bool[Array, ""],
-    record: Record,
+    record: EpochRecord,
     told: UInt8[Array, "rows words atoms"] | None = None,
     pinned: UInt8[Array, "rows words atoms"] | None = None,
-) -> tuple[Outcome, Record]:
+) -> tuple[EpochOutcome, EpochRecord]:
     """Advance with one list until it is used up, the record is full or the last step is done.
 
     Args:
@@ -265,8 +330,8 @@ def run_epoch(
     def unsorted(a):
         return jnp.zeros_like(a).at[:, order].set(a)
 
-    end = State(step, unsorted(x), unsorted(v), unsorted(images), unsorted(x_before), heat)
+    end = EpochState(step, unsorted(x), unsorted(v), unsorted(images), unsorted(x_before), heat)
     if bath is not None:
         end = end._replace(bath=unsorted(bath))
     flags = jnp.stack([rows, due.astype(rows.dtype), finite.astype(rows.dtype), runaway.astype(rows.dtype)])
-    return Outcome(end, flags, largest, before), record
+    return EpochOutcome(end, flags, largest, before), record

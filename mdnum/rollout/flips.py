@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from mdnum.errors import MdnumError
-from mdnum.events import Ledger, changes_in_time, count_set, sort_rows
 from mdnum.md.cell import HostCell, displacement
-from mdnum.md.verlet import PairTable
+from mdnum.md.neighbors import PairTable
+from mdnum.numerics import Ledger, changes_in_time, count_set, sort_rows
 from mdnum.rollout.engine import Segment
 from mdnum.systems.build import Simulation
 
@@ -230,11 +230,7 @@ class PairRecorder:
         return self._held_keys
 
     def _cannot_differ(self, segment: Segment, before) -> bool:
-        """Whether the two lists hold the same pairs inside for certain.
-
-        A safe rule has missed nothing, and no pair gets from inside to beyond the new list unless two atoms
-        cover the skin in a single step. The count is compared all the same: it costs nothing.
-        """
+        """Whether the two lists hold the same pairs inside for certain."""
         rule = self.simulation.rule
         if self._held_segment is None or self._held_positions is None or not rule.safe:
             return False
@@ -243,11 +239,7 @@ class PairRecorder:
         return bool(2 * longest < rule.skin) and self.inside(self._held_segment[1]) == self.inside(before)
 
     def _replace(self, segment: Segment, before) -> tuple[np.ndarray, np.ndarray] | None:
-        """Where a new list and the one before it disagree on the step before: the flips between the two.
-
-        Returns:
-            keys of the flipped pairs and whether each entered; None where the lists agree, as they should.
-        """
+        """Where a new list and the one before it disagree on the step before: the flips between the two."""
         self.missed = 0
         if not segment.opens or (self._held_segment is None and self._held_keys is None):
             return None

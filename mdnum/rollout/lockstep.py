@@ -13,13 +13,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mdnum.program import PairRows
-from mdnum.rollout.compared import Apart, differ
-from mdnum.rollout.crossing import CrossFlip, Crossing
+from mdnum.rollout.compared import Apart, CrossFlip, CrossRecorder, Frame, differ
 from mdnum.rollout.engine import Segment, Start
 from mdnum.rollout.flips import Ambiguous
-from mdnum.rollout.frame import Frame
-from mdnum.rollout.handed import Handed, Overridden
-from mdnum.rollout.tracks import Rows, Track, joined
+from mdnum.rollout.tracks import Handed, Overridden, Rows, Track, joined
 from mdnum.systems.build import Simulation
 
 
@@ -56,7 +53,7 @@ def lockstep(
     leader = Track(a, last, start_a, listener=forward)
     follower = Track(b, last, start_b, frame, listener=backward)
     cell_a = Apart(a.cell)
-    crossing: Crossing | None = None
+    crossing: CrossRecorder | None = None
     while leader.segment() is not None:
         end = leader.ready
         rows_a, flips_a = leader.until(end)
@@ -65,7 +62,7 @@ def lockstep(
         opening: list[CrossFlip] = []
         if crossing is None:
             assert leader.first_pairs is not None and follower.first_pairs is not None
-            crossing = Crossing(leader.first_pairs, follower.first_pairs, a.atoms)
+            crossing = CrossRecorder(leader.first_pairs, follower.first_pairs, a.atoms)
             opening = crossing.opening()
         cross, flips = crossing.take(rows_a.first, len(rows_a), flips_a, flips_b)
         separation = {"B": apart(cell_a, rows_a, rows_b)}

@@ -14,15 +14,12 @@ from jaxtyping import Float, Int, UInt64
 from mdnum.errors import InputError
 from mdnum.md.cell import HostCell
 from mdnum.program import Decision, DecisionHistory, Differing, Number, PairRows
-from mdnum.rollout.compared import Apart
-from mdnum.rollout.crossing import CrossFlip
+from mdnum.rollout.compared import Apart, CrossFlip, Frame
 from mdnum.rollout.dials import Dial, dial, unit
 from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, first_state, unwrapped
 from mdnum.rollout.flips import decided_pairs, fingerprint_of_bits
-from mdnum.rollout.frame import Frame
-from mdnum.rollout.handed import Handed
 from mdnum.rollout.lockstep import Counterfactual, apart, lockstep
-from mdnum.rollout.tracks import Track
+from mdnum.rollout.tracks import Handed, Track
 from mdnum.systems.build import Simulation
 
 #: A loss of the final state: of the simulation, unwrapped positions and velocities per internal time.

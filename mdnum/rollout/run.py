@@ -13,15 +13,13 @@ from ase import Atoms
 
 from mdnum import provenance
 from mdnum.errors import FolderError, InputError, NumericalError
-from mdnum.events import Ledger
-from mdnum.rollout.budget import EnergyBudget
+from mdnum.numerics import Ledger
+from mdnum.rollout.checks import EnergyBudget, ListHealth
 from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, resume_point
 from mdnum.rollout.flips import PairRecorder, flip_columns
-from mdnum.rollout.health import ListHealth
-from mdnum.rollout.series import series_columns
-from mdnum.rollout.summary import Tally, closest_pair, log_line, summarize
+from mdnum.rollout.summary import RunTally, closest_pair, log_line, series_columns, summarize
 from mdnum.store import RunFolder
-from mdnum.store.naming import default_folder
+from mdnum.store.files import default_folder
 from mdnum.systems.build import Simulation, build
 from mdnum.systems.load import System, load
 
@@ -53,7 +51,7 @@ class RunResult:
 class _Progress:
     """What has been done so far; all of it goes into a checkpoint."""
 
-    tally: Tally
+    tally: RunTally
     health: ListHealth
     budget: EnergyBudget
     first: np.ndarray | None = None
@@ -89,7 +87,7 @@ class Rollout:
 
     def __post_init__(self):
         self.recorder = PairRecorder(self.simulation)
-        self.done = _Progress(Tally(), ListHealth(self.simulation), EnergyBudget(self.simulation))
+        self.done = _Progress(RunTally(), ListHealth(self.simulation), EnergyBudget(self.simulation))
         self.start: Start | None = None
         self._earlier_seconds = 0.0
 
@@ -98,7 +96,7 @@ class Rollout:
         self.start = Start.from_arrays(saved)
         done = saved["done"]
         self.done = _Progress(
-            Tally.from_dict(done["tally"]),
+            RunTally.from_dict(done["tally"]),
             ListHealth.from_dict(self.simulation, done["health"]),
             EnergyBudget.from_dict(self.simulation, done["budget"]),
             saved.get("first"),

@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mdnum.events import Ledger
 from mdnum.md.cell import displacement, wrap_positions
+from mdnum.numerics import Ledger
 from mdnum.rollout.engine import Segment
-from mdnum.rollout.series import degrees_of_freedom
+from mdnum.systems import schema
 from mdnum.systems.build import Simulation
 
 
 @dataclass
-class Line:
+class LineFit:
     """A least-squares line through points that are not kept: a run's memory must not grow with its steps.
 
     Values are taken relative to the first, so the sums carry the drift and not the energy itself.
@@ -50,7 +50,7 @@ class Line:
 
 
 @dataclass
-class Tally:
+class RunTally:
     """Totals over the rows seen so far."""
 
     step: int = -1
@@ -65,8 +65,8 @@ class Tally:
     seconds: float = 0.0
     steps_per_second: float | None = None
     jumps: float = 0.0
-    conserved: Line = field(default_factory=Line)
-    without_jumps: Line = field(default_factory=Line)
+    conserved: LineFit = field(default_factory=LineFit)
+    without_jumps: LineFit = field(default_factory=LineFit)
 
     def take(
         self, segment: Segment, rows: dict[str, np.ndarray], ledger: Ledger, bounds: Float[np.ndarray, "..."]
@@ -92,9 +92,9 @@ class Tally:
         return asdict(self)
 
     @classmethod
-    def from_dict(cls, values: dict) -> Tally:
+    def from_dict(cls, values: dict) -> RunTally:
         """The inverse of `to_dict`."""
-        lines = {name: Line(**values[name]) for name in ("conserved", "without_jumps")}
+        lines = {name: LineFit(**values[name]) for name in ("conserved", "without_jumps")}
         return cls(**{**values, **lines})
 
 
@@ -184,3 +184,54 @@ def closest_pair(simulation: Simulation, positions: Float[np.ndarray, "atoms 3"]
     k = int(np.argmin(distance))
     low, high = sorted((int(i[k]), int(j[k])))
     return f"; the closest pair is {low}-{high} at {distance[k]:.4g} {simulation.units.length}"
+
+
+# --- one row per step: energies, temperature, pressure, pairs and flips, in the user's units ----------
+
+
+def degrees_of_freedom(simulation: Simulation) -> int:
+    """3 N, less the three of a center of mass that nothing moves."""
+    conserved = simulation.system.spec.dynamics.remove_drift and not isinstance(
+        simulation.system.spec.dynamics, schema.LangevinTable
+    )
+    return max(3 * simulation.atoms - (3 if conserved and simulation.atoms > 1 else 0), 1)
+
+
+def series_columns(
+    simulation: Simulation, segment: Segment, pairs: np.ndarray, ambiguous: np.ndarray, ledger: Ledger
+) -> dict[str, np.ndarray]:
+    """The rows of series.parquet for a segment.
+
+    Args:
+        simulation: the system as objects.
+        segment: what the engine recorded.
+        pairs: pairs inside at each row.
+        ambiguous: pairs within the rounding bound at each row.
+        ledger: the flips of the segment.
+    """
+    units = simulation.units
+    step = np.arange(segment.first, segment.first + segment.rows)
+    potential, kinetic = segment.rows_of("potential"), segment.rows_of("kinetic")
+    row = ledger.step - segment.first
+    count = segment.rows
+    entered = np.bincount(row[ledger.entered], minlength=count)
+    left = np.bincount(row[~ledger.entered], minlength=count)
+    total = potential + kinetic
+    pressure = (2 * kinetic + segment.rows_of("virial")) / (3 * simulation.cell.volume)
+    return {
+        "step": step,
+        "time": step * simulation.system.spec.dynamics.timestep,
+        "potential": potential,
+        "kinetic": kinetic,
+        "total": total,
+        "temperature": 2 * kinetic / (degrees_of_freedom(simulation) * units.k_B),
+        "pressure": pressure * units.pressure_factor,
+        "pairs": pairs,
+        "entered": entered,
+        "left": left,
+        "displacement": segment.rows_of("moved"),
+        "energy_jump": np.bincount(row, weights=ledger.jump, minlength=count),
+        "ambiguous": ambiguous,
+        "min_margin": segment.rows_of("nearest"),
+        "conserved": total - segment.rows_of("heat"),
+    }

@@ -19,9 +19,10 @@ import numpy as np
 import pyarrow as pa
 
 from mdnum.errors import FolderError, MdnumError
-from mdnum.store import checkpoint, manifest
-from mdnum.store.atomic import SUBFOLDERS, disk_errors, opened, read_text, refuse_link, write_text
-from mdnum.store.frames import FrameFile
+from mdnum.store import checkpoint
+from mdnum.store import files as manifest
+from mdnum.store.checkpoint import FrameFile
+from mdnum.store.files import SUBFOLDERS, disk_errors, opened, read_text, refuse_link, write_text
 from mdnum.store.tables import COLUMNS, TABLES, VERBS, TableStream
 
 if TYPE_CHECKING:

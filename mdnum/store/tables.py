@@ -14,8 +14,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from mdnum.errors import FolderError
-from mdnum.store import manifest
-from mdnum.store.atomic import disk_errors, opened, replacing, subfolder
+from mdnum.store import files as manifest
+from mdnum.store.files import disk_errors, opened, replacing, subfolder
 
 _FLOAT, _INT, _SHORT, _BOOL, _TEXT = pa.float64(), pa.int64(), pa.int32(), pa.bool_(), pa.string()
 
@@ -177,6 +177,7 @@ TABLES: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         "md": ("series", "flips", "epochs"),
         "ball": ("steps", "contacts", "solver", "heights", "separations"),
+        "demos": ("curves",),
         "fork": ("separation", "cross_flips"),
         "screen": (),
         "compare": (),
@@ -197,8 +198,8 @@ TABLES: Mapping[str, tuple[str, ...]] = MappingProxyType(
 VERBS: Mapping[str, str] = MappingProxyType(
     {
         **dict.fromkeys(TABLES, "fork"),
-        "md": "run", "ball": "ball", "audit": "audit", "grad": "grad", "conform": "conform", "flips": "flips",
-        "flips-compare": "flips",
+        "md": "run", "ball": "ball", "demos": "ball --demo", "audit": "audit", "grad": "grad",
+        "conform": "conform", "flips": "flips", "flips-compare": "flips",
     }
 )  # fmt: skip
 

@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Discriminator, Field, WithJsonSchema
+from pydantic import BeforeValidator, Discriminator, Field
 from pydantic_core import PydanticKnownError
 
-from mdnum.systems.interactions import NonNegative, Table
+from mdnum.systems.grammar import Named, NonNegative, TomlTable
 
 Positive = Annotated[float, Field(gt=0)]
 FloatName = Literal["float16", "bfloat16", "float32", "float64"]
@@ -30,41 +30,18 @@ def _numbers(value: Any) -> Any:
     return tuple(float(item) for item in value) if isinstance(value, list | tuple) else value
 
 
-REDUCTIONS = (
-    "sequential", "reversed", "permuted", "pairwise", "blocked", "kahan", "neumaier", "sorted", "exact",
-    "fixed-point",
-)  # fmt: skip
-NUMBERED = ("permuted", "blocked", "fixed-point")
-"""Reductions that a number may follow, after a colon: the seed, the width of a block, the bits."""
-
-
-def _reduction(value: Any) -> Any:
-    """A reduction in the words of mdnum.precision.reductions.parse, told without importing it (and jax)."""
-    if isinstance(value, str):
-        name, colon, number = value.partition(":")
-        if name in REDUCTIONS and (not colon or (name in NUMBERED and number.isdecimal())):
-            return value
-        shown = ", ".join(f'"{one}:n"' if one in NUMBERED else f'"{one}"' for one in REDUCTIONS)
-        raise PydanticKnownError("literal_error", {"expected": f"one of {shown}"})
-    return value
-
-
 def _tuple(value: Any) -> Any:
     # TOML has arrays only; strict pydantic would refuse a list where a tuple is declared
     return tuple(value) if isinstance(value, list) else value
 
 
-_PATTERN = "|".join(rf"{name}(:\d+)?" if name in NUMBERED else name for name in REDUCTIONS)
-Reduction = Annotated[
-    str, BeforeValidator(_reduction), WithJsonSchema({"type": "string", "pattern": f"^({_PATTERN})$"})
-]
 Numbers = Annotated[float | tuple[float, ...], BeforeValidator(_numbers)]
 
 
 # --- start and flight ---------------------------------------------------------------------------------
 
 
-class Boundary(Table):
+class BoundaryTable(TomlTable):
     """A batch at rest whose penetrations sum to stop.tol exactly: one an ulp short of it, and many small."""
 
     terms: int = Field(
@@ -75,7 +52,7 @@ class Boundary(Table):
     )
 
 
-class Start(Table):
+class StartTable(TomlTable):
     """Where the balls are at step 0."""
 
     height: Numbers = Field(default=1.0, description="height above the floor (m), one or one per ball")
@@ -89,25 +66,25 @@ class Start(Table):
     spread_ulps: int = Field(
         default=0, ge=0, description="heights are adjacent floats, so many ulps apart; not with a list"
     )
-    boundary: Boundary | None = Field(
+    boundary: BoundaryTable | None = Field(
         default=None, description="instead of height: a batch whose penetrations sum to stop.tol exactly"
     )
 
 
-class NoControl(Table):
+class NoControl(TomlTable):
     """Nothing but gravity acts in flight."""
 
     kind: Literal["none"]
 
 
-class ConstantControl(Table):
+class ConstantControl(TomlTable):
     """A constant acceleration."""
 
     kind: Literal["constant"]
     value: float = Field(description="acceleration, up is positive (m/s²)")
 
 
-class SineControl(Table):
+class SineControl(TomlTable):
     """amplitude · sin(2π t / period + phase)."""
 
     kind: Literal["sine"]
@@ -116,7 +93,7 @@ class SineControl(Table):
     phase: float = Field(default=0.0, description="phase at time 0 (radians)")
 
 
-class ValuesControl(Table):
+class ValuesControl(TomlTable):
     """An acceleration for each step, held during the step."""
 
     kind: Literal["values"]
@@ -130,7 +107,7 @@ Control = Annotated[
 ]  # fmt: skip
 
 
-class Flight(Table):
+class Flight(TomlTable):
     """What acts on a ball in flight."""
 
     gravity: NonNegative = Field(default=9.81, description="acceleration, downward (m/s²)")
@@ -142,7 +119,7 @@ class Flight(Table):
 # --- contact, stopping rule, integrator ---------------------------------------------------------------
 
 
-class _Contact(Table):
+class _Contact(TomlTable):
     hysteresis: Positive | None = Field(
         default=None, description="a contact ends only above this height (m); default: where it began, at 0"
     )
@@ -189,7 +166,7 @@ Contact = Annotated[PenaltyContact | ProjectionContact | ImpactContact, Discrimi
 _MOST = 2**31 - 1
 
 
-class _Tolerance(Table):
+class _Tolerance(TomlTable):
     tol: Positive = Field(description="the solver stops when its residual is below (m; relative: a share)")
     max_iter: int = Field(
         default=100, ge=1, le=_MOST, description="iterations after which the solver gives up"
@@ -223,7 +200,7 @@ class RelativeRule(_Tolerance):
     rule: Literal["relative"]
 
 
-class FixedRule(Table):
+class FixedRule(TomlTable):
     """So many iterations, whatever the residual."""
 
     rule: Literal["fixed"]
@@ -234,7 +211,7 @@ ToleranceRule = SumRule | PerInstanceRule | MaximumRule | RelativeRule
 Stop = Annotated[SumRule | PerInstanceRule | MaximumRule | RelativeRule | FixedRule, Discriminator("rule")]
 
 
-class Integrator(Table):
+class IntegratorTable(TomlTable):
     """From one step to the next."""
 
     kind: Literal[
@@ -247,7 +224,7 @@ class Integrator(Table):
 # --- precision, loss, gradient ------------------------------------------------------------------------
 
 
-class BallPrecision(Table):
+class BallPrecision(TomlTable):
     """Which float plays which role, and in which order a sum is made."""
 
     state: FloatName = Field(default="float64", description="heights and velocities")
@@ -255,7 +232,7 @@ class BallPrecision(Table):
     decision: FloatName = Field(default="float64", description="a residual and the tolerance, where compared")
     accumulate: FloatName = Field(default="float64", description="the sum of the residuals")
     loss: FloatName = Field(default="float64", description="the loss")
-    reduction: Reduction = Field(
+    reduction: Annotated[str, Named("mdnum.numerics.reductions:REDUCTIONS")] = Field(
         default="sequential",
         description="how the residuals are summed; a number may follow permuted (its seed), blocked (terms "
         'per block) and fixed-point (bits): "permuted:3"',
@@ -266,7 +243,7 @@ class BallPrecision(Table):
     )
 
 
-class Loss(Table):
+class LossTable(TomlTable):
     """The number that a gradient is of."""
 
     kind: Literal["final-height", "mean-height", "residual-penetration"] = Field(
@@ -279,7 +256,7 @@ class Loss(Table):
     )
 
 
-class Gradient(Table):
+class GradientTable(TomlTable):
     """The derivatives asked for."""
 
     of: Annotated[tuple[ParameterName, ...], BeforeValidator(_tuple)] = Field(
@@ -290,7 +267,7 @@ class Gradient(Table):
     )
 
 
-class Fork(Table):
+class BallForkTable(TomlTable):
     """What `mdnum fork` does with this system where the command line does not say."""
 
     vary: str | None = Field(
@@ -324,21 +301,23 @@ def _changes(value: Any) -> Any:
 Variants = Annotated[dict[str, dict[str, Any]], BeforeValidator(_changes)]
 
 
-class BallSpec(Table):
+class BallSpec(TomlTable):
     """A system file of the ball."""
 
     name: str | None = Field(default=None, description="what to call the system; default the file's name")
     about: str = Field(default="", description="one sentence or more for people, with the source")
     world: Literal["ball"] = Field(description='what the file describes: "ball"')
-    start: Start = Field(default_factory=lambda: Start())
+    start: StartTable = Field(default_factory=lambda: StartTable())
     flight: Flight = Field(default_factory=lambda: Flight())
     contact: Contact
     stop: Stop | None = Field(default=None, description="when an iterative solver stops")
-    integrator: Integrator
+    integrator: IntegratorTable
     precision: BallPrecision = Field(default_factory=lambda: BallPrecision())
-    loss: Loss = Field(default_factory=lambda: Loss())
-    gradient: Gradient = Field(default_factory=lambda: Gradient())
-    fork: Fork | None = Field(default=None, description="a question about this system; not about its runs")
+    loss: LossTable = Field(default_factory=lambda: LossTable())
+    gradient: GradientTable = Field(default_factory=lambda: GradientTable())
+    fork: BallForkTable | None = Field(
+        default=None, description="a question about this system; not about its runs"
+    )
     variants: Variants = Field(
         default_factory=dict,
         description='the same system with some keys changed, such as "precision.state" = "float32"',

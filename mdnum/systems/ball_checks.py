@@ -20,7 +20,7 @@ PARAMETERS = {
 ALWAYS = ("gravity", "h", "y0", "v0")
 
 
-class Refusal(Exception):
+class UnusableBall(Exception):
     """A system that cannot be run, with the key at fault; loading adds the place."""
 
     def __init__(self, key: str, message: str, remedy: str):
@@ -53,7 +53,7 @@ def check(spec: ball.BallSpec) -> None:
     """Refuse what cannot be run.
 
     Raises:
-        Refusal: names the key at fault.
+        UnusableBall: names the key at fault.
     """
     _start(spec)
     _combination(spec)
@@ -87,17 +87,17 @@ def _start(spec: ball.BallSpec) -> None:
     if start.boundary is not None:
         given = [
             name
-            for name, field in ball.Start.model_fields.items()
+            for name, field in ball.StartTable.model_fields.items()
             if name != "boundary" and getattr(start, name) != field.default
         ]
         if given:
-            raise Refusal(
+            raise UnusableBall(
                 f"start.{given[0]}",
                 f"[start] has boundary and {', '.join(given)}, but boundary says where every ball is",
                 f"Remove {' and '.join(given)}, or boundary",
             )
         if spec.stop is None or isinstance(spec.stop, ball.FixedRule):
-            raise Refusal(
+            raise UnusableBall(
                 "start.boundary",
                 "a batch on the boundary needs a tolerance to be on the boundary of",
                 'Give a [stop] table with rule = "sum" and tol',
@@ -105,20 +105,20 @@ def _start(spec: ball.BallSpec) -> None:
         low = rounded(spec.stop.tol, start.boundary.format)
         least, most = smallest(start.boundary.format), largest(start.boundary.format)
         if not least <= low <= most:
-            raise Refusal(
+            raise UnusableBall(
                 "stop.tol",
                 f"stop.tol = {spec.stop.tol:g} is outside of what {start.boundary.format} can hold",
                 f"The smallest usable tolerance is {least:.3g}, the largest {most:.4g}",
             )
         if low != spec.stop.tol:
-            raise Refusal(
+            raise UnusableBall(
                 "stop.tol",
                 f"stop.tol = {spec.stop.tol!r} is no {start.boundary.format}, so no sum of them equals it",
                 f"Set it to the nearest one, tol = {low!r}",
             )
         share = spacing(np.nextafter(low, 0.0), start.boundary.format) / start.boundary.terms
         if share < smallest(start.boundary.format):
-            raise Refusal(
+            raise UnusableBall(
                 "start.boundary.terms",
                 f"an ulp of the tolerance in {start.boundary.terms} parts gives {share:g}, below the "
                 f"smallest {start.boundary.format}, {smallest(start.boundary.format):.3g}",
@@ -130,59 +130,61 @@ def _start(spec: ball.BallSpec) -> None:
     }
     for name, value in lists.items():
         if not value:
-            raise Refusal(f"start.{name}", f"start.{name} is an empty array", "Give one number per ball")
+            raise UnusableBall(f"start.{name}", f"start.{name} is an empty array", "Give one number per ball")
         if not all(map(np.isfinite, value)):
-            raise Refusal(
+            raise UnusableBall(
                 f"start.{name}", f"start.{name} holds a number that is not finite", f"Correct {name}"
             )
     if len({len(value) for value in lists.values()}) > 1:
         counts = " and ".join(f"{len(value)} in start.{name}" for name, value in lists.items())
-        raise Refusal("start.velocity", f"arrays of different length: {counts}", "Give one number per ball")
+        raise UnusableBall(
+            "start.velocity", f"arrays of different length: {counts}", "Give one number per ball"
+        )
     if lists and start.balls not in (1, balls(spec)):
-        raise Refusal(
+        raise UnusableBall(
             "start.balls",
             f"start.balls = {start.balls}, but start.{next(iter(lists))} has {balls(spec)} numbers",
             "Leave out start.balls",
         )
     if "height" in lists and (start.spread or start.spread_ulps):
         name = "spread" if start.spread else "spread_ulps"
-        raise Refusal(
+        raise UnusableBall(
             f"start.{name}",
             f"start.{name} has no meaning where start.height gives every ball its own",
             f"Remove {name}, or give one height and start.balls",
         )
     if start.spread and start.spread_ulps:
-        raise Refusal(
+        raise UnusableBall(
             "start.spread_ulps", "start.spread and start.spread_ulps both given", "Keep one of them"
         )
     if (start.spread or start.spread_ulps) and balls(spec) == 1:
         name = "spread" if start.spread else "spread_ulps"
-        raise Refusal(f"start.{name}", f"start.{name} of a single ball", "Set start.balls to 2 or more")
+        raise UnusableBall(f"start.{name}", f"start.{name} of a single ball", "Set start.balls to 2 or more")
 
 
 def _combination(spec: ball.BallSpec) -> None:
     contact, integrator = spec.contact.kind, spec.integrator.kind
     if integrator == "event-located" and contact != "impact":
-        raise Refusal(
+        raise UnusableBall(
             "integrator.kind",
             f"event-located finds the time of an impact, but the contact is a {contact}",
             'Set contact.kind to "impact", or integrator.kind to "semi-implicit-euler"',
         )
     if contact != "penalty" and spec.contact.hysteresis is not None:
-        raise Refusal(
+        raise UnusableBall(
             "contact.hysteresis",
             f"contact.hysteresis has no meaning for {contact}, whose contact ends within the step",
             'Remove it, or set contact.kind to "penalty"; a solver\'s hysteresis is stop.enter',
         )
     control = spec.flight.control
     if isinstance(control, ball.ValuesControl) and len(control.values) != spec.integrator.steps:
-        raise Refusal(
+        raise UnusableBall(
             "flight.control.values",
             f"flight.control.values has {len(control.values)} numbers for {spec.integrator.steps} steps",
             "Give one per step",
         )
     if integrator == "event-located" and control.kind not in ("none", "constant"):
-        raise Refusal(
+        raise UnusableBall(
             "flight.control.kind",
             f"the flight between impacts is a parabola under constant acceleration, not under {control.kind}",
             'Set flight.control.kind to "none" or "constant", or choose another integrator',
@@ -194,14 +196,14 @@ def _stop(spec: ball.BallSpec) -> None:
     if spec.stop is None:
         if needed:
             what = "a projection" if spec.contact.kind == "projection" else "implicit-midpoint"
-            raise Refusal(
+            raise UnusableBall(
                 "stop",
                 f"table [stop] missing; {what} iterates until it is told to stop",
                 'Add for example [stop] with rule = "sum", tol = 1e-6, max_iter = 100',
             )
         return
     if not needed:
-        raise Refusal(
+        raise UnusableBall(
             "stop",
             f"[stop] has no meaning here: {spec.contact.kind} with {spec.integrator.kind} iterates nothing",
             'Remove the table, or set contact.kind to "projection"',
@@ -209,14 +211,14 @@ def _stop(spec: ball.BallSpec) -> None:
     if isinstance(spec.stop, ball.FixedRule):
         return
     if spec.stop.enter is not None and spec.stop.enter < spec.stop.tol:
-        raise Refusal(
+        raise UnusableBall(
             "stop.enter",
             f"stop.enter = {spec.stop.enter:g} is below stop.tol = {spec.stop.tol:g}: a solve would start "
             "that is over before it begins",
             "Make enter at least tol",
         )
     if isinstance(spec.stop, ball.RelativeRule) and spec.stop.tol >= 1:
-        raise Refusal(
+        raise UnusableBall(
             "stop.tol",
             f"stop.tol = {spec.stop.tol:g} of the first residual is above that residual: nothing is solved",
             "A relative tolerance is below 1",
@@ -229,7 +231,7 @@ def _convergence(spec: ball.BallSpec) -> None:
         return
     product = contact.alpha * contact.k
     if product >= 2:
-        raise Refusal(
+        raise UnusableBall(
             "contact.k",
             f"alpha k = {contact.alpha:g} × {contact.k:g} = {product:g}: an iteration multiplies the height "
             f"by 1 - alpha k = {1 - product:g}, so the projection cannot converge",
@@ -261,13 +263,13 @@ def _representable(spec: ball.BallSpec) -> None:
                 _tolerance(spec, stop, key, value)
     for key, value, name, role in _values(spec):
         if abs(value) > largest(name):
-            raise Refusal(
+            raise UnusableBall(
                 key,
                 f"{key} = {value:g} is above the largest {name}, {largest(name):.4g}, which {role} asks for",
                 f"Make it smaller, or {role} wider",
             )
         if 0 < abs(value) < smallest(name):
-            raise Refusal(
+            raise UnusableBall(
                 key,
                 f"{key} = {value:g} is 0 in {name}, which {role} asks for; the least is {smallest(name):.3g}",
                 f"Make it larger, or {role} wider",
@@ -284,14 +286,14 @@ def _tolerance(spec: ball.BallSpec, stop: ball.ToleranceRule, key: str, value: f
     for role in sorted(usable, key=lambda role: -usable[role]):
         name, least = getattr(spec.precision, role), usable[role]
         if value > largest(name):
-            raise Refusal(
+            raise UnusableBall(
                 key,
                 f"{key} = {value:g} is above the largest {name}, {largest(name):.4g}, which precision.{role} "
                 "asks for",
                 f"Make it smaller, or precision.{role} wider",
             )
         if value < least:
-            raise Refusal(
+            raise UnusableBall(
                 key,
                 f"{key} = {value:g} is too small for {name}, which precision.{role} asks for: no residual "
                 "but 0 would be below it",
@@ -302,31 +304,31 @@ def _tolerance(spec: ball.BallSpec, stop: ball.ToleranceRule, key: str, value: f
 def _loss_and_gradient(spec: ball.BallSpec) -> None:
     loss, kind = spec.loss, spec.contact.kind
     if loss.kind == "residual-penetration" and kind != "projection":
-        raise Refusal(
+        raise UnusableBall(
             "loss.kind",
             f"residual-penetration is what a projection's solver leaves, but the contact is a {kind}",
             'Set loss.kind to "final-height"',
         )
     if loss.target is not None and loss.kind != "final-height":
-        raise Refusal(
+        raise UnusableBall(
             "loss.target", f"loss.target has no meaning for {loss.kind}", 'Remove it, or use "final-height"'
         )
     known = (*PARAMETERS[kind], *ALWAYS)
     for name in spec.gradient.of:
         if name not in known:
-            raise Refusal(
+            raise UnusableBall(
                 "gradient.of",
                 f"gradient.of names {name}, which {kind} does not have",
                 f"It has {', '.join(known)}",
             )
         if name == "eps" and isinstance(spec.contact, ball.PenaltyContact) and not spec.contact.eps:
-            raise Refusal(
+            raise UnusableBall(
                 "gradient.of",
                 "gradient.of names eps, but contact.eps = 0 is the sharp contact, which no width belongs to",
                 "Set contact.eps above 0",
             )
         if name == "tol" and (spec.stop is None or isinstance(spec.stop, ball.FixedRule)):
-            raise Refusal(
+            raise UnusableBall(
                 "gradient.of",
                 "gradient.of names tol, but the rule is fixed",
                 "Remove it, or use another rule",

@@ -11,11 +11,11 @@ from typing import Any
 from pydantic import ValidationError
 
 from mdnum.errors import InputError
-from mdnum.store.atomic import disk_errors, write_text
-from mdnum.systems import ball_checks, messages, overrides, toml
+from mdnum.store.files import disk_errors, write_text
+from mdnum.systems import ball_checks, toml
 from mdnum.systems.ball import BallSpec, ValuesControl
-from mdnum.systems.find import SYSTEM_FILE
-from mdnum.systems.grammar import Grammar
+from mdnum.systems.grammar import Grammar, apply_overrides, explain, place, read_overrides
+from mdnum.systems.toml import SYSTEM_FILE
 
 BALL_SCHEMA = "ball-schema.json"
 GRAMMAR = Grammar(BallSpec)
@@ -41,7 +41,7 @@ class Source:
 
 
 @dataclass(frozen=True)
-class Variant:
+class VariantSpec:
     """The same system with some keys changed.
 
     Attributes:
@@ -69,7 +69,7 @@ class BallSystem:
     name: str
     spec: BallSpec
     path: Path | None = None
-    variants: tuple[Variant, ...] = ()
+    variants: tuple[VariantSpec, ...] = ()
 
     @property
     def balls(self) -> int:
@@ -94,7 +94,7 @@ class BallSystem:
         name = name or ", ".join(f"{key}={value}" for key, value in changes.items())
         if name in {variant.name for variant in self.variants}:
             raise InputError(f"there is a variant {name!r} already", remedy="Give it once")
-        given = {".".join(key): value for key, value in overrides.read(changes).items()}
+        given = {".".join(key): value for key, value in read_overrides(changes).items()}
         variant = vary(name, given, self.spec, f"--against {name}")
         tables = {**self.spec.variants, name: given}
         spec = self.spec.model_copy(update={"variants": tables})
@@ -142,20 +142,18 @@ def make(source: Source, data: dict[str, Any]) -> BallSystem:
     Raises:
         InputError: anything that cannot be run, in one line.
     """
-    overrides.apply(data, source.values, GRAMMAR)
+    apply_overrides(data, source.values, GRAMMAR)
     _drop_meaningless(data, source.values)
     try:
         spec = BallSpec.model_validate(data)
     except ValidationError as error:
-        raise messages.explain(error, data, source.text, source.where, source.values, GRAMMAR) from None
+        raise explain(error, data, source.text, source.where, source.values, GRAMMAR) from None
     try:
         ball_checks.check(spec)
-    except ball_checks.Refusal as refusal:
+    except ball_checks.UnusableBall as refusal:
         raise _located(refusal, source) from None
     variants = tuple(
-        vary(
-            name, changes, spec, messages.place(("variants", name), source.text, source.where, source.values)
-        )
+        vary(name, changes, spec, place(("variants", name), source.text, source.where, source.values))
         for name, changes in spec.variants.items()
     )
     return BallSystem(spec.name or source.name, spec, source.path, variants)
@@ -192,14 +190,14 @@ def kind_first(spec: Mapping[str, Any]) -> dict[str, Any]:
     return ordered
 
 
-def _located(refusal: ball_checks.Refusal, source: Source) -> InputError:
+def _located(refusal: ball_checks.UnusableBall, source: Source) -> InputError:
     key = refusal.key
     # a default that cannot be run has no line of its own; the overrides that led there are named
-    where = messages.place(key, source.text, source.where, source.values)
+    where = place(key, source.text, source.where, source.values)
     return InputError(refusal.message, remedy=refusal.remedy, where=where)
 
 
-def vary(name: str, changes: Mapping[str, Any], base: BallSpec, where: str) -> Variant:
+def vary(name: str, changes: Mapping[str, Any], base: BallSpec, where: str) -> VariantSpec:
     """The system with keys changed, checked.
 
     Args:
@@ -224,15 +222,15 @@ def vary(name: str, changes: Mapping[str, Any], base: BallSpec, where: str) -> V
                 where=where,
                 remedy="Remove it",
             )
-    overrides.apply(data, values, GRAMMAR)
+    apply_overrides(data, values, GRAMMAR)
     _drop_meaningless(data, values)
     try:
         spec = BallSpec.model_validate(data)
         ball_checks.check(spec)
     except ValidationError as error:
-        said = messages.explain(error, data, "", where, (), GRAMMAR)
+        said = explain(error, data, "", where, (), GRAMMAR)
         raise InputError(f"variant {name!r}: {said.message}", remedy=said.remedy, where=where) from None
-    except ball_checks.Refusal as refusal:
+    except ball_checks.UnusableBall as refusal:
         raise InputError(f"variant {name!r}: {refusal.message}", remedy=refusal.remedy, where=where) from None
     if ball_checks.balls(spec) != ball_checks.balls(base):
         raise InputError(
@@ -241,4 +239,4 @@ def vary(name: str, changes: Mapping[str, Any], base: BallSpec, where: str) -> V
             where=where,
             remedy="Keep the number of balls",
         )
-    return Variant(name, dict(changes), spec)
+    return VariantSpec(name, dict(changes), spec)

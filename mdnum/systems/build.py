@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -14,32 +14,21 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mdnum.errors import InputError
-from mdnum.md.cell import Cell, displacement
-from mdnum.md.cutoffs import BY_NAME as CUTOFFS
+from mdnum.md.cell import Cell, displacement, wrap_positions
+from mdnum.md.cutoffs import CUTOFFS, Cutoff
 from mdnum.md.decide import PairDecider, Tables
 from mdnum.md.integrators import Integrator, Langevin, VelocityVerlet
-from mdnum.md.lattice import Lattice, LatticeDecider
+from mdnum.md.lattice import Lattice, LatticeDecider, LatticeStep, on_lattice
 from mdnum.md.latticeforce import LatticeForce
-from mdnum.md.latticestep import LatticeStep, on_lattice
-from mdnum.md.manyforce import ManyBodyForce
-from mdnum.md.pairforce import PairForce
-from mdnum.md.potentials import CutPotential, LennardJones, Morse, PairPotential, SoftSphere, pair_type
-from mdnum.md.verlet import BUILDERS, SLOTS, PairTable, RebuildRule, VerletList, check_radius
-from mdnum.precision import PrecisionPolicy, unit_roundoff
-from mdnum.precision.policy import LATTICE
-from mdnum.precision.reductions import BY_NAME as REDUCTIONS
+from mdnum.md.neighbors import BUILDERS, SLOTS, PairTable, RebuildRule, VerletList, check_radius
+from mdnum.md.pairforce import ManyBodyForce, PairForce
+from mdnum.md.potentials import POTENTIALS, CutPotential, pair_type
+from mdnum.numerics import PrecisionPolicy, unit_roundoff
+from mdnum.numerics.reductions import REDUCTIONS
+from mdnum.numerics.roles import LATTICE
 from mdnum.systems import pairs, schema
 from mdnum.systems.load import System, load
 from mdnum.units import Units
-
-if TYPE_CHECKING:
-    from mdnum.systems.evaluate import Evaluation
-
-_POTENTIALS: Mapping[str, type[PairPotential]] = {
-    "lennard-jones": LennardJones,
-    "morse": Morse,
-    "soft-sphere": SoftSphere,
-}
 
 
 @dataclass(frozen=True)
@@ -183,7 +172,7 @@ class Simulation:
     def verlet_list(self, skin: float | None = None) -> VerletList:
         """A new Verlet list for this system, with another skin where one is given."""
         rule = self.rule if skin is None else replace(self.rule, skin=skin)
-        return VerletList(BUILDERS[self.builder], rule, self.r_cut, guard=self._guard)
+        return VerletList(BUILDERS.parse(self.builder), rule, self.r_cut, guard=self._guard)
 
     @property
     def _guard(self) -> float:
@@ -203,9 +192,17 @@ class Simulation:
             types = jnp.asarray(kinds.astype(np.uint8).reshape(shape))
         return Tables(jnp.asarray(table.index.reshape(shape)), types, jnp.asarray(table.order))
 
-    def with_cutoff(self, kind: str) -> Simulation:
+    def with_cutoff(self, cutoff: str | Cutoff) -> Simulation:
         """The same system with another treatment of its cutoff (its radius and pairs stay the same)."""
-        return replace(self, model=eqx.tree_at(lambda m: m.cutoff, self.model, CUTOFFS[kind]))
+        made = CUTOFFS.parse(cutoff) if isinstance(cutoff, str) else cutoff
+        return replace(self, model=replace(self.model, cutoff=made))
+
+    @property
+    def continuous(self) -> Simulation:
+        """The same forces from an energy that does not jump at the cutoff."""
+        if not self.pairwise or self.cutoff.continuous is self.cutoff:
+            return self
+        return self.with_cutoff(self.cutoff.continuous)
 
     def with_cell(self, cell: Cell) -> Simulation:
         """The same system in another box."""
@@ -227,8 +224,6 @@ class Simulation:
         Raises:
             InputError: the cutoff exceeds half the smallest perpendicular width.
         """
-        from mdnum.systems.evaluate import Evaluator
-
         return Evaluator(self, skin=0.0)(positions, cell)
 
     def inside(self, wrapped, table: PairTable, bits) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -252,26 +247,26 @@ def _pair_model(system: System) -> CutPotential:
     radius, onset = pairs.cutoff_radii(spec, species)
     r_cut = jnp.asarray(_per_type(radius))
     return CutPotential(
-        _POTENTIALS[spec.potential.kind](**constants),
-        CUTOFFS[spec.cutoff.kind],
+        POTENTIALS[spec.potential.kind](**constants),
+        CUTOFFS.parse(spec.cutoff.kind),
         r_cut,
         r_cut if onset is None else jnp.asarray(_per_type(onset)),
     )
 
 
 def _many_body_model(system: System):
-    from mdnum.md import manybody
+    from mdnum.md import embedded_atom, manybody
 
     potential = system.spec.potential
     a, b, c = (bool(flag) for flag in system.atoms.pbc)
     pbc = (a, b, c)
-    if isinstance(potential, schema.EmbeddedAtom):
-        return manybody.embedded_atom(
+    if isinstance(potential, schema.EmbeddedAtomTable):
+        return embedded_atom.embedded_atom(
             system.folder / potential.file, system.atoms.get_chemical_symbols(), pbc
         )
-    if isinstance(potential, schema.Tersoff):
+    if isinstance(potential, schema.TersoffTable):
         return manybody.tersoff(potential.parameters, pbc)
-    assert isinstance(potential, schema.StillingerWeber)
+    assert isinstance(potential, schema.StillingerWeberTable)
     return manybody.stillinger_weber(potential.parameters, pbc)
 
 
@@ -323,7 +318,7 @@ def build(system: System | str, overrides: Mapping[str, Any] | None = None) -> S
     rebuild = spec.neighbors.rebuild
     builder = spec.neighbors.builder
     timestep = jnp.asarray(spec.dynamics.timestep * units.time_factor, jnp.float64)
-    if isinstance(spec.dynamics, schema.Langevin):
+    if isinstance(spec.dynamics, schema.LangevinTable):
         integrator: Integrator = Langevin(
             timestep,
             jnp.asarray(spec.dynamics.friction / units.time_factor, jnp.float64),
@@ -345,7 +340,7 @@ def build(system: System | str, overrides: Mapping[str, Any] | None = None) -> S
         # a search on the host wins on a CPU; on an accelerator the positions would have to travel
         ("host" if jax.default_backend() == "cpu" else "jax-md") if builder == "auto" else builder,
         policy,
-        REDUCTIONS[precision.reduction],
+        REDUCTIONS.parse(precision.reduction),
         integrator,
     )
     return _in_whole_numbers(simulation) if precision.state == LATTICE else simulation
@@ -385,3 +380,105 @@ def _in_whole_numbers(simulation: Simulation) -> Simulation:
     # made here, so that a friction that a lattice cannot have is refused before the run
     assert made.propagator is not None
     return made
+
+
+# --- energies and forces of single configurations, with a Verlet list that is kept while it serves ----
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Energies and forces of one configuration.
+
+    Attributes:
+        energy: total energy.
+        forces: shape (atoms, 3), energy/length.
+        stress: dE/dstrain / volume (ASE's sign), shape (3, 3), energy/length³; NaN without a volume.
+        energies: per atom, shape (atoms,), pair terms split evenly; NaN for many-body potentials.
+        i, j: pairs inside the (longest) cutoff, i < j.
+        distance: of those pairs, length.
+    """
+
+    energy: float
+    forces: Float[np.ndarray, "atoms 3"]
+    stress: Float[np.ndarray, "3 3"]
+    energies: Float[np.ndarray, "atoms"]
+    i: Int[np.ndarray, "pairs"]
+    j: Int[np.ndarray, "pairs"]
+    distance: Float[np.ndarray, "pairs"]
+
+
+class Evaluator:
+    """Evaluates one configuration after another, with a list rebuilt once motion and strain used its skin.
+
+    Args:
+        simulation: the system as objects.
+        skin: skin of the list, length; default the system's. A box too narrow for it gets what fits.
+    """
+
+    def __init__(self, simulation: Simulation, skin: float | None = None):
+        self.simulation = simulation
+        self.skin = simulation.rule.skin if skin is None else skin
+        self.builds = 0
+        self._verlet = simulation.verlet_list(self.skin)
+        self._kept: tuple[PairTable, Tables, Float[np.ndarray, "atoms 3"], Cell] | None = None
+
+    def __call__(
+        self,
+        positions: Float[np.ndarray, "atoms 3"] | None = None,
+        cell: Float[np.ndarray, "3 3"] | None = None,
+    ) -> Evaluation:
+        """Energy, forces, stress and pairs.
+
+        Args:
+            positions: length; default the structure's.
+            cell: lattice vectors as rows; default the system's.
+
+        Raises:
+            InputError: the cutoff exceeds half the smallest perpendicular width.
+        """
+        own = self.simulation
+        same_box = cell is None or np.array_equal(cell, np.asarray(own.cell.matrix))
+        here = own if same_box else own.with_cell(Cell.create(cell, own.pbc))
+        at = np.asarray(own.positions if positions is None else positions, np.float64)
+        wrapped, _ = wrap_positions(here.cell, at)
+        table, tables = self._list(here, wrapped)
+        x = jnp.asarray(wrapped[table.order].T, here.policy.dtype("state"))
+        result, bits, virial = _evaluate(here.force, x, tables)
+        forces = np.empty((here.atoms, 3))
+        forces[table.order] = np.asarray(result.force, np.float64).T
+        energies = np.full(here.atoms, np.nan)
+        if here.pairwise:
+            energies[table.order] = np.asarray(result.energy, np.float64)
+        i, j, distance = here.inside(wrapped, table, np.asarray(bits))
+        return Evaluation(
+            float(jnp.sum(result.energy, dtype=jnp.float64)),
+            forces,
+            -np.asarray(virial) / here.cell.volume,
+            energies,
+            i,
+            j,
+            distance,
+        )
+
+    def _list(self, here: Simulation, wrapped) -> tuple[PairTable, Tables]:
+        """The list in use, rebuilt where it no longer holds every pair inside."""
+        if self._kept is not None:
+            table, tables, reference, reference_cell = self._kept
+            if self._verlet.consumed(wrapped, here.cell, reference, reference_cell) <= 1.0:
+                return table, tables
+        slots = self._verlet.slots
+        self._verlet = here.verlet_list(min(self.skin, float(here.cell.widths.min()) / 2 - here.r_cut))
+        # capacity only grows: each new size would be compiled for
+        self._verlet.slots = slots
+        table = self._verlet.build(wrapped, here.cell)
+        self._kept = table, here.tables(table), wrapped, here.cell
+        self.builds += 1
+        return table, self._kept[1]
+
+
+@eqx.filter_jit
+def _evaluate(force: PairForce | ManyBodyForce, x, tables: Tables):
+    """Forces, decisions, and the virial tensor sum r_ij ⊗ F_ij."""
+    result = force(x, tables, decisions=True)
+    assert result.decisions is not None
+    return result, result.decisions.bits, force.virial_tensor(x, tables)

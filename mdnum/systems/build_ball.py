@@ -11,12 +11,11 @@ import numpy as np
 from jaxtyping import Float
 
 from mdnum.ball import contacts, integrators, limits, stopping
-from mdnum.ball.losses import FinalHeight, Loss, MeanHeight, ResidualPenetration
-from mdnum.ball.problem import Problem
+from mdnum.ball.problem import BallLoss, BallProblem, FinalHeight, MeanHeight, ResidualPenetration
 from mdnum.ball.world import World
 from mdnum.errors import InputError
-from mdnum.precision import neighbor, reductions
-from mdnum.precision.policy import RolePrecision
+from mdnum.numerics import neighbor, reductions
+from mdnum.numerics.roles import RolePrecision
 from mdnum.systems import ball, ball_checks
 from mdnum.systems.ball_system import BallSystem
 from mdnum.systems.load import load
@@ -24,7 +23,7 @@ from mdnum.systems.load import load
 _INTEGRATORS: Mapping[str, Any] = {
     "explicit-euler": integrators.ExplicitEuler,
     "semi-implicit-euler": integrators.SemiImplicitEuler,
-    "velocity-verlet": integrators.VelocityVerlet,
+    "velocity-verlet": integrators.BallVerlet,
     "event-located": integrators.EventLocated,
 }
 _RULES: Mapping[str, Any] = {
@@ -47,7 +46,7 @@ class BallVariant:
 
     name: str
     changes: Mapping[str, Any]
-    problem: Problem
+    problem: BallProblem
 
 
 @dataclass(frozen=True)
@@ -61,7 +60,7 @@ class BallSimulation:
     """
 
     system: BallSystem
-    problem: Problem
+    problem: BallProblem
     variants: tuple[BallVariant, ...]
 
 
@@ -89,7 +88,7 @@ def build_ball(
     return BallSimulation(system, problem(system.spec, steps, system.name), variants)
 
 
-def problem(spec: ball.BallSpec, steps: int | None = None, where: str = "system") -> Problem:
+def problem(spec: ball.BallSpec, steps: int | None = None, where: str = "system") -> BallProblem:
     """World, start, steps and loss of the tables of a file.
 
     Args:
@@ -123,7 +122,7 @@ def problem(spec: ball.BallSpec, steps: int | None = None, where: str = "system"
     except InputError as error:
         raise InputError(error.message, remedy=error.remedy, where=error.where or where) from None
     y0, v0 = start(spec)
-    return Problem(world, y0, v0, steps, _loss(spec.loss))
+    return BallProblem(world, y0, v0, steps, _loss(spec.loss))
 
 
 def start(spec: ball.BallSpec) -> tuple[Float[np.ndarray, "balls"], Float[np.ndarray, "balls"]]:
@@ -143,12 +142,8 @@ def start(spec: ball.BallSpec) -> tuple[Float[np.ndarray, "balls"], Float[np.nda
     return np.broadcast_to(height, count).copy(), np.broadcast_to(velocity, count).copy()
 
 
-def _on_the_boundary(spec: ball.BallSpec, boundary: ball.Boundary) -> Float[np.ndarray, "balls"]:
-    """One penetration an ulp short of the tolerance, and the ulp in equal parts.
-
-    Summed largest first, each part is less than half an ulp of the sum and is rounded away; their exact sum
-    is the tolerance.
-    """
+def _on_the_boundary(spec: ball.BallSpec, boundary: ball.BoundaryTable) -> Float[np.ndarray, "balls"]:
+    """One penetration an ulp short of the tolerance, and the ulp in equal parts."""
     assert spec.stop is not None and not isinstance(spec.stop, ball.FixedRule)
     tol = spec.stop.tol
     below = float(np.nextafter(np.asarray(tol, limits.DTYPES[boundary.format]), 0))
@@ -201,15 +196,15 @@ def stop_rule(spec: ball.BallSpec) -> Any:
     table = spec.stop
     assert table is not None
     if isinstance(table, ball.FixedRule):
-        return stopping.Fixed(table.count)
+        return stopping.FixedCount(table.count)
     options = {}
     if table.rule in ("sum", "relative"):
         options["reduction"] = reductions.parse(spec.precision.reduction)
     rule = _RULES[table.rule](table.tol, table.max_iter, **options)
-    return rule if table.enter is None else stopping.Hysteresis(rule, table.enter)
+    return rule if table.enter is None else stopping.HysteresisStop(rule, table.enter)
 
 
-def _loss(table: ball.Loss) -> Loss:
+def _loss(table: ball.LossTable) -> BallLoss:
     if table.kind == "mean-height":
         return MeanHeight()
     if table.kind == "residual-penetration":

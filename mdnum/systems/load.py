@@ -1,8 +1,10 @@
-"""From a name or a path to a checked system: find the file, read it, apply overrides, make the structure."""
+"""Where system files are: shipped ones by name, a person's own by path."""
 
 from __future__ import annotations
 
+import importlib.resources
 import shutil
+import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,18 +16,88 @@ from pydantic import ValidationError
 
 from mdnum import units as unit_systems
 from mdnum.errors import InputError
-from mdnum.store.atomic import disk_errors, replacing, write_text
-from mdnum.systems import messages, pairs, schema, structures, toml
-from mdnum.systems import overrides as overrides_module
+from mdnum.registry import nearest
+from mdnum.store.files import disk_errors, replacing, write_text
+from mdnum.systems import pairs, schema, structures, toml
 from mdnum.systems.ball_system import BALL_SCHEMA, BallSystem, Source, kind_first
 from mdnum.systems.ball_system import make as make_ball
-from mdnum.systems.find import SYSTEM_FILE, find, names, shipped_folder, shown
-from mdnum.systems.grammar import Grammar
+from mdnum.systems.grammar import Grammar, apply_overrides, explain, read_overrides
+from mdnum.systems.toml import SYSTEM_FILE
+
+
+def shipped_folder(kind: Literal["systems", "demos"] = "systems") -> Path:
+    """The folder of shipped files: the packaged copy, else the repository's (editable installs)."""
+    package = Path(str(importlib.resources.files("mdnum")))
+    packaged = package / f"_{kind}"
+    return packaged if packaged.is_dir() else package.parent / kind
+
+
+def names(world: Literal["md", "ball"] | None = None) -> list[str]:
+    """Names of the shipped systems, such as "argon/liquid-864".
+
+    Args:
+        world: only those of this world.
+    """
+    root = shipped_folder()
+    found = list(root.glob("*/*.toml"))
+    if world is not None:
+        found = [path for path in found if _world(path) == world]
+    return sorted(path.relative_to(root).with_suffix("").as_posix() for path in found)
+
+
+def world_of(name: str | Path) -> str:
+    """ "md" or "ball", read from a system's file without checking it; "md" where that is no TOML.
+
+    Raises:
+        InputError: nothing of that name.
+    """
+    try:
+        return str(_world(find(name)[1]))
+    except (ValueError, RecursionError):
+        # whoever loads it says where the mistake is
+        return "md"
+
+
+def _world(path: Path) -> str:
+    return tomllib.loads(path.read_text(encoding="utf-8")).get("world", "md")
+
+
+def find(name: str | Path) -> tuple[str, Path]:
+    """Name and file of a system: a path to a TOML file, a folder that holds system.toml, or a shipped name.
+
+    Raises:
+        InputError: nothing of that name; says the nearest shipped one.
+    """
+    path = Path(name)
+    text = str(name)
+    if path.is_dir() and (path / SYSTEM_FILE).is_file():
+        return path.resolve().name, path / SYSTEM_FILE
+    if path.is_file():
+        return path.stem, path
+    if path.suffix == ".toml":
+        raise InputError("no such system file", where=text, remedy="Check the path")
+    known = names()
+    if text in known:
+        return text, shipped_folder() / f"{text}.toml"
+    short = [one for one in known if one.split("/")[-1] == text]
+    near = short[0] if short else nearest(text, known)
+    hint = f"Did you mean {near}? " if near else ""
+    raise InputError(
+        f"no system called {text!r}, and no file of that name",
+        remedy=f"{hint}`mdnum systems list` names those shipped; your own system is a path to a .toml file",
+    )
+
+
+def shown(path: Path) -> str:
+    """A path as a message names it: from here where it is below here."""
+    try:
+        return str(path.resolve().relative_to(Path.cwd()))
+    except ValueError:
+        return str(path)
+
 
 if TYPE_CHECKING:
     from ase import Atoms
-
-__all__ = ["STRUCTURE_FILE", "SYSTEM_FILE", "System", "copy", "find", "load", "names", "shipped_folder"]
 
 STRUCTURE_FILE = "structure.extxyz"
 
@@ -83,7 +155,7 @@ class System:
     def tables(self) -> set[Path]:
         """Files the potential reads."""
         potential = self.spec.potential
-        return {self.folder / potential.file} if isinstance(potential, schema.EmbeddedAtom) else set()
+        return {self.folder / potential.file} if isinstance(potential, schema.EmbeddedAtomTable) else set()
 
     def to_toml(self, *, beside: bool = True) -> str:
         """The system file with every default written out.
@@ -102,7 +174,7 @@ class System:
             return toml.dump({"name": self.name, **kind_first(spec)})
         kept = {key: structure[key] for key in ("masses", "velocities") if key in structure}
         spec["structure"] = {"file": STRUCTURE_FILE, **kept}
-        if isinstance(self.spec.potential, schema.EmbeddedAtom):
+        if isinstance(self.spec.potential, schema.EmbeddedAtomTable):
             spec["potential"]["file"] = Path(self.spec.potential.file).name
         return toml.dump({"name": self.name, **kind_first(spec)})
 
@@ -193,7 +265,7 @@ def load(
             f"cannot be read ({error})", where=where, remedy="A system file is UTF-8 text"
         ) from error
     data = toml.parse(text, where)
-    values = overrides_module.read(overrides)
+    values = read_overrides(overrides)
     source = Source(found, path, where, text, values)
     is_ball = _is_ball(data, where)
     if world is not None and is_ball != (world == "ball"):
@@ -222,12 +294,12 @@ def _is_ball(data: Mapping[str, Any], where: str) -> bool:
 
 def _make(source: Source, data: dict[str, Any]) -> System:
     """The atoms' system of the tables of a file."""
-    overrides_module.apply(data, source.values, GRAMMAR)
+    apply_overrides(data, source.values, GRAMMAR)
     _draw_again(data, source.values)
     try:
         spec = schema.SystemSpec.model_validate(data)
     except ValidationError as error:
-        raise messages.explain(error, data, source.text, source.where, source.values, GRAMMAR) from None
+        raise explain(error, data, source.text, source.where, source.values, GRAMMAR) from None
     spec = _resolve(spec)
     try:
         atoms = structures.make(spec.structure, spec.units, source.path.parent)
@@ -254,8 +326,6 @@ def _resolve(spec: schema.SystemSpec) -> schema.SystemSpec:
     """The defaults that depend on other keys, written out."""
     update: dict[str, Any] = {"neighbors": spec.neighbors.model_copy(update={"skin": spec.skin})}
     cutoff = spec.cutoff
-    if isinstance(cutoff, schema.SwitchingCutoff) and cutoff.onset is None:
-        base = cutoff.radius if cutoff.radius is not None else cutoff.in_sigma
-        if base is not None:
-            update["cutoff"] = cutoff.model_copy(update={"onset": schema.ONSET_FRACTION * base})
+    if cutoff is not None and cutoff.switches and cutoff.onset is None and cutoff.base is not None:
+        update["cutoff"] = cutoff.model_copy(update={"onset": schema.ONSET_FRACTION * cutoff.base})
     return spec.model_copy(update=update)

@@ -41,14 +41,16 @@ def pair_constants(spec: SystemSpec, species: tuple[str, ...]) -> dict[str, Tabl
         InputError: a pair of species has no constants.
     """
     potential = spec.potential
-    if not isinstance(potential, schema.PairPotential):
+    if not isinstance(potential, schema.PairPotentialTable):
         raise TypeError(f"{potential.kind} is not a pair potential")
     given = {pair_key(*name.split("-")): row for name, row in (potential.pairs or {}).items()}
     tables = {name: np.zeros((len(species), len(species))) for name in potential.constants}
     missing = []
     for a, b in combinations_with_replacement(range(len(species)), 2):
         row = given.get(pair_key(species[a], species[b]))
-        if row is None and not (len(species) == 1 and getattr(potential, potential.constants[0]) is not None):
+        if row is None and not (
+            len(species) == 1 and getattr(potential, potential.constants[0], None) is not None
+        ):
             missing.append(f"{species[a]}-{species[b]}")
             continue
         for name, table in tables.items():
@@ -90,13 +92,12 @@ def cutoff_radii(spec: SystemSpec, species: tuple[str, ...]) -> tuple[Table, Tab
             f"[cutoff.pairs] has no radius for {species[a]}-{species[b]} (it has {', '.join(given)})",
             remedy="Add it, or give a radius for every other pair as cutoff.radius",
         )
-    if not isinstance(cutoff, schema.SwitchingCutoff):
+    if not cutoff.switches:
         return radius, None
     if cutoff.onset is None:
         return radius, schema.ONSET_FRACTION * radius
-    base = cutoff.radius if cutoff.radius is not None else cutoff.in_sigma
-    if base is None:
-        raise TypeError("an onset without a radius passes no schema")
+    base = cutoff.base
+    assert base is not None
     # one radius for all: keep the onset as written instead of rounding it through the ratio
     scaled = radius * (cutoff.onset / base)
     return radius, np.where(radius == cutoff.radius, cutoff.onset, scaled) if cutoff.radius else scaled
@@ -111,9 +112,9 @@ def longest_radius(spec: SystemSpec, species: tuple[str, ...], folder: Path) -> 
         folder: where a potential table is looked for.
     """
     potential = spec.potential
-    if isinstance(potential, schema.EmbeddedAtom):
+    if isinstance(potential, schema.EmbeddedAtomTable):
         return _setfl_header(folder / potential.file, species)
-    if isinstance(potential, schema.ManyBodyPotential):
+    if isinstance(potential, schema.ManyBodyTable):
         unknown = [name for name in species if name != potential.parameters]
         if unknown:
             raise InputError(

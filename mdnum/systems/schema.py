@@ -1,83 +1,269 @@
-"""What a system file may say: frozen pydantic models, one per table, with the unit of every number.
+"""What a system file may hold: frozen pydantic models, one per table, with the unit of every number.
 
 Why strict: a system file decides what is computed, so a misspelled key or a string where a number belongs
-is refused (mdnum.systems.load turns each refusal into one line). Lengths, energies and times are in the
-units of the file: Å, eV, amu, ps and K for "metal"; multiples of σ, ε, m and τ for "lj".
+is an error (mdnum.systems.load makes one line of each). Lengths, energies and times are in the units of the
+file: Å, eV, amu, ps and K for "metal"; multiples of σ, ε, m and τ for "lj".
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from dataclasses import fields
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args
 
-from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
+from pydantic import BeforeValidator, ConfigDict, Discriminator, Field, Tag, create_model, model_validator
 
 from mdnum import units as unit_systems
-from mdnum.systems.interactions import (
-    ONSET_FRACTION,
-    Cutoff,
-    EmbeddedAtom,
-    Length,
-    LennardJones,
-    ManyBodyPotential,
-    Morse,
-    NonNegative,
-    PairPotential,
-    Potential,
-    SoftSphere,
-    StillingerWeber,
-    SwitchingCutoff,
-    Table,
-    Tersoff,
-    pair_key,
+from mdnum.systems.grammar import Named, NonNegative, TomlTable
+
+Length = Annotated[float, Field(gt=0, description="length (Å or σ)")]
+Energy = Annotated[float, Field(gt=0, description="energy (eV or ε)")]
+Compare = Literal["r2 <", "r2 <=", "r <", "r <="]
+
+ONSET_FRACTION = 0.9
+"""A switched cutoff without an onset starts to switch at this fraction of its radius."""
+
+
+# --- potential ----------------------------------------------------------------------------------------
+
+
+def pair_key(a: str, b: str) -> str:
+    """The one spelling under which a pair of species is looked up: "Ni-P" for either order."""
+    return "-".join(sorted((a, b)))
+
+
+def _check_pairs(pairs: Mapping[str, Any] | None) -> None:
+    seen: dict[str, str] = {}
+    for name in pairs or {}:
+        parts = name.split("-")
+        if len(parts) != 2 or not all(part.isalpha() for part in parts):
+            raise ValueError(f"pair {name!r} is not two species joined by a hyphen, such as 'Ni-P'")
+        key = pair_key(*parts)
+        if key in seen:
+            raise ValueError(f"pairs {seen[key]!r} and {name!r} are the same pair")
+        seen[key] = name
+
+
+class LennardJonesPair(TomlTable):
+    """Constants of one pair of species, Lennard-Jones."""
+
+    sigma: Length = Field(description="distance of zero energy (Å or σ)")
+    epsilon: Energy = Field(description="well depth (eV or ε)")
+
+
+class MorsePair(TomlTable):
+    """Constants of one pair of species, Morse."""
+
+    depth: Energy = Field(description="well depth D (eV or ε)")
+    alpha: float = Field(gt=0, description="stiffness (1/length)")
+    r0: Length = Field(description="distance of the minimum (Å or σ)")
+
+
+class SoftSpherePair(TomlTable):
+    """Constants of one pair of species, soft sphere."""
+
+    sigma: Length = Field(description="diameter (Å or σ)")
+    epsilon: Energy = Field(description="energy scale (eV or ε)")
+    alpha: float = Field(default=2.0, gt=1, description="exponent; 2 is harmonic, 2.5 Hertzian")
+
+
+class PairPotentialTable(TomlTable):
+    """A pair potential: one set of constants, or one for each pair of species."""
+
+    if TYPE_CHECKING:
+        kind: str
+        pairs: Mapping[str, Any] | None
+
+    @model_validator(mode="after")
+    def _complete(self) -> Any:
+        pairs = getattr(self, "pairs", None)
+        _check_pairs(pairs)
+        if not pairs:
+            missing = [key for key in self.constants if getattr(self, key, None) is None]
+            if missing:
+                raise ValueError(f"{', '.join(missing)} missing, and no pairs table gives them")
+        return self
+
+    @property
+    def constants(self) -> tuple[str, ...]:
+        """Names of the constants of one pair."""
+        return tuple(key for key in type(self).model_fields if key not in ("kind", "pairs"))
+
+
+def _pair_table(name: str, kind: str, row: type[TomlTable], description: str) -> Any:
+    """The table of a potential whose constants are given once, or as a row for each pair of species."""
+    columns: dict[str, Any] = {"kind": (Literal[kind], ...)}
+    for key, field in row.model_fields.items():
+        value: Any = Annotated[field.annotation, *field.metadata]
+        given = Field(default=None, description=field.description)
+        columns[key] = (value | None, given) if field.is_required() else (field.annotation, field)
+    rows = Field(default=None, description='constants of each pair of species, such as "Ni-P"')
+    columns["pairs"] = (dict[str, row] | None, rows)
+    return create_model(name, __base__=PairPotentialTable, __doc__=description, **columns)
+
+
+LennardJonesTable = _pair_table(
+    "LennardJonesTable", "lennard-jones", LennardJonesPair, "4 ε [(σ/r)^12 - (σ/r)^6]."
+)
+MorseTable = _pair_table("MorseTable", "morse", MorsePair, "D [(1 - exp(-α (r - r0)))^2 - 1].")
+SoftSphereTable = _pair_table(
+    "SoftSphereTable", "soft-sphere", SoftSpherePair, "(ε/α) (1 - r/σ)^α inside σ, nothing outside."
 )
 
-__all__ = [
-    "DEFAULT_SKIN",
-    "NVE",
-    "ONSET_FRACTION",
-    "BuilderStructure",
-    "Cutoff",
-    "Dynamics",
-    "EmbeddedAtom",
-    "FileStructure",
-    "Fork",
-    "Langevin",
-    "LennardJones",
-    "ManyBodyPotential",
-    "Morse",
-    "Neighbors",
-    "PairPotential",
-    "Potential",
-    "Precision",
-    "Rebuild",
-    "Record",
-    "SoftSphere",
-    "StillingerWeber",
-    "Structure",
-    "SwitchingCutoff",
-    "SystemSpec",
-    "Tersoff",
-    "json_schema",
-    "pair_key",
+
+class ManyBodyTable(TomlTable):
+    """A potential that is no sum over pairs, and has its own cutoff."""
+
+    if TYPE_CHECKING:
+        kind: str
+        parameters: str
+
+
+class StillingerWeberTable(ManyBodyTable):
+    """Stillinger-Weber's two- and three-body potential (Phys. Rev. B 31, 5262, 1985)."""
+
+    kind: Literal["stillinger-weber"]
+    parameters: Literal["Si"] = Field(default="Si", description="set of constants; Si: the original silicon")
+
+
+class TersoffTable(ManyBodyTable):
+    """Tersoff's bond-order potential (Phys. Rev. B 38, 9902, 1988)."""
+
+    kind: Literal["tersoff"]
+    parameters: Literal["Si"] = Field(default="Si", description="set of constants; Si: Tersoff's T3 silicon")
+
+
+class EmbeddedAtomTable(ManyBodyTable):
+    """Embedded-atom method from a table."""
+
+    kind: Literal["eam"]
+    file: str = Field(description="setfl table (.eam.alloy), relative to this file")
+
+
+_MANY_BODY = (StillingerWeberTable, TersoffTable, EmbeddedAtomTable)
+_PAIRS = (LennardJonesTable, MorseTable, SoftSphereTable)
+
+
+class OtherRow(TomlTable):
+    """Constants of one pair of species, of a potential that another package adds."""
+
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, float]
+
+
+class OtherTable(PairPotentialTable):
+    """A pair potential that another package adds; its constants are the fields of its class."""
+
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, float]
+
+    kind: str
+    pairs: dict[str, OtherRow] | None = Field(
+        default=None, description='constants of each pair of species, such as "Ni-P"'
+    )
+
+    @property
+    def constants(self) -> tuple[str, ...]:
+        """Names of the constants of one pair."""
+        from mdnum.md.potentials import POTENTIALS
+
+        return tuple(field.name for field in fields(POTENTIALS[self.kind]))
+
+    @model_validator(mode="after")
+    def _known(self) -> Any:
+        for row in (self, *(self.pairs or {}).values()):
+            if unknown := set(row.__pydantic_extra__) - set(self.constants):
+                raise ValueError(f"unknown {', '.join(sorted(unknown))}; it has {', '.join(self.constants)}")
+        return self
+
+
+def _kind_of_potential(value: Any) -> str | None:
+    kind = value.get("kind") if isinstance(value, Mapping) else getattr(value, "kind", None)
+    if kind in _KINDS or not isinstance(kind, str):
+        return kind
+    from mdnum.md.potentials import POTENTIALS
+
+    return "other" if kind in POTENTIALS else kind
+
+
+def _tagged(table: type[TomlTable]) -> Any:
+    (kind,) = get_args(table.model_fields["kind"].annotation)
+    return Annotated[table, Tag(kind)]
+
+
+_KINDS = {get_args(table.model_fields["kind"].annotation)[0] for table in (*_PAIRS, *_MANY_BODY)}
+Potential = Annotated[
+    Union[*(_tagged(table) for table in (*_PAIRS, *_MANY_BODY)), Annotated[OtherTable, Tag("other")]],
+    Discriminator(_kind_of_potential),
 ]
 
+
+# --- cutoff -------------------------------------------------------------------------------------------
+
+
+def _switches(kind: Any) -> bool:
+    # imported here, because a file of the ball needs no molecular dynamics
+    from mdnum.md.cutoffs import CUTOFFS
+
+    return kind not in CUTOFFS or CUTOFFS[kind].switches
+
+
+class CutoffTable(TomlTable):
+    """How a pair potential ends, and where."""
+
+    kind: Annotated[str, Named("mdnum.md.cutoffs:CUTOFFS")]
+    radius: Length | None = Field(default=None, description="cutoff radius (Å or σ)")
+    in_sigma: Annotated[float, Field(gt=0)] | None = Field(
+        default=None, description="cutoff radius as a multiple of each pair's sigma, instead of radius"
+    )
+    pairs: dict[str, Length] | None = Field(
+        default=None, description='cutoff radius of single pairs of species, such as "Ni-P" (Å or σ)'
+    )
+    compare: Compare = Field(default="r2 <", description="what inside means: the quantity compared, and how")
+    onset: Annotated[float, Field(gt=0)] | None = Field(
+        default=None,
+        description="for kinds that switch: where switching starts, in the unit of radius (or of in_sigma); "
+        "default 0.9 of it; pairs with a radius of their own keep onset/radius",
+    )
+
+    @property
+    def switches(self) -> bool:
+        """Whether the kind has an onset."""
+        return _switches(self.kind)
+
+    @property
+    def base(self) -> float | None:
+        """The number that the onset is a part of."""
+        return self.radius if self.radius is not None else self.in_sigma
+
+    @staticmethod
+    def foreign_keys(table: Mapping[str, Any]) -> set[str]:
+        """Keys without a meaning for the kind that a table names."""
+        kind = table.get("kind")
+        return set() if _switches(kind) else {"onset"}
+
+    @model_validator(mode="after")
+    def _one_radius(self) -> Any:
+        _check_pairs(self.pairs)
+        if self.radius is not None and self.in_sigma is not None:
+            raise ValueError("radius and in_sigma both given; keep one")
+        if self.base is None and not self.pairs:
+            raise ValueError("radius missing; give radius, in_sigma or a pairs table")
+        if self.onset is None:
+            return self
+        if not self.switches:
+            raise ValueError(f"onset has no meaning for the kind {self.kind}, which does not switch")
+        if self.base is None:
+            raise ValueError("onset needs radius or in_sigma beside it; pairs scale it with their own radius")
+        if self.onset >= self.base:
+            raise ValueError(f"onset {self.onset:g} is not below the radius {self.base:g}")
+        return self
+
+
+# --- structure, lists, dynamics, precision ---------------------------------------------------------------
 FloatName = Literal["float64", "float32"]
 StateName = Literal["float64", "float32", "lattice"]
 ForceFloatName = Literal["float64", "float32", "bfloat16", "float16"]
-ReductionName = Literal[
-    "sequential",
-    "reversed",
-    "permuted",
-    "pairwise",
-    "blocked",
-    "kahan",
-    "neumaier",
-    "sorted",
-    "exact",
-    "fixed-point",
-]
-
 DEFAULT_SKIN = {"metal": 1.0, "lj": 0.3}
 """Skin when the file gives none: LAMMPS uses 2.0 Å and 0.3 σ; 1.0 Å suits the argon-sized systems here."""
 
@@ -100,7 +286,7 @@ Triple = Annotated[tuple[float, float, float], BeforeValidator(_tuple)]
 Masses = dict[str, Annotated[float, Field(gt=0)]]
 
 
-class _Structure(Table):
+class _Structure(TomlTable):
     pbc: Flags | None = Field(
         default=None, description="periodic along each cell vector; overrides what the structure says"
     )
@@ -152,7 +338,7 @@ Structure = Annotated[
 ]
 
 
-class Rebuild(Table):
+class RebuildTable(TomlTable):
     """When the list is rebuilt, in the words of LAMMPS's neigh_modify."""
 
     every: int = Field(default=1, ge=1, description="consider a rebuild every so many steps")
@@ -165,26 +351,26 @@ class Rebuild(Table):
     )
 
 
-class Neighbors(Table):
+class NeighborsTable(TomlTable):
     """The Verlet list."""
 
     skin: NonNegative | None = Field(
         default=None, description="extra radius of the list (Å or σ); default 1.0 Å for metal, 0.3 σ for lj"
     )
-    builder: Literal["auto", "host", "jax-md"] = Field(
+    builder: Annotated[str, Named("mdnum.md.neighbors:BUILDERS", "auto")] = Field(
         default="auto", description="who searches for neighbors"
     )
-    rebuild: Rebuild = Field(default_factory=lambda: Rebuild())
+    rebuild: RebuildTable = Field(default_factory=lambda: RebuildTable())
 
 
-class _Dynamics(Table):
+class _Dynamics(TomlTable):
     timestep: float = Field(gt=0, description="time step (ps or τ)")
     steps: int = Field(default=1000, ge=0, description="steps of a run")
     seed: int = Field(default=0, ge=0, description="seed of drawn velocities and of the noise")
     remove_drift: bool = Field(default=True, description="take out the center-of-mass velocity at the start")
 
 
-class NVE(_Dynamics):
+class NVETable(_Dynamics):
     """Constant energy: velocity Verlet."""
 
     kind: Literal["nve"]
@@ -194,7 +380,7 @@ class NVE(_Dynamics):
     )
 
 
-class Langevin(_Dynamics):
+class LangevinTable(_Dynamics):
     """Constant temperature: BAOAB."""
 
     kind: Literal["langevin"]
@@ -202,10 +388,10 @@ class Langevin(_Dynamics):
     friction: float = Field(gt=0, description="friction coefficient (1/ps or 1/τ)")
 
 
-Dynamics = Annotated[NVE | Langevin, Discriminator("kind")]
+Dynamics = Annotated[NVETable | LangevinTable, Discriminator("kind")]
 
 
-class Precision(Table):
+class PrecisionTable(TomlTable):
     """Which float plays which role."""
 
     state: StateName = Field(
@@ -226,13 +412,13 @@ class Precision(Table):
     accumulate: FloatName = Field(
         default="float64", description="sums over pairs (with sixteen bits the small terms would be lost)"
     )
-    reduction: ReductionName = Field(
+    reduction: Annotated[str, Named("mdnum.numerics.reductions:REDUCTIONS")] = Field(
         default="sequential",
         description="order of the sums; exact and fixed-point give the same bits in every order of neighbors",
     )
 
 
-class Fork(Table):
+class ForkTable(TomlTable):
     """What `mdnum fork` does with this system where the command line does not say."""
 
     vary: str | None = Field(
@@ -244,7 +430,7 @@ class Fork(Table):
     )
 
 
-class Record(Table):
+class RecordTable(TomlTable):
     """What is kept besides series, flips and epochs."""
 
     save_every: int = Field(
@@ -252,7 +438,7 @@ class Record(Table):
     )
 
 
-class SystemSpec(Table):
+class SystemSpec(TomlTable):
     """A system file."""
 
     name: str | None = Field(default=None, description="what to call the system; default the file's name")
@@ -260,22 +446,24 @@ class SystemSpec(Table):
     units: Literal["metal", "lj"] = Field(description="metal: Å, eV, amu, ps, K; lj: reduced")
     structure: Structure
     potential: Potential
-    cutoff: Cutoff | None = Field(default=None, description="pair potentials only")
-    neighbors: Neighbors = Field(default_factory=lambda: Neighbors())
+    cutoff: CutoffTable | None = Field(default=None, description="pair potentials only")
+    neighbors: NeighborsTable = Field(default_factory=lambda: NeighborsTable())
     dynamics: Dynamics
-    precision: Precision = Field(default_factory=lambda: Precision())
-    record: Record = Field(default_factory=lambda: Record())
-    fork: Fork | None = Field(default=None, description="a question about this system; not about its runs")
+    precision: PrecisionTable = Field(default_factory=lambda: PrecisionTable())
+    record: RecordTable = Field(default_factory=lambda: RecordTable())
+    fork: ForkTable | None = Field(
+        default=None, description="a question about this system; not about its runs"
+    )
 
     @model_validator(mode="after")
     def _cutoff_fits_potential(self) -> SystemSpec:
         kind = self.potential.kind
-        if isinstance(self.potential, PairPotential):
+        if isinstance(self.potential, PairPotentialTable):
             if self.cutoff is None:
                 raise ValueError(f"table [cutoff] missing; {kind} needs one")
-            if self.cutoff.in_sigma is not None and isinstance(self.potential, Morse):
+            if self.cutoff.in_sigma is not None and "sigma" not in self.potential.constants:
                 raise ValueError(
-                    "cutoff.in_sigma needs a potential with a sigma; morse has none, give radius"
+                    f"cutoff.in_sigma needs a potential with a sigma; {kind} has none, give radius"
                 )
         elif self.cutoff is not None:
             raise ValueError(f"[cutoff] given, but {kind} carries its own cutoff; remove the table")

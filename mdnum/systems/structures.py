@@ -6,14 +6,14 @@ import math
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float64, Int64
 
 from mdnum.errors import InputError
+from mdnum.registry import nearest
 from mdnum.systems import schema
-from mdnum.systems.messages import nearest
 
 if TYPE_CHECKING:
     from ase import Atoms
@@ -268,11 +268,11 @@ def _check_width(atoms: Atoms, r_cut: float, skin: float, length: str) -> None:
 
 
 def _smallest_distance(spec: schema.SystemSpec) -> float:
-    potential = spec.potential
-    if isinstance(potential, schema.SoftSphere):
+    potential: Any = spec.potential
+    if isinstance(potential, schema.SoftSphereTable):
         # soft spheres may overlap; only coinciding centers, where the force has no direction, are wrong
         return 1e-9
-    if isinstance(potential, schema.LennardJones):
+    if isinstance(potential, schema.LennardJonesTable):
         sigmas = [potential.sigma] if potential.sigma is not None else []
         sigmas += [row.sigma for row in (potential.pairs or {}).values()]
         return _SMALLEST_IN_SIGMA * min(sigmas)
@@ -298,16 +298,7 @@ def _check_overlap(atoms: Atoms, smallest: float, length: str) -> None:
 def _nearest(
     atoms: Atoms, within: float
 ) -> tuple[Float64[np.ndarray, " atoms"], Int64[np.ndarray, " atoms"], int]:
-    """Of each atom the nearest other one within a distance, over periodic faces, and how many such pairs.
-
-    A tree and not a grid of cells, which has more cells than memory where a box is large or flat.
-
-    Args:
-        within: length, less than half of any periodic width.
-
-    Returns:
-        distance (inf where there is none) and index of the nearest, and the number of pairs.
-    """
+    """Of each atom the nearest other one within a distance, over periodic faces, and how many such pairs."""
     from ase.geometry import complete_cell
     from scipy.spatial import KDTree
 

@@ -16,6 +16,8 @@ from typing import Any
 from mdnum.errors import InputError
 
 Key = tuple[str, ...]
+#: Name of the system file in a folder.
+SYSTEM_FILE = "system.toml"
 
 #: Depth of tables and arrays beyond which a file is refused.
 _DEEPEST = 20

@@ -1,63 +1,97 @@
 """Flips as an MDAnalysis analysis: `NeighborFlips(universe, r_cut=8.5).run().results.flips`.
 
 Frames may be spread over processes. A flip belongs to two frames, so that a process whose frames begin in the
-middle looks at the frame before its first one too: nothing is lost between two parts, and the results are
-those of one process to the last bit. What two parts found at the frame that both looked at is compared.
+middle examines the frame before its first one too: nothing is lost between two parts, and the results are
+those of one process to the last bit. What two parts found at the frame that both examined is compared.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 from MDAnalysis.analysis.base import AnalysisBase
 from MDAnalysis.analysis.results import Results, ResultsGroup
+from MDAnalysis.core.groups import AtomGroup, UpdatingAtomGroup
 from MDAnalysis.core.universe import Universe
 
 from mdnum.errors import InputError
-from mdnum.trajectories.asked import (
-    bound_of,
-    group_of,
-    in_any_pair,
-    indices_of,
-    refuse_backward,
-    refuse_kept_transformations,
-    refuse_strangers,
-    rules_of,
-)
-from mdnum.trajectories.boxes import Boxes
-from mdnum.trajectories.checked import FrameError, check_frame
-from mdnum.trajectories.far import smallest_radius
-from mdnum.trajectories.frame import Frame
-from mdnum.trajectories.joined import Part, RuleResult, joined
-from mdnum.trajectories.mdanalysis_source import (
-    READING_FAILS,
-    first_line,
-    frame_of,
-    labels_of,
-    table_of,
-)
-from mdnum.trajectories.resolution import SAMPLE, Resolution, infer_from
-from mdnum.trajectories.rules import Rule
-from mdnum.trajectories.source import UnreadableFrame
-from mdnum.trajectories.table import Flips
+from mdnum.trajectories.boxes import Boxes, formats_of
+from mdnum.trajectories.frame import Frame, FrameError, UnreadableFrame, check_frame, smallest_radius
+from mdnum.trajectories.ledger import FlipTable, Members
+from mdnum.trajectories.mdanalysis_source import frame_of, labels_of
+from mdnum.trajectories.resolution import Resolution, infer
+from mdnum.trajectories.rules import CutoffRule, Rule, SpeciesCutoffs
 from mdnum.trajectories.tails import left_over, refuse_cut_text
+from mdnum.trajectories.topology import READING_FAILS, first_line, table_of
 from mdnum.trajectories.tracker import Tracker
+from mdnum.trajectories.trajectory import SAMPLE
 from mdnum.trajectories.xtc import XtcFile, opened
 
 
 @dataclass(frozen=True)
-class _Failure:
-    """Why a part ended before its last frame.
+class RuleResult:
+    """What one membership rule gave.
 
     Attributes:
-        frame: its number in the file.
-        message: what was seen.
-        read: whether reading failed, rather than what was read being wrong.
+        rule: the rule.
+        flips: a row per decision that differs from the frame before.
+        pairs: pairs inside, per frame.
+        near: pairs whose margin is within the bound, per frame: the file cannot tell them.
+        min_margin: smallest |margin|, per frame, length.
+        initial: the pairs inside at the first frame.
+        last: and at the last.
     """
+
+    rule: Rule
+    flips: FlipTable
+    pairs: Int[np.ndarray, "frames"]
+    near: Int[np.ndarray, "frames"]
+    min_margin: Float[np.ndarray, "frames"]
+    initial: Members
+    last: Members
+
+    @property
+    def ambiguous(self) -> float:
+        """Share of the flips that the file cannot tell; nan without flips."""
+        return float(self.flips.ambiguous.mean()) if len(self.flips) else float("nan")
+
+    def entered(self) -> Int[np.ndarray, "frames"]:
+        """Pairs that entered, per frame."""
+        return self._per_frame(self.flips.entered)
+
+    def left(self) -> Int[np.ndarray, "frames"]:
+        """Pairs that left, per frame."""
+        return self._per_frame(~self.flips.entered)
+
+    def _per_frame(self, rows: Bool[np.ndarray, "flips"]) -> Int[np.ndarray, "frames"]:
+        return np.bincount(self.flips.frame[rows], minlength=len(self.pairs)).astype(np.int64)
+
+
+@dataclass
+class _ProcessPart:
+    """What one process found with one rule.
+
+    Attributes:
+        flips: of its frames that have any, frames counted from the first that it examined.
+        rows: (pairs, near, smallest margin) of each frame of its own.
+    """
+
+    flips: list[FlipTable] = field(default_factory=list)
+    rows: list[tuple[int, int, float]] = field(default_factory=list)
+    before: Members | None = None  # the pairs inside at the frame before its first; None for the first part
+    initial: Members | None = None  # the pairs inside at its first frame, kept by the first part alone
+    last: Members | None = None  # the pairs inside at its last frame; None where it has none
+
+
+@dataclass(frozen=True)
+class _Failure:
+    """Why a part ended before its last frame: whether reading failed, or what was read was wrong."""
 
     frame: int
     message: str
@@ -65,8 +99,8 @@ class _Failure:
 
 
 @dataclass
-class _Looked:
-    """Frames of a trajectory one after the other, each looked at before the library reads it."""
+class _Guarded:
+    """Frames of a trajectory one after the other, each checked before the library reads it."""
 
     analysis: NeighborFlips
     numbers: np.ndarray
@@ -85,7 +119,7 @@ class NeighborFlips(AnalysisBase):
     After `run`, `results` has for one rule all that `RuleResult` has (`flips`, `pairs`, `near`, `min_margin`,
     `initial`, `last`), and for several the same in each of `results.rules`; `results.resolution` says how
     finely the file tells where atoms are and `results.bound` what that does to a distance, per frame.
-    `frames` and `times` are those of the frames looked at; `Flips.frame` counts among them.
+    `frames` and `times` are those of the frames examined; `FlipTable.frame` counts among them.
 
     When a frame cannot be read or holds what cannot be right, the results of the frames before it are kept
     and the error names it.
@@ -123,25 +157,34 @@ class NeighborFlips(AnalysisBase):
         verbose: bool = False,
     ):
         everything = isinstance(universe_or_atomgroup, Universe)
-        group = group_of(universe_or_atomgroup.atoms if everything else universe_or_atomgroup, "atoms")
+        group = _group_of(universe_or_atomgroup.atoms if everything else universe_or_atomgroup, "atoms")
         super().__init__(group.universe.trajectory, verbose=verbose)
-        self._first = None if everything and other is None else indices_of(group)
+        self._first = None if everything and other is None else _indices_of(group)
         self._second = None
         if other is not None:
-            second = group_of(other, "other")
+            second = _group_of(other, "other")
             if second.universe is not group.universe:
                 raise InputError(
                     "the two groups belong to two universes", remedy="Select both from one universe"
                 )
-            self._second = indices_of(second)
-        self.rules = rules_of(r_cut, rule)
+            self._second = _indices_of(second)
+        self.rules = _rules_of(r_cut, rule)
         self._radius = smallest_radius(self.rules)
         self._species = None
         if any(one.needs_species for one in self.rules):
             self._species = [str(one) for one in table_of(group.universe.atoms).species]
-            refuse_strangers(self.rules, self._species)
-        self._seen = in_any_pair(self._first, self._second)
-        self._bound = bound_of(bound)
+            for one in self.rules:
+                if isinstance(one, SpeciesCutoffs):
+                    # a species that no atom has
+                    one.table(self._species)
+        groups = [one for one in (self._first, self._second) if one is not None]
+        self._seen = np.unique(np.concatenate(groups)) if groups else None
+        if bound is not None and not (math.isfinite(bound) and bound >= 0):
+            raise InputError(
+                f"bound = {bound!r}; expected a length of 0 or more, Å",
+                remedy="Leave it out for what the resolution of the file gives",
+            )
+        self._bound = bound
         self._resolution: Resolution | None = None
         self._pbc: np.ndarray | None = None
         self._numbers = np.zeros(0, np.int64)
@@ -180,23 +223,31 @@ class NeighborFlips(AnalysisBase):
     def _configure_backend(self, backend: Any, *args: Any, **kwargs: Any) -> Any:
         """MDAnalysis's, which ends at a transformation that is a plain function."""
         if backend != "serial":
-            refuse_kept_transformations(self._trajectory, backend)
+            for one in getattr(self._trajectory, "transformations", ()):
+                if not getattr(one, "parallelizable", False):
+                    name = getattr(one, "__name__", type(one).__name__)
+                    raise InputError(
+                        f"the transformation {name!r} of the trajectory cannot be handed over by {backend=}",
+                        remedy="Use backend='serial', or make it an "
+                        "MDAnalysis.transformations.TransformationBase with parallelizable=True",
+                    )
         return super()._configure_backend(backend, *args, **kwargs)
 
     def _setup_computation_groups(
-        self,
-        n_parts: int,
-        start: Any = None,
-        stop: Any = None,
-        step: Any = None,
-        frames: Any = None,
+        self, n_parts: int, start: Any = None, stop: Any = None, step: Any = None, frames: Any = None
     ) -> list[np.ndarray]:
         """MDAnalysis's, and what all parts must agree on: done once, before frames are spread."""
         groups = super()._setup_computation_groups(n_parts, start, stop, step, frames)
         # who names the frames gets those
         self._to_the_end = frames is None and (stop is None or stop > len(self._trajectory))
         self._numbers = np.concatenate([one[:, 1] for one in groups]).astype(np.int64)
-        refuse_backward(self._numbers)
+        back = np.flatnonzero(np.diff(self._numbers) <= 0)
+        if back.size:
+            after, before = self._numbers[back[0] + 1], self._numbers[back[0]]
+            raise InputError(
+                f"the frames go backward or stand still: frame {after} after frame {before}",
+                remedy="Give them in ascending order: flips follow time",
+            )
         sample = []
         for number in self._numbers[:SAMPLE]:
             try:
@@ -205,7 +256,7 @@ class NeighborFlips(AnalysisBase):
                 # met again in its turn, and told there
                 break
         if sample:
-            self._resolution = infer_from(sample, 32, _format(self._trajectory))
+            self._resolution = infer(sample, 32, formats_of(self._trajectory)[0])
             self._pbc = sample[0].box.pbc
         self._let_go()
         return groups
@@ -213,7 +264,7 @@ class NeighborFlips(AnalysisBase):
     def _prepare_sliced_trajectory(self, slicer: Any) -> None:
         super()._prepare_sliced_trajectory(slicer)
         if isinstance(slicer, np.ndarray):
-            self._sliced_trajectory = _Looked(self, slicer)
+            self._sliced_trajectory = _Guarded(self, slicer)
 
     def timestep(self, number: int) -> Any:
         """MDAnalysis's timestep of a frame, once it is known that reading it does not end the process."""
@@ -247,7 +298,7 @@ class NeighborFlips(AnalysisBase):
             number = int(self._numbers[self._at + self._done])
             self._stopped(_Failure(number, f"frame {number} cannot be read ({first_line(error)})", True))
         for part, tracker in zip(self.results.parts[0], self._trackers, strict=True):
-            part.last = tracker.members() if part.pairs else None
+            part.last = tracker.members() if part.rows else None
         # what a process sends back is what it found, not what it needed for that
         self._trackers = []
         self._let_go()
@@ -263,62 +314,49 @@ class NeighborFlips(AnalysisBase):
         self._trackers = [
             Tracker(rule, self._first, self._second, self._species, self._bound or 0.0) for rule in self.rules
         ]
-        self.results.parts = [[Part() for _ in self.rules]]
+        self.results.parts = [[_ProcessPart() for _ in self.rules]]
         self.results.bounds = [[]]
         if self._at:
+            # the frame before the first of this part
             self._done = -1
-            self._before(self.timestep(int(self._numbers[self._at - 1])))
-            self._done = 0
-
-    def _before(self, ts: Any) -> None:
-        """Looks at the frame before the first of this part."""
-        self._reading = False
-        frame = self._checked(ts)
-        bound = self._bound_at(frame)
-        for part, tracker in zip(self.results.parts[0], self._trackers, strict=True):
-            self._stepped(tracker, frame, bound)
-            part.before = tracker.members()
-        self._reading = True
+            ts = self.timestep(int(self._numbers[self._at - 1]))
+            self._reading = False
+            self._examined(ts)
+            for part, tracker in zip(self.results.parts[0], self._trackers, strict=True):
+                part.before = tracker.members()
+            self._done, self._reading = 0, True
 
     def _single_frame(self) -> None:
         self._reading = False
-        frame = self._checked(self._ts)
-        bound = self._bound_at(frame)
-        flips = [self._stepped(tracker, frame, bound) for tracker in self._trackers]
-        for part, tracker, rows in zip(self.results.parts[0], self._trackers, flips, strict=True):
-            if len(rows):
-                part.flips.append(rows)
+        bound, found = self._examined(self._ts)
+        for part, tracker, flips in zip(self.results.parts[0], self._trackers, found, strict=True):
+            if len(flips):
+                part.flips.append(flips)
             if self._at == 0 and self._done == 0:
                 part.initial = tracker.members()
-            part.pairs.append(tracker.pairs)
-            part.near.append(tracker.near)
-            part.min_margin.append(tracker.min_margin)
+            part.rows.append((tracker.pairs, tracker.near, tracker.min_margin))
         self.results.bounds[0].append(bound)
         self._done += 1
         self._reading = True
 
-    def _stepped(self, tracker: Tracker, frame: Frame, bound: float) -> Flips:
+    def _examined(self, ts: Any) -> tuple[float, list[FlipTable]]:
+        """(how far a distance can be off, flips of each rule) at a timestep."""
+        frame = self._frame(ts)
+        check_frame(frame, self._seen, self._pbc, None, self._names, radius=self._radius, bits=32)
+        bound = self._bound or 0.0
+        if self._bound is None and self._resolution is not None:
+            bound = self._resolution.bound(frame, self._seen)
         try:
             # a margin among the nearest is the difference of two distances
-            return tracker.step(frame, bound=bound * (1 + tracker.rule.directed))
+            return bound, [one.step(frame, bound=bound * (1 + one.rule.directed)) for one in self._trackers]
         except InputError as error:
             raise FrameError(
                 f"frame {frame.index}: {error.message}", frame=frame.index, remedy=error.remedy or ""
             ) from error
 
-    def _checked(self, ts: Any) -> Frame:
-        frame = self._frame(ts)
-        check_frame(frame, self._seen, self._pbc, None, self._names, radius=self._radius, bits=32)
-        return frame
-
     def _frame(self, ts: Any) -> Frame:
         assert self._boxes is not None and self._labels is not None
         return frame_of(ts, int(ts.frame), self._boxes, labels=self._labels(int(ts.frame)))
-
-    def _bound_at(self, frame: Frame) -> float:
-        if self._bound is not None or self._resolution is None:
-            return self._bound or 0.0
-        return self._resolution.bound(frame, self._seen)
 
     def _get_aggregator(self) -> ResultsGroup:
         flat = ResultsGroup.flatten_sequence
@@ -333,7 +371,7 @@ class NeighborFlips(AnalysisBase):
         done = sum(len(one) for one in results.bounds[:kept])
         self.frames, self.times = self.frames[:done], self.times[:done]
         found = [
-            joined(rule, [part[k] for part in results.parts[:kept]]) for k, rule in enumerate(self.rules)
+            _joined(rule, [part[k] for part in results.parts[:kept]]) for k, rule in enumerate(self.rules)
         ]
         bound = np.array([value for one in results.bounds[:kept] for value in one], np.float64)
         for name in ("parts", "bounds", "failures"):
@@ -341,8 +379,8 @@ class NeighborFlips(AnalysisBase):
         results.failure = failures[failed[0]] if failed else self._behind_the_last()
         results.rules, results.bound, results.resolution = found, bound, self._resolution
         if len(found) == 1:
-            for one in fields(RuleResult):
-                results[one.name] = getattr(found[0], one.name)
+            for name, value in vars(found[0]).items():
+                results[name] = value
 
     def _behind_the_last(self) -> _Failure | None:
         """A frame behind the last one that the library has, which it leaves out."""
@@ -353,6 +391,95 @@ class NeighborFlips(AnalysisBase):
         return _Failure(count, f"frame {count} cannot be read ({rest})", True)
 
 
-def _format(trajectory: Any) -> str:
-    word = trajectory.format
-    return str(word if isinstance(word, str) else word[0])
+def _joined(rule: Rule, parts: Sequence[_ProcessPart]) -> RuleResult:
+    """The parts one after the other, frames counted from the first of all.
+
+    Raises:
+        InputError: two processes found other pairs at the frame between them: the file changed meanwhile.
+    """
+    flips: list[FlipTable] = []
+    done, last = 0, None
+    for part in parts:
+        if last is not None and part.before is not None:
+            both = zip(vars(last).values(), vars(part.before).values(), strict=True)
+            if not all(np.array_equal(one, other) for one, other in both):
+                raise InputError(
+                    f"two processes found other pairs at the frame between them (number {done - 1} of those "
+                    "examined)",
+                    remedy="The file was changed while it was read; run again",
+                )
+        # a part that examined the frame before its first has counted that one too
+        shift = done - (part.before is not None)
+        flips += [replace(rows, frame=rows.frame + shift) for rows in part.flips]
+        done += len(part.rows)
+        last = last if part.last is None else part.last
+    rows = np.array([row for part in parts for row in part.rows], float).reshape(-1, 3)
+    return RuleResult(
+        rule,
+        FlipTable.concatenate(flips) if flips else FlipTable.none(),
+        rows[:, 0].astype(np.int64),
+        rows[:, 1].astype(np.int64),
+        rows[:, 2],
+        (parts[0].initial if parts else None) or Members.none(),
+        last or Members.none(),
+    )
+
+
+def _group_of(atoms: Any, name: str) -> AtomGroup:
+    """The group; refuses one that is none, is empty, or changes from frame to frame."""
+    if isinstance(atoms, UpdatingAtomGroup):
+        raise InputError(
+            f"the group {name} changes from frame to frame, and a pair not examined any more has not left",
+            remedy="Give atoms.select_atoms(...) without updating=True",
+        )
+    if not isinstance(atoms, AtomGroup):
+        raise InputError(
+            f"{type(atoms).__name__} where atoms are expected", remedy="Give a Universe or an AtomGroup"
+        )
+    if len(atoms) == 0:
+        raise InputError(f"the group {name} is empty", remedy="Check the selection")
+    return atoms
+
+
+def _indices_of(group: AtomGroup) -> np.ndarray:
+    """Its atoms, ascending, each once."""
+    return np.unique(np.asarray(group.indices, np.int64))
+
+
+def _rules_of(r_cut: Any, rule: Rule | Sequence[Rule] | None) -> list[Rule]:
+    """Membership rules from what `NeighborFlips` takes for them."""
+    rules: list[Rule] = []
+    if r_cut is not None:
+        several = isinstance(r_cut, list | tuple) or (isinstance(r_cut, np.ndarray) and r_cut.ndim)
+        rules.extend(_cutoff(one) for one in (r_cut if several else [r_cut]))
+    if rule is not None:
+        rules.extend(rule if isinstance(rule, Sequence) else [rule])
+    if not rules:
+        raise InputError(
+            "no cutoff", remedy="Give r_cut=8.5 (Å), several as a list, or a rule of mdnum.trajectories.rules"
+        )
+    for one in rules:
+        if not isinstance(one, Rule):
+            raise InputError(
+                f"{one!r} is no membership rule",
+                remedy="Give CutoffRule, SpeciesCutoffs, Nearest or Capped of mdnum.trajectories.rules",
+            )
+    return rules
+
+
+def _cutoff(value: Any) -> Rule:
+    try:
+        if isinstance(value, Mapping):
+            return SpeciesCutoffs({pair: _length(one) for pair, one in value.items()})
+        return CutoffRule(_length(value))
+    except (TypeError, ValueError):
+        raise InputError(
+            f"r_cut = {value!r}; expected a length in Å, or lengths by pair of species",
+            remedy='Give r_cut=8.5, {("O", "H"): 2.5}, or a list of them',
+        ) from None
+
+
+def _length(value: Any) -> float:
+    if isinstance(value, str | bytes):
+        raise ValueError("words")
+    return float(value)

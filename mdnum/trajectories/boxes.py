@@ -8,25 +8,37 @@ otherwise too, and images would be put into wrong places without a word:
 - HOOMD's have tilt factors, which MDAnalysis takes for the cosines of angles (in gsd files);
 - those of H5MD and of DL_POLY's HISTORY are vectors in any direction.
 
-Of PDB files with many models it loses boxes: see `mdnum.trajectories.pdb_boxes`.
+Of PDB files with many models it loses boxes unless there are as many as models. Programs write CRYST1 once at
+the head (OpenMM), before each model (GROMACS), or inside of each. MDAnalysis reads a model from its MODEL
+record on: what stands before the first is never read, and what stands behind a model is taken for that
+one's, though it is the next one's.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from jaxtyping import Float
 
 from mdnum.trajectories.frame import Box
-from mdnum.trajectories.pdb_boxes import ModelBoxes, model_boxes
 
 Matrix = Float[np.ndarray, "3 3"]
+Dimensions = tuple[float, ...] | None
 
 _PDB = frozenset({"PDB", "ENT", "XPDB"})
-_ONCE = "The file tells a box once, before its first model: it is taken for all frames."
+_ONCE = "The file gives a box once, before its first model: it is taken for all frames."
+# a box of this is a word for none: CRYST1 is demanded by the format
+_PLACEHOLDER = (1.0, 1.0, 1.0, 90.0, 90.0, 90.0)
+_COLUMNS = ((6, 15), (15, 24), (24, 33), (33, 40), (40, 47), (47, 54))
+
+
+def formats_of(trajectory: Any) -> list[str]:
+    """MDAnalysis's words for the format of one of its readers."""
+    return [trajectory.format] if isinstance(trajectory.format, str) else list(trajectory.format)
 
 
 class Boxes:
@@ -34,37 +46,36 @@ class Boxes:
 
     Args:
         trajectory: MDAnalysis's reader.
+
+    Attributes:
+        notes: what somebody who relies on the boxes should know, in sentences.
+        own: whether boxes are read from the file itself, and may be others than MDAnalysis's.
     """
 
     def __init__(self, trajectory: Any):
         self._matrix: Callable[[int, Any], Matrix | None] | None = None
-        self._models: ModelBoxes | None = None
+        self._models: tuple[Dimensions, ...] = ()
+        self.notes: tuple[str, ...] = ()
         path = getattr(trajectory, "filename", None)
         if isinstance(path, str | Path):
-            words = [trajectory.format] if isinstance(trajectory.format, str) else list(trajectory.format)
+            words = formats_of(trajectory)
             makers = {"DCD": _charmm, "GSD": _hoomd, "H5MD": _h5md, "HISTORY": _dlpoly}
             make = next((makers[word] for word in words if word in makers), None)
             self._matrix = make(str(path), trajectory) if make else None
-            if any(word in _PDB for word in words):
-                self._models = model_boxes(trajectory)
+            if _PDB & set(words) and trajectory.n_frames > 1 and Path(path).is_file():
+                stat = Path(path).stat()
+                self._models, records = _models(str(path), stat.st_size, stat.st_mtime_ns)
+                self.notes = (_ONCE,) if self._models and records == 1 else ()
         self._changed = bool(getattr(trajectory, "transformations", ()))
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What somebody who relies on the boxes should know, in sentences."""
-        return (_ONCE,) if self._models is not None and self._models.once else ()
-
-    @property
-    def own(self) -> bool:
-        """Whether boxes are read from the file itself, and may be others than MDAnalysis's."""
-        return self._matrix is not None or self._models is not None
+        self.own = self._matrix is not None or bool(self._models)
 
     def box(self, ts: Any, number: int) -> Box:
         """The box of a timestep that is this frame of the file."""
         dimensions = ts.dimensions
-        if self._models is not None and (dimensions is None or not self._changed):
-            # transformations may have set another
-            dimensions = self._models.of(number)
+        # transformations may have set another
+        if self._models and (dimensions is None or not self._changed):
+            found = self._models[number] if number < len(self._models) else None
+            dimensions = None if found is None else np.array(found, np.float64)
         box = box_of(dimensions)
         if self._matrix is None or not box.periodic:
             return box
@@ -168,3 +179,31 @@ def _dlpoly(path: str, trajectory: Any) -> Callable[[int, Any], Matrix | None]:
         return np.array(rows, np.float64)
 
     return matrix
+
+
+@lru_cache(maxsize=4)
+def _models(path: str, size: int, changed: int) -> tuple[tuple[Dimensions, ...], int]:
+    """(lengths and angles of each model's box, records); read again if the file has changed."""
+    from MDAnalysis.lib.util import anyopen
+
+    found: list[Dimensions] = []
+    now, records, open_model = None, 0, False
+    with anyopen(path, "rb") as file:
+        for line in cast("Iterable[bytes]", file):
+            if line.startswith((b"ATOM", b"HETATM")):
+                if open_model:
+                    found.append(now)
+                    open_model = False
+            elif line.startswith(b"MODEL"):
+                open_model = True
+            elif line.startswith(b"CRYST1"):
+                now, records = _dimensions(line), records + 1
+    return tuple(found) if any(found) else (), records
+
+
+def _dimensions(line: bytes) -> Dimensions:
+    try:
+        found = tuple(float(line[begin:end]) for begin, end in _COLUMNS)
+    except ValueError:
+        return None
+    return None if np.allclose(found, _PLACEHOLDER) or not any(found[:3]) else found

@@ -1,4 +1,4 @@
-"""Two trajectories of the same atoms: how far apart, and which pairs are inside in one of them only.
+"""Two trajectories of the same atoms: their separation, and which pairs are inside in one of them only.
 
 The sets are compared once, at the first frame; from there the flips of either say what becomes of the
 difference, so that a frame costs what changed in it.
@@ -6,22 +6,31 @@ difference, so that a frame costs what changed in it.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from mdnum.trajectories.changes import image_distances
-from mdnum.trajectories.frame import Box, Frame
+from mdnum.errors import InputError
+from mdnum.trajectories.frame import Box, Frame, checked, smallest_radius
 from mdnum.trajectories.lattice import lattice_of
-from mdnum.trajectories.table import Flips, Members
+from mdnum.trajectories.ledger import FlipTable, Members
+from mdnum.trajectories.resolution import Resolution
+from mdnum.trajectories.rules import CutoffRule, Rule, SpeciesCutoffs
+from mdnum.trajectories.search import image_distances
+from mdnum.trajectories.tracker import Tracker
+from mdnum.trajectories.trajectory import Trajectory
 
 Pair = tuple[int, int, int]
+#: Takes rows of a table: its name and equally long columns.
+Sink = Callable[[str, dict[str, Any]], None]
 
 
 @dataclass(frozen=True)
-class Apart:
-    """How far two frames are apart, atom by atom.
+class Separation:
+    """How far atoms are from where they are in another frame.
 
     Attributes:
         furthest: largest displacement, length.
@@ -75,8 +84,8 @@ def same_lattice(one: Box, other: Box, tolerance: float) -> bool:
     return bool(np.abs(b - whole @ a).max() <= tolerance and abs(round(np.linalg.det(whole))) == 1)
 
 
-def apart(one: Frame, other: Frame, atoms: Int[np.ndarray, "chosen"] | None = None) -> Apart:
-    """How far two frames are apart.
+def separation(one: Frame, other: Frame, atoms: Int[np.ndarray, "chosen"] | None = None) -> Separation:
+    """The separation of two frames.
 
     Args:
         atoms: only these; None for all.
@@ -86,7 +95,7 @@ def apart(one: Frame, other: Frame, atoms: Int[np.ndarray, "chosen"] | None = No
         moved, whole = moved[atoms], whole[atoms]
     square = np.sum(moved**2, axis=1)
     at = int(np.argmax(square))
-    return Apart(
+    return Separation(
         float(np.sqrt(square[at])),
         float(np.sqrt(square.mean())),
         at if atoms is None else int(atoms[at]),
@@ -95,7 +104,7 @@ def apart(one: Frame, other: Frame, atoms: Int[np.ndarray, "chosen"] | None = No
 
 
 @dataclass
-class Difference:
+class SetDifference:
     """Pairs that are inside in one trajectory only, carried along by the flips of both.
 
     Attributes:
@@ -108,7 +117,7 @@ class Difference:
     new: list[Pair] = field(default_factory=list)
 
     @classmethod
-    def of(cls, a: Members, b: Members) -> Difference:
+    def of(cls, a: Members, b: Members) -> SetDifference:
         """At the first frame."""
         first, second = (_pairs(one.i, one.j, one.rank) for one in (a, b))
         both = first & second
@@ -119,7 +128,7 @@ class Difference:
     def __len__(self) -> int:
         return len(self.only_a) + len(self.only_b)
 
-    def step(self, a: Flips, b: Flips) -> None:
+    def step(self, a: FlipTable, b: FlipTable) -> None:
         """After the flips of the next frame in either."""
         differed: dict[Pair, bool] = {}
         for flips, mine, others in ((a, self.only_a, self.only_b), (b, self.only_b, self.only_a)):
@@ -153,23 +162,242 @@ def distances(frame: Frame, pairs: list[Pair], directed: bool = False) -> Float[
 
 
 def growth(
-    time: Float[np.ndarray, "frames"], separation: Float[np.ndarray, "frames"], limit: float
+    time: Float[np.ndarray, "frames"], length: Float[np.ndarray, "frames"], limit: float
 ) -> tuple[float, float, int] | None:
     """Rate at which a separation grows, from a straight line through its logarithm.
 
     Args:
-        time: of each frame.
-        separation: above zero where it counts.
+        length: the separation, above zero where it counts.
         limit: length above which it is no small difference any more, and is left out.
 
     Returns:
         (rate per time, r² of the line, frames used); None with fewer than five.
     """
-    use = (separation > 0) & (separation < limit) & np.isfinite(separation)
+    use = (length > 0) & (length < limit) & np.isfinite(length)
     if np.count_nonzero(use) < 5 or np.ptp(time[use]) == 0:
         return None
-    x, y = time[use], np.log(separation[use])
+    x, y = time[use], np.log(length[use])
     slope, offset = np.polyfit(x, y, 1)
     spread = float(np.sum((y - y.mean()) ** 2))
     left = float(np.sum((y - slope * x - offset) ** 2))
     return float(slope), 1.0 - left / spread if spread > 0 else 1.0, int(np.count_nonzero(use))
+
+
+@dataclass
+class ComparedSide:
+    """One of the two trajectories."""
+
+    trajectory: Trajectory
+    tracker: Tracker
+    resolution: Resolution
+    distance_bound: float = 0.0  # how far a distance can be off at the last frame, length
+    box_bound: float = 0.0  # the part of it that comes from the box, for a pair through one period
+    bound: float = 0.0  # how far a margin can be off
+
+    def step(self, frame: Frame) -> FlipTable:
+        """The flips of the next frame."""
+        self.distance_bound = self.resolution.bound(frame)
+        self.box_bound = self.resolution.bound(frame, np.zeros(0, np.int64))
+        # a margin among the nearest is the difference of two distances
+        self.bound = self.distance_bound * (1 + self.tracker.rule.directed)
+        return self.tracker.step(frame, bound=self.bound)
+
+    def position_bound(self, periods: int) -> float:
+        """How far one atom, seen through so many periods of the box, can be off at the last frame, length."""
+        # a distance has two atoms that are off
+        return (self.distance_bound - self.box_bound) / 2 + max(1, periods) * self.box_bound
+
+
+def differing_rows(
+    pairs: list[Pair], difference: SetDifference, sides: Sequence[ComparedSide], frames: Sequence[Frame]
+) -> dict[str, np.ndarray]:
+    """Columns on pairs that differ: where each is inside, and by how much.
+
+    A pair is ambiguous where its distance in either file is so close to the threshold that the positions may
+    have been on its other side before they were written.
+    """
+    rule = sides[0].tracker.rule
+    i, j, rank = (np.array([pair[k] for pair in pairs], np.int64) for k in range(3))
+    in_a = np.array([pair in difference.only_a for pair in pairs], bool)
+    lengths = [distances(frame, pairs, rule.directed) for frame in frames]
+    margins = [
+        _thresholds(i, j, inside, rule, side) - distance
+        for inside, side, distance in zip((in_a, ~in_a), sides, lengths, strict=True)
+    ]
+    # what has no threshold is not known to be away from it
+    clear = [np.abs(margin) > side.bound for margin, side in zip(margins, sides, strict=True)]
+    return {
+        "i": i, "j": j, "rank": rank,
+        "inside": np.where(in_a, "A", "B").astype(object),
+        "distance_a": lengths[0], "distance_b": lengths[1], "margin_a": margins[0], "margin_b": margins[1],
+        "bound": np.full(len(pairs), max(side.bound for side in sides)), "ambiguous": ~(clear[0] & clear[1]),
+    }  # fmt: skip
+
+
+def _thresholds(
+    i: np.ndarray, j: np.ndarray, inside: np.ndarray, rule: Rule, side: ComparedSide
+) -> Float[np.ndarray, "pairs"]:
+    """Distance under which each pair is inside, length; that of a neighbor where it is one."""
+    if isinstance(rule, CutoffRule):
+        return np.full(len(i), rule.radius)
+    if isinstance(rule, SpeciesCutoffs):
+        species = side.trajectory.species.astype(str)
+        names = list(zip(species[i].tolist(), species[j].tolist(), strict=True))
+        return np.array([rule.radii.get((a, b), rule.radii.get((b, a), np.nan)) for a, b in names], float)
+    stays, enters = side.tracker.thresholds()
+    return np.where(inside, stays[i], enters[i])
+
+
+# ---- in step
+
+#: Rows of the table of pairs that come to differ.
+ROWS = 1_000
+_FIRST = 8
+# times that differ by less than this, relative, are the same
+_SAME_TIME = 1e-6
+
+
+@dataclass
+class NeighborSets:
+    """The neighbor sets of one rule in the two trajectories."""
+
+    rule: Rule
+    sides: list[ComparedSide]
+    difference: SetDifference = field(default_factory=SetDifference)
+    first: dict[str, Any] | None = None  # what was seen at the first frame whose sets differ
+    certain: int | None = None  # first frame at which a pair differs that no resolution could have moved
+    first_pairs: list[dict[str, Any]] = field(default_factory=list)  # some of the pairs that differ there
+    rows: int = 0  # pairs written to the table of those that come to differ
+
+
+@dataclass
+class Compared:
+    """What the frames showed.
+
+    Attributes:
+        beyond: first frame at which an atom is further apart than the resolution of the two files explains.
+        last: the separation at the last frame.
+    """
+
+    frames: int = 0
+    seed: int | None = None  # first frame whose positions differ at all
+    beyond: int | None = None
+    other_box: dict[str, Any] | None = None  # the boxes at the first frame at which they are not the same
+    times_differ: int = 0
+    last: Separation = field(default_factory=lambda: Separation(0.0, 0.0, 0))
+    stopped: InputError | None = None
+
+
+def follow_both(sets: list[NeighborSets], atoms: np.ndarray | None, sink: Sink) -> Iterator[Compared]:
+    """Reads both once, in step, yielding the same `Compared` after each frame.
+
+    Args:
+        sets: of every rule.
+        atoms: those that matter; None for all.
+        sink: takes rows of "apart" and "differing": name of the table, and columns.
+    """
+    found, sides = Compared(), sets[0].sides
+    radius = smallest_radius([one.rule for one in sets])
+    files = [side.trajectory for side in sides]
+    both = [checked(one.frames(), atoms, str(one.path), radius=radius, bits=one.bits) for one in files]
+    while True:
+        try:
+            a, b = (next(one, None) for one in both)
+            if a is None or b is None:
+                break
+            # every rule first: a frame that one of them refuses is not examined by another
+            flips = [
+                [side.step(frame) for side, frame in zip(one.sides, (a, b), strict=True)] for one in sets
+            ]
+        except InputError as error:
+            if not found.frames:
+                raise
+            found.stopped = error
+            return
+        at, before, now = found.frames, found.last, separation(a, b, atoms)
+        if found.seed is None and now.furthest > 0:
+            found.seed = at
+        allowed = sum(side.position_bound(now.periods) for side in sides)
+        if found.beyond is None and now.furthest > allowed:
+            found.beyond = at
+        # formats that round positions may round the box as much
+        if found.other_box is None and not same_lattice(
+            a.box, b.box, sum(side.distance_bound for side in sides)
+        ):
+            axes = bool((a.box.pbc != b.box.pbc).any())
+            found.other_box = {"frame": at, "axes": axes, "a": _plain(a.box), "b": _plain(b.box)}
+        found.times_differ += int(abs(a.time - b.time) > _SAME_TIME * max(abs(a.time), abs(b.time)))
+        for place, (one, new) in enumerate(zip(sets, flips, strict=True)):
+            if at:
+                one.difference.step(*new)
+            else:
+                one.difference = SetDifference.of(*(side.tracker.members() for side in one.sides))
+            _sets_at(sink, place, one, at, (a, b), now, before)
+        # pairs are those of the first rule
+        only, tracked = sets[0].difference, [side.tracker.pairs for side in sides]
+        row = {
+            "frame": at, "number_a": a.index, "number_b": b.index, "time": a.time, "time_b": b.time,
+            "furthest": now.furthest, "bound": allowed, "typical": now.typical, "atom": now.atom,
+            "pairs_a": tracked[0], "pairs_b": tracked[1],
+            "only_a": len(only.only_a), "only_b": len(only.only_b),
+        }  # fmt: skip
+        sink("apart", {name: [value] for name, value in row.items()})
+        found.last = now
+        found.frames += 1
+        yield found
+    if not found.frames:
+        raise InputError("no frame is left of what was asked for", remedy="Ask for others")
+
+
+def _sets_at(
+    sink: Sink,
+    number: int,
+    one: NeighborSets,
+    at: int,
+    frames: tuple[Frame, Frame],
+    now: Separation,
+    before: Separation,
+) -> None:
+    """What one rule's sets show at a frame, and the pairs that are new among those that differ."""
+    difference, first = one.difference, False
+    if one.certain is None and len(difference):
+        # all that differ: one that came to differ within the resolution may be beyond it by now
+        differing = sorted(difference.only_a | difference.only_b)
+        standing = differing_rows(differing, difference, one.sides, frames)
+        undecided, first = int(np.count_nonzero(standing["ambiguous"])), one.first is None
+        if first:
+            one.first = {
+                "frame": at, "number": frames[0].index, "time": frames[0].time, "pairs": len(difference),
+                "furthest": now.furthest, "typical": now.typical,
+                "furthest_before": before.furthest if at else None,
+                "typical_before": before.typical if at else None, "ambiguous": undecided,
+            }  # fmt: skip
+        if undecided < len(difference):
+            one.certain = at
+    if new := difference.new[: ROWS - one.rows]:
+        rows = differing_rows(new, difference, one.sides, frames)
+        told = {"rule": np.full(len(new), number), "frame": np.full(len(new), at), **rows}
+        sink("differing", told)
+        one.rows += len(new)
+        if first:
+            kept = range(min(len(new), _FIRST))
+            one.first_pairs = [{name: values[k] for name, values in told.items()} for k in kept]
+
+
+def growth_of(frames: int, one: NeighborSets, table: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """Rates at which the separation grows before the sets differ, and from then on."""
+    limit = 0.1 * (
+        one.rule.radius if isinstance(one.rule, CutoffRule) else float(table["furthest"].max(initial=0.0))
+    )
+    cut = frames if one.first is None else one.first["frame"]
+    # up to its bound a separation may be made of rounding
+    length = np.where(table["furthest"] > table["bound"], table["furthest"], 0.0)
+    parts = {}
+    for name, part in (("before", slice(None, cut + 1)), ("after", slice(cut, None))):
+        line = growth(table["time"][part], length[part], limit)
+        parts[name] = None if line is None else dict(zip(("rate", "r2", "frames"), line, strict=True))
+    return parts
+
+
+def _plain(box: Box) -> dict[str, Any]:
+    return {"matrix": np.asarray(box.matrix, float).tolist(), "pbc": np.asarray(box.pbc, bool).tolist()}

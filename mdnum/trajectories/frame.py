@@ -1,13 +1,27 @@
-"""One frame of a trajectory, and the box it stands in: float64, whatever the file stores."""
+"""One frame of a trajectory in float64, whatever the file stores, and what no simulation writes into one.
+
+Formats that hold plain floats (dcd, trr, netcdf) take any bytes for coordinates: what damage leaves there is
+often a number, and a huge one. It would count as a place, and would widen what rounding may have done to
+every other pair of that frame.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
-_NO_BOX = ((0.0, 0.0, 0.0),) * 3
+from mdnum.errors import InputError
+from mdnum.trajectories.rules import Capped, CutoffRule, Rule, SpeciesCutoffs
+
+# Sizes of the system from its middle at which nothing is any more: unwrapped coordinates of a liquid get
+# some thousand boxes far in a second; what flies off into empty space gets further.
+_FAR_BOXES, _FAR_SIZES = 1e5, 1e6
+# The same for the way between two frames.
+_LEAP_BOXES, _LEAP_SIZES = 100.0, 1e4
+_UNIT = {32: 2.0**-24, 64: 2.0**-53}
 
 
 @dataclass(frozen=True)
@@ -15,11 +29,11 @@ class Box:
     """Lattice vectors, and the directions in which they repeat.
 
     Attributes:
-        matrix: lattice vectors as rows, length; rows of directions that do not repeat are not looked at.
+        matrix: lattice vectors as rows, length; rows of directions that do not repeat do not matter.
         pbc: which of them repeat.
     """
 
-    matrix: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.array(_NO_BOX))
+    matrix: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.zeros((3, 3)))
     pbc: Bool[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3, bool))
 
     @property
@@ -47,3 +61,222 @@ class Frame:
     box: Box
     velocities: Float[np.ndarray, "atoms 3"] | None = None
     labels: np.ndarray | None = None
+
+
+class FrameError(InputError):
+    """A frame was read and holds what cannot be right.
+
+    Args:
+        frame: its number in the file, from 0.
+    """
+
+    def __init__(self, message: str, *, frame: int, remedy: str, where: str | None = None):
+        super().__init__(message, remedy=remedy, where=where)
+        self.frame = frame
+
+
+class UnreadableFrame(InputError):
+    """A frame in the middle of a file cannot be read; those before it were given out.
+
+    Args:
+        frame: its number in the file, from 0.
+    """
+
+    def __init__(self, message: str, *, frame: int, where: str, remedy: str | None = None):
+        otherwise = (
+            f"The frames before it were read; to stop there add @:{frame} to the path"
+            if frame
+            else "Check that the file is whole and of the kind its name says"
+        )
+        super().__init__(message, remedy=remedy or otherwise, where=where)
+        self.frame = frame
+
+
+def checked(
+    frames: Iterable[Frame],
+    atoms: Int[np.ndarray, "chosen"] | None = None,
+    where: str | None = None,
+    *,
+    radius: float = np.inf,
+    bits: int = 64,
+) -> Iterator[Frame]:
+    """The frames, each checked before it is given on.
+
+    Args:
+        frames: of a trajectory.
+        atoms: the atoms that matter, ascending; None for all.
+        where: the file, for messages.
+        radius: the shortest length that distances are compared with.
+        bits: width of a coordinate as it was read.
+
+    Raises:
+        FrameError: a coordinate is not finite, an atom is further out than any gets or than floats resolve
+            distances of that length, more than one atom is at exactly 0, 0, 0, the box repeats along other
+            axes than in the first frame (most often: there is none), or along one without a vector, or an
+            atom is labeled as another one than in the first frame.
+    """
+    pbc = labels = None
+    for frame in frames:
+        pbc = frame.box.pbc if pbc is None else pbc
+        labels = frame.labels if labels is None else labels
+        check_frame(frame, atoms, pbc, where, labels, radius=radius, bits=bits)
+        yield frame
+
+
+def check_frame(
+    frame: Frame,
+    atoms: Int[np.ndarray, "chosen"] | None = None,
+    pbc: Bool[np.ndarray, "3"] | None = None,
+    where: str | None = None,
+    labels: np.ndarray | None = None,
+    *,
+    radius: float = np.inf,
+    bits: int = 64,
+) -> None:
+    """As `checked`, for one frame; pbc and labels are those of the first, None for any."""
+
+    def refused(message: str, remedy: str) -> FrameError:
+        return FrameError(f"frame {frame.index}{message}", frame=frame.index, remedy=remedy, where=where)
+
+    def place(atom: int) -> str:
+        return f"({', '.join(f'{value:g}' for value in frame.positions[atom])})"
+
+    failed = (
+        f"The simulation or the writing of it failed there; stop before that frame (@:{frame.index})"
+        if frame.index
+        else "The simulation or the writing of it failed from the first frame on"
+    )
+    if labels is not None and frame.labels is not None:
+        others = np.flatnonzero(labels != frame.labels)
+        others = others if atoms is None else np.intersect1d(others, atoms)
+        if others.size:
+            atom = int(others[0])
+            raise refused(
+                f": atom {atom} is {frame.labels[atom]}, and {labels[atom]} in the first one looked at"
+                f"{_and_others(others.size)}",
+                "Write all frames in one order of atoms, or leave out those that differ with @START:STOP: "
+                "pairs are followed by the place of their atoms in the file",
+            )
+    if pbc is not None and (frame.box.pbc != pbc).any():
+        raise refused(
+            f" {_repeats(frame.box.pbc)}, and the first one looked at {_repeats(pbc)}",
+            "Leave out the frames that differ with @START:STOP: distances in the two do not compare",
+        )
+    x = frame.positions if atoms is None else frame.positions[atoms]
+    for axis in np.flatnonzero(frame.box.pbc):
+        if not (vector := frame.box.matrix[axis]).any() or not np.isfinite(vector).all():
+            raise refused(
+                f": the box repeats along {'abc'[axis]}, but its vector there is {vector.tolist()}",
+                "Give the frames a box, or say that this direction does not repeat",
+            )
+    # a sum is finite unless a term is not, or the terms are of no use anyway
+    with np.errstate(over="ignore", invalid="ignore"):
+        total = x.sum()
+    if not np.isfinite(total) and (bad := np.flatnonzero(~np.isfinite(x).all(axis=1))).size:
+        first = _named(int(bad[0]), atoms)
+        raise refused(f": atom {first} is at {place(first)}{_and_others(bad.size)}", failed)
+    if (found := far_out(frame, atoms, radius, bits)) is not None:
+        atom, many, why = found
+        raise refused(
+            f": atom {atom} is at {place(atom)}, {why}{_and_others(many)}",
+            f"{failed}; an atom that did fly off is left out with --between",
+        )
+    # one atom may well be at the origin; two cannot be at one place
+    zero = np.flatnonzero(~x.any(axis=1))
+    if zero.size > 1:
+        some = f"atom {_named(int(zero[0]), atoms)} is at exactly 0, 0, 0{_and_others(zero.size)}"
+        raise refused(
+            f": {'all coordinates are 0' if zero.size == len(x) else some}, as where coordinates were never "
+            "written",
+            "Leave the frame out with @START:STOP, or the atoms with --between",
+        )
+
+
+def _repeats(pbc: np.ndarray) -> str:
+    if pbc.any() and not pbc.all():
+        axes = ", ".join(name for name, yes in zip("abc", pbc, strict=True) if yes)
+        return f"has a box that repeats along {axes}"
+    return "has a box" if pbc.any() else "has no box"
+
+
+def _and_others(count: int) -> str:
+    return "" if count == 1 else f", and {count - 1:,} other{'s' if count > 2 else ''} likewise"
+
+
+# ---- further out, or further from one frame to the next, than any simulation takes an atom
+
+
+def smallest_radius(rules: Sequence[Rule]) -> float:
+    """The shortest length that any of the rules compares distances with; infinite where none does."""
+    radii = [np.inf]
+    for rule in rules:
+        if isinstance(rule, SpeciesCutoffs):
+            radii.extend(rule.radii.values())
+        elif isinstance(rule, CutoffRule | Capped):
+            radii.append(rule.radius)
+    return float(min(radii))
+
+
+def far_out(
+    frame: Frame, atoms: Int[np.ndarray, "chosen"] | None = None, radius: float = np.inf, bits: int = 64
+) -> tuple[int, int, str] | None:
+    """The atom that is furthest out, where that is further than can be; arguments as of `checked`.
+
+    Returns:
+        (the atom, how many are too far out, why in words); None where none is.
+    """
+    x = frame.positions if atoms is None else frame.positions[atoms]
+    if len(x) < 2:
+        return None
+    # how far a distance is off between coordinates of size 1, twice over
+    unit = 2 * 4 * float(np.sqrt(3)) * _UNIT[bits]
+    largest = np.abs(x).max(axis=1)
+    top, box = float(largest.max()), _box(frame)
+    if ((box and top <= _FAR_BOXES * box / 2) or not top) and unit * top <= radius:
+        return None
+    away = np.abs(x - np.median(x, axis=0)).max(axis=1)
+    size = max(box, float(np.median(away)))
+    limit = (_FAR_BOXES if box else _FAR_SIZES) * size
+    if size and away.max() > limit:
+        at, what = int(np.argmax(away)), "the box" if box >= size else "all the rest"
+        why = f"{float(away[at]) / size:.2g} times the size of {what} away from the others"
+        return _named(at, atoms), int(np.count_nonzero(away > limit)), why
+    if unit * top > radius:
+        why = f"so far out that float{bits} tells distances no better than to {unit * top:.2g}"
+        return _named(int(np.argmax(largest)), atoms), int(np.count_nonzero(unit * largest > radius)), why
+    return None
+
+
+def leap(
+    before: Frame, now: Frame, atoms: Int[np.ndarray, "chosen"] | None = None
+) -> tuple[int, float] | None:
+    """The atom that is furthest from where it was a frame before, where that is further than can be.
+
+    Wrapping an atom, or all of them at once after a long time, is none.
+
+    Returns:
+        (the atom, how far, length); None where there is no leap.
+    """
+    x = now.positions if atoms is None else now.positions[atoms]
+    moved = x - (before.positions if atoms is None else before.positions[atoms])
+    box = _box(now)
+    if len(moved) < 2 or (box and np.abs(moved).max() <= _LEAP_BOXES * box / 2):
+        return None
+    # all of them may be shifted together
+    distance = np.abs(moved - np.median(moved, axis=0)).max(axis=1)
+    size = max(box, float(np.median(np.abs(x - np.median(x, axis=0)).max(axis=1))))
+    at = int(np.argmax(distance))
+    if not size or distance[at] <= (_LEAP_BOXES if box else _LEAP_SIZES) * size:
+        return None
+    return _named(at, atoms), float(distance[at])
+
+
+def _box(frame: Frame) -> float:
+    """The longest lattice vector along which the frame repeats, length; 0 where it does not along each."""
+    if not frame.box.pbc.all() or not np.isfinite(frame.box.matrix).all():
+        return 0.0
+    return float(np.linalg.norm(frame.box.matrix, axis=1).max())
+
+
+def _named(at: int, atoms: Int[np.ndarray, "chosen"] | None) -> int:
+    return at if atoms is None else int(atoms[at])

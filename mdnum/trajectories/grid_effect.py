@@ -11,14 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import islice, pairwise
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from mdnum.trajectories.frame import Box, Frame
-from mdnum.trajectories.resolution import SAMPLE, Resolution
-from mdnum.trajectories.source import Trajectory
+from mdnum.trajectories.resolution import Resolution
 
 Places = tuple[Float[np.ndarray, "draws 3"], ...]
 
@@ -33,44 +32,14 @@ _WIDE = 4.0
 
 @dataclass(frozen=True)
 class GridEffect:
-    """Flips with and without the rounding of the file, estimated.
+    """Flips with and without the rounding of the file, estimated."""
 
-    Attributes:
-        missed: share of the flips that happened between two frames and are not in the file at that frame.
-        invented: share of the flips in the file that did not happen at that frame.
-        ratio: flips in the file over flips that happened.
-        move: root mean square displacement of an atom between two frames, along an axis, length.
-        lag: frames between the two that it was read from.
-        frames: frames it was estimated from.
-    """
-
-    missed: float
-    invented: float
-    ratio: float
-    move: float
-    lag: int
-    frames: int
-
-    def words(self) -> str:
-        """A sentence on it, for people."""
-        if max(self.missed, self.invented) < 5e-4:
-            return "At this stride the resolution of the file hides or makes up fewer than 1 flip in 1,000."
-        return (
-            f"At this stride the resolution of the file hides about {100 * self.missed:.2g} % of the flips "
-            f"that happened, and about {100 * self.invented:.2g} % of those in it did not happen where they "
-            "stand (estimated from how atoms move in it)."
-        )
-
-
-def effect_on(
-    trajectory: Trajectory,
-    resolution: Resolution,
-    radius: float,
-    first: Int[np.ndarray, "first"] | None = None,
-    second: Int[np.ndarray, "second"] | None = None,
-) -> GridEffect | None:
-    """As `grid_effect`, from the first frames of a trajectory."""
-    return grid_effect(resolution, list(islice(trajectory.frames(), SAMPLE)), radius, first, second)
+    missed: float  # share of the flips that happened between two frames and are not in the file at that frame
+    invented: float  # share of the flips in the file that did not happen at that frame
+    ratio: float  # flips in the file over flips that happened
+    move: float  # root mean square displacement of an atom between two frames, along an axis, length
+    lag: int  # frames between the two that it was read from
+    frames: int  # frames it was estimated from
 
 
 def grid_effect(
@@ -247,8 +216,11 @@ def _shortest(d: Float[np.ndarray, "atoms 3"], box: Box) -> Float[np.ndarray, "a
 
 
 def _rounded(places: Places, steps: Float[np.ndarray, "3 3"]) -> Places:
+    size = np.diag(steps)
+    if np.count_nonzero(steps) == 3 and size.all():
+        return tuple(np.rint(x / size) * size for x in places)
     inverse = np.linalg.inv(steps)
-    return tuple(np.round(x @ inverse) @ steps for x in places)
+    return tuple(np.rint(x @ inverse) @ steps for x in places)
 
 
 def _inside(places: Places, radius: float) -> np.ndarray:

@@ -5,14 +5,14 @@ tiles space in the same way. A decision is always taken on the same number: the 
 
     (x_j - x_i) + s_0 a_0 + s_1 a_1 + s_2 a_2
 
-with the coordinates as they are stored, i < j, whole numbers s and the reduced vectors a, in this order of
+with the coordinates as they are stored, i < j, integers s and the reduced vectors a, in this order of
 operations. So it does not depend on which search found the pair.
 """
 
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -26,23 +26,20 @@ _UNIT_ROUNDOFF = 2.0**-53
 _FLAT = 1e-10
 
 
-@dataclass(frozen=True)
-class Lattice:
-    """What a search needs to know of a box.
+class ReducedLattice(NamedTuple):
+    """What a search needs to know of a box; the compiled loops take it as it is.
 
     Attributes:
         vectors: reduced lattice vectors as rows, length; zero along directions that do not repeat.
-        periodic: which rows repeat.
         inverse: of the vectors completed by unit vectors normal to them: x @ inverse are the coordinates.
         widths: distance between opposite faces, length; inf along directions that do not repeat.
-        combination: vectors = combination @ matrix of the box.
     """
 
     vectors: Float[np.ndarray, "3 3"]
-    periodic: Bool[np.ndarray, "3"]
+    periodic: Bool[np.ndarray, "3"]  # which rows repeat
     inverse: Float[np.ndarray, "3 3"]
     widths: Float[np.ndarray, "3"]
-    combination: Int[np.ndarray, "3 3"]
+    combination: Int[np.ndarray, "3 3"]  # vectors = combination @ matrix of the box
 
     @property
     def narrowest(self) -> float:
@@ -67,12 +64,15 @@ class Lattice:
         return 16.0 * _UNIT_ROUNDOFF * size
 
 
-def lattice_of(box: Box) -> Lattice:
+def lattice_of(box: Box) -> ReducedLattice:
     """The lattice of a box.
 
     Raises:
         InputError: a direction repeats, but its vector is zero, not finite, or in the plane of the others.
     """
+    from ase.geometry import complete_cell
+    from ase.geometry.minkowski_reduction import minkowski_reduce
+
     pbc = np.asarray(box.pbc, bool)
     matrix = np.where(pbc[:, None], np.asarray(box.matrix, np.float64), 0.0)
     for axis in np.flatnonzero(pbc):
@@ -82,79 +82,25 @@ def lattice_of(box: Box) -> Lattice:
                 remedy="Give the frame a box, or say that this direction does not repeat",
                 where="box",
             )
-    rows = np.flatnonzero(pbc)
-    combination = np.eye(3, dtype=np.int64)
-    if len(rows):
-        lengths = np.linalg.norm(matrix[rows], axis=1)
-        scaled = matrix[rows] / lengths[:, None]
+    combination, vectors = np.eye(3, dtype=np.int64), matrix
+    if pbc.any():
+        scaled = matrix[pbc] / np.linalg.norm(matrix[pbc], axis=1)[:, None]
         if not np.sqrt(max(np.linalg.det(scaled @ scaled.T), 0.0)) > _FLAT:
             raise InputError(
-                f"the vectors of the box lie in one plane: {matrix[rows].tolist()}",
+                f"the vectors of the box lie in one plane: {matrix[pbc].tolist()}",
                 remedy="Give the frame the box it was run in",
                 where="box",
             )
-        combination[np.ix_(rows, rows)] = _reduced(matrix[rows])
-    vectors = np.where(pbc[:, None], combination @ matrix, 0.0)
-    completed = _completed(vectors, pbc)
-    inverse = np.linalg.inv(completed)
+        if np.count_nonzero(matrix) > pbc.sum():
+            # a box with right angles is reduced, and stays in its order
+            combination = np.asarray(minkowski_reduce(matrix, pbc.tolist())[1], np.int64)
+        vectors = np.where(pbc[:, None], combination @ matrix, 0.0)
+    inverse = np.linalg.inv(complete_cell(vectors))
     widths = np.where(pbc, 1.0 / np.linalg.norm(inverse, axis=0), np.inf)
-    return Lattice(vectors, pbc, inverse, widths, combination)
+    return ReducedLattice(vectors, pbc, inverse, widths, combination)
 
 
-def _reduced(vectors):
-    """Whole-number combinations of at most three vectors that are Minkowski-reduced.
-
-    Each pass takes from a vector the combination of the shorter ones that leaves the least; a vector that
-    gets no shorter by any of these ends it (Nguyen and Stehlé 2009, greedy reduction, dimension <= 3).
-    """
-    count = len(vectors)
-    made = np.eye(count, dtype=np.int64)
-    tries = [np.array(one) for one in itertools.product((-1, 0, 1), repeat=count - 1)] if count > 1 else []
-    for _ in range(200):
-        current = made @ vectors
-        changed = False
-        for k in np.argsort(-np.einsum("ij,ij->i", current, current), kind="stable"):
-            current = made @ vectors
-            others = [m for m in range(count) if m != k]
-            if not others:
-                break
-            base = np.rint(np.linalg.lstsq(current[others].T, current[k], rcond=None)[0])
-            length = float(current[k] @ current[k])
-            best, taken = length * (1.0 - 1e-12), None
-            # around nothing as well: then the end of the passes is the definition of a reduced basis
-            for whole in itertools.chain((base + more for more in tries), tries):
-                whole = whole.astype(np.int64)
-                left = current[k] - whole @ current[others]
-                if float(left @ left) < best:
-                    best, taken = float(left @ left), whole
-            if taken is not None:
-                made[k] -= taken @ made[others]
-                changed = True
-        if not changed:
-            break
-    return made
-
-
-def _completed(vectors, pbc):
-    """The vectors with those that do not repeat replaced by unit vectors normal to all others."""
-    free = np.flatnonzero(~pbc)
-    if not len(free):
-        return vectors
-    completed = vectors.copy()
-    if len(free) == 3:
-        return np.eye(3)
-    if len(free) == 1:
-        normal = np.cross(vectors[(free[0] + 1) % 3], vectors[(free[0] + 2) % 3])
-        completed[free[0]] = normal / np.linalg.norm(normal)
-        return completed
-    along = vectors[pbc][0] / np.linalg.norm(vectors[pbc][0])
-    other = np.cross(along, np.eye(3)[np.argmin(np.abs(along))])
-    completed[free[0]] = other / np.linalg.norm(other)
-    completed[free[1]] = np.cross(along, completed[free[0]])
-    return completed
-
-
-def own_images(lattice: Lattice, radius: float) -> Float[np.ndarray, "images"]:
+def own_images(lattice: ReducedLattice, radius: float) -> Float[np.ndarray, "images"]:
     """Squared lengths of the lattice vectors no longer than radius, one of each ± pair, ascending."""
     span = [range(-int(radius / w) - 1, int(radius / w) + 2) if p else range(1)
             for w, p in zip(lattice.widths, lattice.periodic, strict=True)]  # fmt: skip
@@ -183,27 +129,14 @@ def square_of(x, i, j, s0, s1, s2, vectors):
     return d0 * d0 + d1 * d1 + d2 * d2
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
-def rounded_image(x, i, j, inverse, periodic):
-    """Lattice vector to add to j that brings it near i, by rounding: nearest where that is near enough."""
-    y0, y1, y2 = x[j, 0] - x[i, 0], x[j, 1] - x[i, 1], x[j, 2] - x[i, 2]
-    n0, n1, n2 = 0, 0, 0
-    if periodic[0]:
-        n0 = -np.int64(np.rint(y0 * inverse[0, 0] + y1 * inverse[1, 0] + y2 * inverse[2, 0]))
-    if periodic[1]:
-        n1 = -np.int64(np.rint(y0 * inverse[0, 1] + y1 * inverse[1, 1] + y2 * inverse[2, 1]))
-    if periodic[2]:
-        n2 = -np.int64(np.rint(y0 * inverse[0, 2] + y1 * inverse[1, 2] + y2 * inverse[2, 2]))
-    return n0, n1, n2
-
-
 @numba.njit(cache=True, nogil=True, inline="never")
-def near_squares(x, i, j, vectors, inverse, y, squares):
-    """`square_of` the image that `rounded_image` names, of a block of pairs; y is room for (3, block).
+def near_squares(x, i, j, lattice, y, squares):
+    """`square_of` the image that rounding to the lattice names, of pairs; y is room for (3, block).
 
     Without a branch: to add a sum of zeros changes no square, and vectors are zero where a direction does not
     repeat. Gathered first, so that the rest are vector instructions; what the lattice is, is read once.
     """
+    vectors, inverse = lattice.vectors, lattice.inverse
     y0, y1, y2 = y[0], y[1], y[2]
     for k in range(i.shape[0]):
         # unsigned: no test for indices from the end
@@ -226,16 +159,23 @@ def near_squares(x, i, j, vectors, inverse, y, squares):
 
 
 @numba.njit(cache=True, nogil=True)
-def image_square(x, i, j, rank, vectors, inverse, periodic, widths):
+def image_square(x, i, j, rank, lattice):
     """Squared distance to the image of j that has `rank` nearer ones; inf where there are not so many.
 
     i < j, or i == j for images of an atom itself, of which one of each ± pair counts.
     """
-    n0, n1, n2 = rounded_image(x, i, j, inverse, periodic)
+    vectors, periodic, widths = lattice.vectors, lattice.periodic, lattice.widths
+    # the image that rounding names; nearest where that is near enough
+    base = np.zeros(3, np.int64)
+    for k in range(3):
+        if periodic[k]:
+            f = 0.0
+            for c in range(3):
+                f += (x[j, c] - x[i, c]) * lattice.inverse[c, k]
+            base[k] = -np.int64(np.rint(f))
     narrowest = min(widths[0], widths[1], widths[2])
     if narrowest == np.inf:
         return np.inf if rank > 0 or i == j else square_of(x, i, j, 0, 0, 0, vectors)
-    base = np.array([n0, n1, n2])
     best = np.empty(rank + 1)
     span = np.zeros(3, np.int64)
     for k in range(3):

@@ -1,18 +1,26 @@
-"""The heads of NetCDF files: how many records there should be, and how many there are.
+"""Amber's NetCDF files that end early, read up to where they do: what a run that was killed has left.
 
-The libraries that read them take a file with fewer records than its head tells of for no file at all. Classic
-format, with 32 or 64 bit offsets (docs.unidata.ucar.edu/netcdf-c, "File Format Specifications").
+The libraries that read them take a file with fewer records than its head names for no file at all. Classic
+format, with 32 or 64 bit offsets (docs.unidata.ucar.edu/netcdf-c, "File Format Specifications"); frames as
+MDAnalysis hands over those of whole files (ambermd.org/netcdf/nctraj.xhtml).
 """
 
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass
 from io import BufferedReader
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+
+from mdnum.errors import InputError
+from mdnum.trajectories.boxes import box_of
+from mdnum.trajectories.frame import Box, Frame, UnreadableFrame
+from mdnum.trajectories.topology import notes_on
+from mdnum.trajectories.trajectory import Trajectory
 
 # bytes of each type: byte, char, short, int, float, double
 _TYPES = {1: ">i1", 2: "S1", 3: ">i2", 4: ">i4", 5: ">f4", 6: ">f8"}
@@ -23,44 +31,26 @@ _STREAMING = 0xFFFFFFFF
 _LONGEST = 1 << 24
 
 
-@dataclass(frozen=True)
-class RecordVariable:
-    """A variable with a value in every record.
+class RecordVariable(NamedTuple):
+    """A variable with a value in every record."""
 
-    Attributes:
-        begin: of the first value in the file, bytes.
-        dtype: as stored.
-        shape: of a value.
-        size: of a value, bytes.
-        scale: factor that values are meant to be multiplied with; None for none.
-    """
-
-    begin: int
-    dtype: np.dtype
+    begin: int  # of the first value in the file, bytes
+    dtype: np.dtype  # of a value, as stored
     shape: tuple[int, ...]
-    size: int
-    scale: float | None
+    size: int  # of a value, bytes
+    scale: float | None  # factor that values are meant to be multiplied with; None for none
 
 
 @dataclass(frozen=True)
 class NetcdfHead:
-    """What the head of a NetCDF file says.
+    """What the head of a NetCDF file says."""
 
-    Attributes:
-        records: how many there should be; None where the writer did not get to say.
-        whole: how many there are from beginning to end.
-        rest: bytes behind them.
-        record: bytes of one.
-        atoms: the dimension of that name; 0 without one.
-        variables: those with a value in every record, by name.
-    """
-
-    records: int | None
-    whole: int
-    rest: int
-    record: int
-    atoms: int
-    variables: dict[str, RecordVariable] = field(default_factory=dict)
+    records: int | None  # how many there should be; None where the writer did not get to say
+    whole: int  # how many there are from beginning to end
+    rest: int  # bytes behind them
+    record: int  # bytes of one
+    atoms: int  # the dimension of that name; 0 without one
+    variables: dict[str, RecordVariable]  # those with a value in every record, by name
 
     @property
     def cut(self) -> bool:
@@ -116,7 +106,7 @@ def _number(file: BufferedReader) -> int:
 
 
 def _count(file: BufferedReader) -> int:
-    """Elements of a list, whose kind stands before it."""
+    """Elements of a list, behind its kind."""
     _number(file)
     return _number(file)
 
@@ -137,3 +127,65 @@ def _attributes(file: BufferedReader) -> dict[str, Any]:
             raise ValueError("no attribute is as long")
         found[name] = np.frombuffer(file.read(-(-size // 4) * 4)[:size], dtype)
     return found
+
+
+class NetcdfTrajectory(Trajectory):
+    """An Amber NetCDF file that ends early, in Å and ps."""
+
+    format = "NCDF"
+
+    def __init__(self, path: Path, topology: str | Path | None, frames: slice):
+        super().__init__(path, topology, frames)
+        head = head_of(path)
+        if head is None or "coordinates" not in head.variables or not head.atoms:
+            raise InputError(
+                "it is no Amber NetCDF file, or one that ends in its head",
+                remedy="Check that the file is whole and of the kind its name says",
+                where=str(path),
+            )
+        self._head, self._count = head, head.whole + 1
+        if not head.whole:
+            raise self._ends(0)
+        self.bits = 8 * head.variables["coordinates"].dtype.itemsize
+        self.time = "ps" if "time" in head.variables else "frame"
+        self._has(head.atoms)
+        self.notes = notes_on(self.table)
+
+    def _raw(self, numbers: Iterator[int]) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
+        names = ("coordinates", "velocities", "time", "cell_lengths", "cell_angles")
+        with self.path.open("rb") as file:
+            for number in numbers:
+                if number >= self._head.whole:
+                    raise self._ends(number)
+                variables = {name: self._head.variables.get(name) for name in names}
+                yield (
+                    number,
+                    {
+                        name: self._value(file, one, number)
+                        for name, one in variables.items()
+                        if one is not None
+                    },
+                )
+
+    def _ends(self, number: int) -> UnreadableFrame:
+        count = self._head.records or 0
+        return self._unreadable(number, f"the file ends in it, and its head tells of {count:,} frames")
+
+    def _frame(self, number: int, raw: dict[str, np.ndarray]) -> Frame:
+        box = Box()
+        if {"cell_lengths", "cell_angles"} <= set(raw):
+            box = box_of(np.concatenate([raw["cell_lengths"], raw["cell_angles"]]).astype(np.float32))
+        return Frame(
+            index=number,
+            time=float(raw["time"]) if "time" in raw else float(number),
+            positions=raw["coordinates"].astype(np.float64),
+            box=box,
+            velocities=raw["velocities"].astype(np.float64) if "velocities" in raw else None,
+        )
+
+    def _value(self, file: BufferedReader, one: RecordVariable, number: int) -> np.ndarray:
+        file.seek(one.begin + number * self._head.record)
+        values = np.frombuffer(file.read(one.size), one.dtype).reshape(one.shape)
+        values = values.astype(one.dtype.newbyteorder("="))
+        # rounded once, as MDAnalysis does
+        return values if one.scale is None else (values * np.float64(one.scale)).astype(values.dtype)

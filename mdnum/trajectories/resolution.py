@@ -9,18 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from mdnum.errors import InputError
 from mdnum.trajectories.frame import Frame
-from mdnum.trajectories.grids import decimal_grid, steps_of
-from mdnum.trajectories.source import Trajectory
 
-#: Frames looked at by `infer`.
-SAMPLE = 8
 # Coordinates looked at: chance hits decide nothing long before.
 _ENOUGH = 6000
 # Roundings that a number in the file may have seen beside those to its grid (a product in the writer,
@@ -31,6 +25,13 @@ _UNIT = {32: 2.0**-24, 64: 2.0**-53}
 _BOX_STEPS = {"PDB": (1e-3, 1e-2), "ENT": (1e-3, 1e-2), "GRO": (1e-4, 0.0)}
 # Steps of coordinates that formats have as a rule, Å.
 _USUAL_STEPS = {"PDB": 1e-3, "ENT": 1e-3, "GRO": 1e-2, "XTC": 1e-2}
+
+# decimal steps tried, in Å or in fractions of the box: from 1 down
+_STEPS = tuple(one * 10.0**-k for k in range(13) for one in (1.0, 0.5, 0.2))
+# significant digits tried; LAMMPS writes 6 unless told otherwise
+_DIGITS = range(4, 13)
+# what chance would do with no more than this probability is taken for meant
+_CHANCE = np.log(1e-6)
 
 
 @dataclass(frozen=True)
@@ -48,8 +49,8 @@ class Resolution:
         moved: whether atoms moved between them. Where none did, the grid may be the structure's and not the
             file's.
         box: step of the box's lengths, length, and of its angles, degrees, where the format rounds them.
-        told: whether the coordinates tell it. Where they are all 0, a grid is that which the format has as a
-            rule.
+        told: whether the coordinates determine it. Where they are all 0, a grid is that which the format has
+            as a rule.
     """
 
     kind: str
@@ -91,12 +92,6 @@ class Resolution:
         arithmetic = 16 * _UNIT[64] * (largest + lattice)
         return float(2 * np.sqrt(3) * coordinate + box + arithmetic)
 
-    def typical(self, frame: Frame) -> float:
-        """Standard deviation of a distance's error: rounding errors spread evenly within a step, length."""
-        frame = _of(frame, None)
-        # two atoms, each with variance step²/12 along the line between them
-        return float(np.sqrt(2 / 12)) * self.usual_step(frame)
-
     def usual_step(self, frame: Frame) -> float:
         """Root mean square of what the last digit of a coordinate is worth, length."""
         if not len(frame.positions):
@@ -109,33 +104,6 @@ class Resolution:
             # a step along each lattice vector, and the mean over the axes
             return float(np.sqrt((((steps**2).mean(axis=0)[:, None]) * frame.box.matrix**2).sum() / 3))
         return float(np.sqrt((steps_of(frame.positions, self.step, self.digits) ** 2).mean()))
-
-    def words(self, length: str = "Å") -> str:
-        """A sentence on the resolution, for people."""
-        unit = f" {length}" if length else ""
-        through = (
-            " The reader hands coordinates over in float32, whatever the file stores."
-            if self.bits == 32 and self.kind == "float32"
-            else ""
-        )
-        unsure = (
-            ""
-            if self.moved
-            else " No atom moved between the frames looked at, so this may be the structure's."
-        )
-        if not self.told:
-            rule = f"; as a rule the format keeps multiples of {self.step:g}{unit}" if self.step else ""
-            return f"No coordinate looked at is other than 0, which does not tell what the file keeps{rule}."
-        of = " of the box" if self.kind == "fractions" else unit
-        if self.digits:
-            return (
-                f"Every coordinate has at most {self.digits} digits, the last worth {self.step:g}{of} in the "
-                f"largest: the file keeps no more.{unsure}"
-            )
-        if self.step:
-            return f"Every coordinate is a multiple of {self.step:g}{of}: the file keeps no more.{unsure}"
-        digits = {"float32": "about 7", "float64": "about 16"}[self.kind]
-        return f"Coordinates have the resolution of {self.kind}, {digits} digits.{through}"
 
     @property
     def _narrow(self) -> bool:
@@ -153,25 +121,7 @@ class Resolution:
         return float(steps_of(largest, self.step, self.digits).max()) / 2
 
 
-def infer(trajectory: Trajectory, frames: int = SAMPLE) -> Resolution:
-    """The resolution of a file, from the first frames asked for.
-
-    Args:
-        trajectory: its frames are read from the first on.
-        frames: how many of them at most.
-
-    Raises:
-        InputError: there is none.
-    """
-    sample = list(islice(trajectory.frames(), frames))
-    if not sample:
-        raise InputError(
-            "no frame is left of what was asked for", remedy="Ask for others", where=str(trajectory.path)
-        )
-    return infer_from(sample, trajectory.bits, trajectory.format)
-
-
-def infer_from(sample: Sequence[Frame], bits: int = 64, format: str = "") -> Resolution:
+def infer(sample: Sequence[Frame], bits: int = 64, format: str = "") -> Resolution:
     """The resolution of frames.
 
     Args:
@@ -257,3 +207,74 @@ def _extent(frame: Frame) -> tuple[float, float]:
     largest = float(np.abs(frame.positions).max()) if len(frame.positions) else 0.0
     rows = frame.box.matrix[frame.box.pbc]
     return largest, float(np.abs(rows).sum(axis=0).max()) if len(rows) else 0.0
+
+
+# ---- which decimals numbers were written with
+
+
+def decimal_grid(
+    values: Float[np.ndarray, "values"], slack: Float[np.ndarray, "values"]
+) -> tuple[float, int]:
+    """The decimals that all values keep to.
+
+    Args:
+        values: as read.
+        slack: how far each may be off through the arithmetic behind it.
+
+    Returns:
+        the coarsest decimal step that all are multiples of, and 0; or the step of the largest and the number
+        of significant digits that all have; or 0.0 and 0 where they are no decimals.
+    """
+    values, index = np.unique(values, return_index=True)
+    slack = slack[index]
+    some = values != 0
+    values, slack = values[some], slack[some]
+    if not len(values):
+        return 0.0, 0
+    fixed = _fixed(values, slack)
+    floor = np.maximum(2 * slack, fixed)
+    for digits in _DIGITS:
+        steps = steps_of(values, 0.0, digits)
+        # where they are finer than what is known already they say nothing
+        coarse = steps > floor
+        if not coarse.any():
+            continue
+        if _chance(floor[coarse] / steps[coarse]) > _CHANCE:
+            break
+        if _multiples(values[coarse], steps[coarse], slack[coarse]):
+            return float(steps.max()), digits
+    return fixed, 0
+
+
+def steps_of(values: Float[np.ndarray, "*shape"], step: float, digits: int) -> Float[np.ndarray, "*shape"]:
+    """What the last digit of each value is worth: the step, or by the value's size where digits count."""
+    if digits == 0:
+        return np.full_like(values, step)
+    size = np.where(values == 0, 1.0, np.abs(values))
+    # just below a power of ten rounds up to it
+    exponent = np.floor(np.log10(size * (1 + 1e-12)))
+    return np.where(values == 0, 0.0, 10.0 ** (exponent + 1 - digits))
+
+
+def _fixed(values: Float[np.ndarray, "values"], slack: Float[np.ndarray, "values"]) -> float:
+    for step in _STEPS:
+        if _chance(np.minimum(2 * slack / step, 1.0)) > _CHANCE:
+            # finer steps are told from chance less well still
+            return 0.0
+        if _multiples(values, np.full_like(values, step), slack):
+            return step
+    return 0.0
+
+
+def _chance(parts: Float[np.ndarray, "values"]) -> float:
+    """Logarithm of the probability that values at random all fall into these parts of a step."""
+    return float(np.log(np.maximum(parts, 1e-300)).sum())
+
+
+def _multiples(
+    values: Float[np.ndarray, "values"],
+    steps: Float[np.ndarray, "values"],
+    slack: Float[np.ndarray, "values"],
+) -> bool:
+    ratio = values / steps
+    return bool((np.abs(ratio - np.round(ratio)) * steps <= slack).all())

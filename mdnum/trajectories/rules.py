@@ -3,7 +3,7 @@
 A rule is *symmetric* (a pair is inside or not, whoever asks) or *directed* (j is a neighbor of i, and i need
 not be one of j). Distances are compared as float64 squares; a margin is a length, positive inside:
 
-    Cutoff          r_cut - r
+    CutoffRule      r_cut - r
     SpeciesCutoffs  r_cut of the two species - r
     Nearest         distance of the first outside - r for a neighbor, distance of the k-th - r for another
     Capped          the same, and never more than radius - r
@@ -43,7 +43,7 @@ def _count(value: int, where: str) -> None:
 
 
 @dataclass(frozen=True)
-class Cutoff:
+class CutoffRule:
     """Inside where r < radius.
 
     The decision compares r² with radius² in float64, as most codes do; a pair within rounding of the radius
@@ -56,7 +56,7 @@ class Cutoff:
     radius: float
 
     def __post_init__(self):
-        _radius(self.radius, "Cutoff.radius")
+        _radius(self.radius, "CutoffRule.radius")
 
     directed = False
     needs_species = False
@@ -193,4 +193,4 @@ class Capped:
         return self.radius
 
 
-Rule = Cutoff | SpeciesCutoffs | Nearest | Capped
+Rule = CutoffRule | SpeciesCutoffs | Nearest | Capped

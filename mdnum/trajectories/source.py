@@ -1,17 +1,10 @@
-"""Trajectories of any code as frames in float64: the contract, and which reader a file gets.
-
-Positions are those of the file: nothing is wrapped, made whole or centered. Readers differ in what they keep:
-ASE's and mdnum's own (gro, LAMMPS's text dumps) keep every digit, MDAnalysis's narrow every coordinate to
-float32 (`Trajectory.bits`).
-"""
+"""Trajectories of any code: which reader a file gets, and atoms selected by words."""
 
 from __future__ import annotations
 
 import json
+import warnings
 import zlib
-from abc import ABC, abstractmethod
-from collections.abc import Iterator
-from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -21,126 +14,24 @@ from jaxtyping import Int
 
 from mdnum.errors import InputError
 from mdnum.trajectories.frame import Frame
-from mdnum.trajectories.slices import parse_slice, split_path
+from mdnum.trajectories.topology import AtomTable, first_line, topology_universe, with_elements
+from mdnum.trajectories.trajectory import Trajectory, parse_slice, split_path
 
-
-class UnreadableFrame(InputError):
-    """A frame in the middle of a file cannot be read; those before it were given out.
-
-    Args:
-        frame: its number in the file, from 0.
-    """
-
-    def __init__(self, message: str, *, frame: int, where: str, remedy: str | None = None):
-        otherwise = (
-            f"The frames before it were read; to stop there add @:{frame} to the path"
-            if frame
-            else "Check that the file is whole and of the kind its name says"
-        )
-        super().__init__(message, remedy=remedy or otherwise, where=where)
-        self.frame = frame
-
-
-@dataclass(frozen=True)
-class AtomTable:
-    """What a topology says of every atom, one entry an atom.
-
-    Attributes:
-        names: as in the file ("OW"); the species where it has no names.
-        species: chemical element where it is known or can be guessed, else the file's atom type.
-        residue_names: "" where there are none.
-        residue_ids: number of the residue as the file has it; 0 where there are none.
-        residues: index of the atom's residue from 0, different for two residues of one number.
-        named: False where the file says nothing of its atoms but how many they are.
-        guessed: whether the species were guessed from names.
-    """
-
-    names: np.ndarray
-    species: np.ndarray
-    residue_names: np.ndarray
-    residue_ids: Int[np.ndarray, "atoms"]
-    residues: Int[np.ndarray, "atoms"]
-    named: bool = True
-    guessed: bool = False
-
-    def __len__(self) -> int:
-        return len(self.names)
-
-    @classmethod
-    def plain(cls, species: list[str], named: bool = True) -> AtomTable:
-        """Atoms that have a species and belong to no residue."""
-        words, none = np.array(species, dtype=object), np.zeros(len(species), np.int64)
-        return cls(words, words, np.full(len(species), "", dtype=object), none, none, named)
-
-
-class Trajectory(ABC):
-    """Frames of one file, read lazily and in order, as often as wanted.
-
-    Attributes:
-        path: the file.
-        format: the file's format in the reader's word ("XTC", "extxyz").
-        reader: who reads it ("MDAnalysis", "ASE", "mdnum").
-        bits: width of a coordinate as it comes from the reader, 32 or 64; frames are float64 either way.
-        length: unit of length in words; "" where the file does not say.
-        time: unit of time in words; "frame" where the file has no times, whose numbers then stand for them
-            (velocities are per ps there, if the file has any).
-        table: what is known of the atoms.
-        notes: what a reader of the results should know about the reading, each a sentence.
-        slice: the frames asked for.
-        topology: the file that says what the atoms are, where it is another one.
-    """
-
-    path: Path
-    topology: Path | None = None
-    format: str
-    reader: str
-    bits: int = 64
-    length: str = "Å"
-    time: str = "frame"
-    table: AtomTable
-    notes: tuple[str, ...] = ()
-    slice: slice
-
-    @property
-    def atoms(self) -> int:
-        """Atoms in every frame."""
-        return len(self.table)
-
-    @property
-    def species(self) -> np.ndarray:
-        """Species of every atom, words, shape (atoms,)."""
-        return self.table.species
-
-    @property
-    def name(self) -> str:
-        """The file's name, with what was asked for of its frames."""
-        return self.path.name
-
-    @property
-    @abstractmethod
-    def in_file(self) -> int | None:
-        """Frames in the file; None where they are not known without reading it."""
-
-    @property
-    def count(self) -> int | None:
-        """Frames that `frames` gives; None where they are not known without reading the file."""
-        if self.in_file is None:
-            return None
-        return len(range(*self.slice.indices(self.in_file)))
-
-    @property
-    def universe(self) -> Any:
-        """The MDAnalysis Universe behind it, or None: another reader has none."""
-        return None
-
-    @abstractmethod
-    def frames(self) -> Iterator[Frame]:
-        """The frames asked for, in order, one in memory at a time. Each call starts at the first again.
-
-        Raises:
-            UnreadableFrame: one cannot be read. Those before it have been given.
-            InputError: a frame has another number of atoms.
-        """
+# MDAnalysis reads XYZ too, but neither boxes nor more than float32 of it; the others it does not know
+_ASE_SUFFIXES = frozenset({".traj", ".extxyz", ".json", ".db", ".bundle", ".castep", ".xsf", ".con"})
+_OWN = {
+    "lammpsdump": "lammps",
+    "lammpstrj": "lammps",
+    "lammps-dump-text": "lammps",
+    "gro": "gro",
+    "xtc": "xtc",
+}
+# Amber's, of which MDAnalysis reads those that are whole
+_NETCDF = frozenset({"nc", "ncdf", "netcdf"})
+_LANGUAGE = (
+    'Write it as MDAnalysis does: "name OW", "protein", "element O", "index 0:99", "resname SOL and name OW"'
+)
+_SHOWN = 8
 
 
 def open_trajectory(
@@ -169,7 +60,7 @@ def open_trajectory(
         file = file / "trajectory.traj"
     if file.is_dir():
         if (file / "summary.json").exists():
-            _refuse_folder(file)
+            raise _no_trajectory(file)
         if file.suffix != ".bundle":
             raise InputError("it is a folder", remedy="Give the trajectory itself", where=str(file))
     for one in (file, None if topology is None else Path(topology).expanduser()):
@@ -177,129 +68,71 @@ def open_trajectory(
             raise InputError("no such file", remedy="Check the path", where=str(one))
         if one is not None and one.is_file() and not one.stat().st_size:
             raise InputError("the file is empty", remedy="Check how it was written", where=str(one))
-    opened = _opened(file, topology, frames, format)
+    from mdnum.trajectories import ase_source, mdanalysis_source, netcdf, text, xtc
+
+    readers = {
+        "lammps": text.LammpsDump, "gro": text.GroTrajectory, "xtc": xtc.XtcTrajectory,
+        "netcdf": netcdf.NetcdfTrajectory,
+    }  # fmt: skip
+    kind = _reader_of(file, format)
+    if kind in readers:
+        opened = readers[kind](file, topology, frames)
+    elif kind == "ase":
+        word = format or ase_source.format_of(file)
+        if word == "extxyz":
+            opened = text.ExtxyzTrajectory(file, topology, frames)
+        else:
+            opened = ase_source.AseTrajectory(file, topology, frames, word)
+    else:
+        opened = mdanalysis_source.MDAnalysisTrajectory(file, topology, frames, format)
     if not opened.atoms:
         raise InputError("its frames have no atoms", remedy="Check how the file was written", where=str(file))
     return opened
 
 
-def _refuse_folder(folder: Path) -> None:
-    """Says why a folder that mdnum wrote holds no trajectory."""
+def _no_trajectory(folder: Path) -> InputError:
+    """Why a folder that mdnum wrote holds no trajectory."""
     try:
         world = json.loads((folder / "summary.json").read_text()).get("world", "md")
     except (ValueError, AttributeError, OSError):
         world = "md"
     if world != "md":
-        raise InputError(
+        return InputError(
             "this folder holds results, and no trajectory",
             remedy=f"Give the trajectory itself; `mdnum report {folder}` shows what the folder holds",
             where=str(folder),
         )
-    raise InputError(
+    return InputError(
         "this run folder has no trajectory",
         remedy="Run again with --save-every 1 (or another number of steps)",
         where=str(folder),
     )
 
 
-def _opened(file: Path, topology: str | Path | None, frames: slice, format: str | None) -> Trajectory:
-    reader = _reader_of(file, format)
-    if reader == "ase":
-        from mdnum.trajectories.ase_source import AseTrajectory
-
-        return AseTrajectory(file, topology, frames, format)
-    if reader == "lammps":
-        from mdnum.trajectories.lammps_dump import LammpsDump
-
-        return LammpsDump(file, topology, frames)
-    if reader == "xtc":
-        from mdnum.trajectories.xtc_source import XtcTrajectory
-
-        return XtcTrajectory(file, topology, frames)
-    if reader == "netcdf":
-        from mdnum.trajectories.netcdf_source import NetcdfTrajectory
-
-        return NetcdfTrajectory(file, topology, frames)
-    if reader == "gro":
-        from mdnum.trajectories.gro import GroTrajectory
-
-        return GroTrajectory(file, topology, frames)
-    from mdnum.trajectories.mdanalysis_source import MDAnalysisTrajectory
-
-    return MDAnalysisTrajectory(file, topology, frames, format)
-
-
-def table_of_topology(topology: str | Path) -> AtomTable:
-    """The atoms of a topology file: any that MDAnalysis takes for one, or any structure that ASE reads.
-
-    Raises:
-        InputError: neither reads it.
-    """
-    from mdnum.trajectories.mdanalysis_source import table_of, topology_universe
-
-    try:
-        return table_of(topology_universe(topology).atoms)
-    except InputError:
-        from ase import Atoms
-        from ase.io import read
-
-        try:
-            atoms = read(str(topology))
-        except Exception as error:
-            raise InputError("neither MDAnalysis nor ASE reads this topology", where=str(topology)) from error
-        assert isinstance(atoms, Atoms)
-        return AtomTable.plain(atoms.get_chemical_symbols())
-
-
-# MDAnalysis reads XYZ too, but neither boxes nor more than float32 of it; the others it does not know
-_ASE_SUFFIXES = frozenset({".traj", ".extxyz", ".json", ".db", ".bundle", ".castep", ".xsf", ".con"})
-
-
-_OWN = {"lammpsdump": "lammps", "lammpstrj": "lammps", "lammps-dump-text": "lammps"}
-_OWN |= {"gro": "gro", "xtc": "xtc"}
-# Amber's, of which MDAnalysis reads those that are whole
-_NETCDF = frozenset({"nc", "ncdf", "netcdf"})
-
-
 def _reader_of(file: Path, format: str | None) -> str:
     """Which reader a file gets: "ase", "mdanalysis", or one of mdnum's: "lammps", "gro", "xtc", "netcdf"."""
+    import MDAnalysis
+
+    from mdnum.trajectories.netcdf import head_of
+
+    known: set[str] = set(MDAnalysis._READERS)
     suffix = (file.with_suffix("") if file.suffix in (".gz", ".bz2") else file).suffix.lower()
     if format is not None and format.lower() in _OWN:
         return _OWN[format.lower()]
-    if (format or suffix[1:]).lower() in _NETCDF and _is_cut_netcdf(file):
+    if (format or suffix[1:]).lower() in _NETCDF and (head := head_of(file)) is not None and head.cut:
         return "netcdf"
     if format is not None:
-        return "mdanalysis" if format.upper() in _mdanalysis_formats() else "ase"
+        return "mdanalysis" if format.upper() in known else "ase"
     if suffix in _ASE_SUFFIXES or (suffix == ".cif" and find_spec("gemmi") is None):
         return "ase"
     if suffix in (".gro", ".xtc"):
         return suffix[1:]
-    if suffix[1:].upper() not in _mdanalysis_formats() and _first_lines(file)[0].startswith("item:"):
+    head, comment = _first_lines(file)
+    if suffix[1:].upper() not in known and head.startswith("item:"):
         return "lammps"
-    if suffix == ".xyz" and _is_extended(file):
-        return "ase"
-    if suffix[1:].upper() in _mdanalysis_formats():
-        return "mdanalysis"
-    return "ase"
-
-
-def _is_cut_netcdf(file: Path) -> bool:
-    from mdnum.trajectories.netcdf import head_of
-
-    head = head_of(file)
-    return head is not None and head.cut
-
-
-def _mdanalysis_formats() -> set[str]:
-    import MDAnalysis
-
-    return set(MDAnalysis._READERS)
-
-
-def _is_extended(file: Path) -> bool:
-    """Whether the comment line of an XYZ file says what its columns are, or its box."""
-    comment = _first_lines(file)[1]
-    return "lattice=" in comment or "properties=" in comment
+    # the comment line of an extended XYZ file says what its columns are, or its box
+    extended = suffix == ".xyz" and ("lattice=" in comment or "properties=" in comment)
+    return "mdanalysis" if suffix[1:].upper() in known and not extended else "ase"
 
 
 def _first_lines(file: Path) -> tuple[str, str]:
@@ -311,3 +144,98 @@ def _first_lines(file: Path) -> tuple[str, str]:
             return lines.readline(1000).lower(), lines.readline(10_000).lower()
     except (OSError, EOFError, zlib.error, UnicodeDecodeError):
         return "", ""
+
+
+# ---- atoms by words, in MDAnalysis's selection language, whoever reads the file
+
+
+def select(trajectory: Trajectory, words: str) -> Int[np.ndarray, "chosen"]:
+    """Indices of the atoms that words name at the first frame asked for, ascending.
+
+    A selection that depends on where atoms are ("around 5 protein") is made once, there.
+
+    Raises:
+        InputError: the words are no selection, name no atom, or need what the file does not tell.
+    """
+    from MDAnalysis.exceptions import NoDataError, SelectionError
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        universe = _universe(trajectory)
+        try:
+            found = universe.select_atoms(words)
+        except (NoDataError, AttributeError) as error:
+            raise InputError(
+                f"the selection {words!r} asks for what the file does not tell ({first_line(error)})",
+                remedy="Give a topology that has it with -s TOPOLOGY, or select by index",
+                where=str(trajectory.path),
+            ) from error
+        except (SelectionError, ValueError, TypeError) as error:
+            raise InputError(
+                f"{words!r} is no selection ({first_line(error)})",
+                remedy=_LANGUAGE,
+                where=str(trajectory.path),
+            ) from error
+    if len(found) == 0:
+        raise InputError(
+            f"the selection {words!r} names no atom of {trajectory.atoms:,}; {_there_are(trajectory.table)}",
+            remedy=_LANGUAGE if trajectory.table.named else "Give a topology with -s TOPOLOGY",
+            where=str(trajectory.path),
+        )
+    return np.asarray(found.indices, np.int64)
+
+
+def _universe(trajectory: Trajectory) -> Any:
+    """A Universe that stands at the first frame asked for."""
+    first = next(iter(trajectory.frames()), None)
+    if first is None:
+        raise InputError(
+            "no frame is left of what was asked for", remedy="Ask for others", where=str(trajectory.path)
+        )
+    if trajectory.universe is not None:
+        # `frames` has left the Universe there
+        return trajectory.universe
+    if trajectory.topology is not None:
+        try:
+            universe = topology_universe(trajectory.topology)
+        except InputError:
+            # a topology of ASE's: it says no more than the table
+            return universe_of(trajectory.table, first)
+        with_elements(universe, trajectory.table)
+        return _standing(universe, first)
+    return universe_of(trajectory.table, first)
+
+
+def _standing(universe: Any, frame: Frame) -> Any:
+    """The Universe at this frame. Distances in a selection are float32."""
+    from MDAnalysis.lib.mdamath import triclinic_box
+
+    box = triclinic_box(*frame.box.matrix) if frame.box.pbc.all() else np.zeros(6, np.float32)
+    universe.load_new(frame.positions[None].astype(np.float32), order="fac", dimensions=np.asarray(box)[None])
+    return universe
+
+
+def universe_of(table: AtomTable, frame: Frame) -> Any:
+    """An MDAnalysis Universe with one frame, for its selection language."""
+    import MDAnalysis
+
+    first = np.unique(table.residues, return_index=True)[1]
+    universe: Any = MDAnalysis.Universe.empty(len(table), n_residues=len(first), atom_resindex=table.residues)
+    for name, values in (("names", table.names), ("types", table.species), ("elements", table.species)):
+        universe.add_TopologyAttr(name, values)
+    universe.add_TopologyAttr("resnames", table.residue_names[first])
+    universe.add_TopologyAttr("resids", table.residue_ids[first])
+    return _standing(universe, frame)
+
+
+def _there_are(table: AtomTable) -> str:
+    """What could have been named."""
+    if not table.named:
+        return "the file has no names of atoms"
+    words = []
+    for kind, values in (("names", table.names), ("residues", table.residue_names)):
+        known, counts = np.unique(values.astype(str), return_counts=True)
+        ordered = [str(one) for one in known[np.argsort(-counts, kind="stable")] if one]
+        if ordered:
+            words.append(f"{kind} {', '.join(ordered[:_SHOWN])}{', ...' if len(ordered) > _SHOWN else ''}")
+    return "there are " + "; ".join(words)

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mdnum.trajectories.frame import Frame
-from mdnum.trajectories.history import History
+from mdnum.trajectories.history import History, Sums
 
 # share of the flips below which those that a stride of 2 loses are too few to see a trend in
 _FEW = 5e-3
@@ -28,19 +28,18 @@ _DIES_OUT = 0.9
 
 
 @dataclass(frozen=True)
-class Strides:
-    """Flips that are left when only every so manieth frame is looked at; sums over parts of the pairs add up.
+class Strides(Sums):
+    """Flips that are left when only every nth frame is examined.
 
     Attributes:
-        stride: 1, 2, 4, ...
-        flips: of the frames 0, stride, 2 stride, ...
-        of: flips of all frames, as far as these reach.
         doubtful: of those that are left out, flips that the rounding of the file may have made.
     """
 
-    stride: Int[np.ndarray, "strides"]
-    flips: Int[np.ndarray, "strides"]
-    of: Int[np.ndarray, "strides"]
+    _common = ("stride",)
+
+    stride: Int[np.ndarray, "strides"]  # 1, 2, 4,
+    flips: Int[np.ndarray, "strides"]  # of the frames 0, stride, 2 stride,
+    of: Int[np.ndarray, "strides"]  # flips of all frames, as far as these reach
     doubtful: Int[np.ndarray, "strides"]
 
     @classmethod
@@ -61,11 +60,6 @@ class Strides:
         kept, total, doubtful = np.array(counts, np.int64).reshape(-1, 3).T
         return cls(np.array(strides, np.int64), kept, total, doubtful)
 
-    def __add__(self, other: Strides) -> Strides:
-        return Strides(
-            self.stride, self.flips + other.flips, self.of + other.of, self.doubtful + other.doubtful
-        )
-
     @property
     def share(self) -> Float[np.ndarray, "strides"]:
         """Share of the flips that are left at each stride; nan where there were none."""
@@ -73,21 +67,21 @@ class Strides:
 
 
 @dataclass(frozen=True)
-class Between:
+class MissingFlips:
     """An estimate of what is missing between the frames, as shares of all flips that happened.
 
     Attributes:
-        lost: the estimate; None where the numbers do not tell.
-        low, high: the range of it, never of no width; None where `lost` is.
-        doubled: share that every second frame alone would lose.
-        says: where it comes from, or why there is none, in words.
+        reason: "none_lost", "few" (too few lost to see a trend), "trend"; or why there is no number:
+            "rounding" (the file's digits may have made them), "brownian" (losses do not die out).
     """
 
-    lost: float | None
-    low: float | None
-    high: float | None
-    doubled: float
-    says: str
+    reason: str
+    doubled: float  # share that every second frame alone would lose, and every fourth
+    fourth: float
+    rounded: float  # share of the first that the rounding of the file may have made
+    lost: float | None = None  # the estimate; None where the numbers do not tell
+    low: float | None = None  # the range of it, never of no width; None where `lost` is
+    high: float | None = None
 
 
 def doublings(frames: int) -> list[int]:
@@ -98,7 +92,7 @@ def doublings(frames: int) -> list[int]:
     return strides
 
 
-def between_frames(found: Strides) -> Between | None:
+def between_frames(found: Strides) -> MissingFlips | None:
     """What lies between the frames, from how the flips thin out when frames are left out.
 
     Going from stride 2 to 1 brought some flips back, going from 4 to 2 some others. Where the first are fewer
@@ -121,42 +115,26 @@ def between_frames(found: Strides) -> Between | None:
         return None
     shares, of = found.share[:4], int(found.of[1])
     near, second = float(shares[0] - shares[1]), float(shares[0] - shares[2])
+    seen = (near, second, float(found.doubtful[1] / of))
     if near <= 0:
         # 3 events or fewer are not seen in one case of 20; each is two flips
-        return Between(
-            0.0, 0.0, _share(2 * 6.0 / of), 0.0, "looking at every second frame alone loses no flip"
-        )
-    said = (
-        f"looking at every second frame alone loses {_percent(near)} of the flips, at every fourth "
-        f"{_percent(second)}"
-    )
+        return MissingFlips("none_lost", *seen, 0.0, 0.0, _share(2 * 6.0 / of))
     if 2 * found.doubtful[1] > found.of[1] - found.flips[1]:
-        made = _percent(float(found.doubtful[1] / found.of[1]))
-        return Between(
-            None, None, None, near,
-            f"{said}: but the file's digits may have made {made}, which is not told apart from motion",
-        )  # fmt: skip
+        return MissingFlips("rounding", *seen)
     lost = np.diff(-found.flips[:4] * (of / found.of[:4]))
     sure = np.maximum(lost - np.diff(found.doubtful[:4] * (of / found.of[:4])), 0.0)
     if near < _FEW:
         # straight flight, and too few to see a trend in: in proportion to the stride, or to its square
         low, high = float(sure[0]) / of / 3, 2 * (near + 2 * math.sqrt(2 * near / of))
-        return Between(_share(near), _share(low), _share(high), near, said)
+        return MissingFlips("few", *seen, _share(near), _share(low), _share(high))
     ranges = [carried for carried in map(_carried_on, (lost, sure)) if carried is not None]
     if len(ranges) < 2:
-        return Between(
-            None,
-            None,
-            None,
-            near,
-            f"{said}: that does not die out as the stride is halved, as where motion looks Brownian",
-        )
+        return MissingFlips("brownian", *seen)
     low, high = min(low for low, _ in ranges) / of, max(high for _, high in ranges) / of
-    # what chance does to the counts: a flip that is left out comes with the one that takes it back
+    # what chance does to the counts: a flip that is left out comes with the one that reverses it
     chance = 2 * np.sqrt(2 * np.maximum(lost[:2], 2.0) / lost[:2] ** 2)
     least, most = low * max(1 - chance[0], 0.0), high * (1 + chance.sum())
-    said = f"{said}, carried on to ever shorter strides"
-    return Between(_share(math.sqrt(low * high)), _share(least), _share(most), near, said)
+    return MissingFlips("trend", *seen, _share(math.sqrt(low * high)), _share(least), _share(most))
 
 
 def _carried_on(lost: Float[np.ndarray, "doublings"]) -> tuple[float, float] | None:
@@ -190,10 +168,6 @@ def _series(first: float, q: float, trend: float) -> float | None:
 def _share(missing: float) -> float:
     """Of all flips, those missing, from those missing for each flip in the file."""
     return missing / (1 + missing)
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.2g} %"
 
 
 def crossings(frame: Frame, count: Callable[[Frame, Frame], int], move: float) -> tuple[int, float] | None:

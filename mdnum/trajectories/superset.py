@@ -9,22 +9,23 @@ come |m| between them. An odometer adds up, frame after frame, how far any two a
 and each pair knows the reading at which it is due. Pairs that are not due are not touched.
 
 Displacements are those of the nearest lattice translation, so atoms that a code wraps back into the box
-between two frames have not moved far, and the pair's image is followed through it.
+between two frames have not moved far, and the pair's image is followed through it: pairs are measured in
+coordinates that follow each atom from the frame at which the list was made. Where what these round could
+matter, the number that decides is computed.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numba
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from mdnum.trajectories.binned import Limits, Sides, binned
-from mdnum.trajectories.bins import lattice_vector
-from mdnum.trajectories.candidates import BAND
-from mdnum.trajectories.lattice import Lattice
-from mdnum.trajectories.pairs import exact_square
+from mdnum.trajectories.bins import BAND, Candidates, SearchLimits, Sides, binned, lattice_vector, meet
+from mdnum.trajectories.lattice import ReducedLattice
+from mdnum.trajectories.search import exact_square
 
 #: a skin is meant to last this many frames; shorter than the least, a fresh search is as good
 FRAMES, FEWEST = 24.0, 4.0
@@ -36,63 +37,90 @@ MOST_LISTED = 24_000_000
 GROUPS = 64
 
 
+class Listed(NamedTuple):
+    """The pairs of a list."""
+
+    i: Int[np.ndarray, "room"]  # pairs, batch by batch of the search, and by |margin| within a batch
+    j: Int[np.ndarray, "room"]
+    code: UInt8[np.ndarray, "room"]  # the lattice vector that is added to wrapped j, see `shift_code`
+    due: Float[np.ndarray, "room"]  # reading of the odometer at which each pair has to be examined again
+    inside: Bool[np.ndarray, "room"]  # the decision on each pair at the last frame
+
+    @classmethod
+    def room(cls, pairs: int) -> Listed:
+        """Room for so many."""
+        return cls(*(np.empty(pairs, kind) for kind in (np.int32, np.int32, np.uint8, np.float32, np.bool_)))
+
+
+class Groups(NamedTuple):
+    """Runs of pairs of a list, of about one |margin| each."""
+
+    start: Int[np.ndarray, "edges"]  # first pair of each group; the last is the number of pairs
+    earliest: Float[np.ndarray, "groups"]  # reading before which no pair of the group is due
+
+
 @dataclass
 class Superset:
-    """A list in use.
+    """A list in use."""
 
-    Attributes:
-        skin: no unlisted pair was nearer to its threshold when the list was made, length.
-        i, j: pairs, batch by batch of the search, and by |margin| within a batch.
-        code: the lattice vector that is added to wrapped j, see `shift_code`.
-        due: reading of the odometer at which each pair has to be looked at again.
-        inside: the decision on each pair at the last frame.
-        start: first pair of each group; the last is their number.
-        earliest: reading before which no pair of the group is due.
-        home: lattice vectors that have been taken off each atom.
-        gone: reading of the odometer, length.
-        last: what the last frame added to it, length.
-    """
+    skin: float  # no unlisted pair was nearer to its threshold when the list was made, length
+    pairs: Listed  # what is listed
+    groups: Groups
+    home: Int[np.ndarray, "atoms 3"]  # lattice vectors that have been taken off each atom
+    gone: float = 0.0  # reading of the odometer, length
+    last: float = 0.0  # what the last frame added to it, length
 
-    skin: float
-    i: Int[np.ndarray, "room"]
-    j: Int[np.ndarray, "room"]
-    code: UInt8[np.ndarray, "room"]
-    due: Float[np.ndarray, "room"]
-    inside: Bool[np.ndarray, "room"]
-    start: Int[np.ndarray, "edges"]
-    earliest: Float[np.ndarray, "groups"]
-    home: Int[np.ndarray, "atoms 3"]
-    gone: float = 0.0
-    last: float = field(default=0.0)
-
-    @property
-    def pairs(self) -> int:
-        """How many are listed."""
-        return int(self.start[-1])
-
-    def serves(self, reading: float, lattice: Lattice, radius: float, clear: float) -> bool:
-        """Whether every pair within `clear` of its threshold is in the list at this reading.
-
-        Args:
-            reading: of the odometer.
-            lattice: of the frame.
-            radius: largest one, length.
-            clear: length.
-        """
+    def serves(self, lattice: ReducedLattice, radius: float, clear: float) -> bool:
+        """Whether every pair within `clear` of its threshold is listed, where `radius` is the largest one."""
         # a second image within reach would have a rank, and the list knows the nearest alone
-        return reading + clear < self.skin and lattice.narrowest >= 2.0 * (radius + self.skin)
+        return self.gone + clear < self.skin and lattice.narrowest >= 2.0 * (radius + self.skin)
+
+
+class Examined(NamedTuple):
+    """What the pairs that were due turned out to be."""
+
+    i: Int[np.ndarray, "flips"]  # of the pairs that flipped
+    j: Int[np.ndarray, "flips"]
+    entered: Bool[np.ndarray, "flips"]  # what they became
+    close: int  # pairs within the bound of their threshold
+    smallest: float  # smallest |margin|; at least the horizon where it is not known
+    count: int  # pairs that were examined
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def shift_code(n0, n1, n2):
-    """Three whole numbers from -1 to 1 as one: no other brings a wrapped atom within half a box's width."""
+    """Three integers from -1 to 1 as one: no other brings a wrapped atom within half a box's width."""
     return (n0 + 1) * 9 + (n1 + 1) * 3 + (n2 + 1)
 
 
+def displaced(
+    before: Float[np.ndarray, "atoms 3"],
+    old: ReducedLattice,
+    now: Float[np.ndarray, "atoms 3"],
+    new: ReducedLattice,
+    home: Int[np.ndarray, "atoms 3"],
+    radius: float,
+) -> float:
+    """How much nearer or further two atoms at most `radius` apart can have come between two frames, length.
+
+    Args:
+        home: lattice vectors taken off each atom; those that atoms were moved by in between are added.
+        radius: length.
+    """
+    same = old.vectors is new.vectors or np.array_equal(old.vectors, new.vectors)
+    strain, stretch = np.eye(3), 0.0
+    if not same:
+        strain = old.inverse @ np.linalg.inv(new.inverse)
+        stretch = float(np.abs(np.linalg.svd(strain, compute_uv=False) - 1.0).max())
+    most, second = _displaced(before, now, strain, not same, new, home)
+    return float(np.sqrt(most) + np.sqrt(second)) + radius * stretch
+
+
 @numba.njit(cache=True, nogil=True)
-def _displaced(before, now, strain, strained, vectors, inverse, periodic, home):
+def _displaced(before, now, strain, strained, lattice, home):
     """The two largest squared displacements; counts in home the lattice vectors that atoms were moved by."""
     most, second = 0.0, 0.0
+    vectors, inverse, periodic = lattice.vectors, lattice.inverse, lattice.periodic
     for i in range(now.shape[0]):
         if strained:
             y0 = now[i, 0] - (
@@ -125,33 +153,7 @@ def _displaced(before, now, strain, strained, vectors, inverse, periodic, home):
     return most, second
 
 
-def displaced(
-    before: Float[np.ndarray, "atoms 3"],
-    old: Lattice,
-    now: Float[np.ndarray, "atoms 3"],
-    new: Lattice,
-    home: Int[np.ndarray, "atoms 3"],
-    radius: float,
-) -> float:
-    """How much nearer or further two atoms at most `radius` apart can have come between two frames, length.
-
-    Args:
-        home: lattice vectors taken off each atom; those that atoms were moved by in between are added.
-        radius: length.
-    """
-    same = old.vectors is new.vectors or np.array_equal(old.vectors, new.vectors)
-    strain, stretch = np.eye(3), 0.0
-    if not same:
-        strain = old.inverse @ np.linalg.inv(new.inverse)
-        sizes = np.linalg.svd(strain, compute_uv=False)
-        stretch = float(np.abs(sizes - 1.0).max())
-    most, second = _displaced(
-        before, now, strain, not same, new.vectors, new.inverse, new.periodic, home
-    )  # fmt: skip
-    return float(np.sqrt(most) + np.sqrt(second)) + radius * stretch
-
-
-def skin_for(inc: float, radius: float, clear: float, lattice: Lattice, pairs: int) -> float:
+def skin_for(inc: float, radius: float, clear: float, lattice: ReducedLattice, pairs: int) -> float:
     """A skin that lasts, length; 0 where none would last long enough to be worth it.
 
     Args:
@@ -171,7 +173,7 @@ def skin_for(inc: float, radius: float, clear: float, lattice: Lattice, pairs: i
 
 def listed(
     positions: Float[np.ndarray, "atoms 3"],
-    lattice: Lattice,
+    lattice: ReducedLattice,
     sides: Sides,
     radii: Float[np.ndarray, "species species"],
     skin: float,
@@ -183,74 +185,59 @@ def listed(
     """A list made at this frame; no direction may repeat so soon that a pair has two images in it.
 
     Args:
-        positions, lattice, sides, radii, guard: as of `pairs.search`.
+        positions, lattice, sides, radii, guard: as of `search`.
         skin: length.
         pairs: inside, about.
         spare: a list that is not needed any more: its memory is used again.
     """
     radius = float(radii.max(initial=0.0))
-    placed = binned(positions, lattice, sides, radius + skin, guard)
-    limits, square = Limits.of(radii, BAND, skin), np.where(radii >= 0, radii * radii, -1.0)
+    atoms, limits = (
+        binned(positions, lattice, sides, radius + skin, guard),
+        SearchLimits.of(radii, BAND, skin),
+    )
     # twice the inner shell: the outer one holds more
     room = int(pairs * ((1 + skin / radius) ** 3 - (1 - skin / radius) ** 3) * 1.1) + 4096
-    held = [spare.i, spare.j, spare.code, spare.due, spare.inside] if spare is not None else _room(0)
-    if len(held[0]) < room:
-        held = _room(room)
-    batches, none = list(placed.batches()), np.zeros(0, np.int32)
-    start = np.zeros(len(batches) * GROUPS + 1, np.int64)
-    earliest = np.empty(len(batches) * GROUPS)
-    batch, tally = _batch(4096), np.zeros(3, np.int64)
+    held = Listed.room(0) if spare is None else spare.pairs
+    if len(held.i) < room:
+        held = Listed.room(room)
+    batches = atoms.batches()
+    start, earliest = np.zeros(len(batches) * GROUPS + 1, np.int64), np.empty(len(batches) * GROUPS)
+    found = Candidates.room(0, 4096)
     for at, bins in enumerate(batches):
-        _, left = placed.met(limits, bins, tally, none, none, *batch)
-        if left > len(batch[0]):
-            batch = _batch(int(1.2 * left))
-            placed.met(limits, bins, tally, none, none, *batch)
-        count = int(start[at * GROUPS])
-        if count + left > len(held[0]):
-            share = (at + 1) / len(batches)
-            larger = _room(int(max(1.5, 1.1 / share) * (count + left)))
+        _, left = meet(atoms, limits, *bins, found)
+        if left > len(found.value):
+            found = Candidates.room(0, int(1.2 * left))
+            meet(atoms, limits, *bins, found)
+        first = at * GROUPS
+        count = int(start[first])
+        if count + left > len(held.i):
+            larger = Listed.room(int(max(1.5, 1.1 * len(batches) / (at + 1)) * (count + left)))
             for old, new in zip(held, larger, strict=True):
                 new[:count] = old[:count]
             held = larger
-        groups = start[at * GROUPS : (at + 1) * GROUPS + 1], earliest[at * GROUPS : (at + 1) * GROUPS]
-        arrays = [*batch, *groups, *held]
-        _store(
-            positions, placed.home, lattice.vectors, sides.species, radii, square, skin, guard, left, *arrays
-        )
-    i, j, code, due, inside = held
-    return Superset(skin, i, j, code, due, inside, start, earliest, placed.home)
-
-
-def _room(pairs: int) -> list[np.ndarray]:
-    return [np.empty(pairs, kind) for kind in (np.int32, np.int32, np.uint8, np.float32, np.bool_)]
-
-
-def _batch(pairs: int) -> list[np.ndarray]:
-    return [np.empty(pairs, kind) for kind in (np.int32, np.int32, np.int32, np.float64)]
+        groups = Groups(start[first : first + GROUPS + 1], earliest[first : first + GROUPS])
+        _store(positions, atoms, radii, skin, guard, found, groups, held)
+    return Superset(skin, held, Groups(start, earliest), atoms.home)
 
 
 @numba.njit(cache=True, nogil=True)
-def _store(
-    x, home, vectors, species, radius, square, skin, guard, count, i_in, j_in, code_in, value,
-    start, earliest, i, j, code, due, inside,
-):  # fmt: skip
-    """Sort a batch of pairs by |margin|, coarsely: those in later groups are not due for some time.
-
-    value holds squares of wrapped coordinates; start and earliest are those of the batch.
-    """
-    groups = earliest.shape[0]
+def _store(x, atoms, radius, skin, guard, found, of, held):
+    """Sort a batch of pairs by |margin|, coarsely: those in later groups are not due for some time."""
+    start, value, count, groups = of.start, found.value, found.counts[1], of.earliest.shape[0]
+    home, vectors, species = atoms.home, atoms.lattice.vectors, atoms.species
     scale = groups / skin
     several = radius.shape[0] > 1
     cursor = np.zeros(groups + 1, np.int64)
     for k in range(count):
-        si, sj = (species[i_in[k]], species[j_in[k]]) if several else (0, 0)
-        margin = radius[si, sj] - np.sqrt(value[k])
+        i, j = found.i_open[k], found.j_open[k]
+        reach = radius[species[i], species[j]] if several else radius[0, 0]
+        margin = reach - np.sqrt(value[k])
         if abs(margin) <= guard:
-            n0, n1, n2 = lattice_vector(code_in[k])
-            real = exact_square(x, home, i_in[k], j_in[k], n0, n1, n2, vectors)
+            n0, n1, n2 = lattice_vector(found.code[k])
+            real = exact_square(x, home, i, j, n0, n1, n2, vectors)
             # with the sign of the decision, whatever the root rounds to
-            margin = abs(radius[si, sj] - np.sqrt(real))
-            if not real < square[si, sj]:
+            margin = abs(reach - np.sqrt(real))
+            if not real < reach * reach:
                 margin = -margin
         value[k] = margin
         cursor[min(groups - 1, np.uint32(abs(margin) * scale)) + 1] += 1
@@ -259,13 +246,178 @@ def _store(
         cursor[g + 1] += cursor[g]
         start[g + 1] = cursor[g + 1]
         # rounded down, so that a pair is due too early rather than too late
-        earliest[g] = g * (skin / groups) - guard - 1e-6 * skin
+        of.earliest[g] = g * (skin / groups) - guard - 1e-6 * skin
     for k in range(count):
         margin = abs(value[k])
         g = min(groups - 1, np.uint32(margin * scale))
         at = cursor[g]
         cursor[g] += 1
-        n0, n1, n2 = lattice_vector(code_in[k])
-        i[at], j[at], code[at] = i_in[k], j_in[k], shift_code(n0, n1, n2)
-        due[at] = margin - guard - 1e-6 * skin
-        inside[at] = not np.signbit(value[k])
+        n0, n1, n2 = lattice_vector(found.code[k])
+        held.i[at], held.j[at], held.code[at] = found.i_open[k], found.j_open[k], shift_code(n0, n1, n2)
+        held.due[at] = margin - guard - 1e-6 * skin
+        held.inside[at] = not np.signbit(value[k])
+
+
+def examine(
+    superset: Superset,
+    positions: Float[np.ndarray, "atoms 3"],
+    lattice: ReducedLattice,
+    sides: Sides,
+    radii: Float[np.ndarray, "species species"],
+    *,
+    bound: float,
+    horizon: float,
+    guard: float,
+) -> Examined:
+    """Examine the pairs that are due at the odometer's reading, and those that can be nearest.
+
+    Args:
+        superset: the list; the atoms' lattice vectors are those at this frame.
+        bound: pairs this close are counted, length.
+        horizon: the smallest |margin| is known up to here, length.
+        guard: how far a distance in following coordinates can be off, length.
+    """
+    pairs, frame = superset.pairs, _Frame.of(positions, superset.home, lattice, sides.species, radii)
+    flip = np.empty(int(superset.groups.start[-1]), np.int64)
+    counts, smallest = np.zeros(3, np.int64), np.inf
+    slack = 1e-6 * superset.skin + guard
+    # mostly the pairs at hand hold the nearest of all; where they may not, those that can be are due too
+    seen = max(bound, 0.02 * superset.last)
+    for reach in (seen, max(bound, horizon)):
+        if smallest <= seen:
+            break
+        counts[1] = 0
+        limit = superset.gone + min(smallest, reach)
+        smallest = _evaluate(
+            frame, pairs, superset.groups, superset.gone, limit, bound, guard, slack, flip, counts, smallest
+        )
+    k = flip[: int(counts[0])]
+    return Examined(
+        pairs.i[k].astype(np.int64), pairs.j[k].astype(np.int64), pairs.inside[k], int(counts[1]),
+        float(smallest), int(counts[2]),
+    )  # fmt: skip
+
+
+class _Frame(NamedTuple):
+    """What margins are computed from: positions as stored, and less the lattice vectors of home."""
+
+    positions: Float[np.ndarray, "atoms 3"]
+    followed: Float[np.ndarray, "atoms 3"]
+    shifts: Float[np.ndarray, "codes 3"]
+    home: Int[np.ndarray, "atoms 3"]
+    vectors: Float[np.ndarray, "3 3"]
+    species: Int[np.ndarray, "atoms"]
+    radius: Float[np.ndarray, "species species"]
+    square: Float[np.ndarray, "species species"]
+
+    @classmethod
+    def of(cls, positions, home, lattice: ReducedLattice, species, radii) -> _Frame:
+        followed, shifts = np.empty_like(positions), np.empty((27, 3))
+        _follow(positions, home, lattice.vectors, followed, shifts)
+        square = np.where(radii >= 0, radii * radii, -1.0)
+        return cls(positions, followed, shifts, home, lattice.vectors, species, radii, square)
+
+
+@numba.njit(cache=True, nogil=True)
+def _follow(x, home, vectors, followed, shifts):
+    """Coordinates less the lattice vectors that were taken off, and the vector of each `shift_code`."""
+    for i in range(x.shape[0]):
+        h0, h1, h2 = home[i, 0], home[i, 1], home[i, 2]
+        for c in range(3):
+            followed[i, c] = x[i, c] - (h0 * vectors[0, c] + h1 * vectors[1, c] + h2 * vectors[2, c])
+    for code in range(27):
+        for c in range(3):
+            shifts[code, c] = (
+                (code // 9 - 1) * vectors[0, c]
+                + (code // 3 % 3 - 1) * vectors[1, c]
+                + (code % 3 - 1) * vectors[2, c]
+            )
+
+
+@numba.njit(cache=True, nogil=True)
+def _evaluate(frame, pairs, groups, gone, limit, bound, guard, slack, flip, counts, smallest):
+    """Examine the pairs that are due; flips go into `flip`, numbers into (flips, close, examined)."""
+    start, earliest, inside = groups.start, groups.earliest, pairs.inside
+    x, home, vectors, species = frame.positions, frame.home, frame.vectors, frame.species
+    radius, square, followed, shifts = frame.radius, frame.square, frame.followed, frame.shifts
+    block = 1024
+    chosen, margins, y = np.empty(block + 1, np.uint32), np.empty(block), np.empty((4, block))
+    flips, close, examined = counts[0], counts[1], counts[2]
+    # margins up to here are computed from the coordinates as stored: all that are counted or compared
+    near = max(bound, smallest) + guard
+    for g in range(earliest.shape[0]):
+        if earliest[g] > limit:
+            continue
+        first_due = np.float32(np.inf)
+        for begin in range(start[g], start[g + 1], block):
+            end = min(begin + block, start[g + 1])
+            i_here, j_here, code_here = pairs.i[begin:end], pairs.j[begin:end], pairs.code[begin:end]
+            due_here = pairs.due[begin:end]
+            kept = _due(due_here, limit, chosen)
+            _measured(chosen[:kept], i_here, j_here, code_here, followed, shifts, species, radius, y, margins)
+            for m in range(kept):
+                k = chosen[m]
+                margin = abs(margins[m])
+                due_here[k] = gone + margin - slack
+                if margin > near and (margins[m] > 0) == inside[begin + k]:
+                    continue
+                a, b, s = i_here[k], j_here[k], np.int64(code_here[k])
+                real = exact_square(x, home, a, b, s // 9 - 1, s // 3 % 3 - 1, s % 3 - 1, vectors)
+                margin = abs(radius[species[a], species[b]] - np.sqrt(real))
+                yes = real < square[species[a], species[b]]
+                if margin < smallest:
+                    smallest = margin
+                    near = max(bound, smallest) + guard
+                close += int(margin <= bound)
+                if yes != inside[begin + k]:
+                    inside[begin + k] = yes
+                    flip[flips] = begin + k
+                    flips += 1
+            examined += kept
+            first_due = min(first_due, _least(due_here))
+        earliest[g] = first_due
+    counts[0], counts[1], counts[2] = flips, close, examined
+    return smallest
+
+
+@numba.njit(cache=True, nogil=True, inline="never")
+def _due(due, limit, chosen):
+    """Which pairs of a block are due, and how many."""
+    kept = 0
+    for k in range(due.shape[0]):
+        chosen[kept] = k
+        kept += int(due[k] <= limit)
+    return kept
+
+
+@numba.njit(cache=True, nogil=True, inline="never")
+def _measured(chosen, i, j, code, followed, shifts, species, radius, y, margins):
+    """Margins of the chosen pairs in following coordinates; gathered first, so that the rest vectorizes."""
+    y0, y1, y2, reach = y[0], y[1], y[2], y[3]
+    several = radius.shape[0] > 1
+    for m in range(chosen.shape[0]):
+        k = chosen[m]
+        a, b, s = np.uint32(i[k]), np.uint32(j[k]), code[k]
+        y0[m] = followed[b, 0] - followed[a, 0] + shifts[s, 0]
+        y1[m] = followed[b, 1] - followed[a, 1] + shifts[s, 1]
+        y2[m] = followed[b, 2] - followed[a, 2] + shifts[s, 2]
+        reach[m] = radius[species[a], species[b]] if several else radius[0, 0]
+    for m in range(chosen.shape[0]):
+        margins[m] = reach[m] - np.sqrt(y0[m] * y0[m] + y1[m] * y1[m] + y2[m] * y2[m])
+
+
+@numba.njit(cache=True, nogil=True, inline="never")
+def _least(due):
+    # sixteen at once: a single minimum waits for the one before
+    held = np.full(16, np.float32(np.inf))
+    whole = due.shape[0] // 16 * 16
+    for k in range(0, whole, 16):
+        for c in range(16):
+            value = due[k + c]
+            held[c] = value if value < held[c] else held[c]
+    least = np.float32(np.inf)
+    for c in range(16):
+        least = min(least, held[c])
+    for k in range(whole, due.shape[0]):
+        least = min(least, due[k])
+    return least

@@ -15,6 +15,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from mdnum.trajectories.boxes import formats_of
 from mdnum.trajectories.netcdf import head_of
 
 # magic, length of the word with its end, length of the word, the word; then thirteen numbers
@@ -38,7 +39,7 @@ def left_over(trajectory: Any) -> str | None:
     path = getattr(trajectory, "filename", None)
     if not isinstance(path, str | Path) or not Path(path).is_file():
         return None
-    words = [trajectory.format] if isinstance(trajectory.format, str) else list(trajectory.format)
+    words = formats_of(trajectory)
     if "DCD" in words:
         rest, frame = _behind_dcd(Path(path), int(trajectory.n_frames))
     elif "TRR" in words:
@@ -152,8 +153,7 @@ def _last_bytes(path: Path) -> tuple[bytes, int]:
 def _text(trajectory: Any) -> tuple[Path, str] | None:
     """(file, format) behind MDAnalysis's reader where it reads text by lines."""
     path = getattr(trajectory, "filename", None)
-    words = [trajectory.format] if isinstance(trajectory.format, str) else list(trajectory.format)
-    word = next((one for one in words if one in _LINES), None)
+    word = next((one for one in formats_of(trajectory) if one in _LINES), None)
     return (Path(path), word) if word is not None and isinstance(path, str | Path) else None
 
 

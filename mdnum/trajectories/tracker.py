@@ -5,26 +5,52 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numba
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from mdnum.errors import InputError
-from mdnum.trajectories.candidates import INSIDE
-from mdnum.trajectories.changes import compared, image_distances
-from mdnum.trajectories.columns import Changed, Ledger, Thresholds
-from mdnum.trajectories.exchanged import exchanged
+from mdnum.trajectories.bins import INSIDE, Sides, binned
 from mdnum.trajectories.frame import Box, Frame
-from mdnum.trajectories.lattice import Lattice, lattice_of, own_images
-from mdnum.trajectories.looking import look
-from mdnum.trajectories.nearest import chosen
-from mdnum.trajectories.pairs import Found, Rows, pairs_of, ranks, rows_of, search
-from mdnum.trajectories.participants import Participants, by_place, indices, participants, taken
-from mdnum.trajectories.rules import Capped, Nearest, Rule
-from mdnum.trajectories.superset import Superset, displaced, listed, skin_for
-from mdnum.trajectories.table import Flips, Members
+from mdnum.trajectories.lattice import ReducedLattice, lattice_of, own_images
+from mdnum.trajectories.ledger import FlipTable, LedgerRows, Members, Thresholds
+from mdnum.trajectories.rules import Capped, CutoffRule, Nearest, Rule, SpeciesCutoffs
+from mdnum.trajectories.search import (
+    Changed,
+    Found,
+    NeighborRows,
+    compared,
+    exchanged,
+    image_distances,
+    nearest,
+    ranks,
+    rows_of,
+    search,
+)
+from mdnum.trajectories.superset import Superset, displaced, examine, listed, skin_for
 
 #: `Tracker.min_margin` looks this share of the radius away from it
 HORIZON = 0.02
+
+
+@dataclass(frozen=True)
+class Participants:
+    """The atoms that take part in a rule, numbered among themselves.
+
+    Attributes:
+        radii: by species, length; negative for pairs that are never inside.
+    """
+
+    labels: Int[np.ndarray, "participants"]  # their numbers in the file
+    sides: Sides  # who is asked for neighbors, and who can be one
+    radii: Float[np.ndarray, "species species"]
+    both: Bool[np.ndarray, "participants"]  # atoms on both sides: images of themselves can be their neighbors
+    own: Int[np.ndarray, "species"]  # how many of those there are, by species
+
+    @property
+    def radius(self) -> float:
+        """Largest radius, length."""
+        return float(self.radii.max(initial=0.0))
 
 
 @dataclass(frozen=True)
@@ -32,23 +58,17 @@ class Moment:
     """One frame as it was decided.
 
     Attributes:
-        positions: of the atoms that take part, length.
-        lattice: of its box.
-        rounding: how far a distance can be off through float64, length.
         found: pairs inside; None where they have not been searched for, or the rule is directed.
-        rows: neighbors, where the rule is directed.
-        own: images of an atom itself that are inside, by species.
-        last_in, first_out: thresholds of each atom, where the rule is directed.
     """
 
-    positions: Float[np.ndarray, "atoms 3"]
-    lattice: Lattice
-    rounding: float
-    found: Found | None
-    rows: Rows | None
-    own: Int[np.ndarray, "species"]
-    last_in: Float[np.ndarray, "limits"]
+    positions: Float[np.ndarray, "atoms 3"]  # of the atoms that take part, length
+    lattice: ReducedLattice  # of its box
+    rounding: float  # how far a distance can be off through float64, length
+    own: Int[np.ndarray, "species"]  # images of an atom itself that are inside, by species
+    last_in: Float[np.ndarray, "limits"]  # thresholds of each atom, where the rule is directed
     first_out: Float[np.ndarray, "limits"]
+    found: Found | None = None
+    rows: NeighborRows | None = None  # neighbors, where the rule is directed
 
 
 class Tracker:
@@ -71,7 +91,7 @@ class Tracker:
             radius. The nearest few of an atom without a radius have no such limit.
 
     Raises:
-        InputError: indices that are not whole numbers from 0 or come twice; no species where they are needed.
+        InputError: indices that are not integers from 0; no species where they are needed.
     """
 
     def __init__(
@@ -84,9 +104,8 @@ class Tracker:
     ):
         if first is None and second is not None:
             first, second = second, None
-        self.rule = rule
-        self.bound = float(bound)
-        self._first, self._second = indices(first, "first"), indices(second, "second")
+        self.rule, self.bound = rule, float(bound)
+        self._first, self._second = _indices(first, "first"), _indices(second, "second")
         if rule.needs_species and species is None:
             raise InputError(
                 f"{rule.name} needs to know which species the atoms are of",
@@ -95,7 +114,7 @@ class Tracker:
             )
         self._species = None if species is None else np.asarray(species, str)
         self._atoms = -1
-        # how many there were last time, to make room for as many
+        # how many were decided from the coordinates as stored last time, to make room for as many
         self._open = 0
         self._list: Superset | None = None
         # one that has served, whose memory the next can use
@@ -103,16 +122,14 @@ class Tracker:
         self._who: Participants
         self._box: Box | None = None
         self._last: Moment | None = None
-        self.frames = 0
-        self.pairs = 0
-        self.near = 0
+        self.frames = self.pairs = self.near = 0
         self.min_margin = np.inf
 
-    def step(self, frame: Frame, bound: float | None = None) -> Flips:
+    def step(self, frame: Frame, bound: float | None = None) -> FlipTable:
         """What changed since the frame before; nothing at the first.
 
         Args:
-            frame: the next one; its own index is not looked at.
+            frame: the next one; its own index does not matter.
             bound: of this frame and from here on, length; None for the one before.
         Raises:
             InputError: a position that is not finite; a direction that repeats without a vector; another
@@ -125,19 +142,23 @@ class Tracker:
         if flips is None:
             self._list = None
             now = self._decided(now)
-            flips = Flips.none() if before is None else self._flips(before, now)
+            flips = FlipTable.none() if before is None else self._flips(before, now)
         self._last = now
         self.frames += 1
         return flips
 
     def members(self) -> Members:
         """The pairs inside at the last frame."""
-        none = np.zeros(0, np.int64)
-        if self._last is None:
-            return Members(none, none, none, np.zeros(0))
         now = self._last
-        i, j = self._inside(now)
-        own = self._own_members(now)
+        if now is None:
+            return Members.none()
+        if self.rule.directed:
+            i, j = self._rows(now).pairs()
+        else:
+            found = now.found or self._searched(now)
+            i, j = found.i.astype(np.int64), found.j.astype(np.int64)
+        # each atom as often as images of its own are inside; directed rules list them with the others
+        own = np.repeat(np.arange(len(self._who.both)), self._who.both * now.own[self._who.sides.species])
         i, j = np.concatenate([i, own]), np.concatenate([j, own])
         first, second = self._who.labels[i], self._who.labels[j]
         if not self.rule.directed:
@@ -163,203 +184,33 @@ class Tracker:
     def _moment(self, frame: Frame) -> Moment:
         """A frame that can be decided on."""
         positions, largest = self._checked(frame)
-        lattice = self._lattice_of(frame)
-        radius = self._who.radius
+        lattice, radius = self._lattice_of(frame.box), self._who.radius
         rounding = lattice.rounding(largest, radius if np.isfinite(radius) else 4.0 * largest)
         if np.isfinite(radius) and rounding > 1e-3 * radius:
             raise InputError(
-                f"coordinates up to {largest:.3g} with a cutoff of {radius:g}: float64 cannot tell distances",
+                f"coordinates up to {largest:.3g} with a cutoff of {radius:g}: float64 cannot resolve them",
                 remedy="Check the unit, and that the file's coordinates are not broken",
                 where=f"frame {frame.index}",
             )
         none = np.zeros(0)
-        return Moment(
-            positions, lattice, rounding, None, None, np.zeros(len(self._who.radii), np.int64), none, none
-        )
-
-    def _lattice_of(self, frame: Frame) -> Lattice:
-        box, last = frame.box, self._box
-        if last is None or not (
-            np.array_equal(box.matrix, last.matrix) and np.array_equal(box.pbc, last.pbc)
-        ):
-            # a copy: readers reuse their arrays
-            self._box = Box(np.array(box.matrix, np.float64), np.array(box.pbc, bool))
-            self._lattice = lattice_of(self._box)
-        return self._lattice
-
-    def _decided(self, now: Moment) -> Moment:
-        """The same with its neighbors searched for, and their numbers noted."""
-        positions, lattice, rounding = now.positions, now.lattice, now.rounding
-        rule, bound = self.rule, self.bound + now.rounding
-        if isinstance(rule, Nearest | Capped):
-            made = chosen(
-                positions, lattice, self._who.sides, rule,
-                band=max(bound, HORIZON * rule.reach if np.isfinite(rule.reach) else 0.0, 4 * rounding),
-                bound=bound, guard=rounding,
-            )  # fmt: skip
-            self.pairs, self.near = len(made.rows.other), made.rows.close
-            horizon = HORIZON * rule.reach
-            self.min_margin = made.rows.smallest if made.rows.smallest <= horizon else np.inf
-            return replace(now, rows=made.rows, last_in=made.last_in, first_out=made.first_out)
-        found = self._searched(now)
-        own, close, smallest = self._own(lattice, bound)
-        smallest = min(found.smallest, smallest)
-        self.pairs = len(found.i) + int((own * self._who.own).sum())
-        self.near = found.close + close
-        self.min_margin = smallest if smallest <= HORIZON * self._who.radius else np.inf
-        return replace(now, found=found, own=own)
-
-    def _rows(self, moment: Moment) -> Rows:
-        """The neighbors at a moment; searched for where they are not known."""
-        if moment.rows is not None:
-            return moment.rows
-        return rows_of(moment.found or self._searched(moment), len(moment.positions))
-
-    def _inside(self, moment: Moment) -> tuple[np.ndarray, np.ndarray]:
-        """(i, j) of the pairs inside at a moment, in no order."""
-        if self.rule.directed:
-            return pairs_of(self._rows(moment))
-        found = moment.found or self._searched(moment)
-        return found.i.astype(np.int64), found.j.astype(np.int64)
-
-    def _searched(self, moment: Moment) -> Found:
-        """The pairs inside at a moment, found afresh."""
-        bound, guard = self.bound + moment.rounding, moment.rounding
-        found = search(
-            moment.positions, moment.lattice, self._who.sides, self._who.radii, INSIDE,
-            band=max(bound, HORIZON * self._who.radius, 4 * guard), bound=bound, guard=guard,
-            room=int(1.1 * (self.pairs + self._open)), open_room=int(1.2 * self._open),
-        )  # fmt: skip
-        self._open = found.open
-        return found
-
-    def _own(self, lattice: Lattice, bound: float) -> tuple[np.ndarray, int, float]:
-        """Images of an atom itself that are inside, by species; how many are close; the smallest |margin|."""
-        inside = np.zeros(len(self._who.radii), np.int64)
-        close, smallest = 0, np.inf
-        reach = float(self._who.radii.max(initial=0.0)) * (1.0 + HORIZON) + bound
-        squares = own_images(lattice, reach)
-        for kind, radius in enumerate(np.diag(self._who.radii)):
-            if radius < 0 or not self._who.own[kind]:
-                continue
-            inside[kind] = int((squares < radius * radius).sum())
-            margins = np.abs(radius - np.sqrt(squares))
-            close += int((margins <= bound).sum()) * int(self._who.own[kind])
-            smallest = min(smallest, float(margins.min(initial=np.inf)))
-        return inside, close, smallest
-
-    def _own_members(self, moment: Moment) -> np.ndarray:
-        """Each atom as often as images of its own are inside (directed rules list them with the others)."""
-        times = np.where(self._who.both, moment.own[self._who.sides.species], 0)
-        return np.repeat(np.arange(len(times)), times)
-
-    # ---- two frames
-
-    def _from_list(self, before: Moment, now: Moment) -> Flips | None:
-        """The flips as a list tells them; None where none would be worth its making."""
-        radius, horizon = self._who.radius, HORIZON * self._who.radius
-        bound = self.bound + now.rounding
-        clear = max(bound, horizon)
-        held = self._list
-        # what rounding adds to every distance
-        slack = 8.0 * max(before.rounding, now.rounding)
-        if held is not None:
-            came = displaced(before.positions, before.lattice, now.positions, now.lattice, held.home,
-                             radius + 2.0 * held.skin)  # fmt: skip
-            held.last, held.gone = came, held.gone + came + slack
-            if not held.serves(held.gone, now.lattice, radius, clear):
-                self._spare, held = held, None
-        if held is None:
-            held = self._listed(before, now, clear, slack)
-        self._list = held
-        if held is None:
-            return None
-        seen = look(held, now.positions, now.lattice, self._who.sides, self._who.radii,
-                    bound=bound, horizon=horizon, guard=slack)  # fmt: skip
-        self.pairs += 2 * int(seen.entered.sum()) - len(seen.entered)
-        self.near, self.min_margin = seen.close, seen.smallest if seen.smallest <= horizon else np.inf
-        return self._table(before, now, seen.i, seen.j, np.zeros(len(seen.i), np.int64), seen.entered)
-
-    def _listed(self, before: Moment, now: Moment, clear: float, slack: float) -> Superset | None:
-        """A list made at the frame before that serves now and will for a while; None where there is none."""
-        radius = self._who.radius
-        home = np.zeros((len(now.positions), 3), np.int64)
-        pace = displaced(before.positions, before.lattice, now.positions, now.lattice, home, 1.5 * radius)
-        skin = skin_for(pace, radius, clear, before.lattice, self.pairs)
-        if not skin > 0:
-            return None
-        made = listed(
-            before.positions, before.lattice, self._who.sides, self._who.radii, skin,
-            guard=before.rounding, pairs=self.pairs, spare=self._spare,
-        )  # fmt: skip
-        self._spare = None
-        came = displaced(before.positions, before.lattice, now.positions, now.lattice, made.home,
-                         radius + 2.0 * skin)  # fmt: skip
-        made.last, made.gone = came, came + slack
-        return made if made.serves(made.gone, now.lattice, radius, clear) else None
-
-    def _flips(self, before: Moment, now: Moment) -> Flips:
-        if not self.rule.directed and self._one_image(before, now):
-            i, j, entered = exchanged(
-                before.found or self._searched(before), now.found or self._searched(now),
-                (before.positions, before.lattice), (now.positions, now.lattice),
-                self._who.sides.species, self._who.radii,
-            )  # fmt: skip
-            return self._table(before, now, i, j, np.zeros(len(i), np.int64), entered)
-        i, j, rank, entered = compared(self._rows(before), self._rows(now), self.pairs // 2 + 4096)
-        if (before.own != now.own).any():
-            parts = [(i, j, rank, entered)]
-            for kind in np.flatnonzero(before.own != now.own):
-                atoms = np.flatnonzero(self._who.both & (self._who.sides.species == kind))
-                low, high = sorted((int(before.own[kind]), int(now.own[kind])))
-                a = np.repeat(atoms, high - low)
-                yes = np.full(len(a), bool(now.own[kind] > before.own[kind]))
-                parts.append((a, a, np.tile(np.arange(low, high), len(atoms)), yes))
-            i, j, rank, entered = (np.concatenate([part[k] for part in parts]) for k in range(4))
-        return self._table(before, now, i, j, rank, entered)
-
-    def _one_image(self, *moments: Moment) -> bool:
-        """Whether no pair has two images inside, nor one that rounding could miss."""
-        reach = self._who.radius + 8.0 * max(one.rounding for one in moments)
-        return all(one.lattice.narrowest >= 2.000002 * reach for one in moments)
-
-    def _table(self, before: Moment, now: Moment, i, j, rank, entered) -> Flips:
-        """The flips as columns, from indices among the atoms that take part."""
-        changed = Changed(
-            i, j, rank, entered, self._distances(now, i, j, rank), self._distances(before, i, j, rank)
-        )
-        thresholds = Thresholds(
-            self.rule.directed, self._who.sides.species, self._who.radii,
-            now.last_in, now.first_out, before.last_in, before.first_out,
-        )  # fmt: skip
-        bound = self.bound + max(before.rounding, now.rounding)
-        return self._ledger.flips(self.frames, changed, thresholds, bound)
-
-    def _distances(self, moment: Moment, i, j, rank) -> np.ndarray:
-        if self.rule.directed:
-            # both of a ± pair are neighbors of an atom
-            rank = np.where(i == j, rank // 2, rank)
-        return image_distances(moment.positions, moment.lattice, i, j, rank)
-
-    # ---- input
+        return Moment(positions, lattice, rounding, np.zeros(len(self._who.radii), np.int64), none, none)
 
     def _checked(self, frame: Frame) -> tuple[np.ndarray, float]:
         """Positions of the atoms that take part, and the largest coordinate."""
         atoms = len(frame.positions)
         if self._atoms < 0:
             self._atoms = atoms
-            self._who = participants(self.rule, self._first, self._second, self._species, atoms)
+            self._who = _participants(self.rule, self._first, self._second, self._species, atoms)
             if not self.rule.directed:
-                self._who = by_place(self._who, frame.positions, frame.box)
-            self._ledger = Ledger(self._who.labels, atoms)
+                self._who = _by_place(self._who, frame)
+            self._ledger = LedgerRows(self._who.labels, atoms)
         if atoms != self._atoms:
             raise InputError(
                 f"{atoms} atoms, {self._atoms} in the frames before",
                 remedy="Split the trajectory where the number of atoms changes",
                 where=f"frame {frame.index}",
             )
-        positions = np.empty((len(self._who.labels), 3))
-        largest = taken(np.require(frame.positions, np.float64, ["C", "W"]), self._who.labels, positions)
+        positions, largest = _taken(frame.positions, self._who.labels)
         if not np.isfinite(largest):
             broken = np.flatnonzero(~np.isfinite(positions).all(axis=1))
             at = int(broken[np.argmin(self._who.labels[broken])])
@@ -369,3 +220,231 @@ class Tracker:
                 where=f"frame {frame.index}",
             )
         return positions, largest
+
+    def _lattice_of(self, box: Box) -> ReducedLattice:
+        last = self._box
+        same = (
+            last is not None and np.array_equal(box.matrix, last.matrix) and np.array_equal(box.pbc, last.pbc)
+        )
+        if not same:
+            # a copy: readers reuse their arrays
+            self._box = Box(np.array(box.matrix, np.float64), np.array(box.pbc, bool))
+            self._lattice = lattice_of(self._box)
+        return self._lattice
+
+    def _decided(self, now: Moment) -> Moment:
+        """The same with its neighbors searched for, and their numbers noted."""
+        rule, bound = self.rule, self.bound + now.rounding
+        if isinstance(rule, Nearest | Capped):
+            reach = rule.reach if np.isfinite(rule.reach) else 0.0
+            made = nearest(
+                now.positions, now.lattice, self._who.sides, rule,
+                band=max(bound, HORIZON * reach, 4 * now.rounding), bound=bound, guard=now.rounding,
+            )  # fmt: skip
+            self.pairs, self.near = len(made.rows.other), made.close
+            self.min_margin = made.smallest if made.smallest <= HORIZON * rule.reach else np.inf
+            return replace(now, rows=made.rows, last_in=made.last_in, first_out=made.first_out)
+        found, who = self._searched(now), self._who
+        smallest, self.near, own = found.smallest, found.close, now.own.copy()
+        squares = own_images(now.lattice, who.radius * (1.0 + HORIZON) + bound)
+        for kind, radius in enumerate(np.diag(who.radii)):
+            if radius >= 0 and who.own[kind]:
+                own[kind] = int((squares < radius * radius).sum())
+                margins = np.abs(radius - np.sqrt(squares))
+                self.near += int((margins <= bound).sum()) * int(who.own[kind])
+                smallest = min(smallest, float(margins.min(initial=np.inf)))
+        self.pairs = len(found.i) + int((own * who.own).sum())
+        self.min_margin = smallest if smallest <= HORIZON * who.radius else np.inf
+        return replace(now, found=found, own=own)
+
+    def _rows(self, moment: Moment) -> NeighborRows:
+        """The neighbors at a moment; searched for where they are not known."""
+        return moment.rows or rows_of(moment.found or self._searched(moment), len(moment.positions))
+
+    def _searched(self, moment: Moment) -> Found:
+        """The pairs inside at a moment, searched for again."""
+        bound, guard = self.bound + moment.rounding, moment.rounding
+        found = search(
+            moment.positions, moment.lattice, self._who.sides, self._who.radii, INSIDE,
+            band=max(bound, HORIZON * self._who.radius, 4 * guard), bound=bound, guard=guard,
+            room=int(1.1 * (self.pairs + self._open)), open_room=int(1.2 * self._open),
+        )  # fmt: skip
+        self._open = found.open
+        return found
+
+    # ---- two frames
+
+    def _from_list(self, before: Moment, now: Moment) -> FlipTable | None:
+        """The flips that a list gives; None where none would be worth its making."""
+        who, radius, bound = self._who, self._who.radius, self.bound + now.rounding
+        clear = max(bound, HORIZON * radius)
+        # what rounding adds to every distance
+        slack = 8.0 * max(before.rounding, now.rounding)
+
+        def moved(home: np.ndarray, reach: float) -> float:
+            return displaced(before.positions, before.lattice, now.positions, now.lattice, home, reach)
+
+        def advanced(held: Superset) -> bool:
+            """Whether a list serves once its odometer has been read."""
+            held.last = moved(held.home, radius + 2.0 * held.skin)
+            held.gone += held.last + slack
+            return held.serves(now.lattice, radius, clear)
+
+        if self._list is not None and not advanced(self._list):
+            self._spare, self._list = self._list, None
+        if self._list is None:
+            # made at the frame before, if it serves now and will for a while
+            pace = moved(np.zeros((len(now.positions), 3), np.int64), 1.5 * radius)
+            skin = skin_for(pace, radius, clear, before.lattice, self.pairs)
+            if not skin > 0:
+                return None
+            made = listed(
+                before.positions, before.lattice, who.sides, who.radii, skin, guard=before.rounding,
+                pairs=self.pairs, spare=self._spare,
+            )  # fmt: skip
+            self._spare = None
+            if not advanced(made):
+                return None
+            self._list = made
+        horizon = HORIZON * radius
+        seen = examine(
+            self._list, now.positions, now.lattice, who.sides, who.radii,
+            bound=bound, horizon=horizon, guard=slack,
+        )  # fmt: skip
+        self.pairs += 2 * int(seen.entered.sum()) - len(seen.entered)
+        self.near, self.min_margin = seen.close, seen.smallest if seen.smallest <= horizon else np.inf
+        rank = np.zeros(len(seen.i), np.int64)
+        return self._table(before, now, Changed(seen.i, seen.j, rank, seen.entered))
+
+    def _flips(self, before: Moment, now: Moment) -> FlipTable:
+        """The flips between two moments that were searched for, or can be."""
+        who = self._who
+        reach = who.radius + 8.0 * max(before.rounding, now.rounding)
+        if not self.rule.directed and all(one.lattice.narrowest >= 2.000002 * reach for one in (before, now)):
+            # no pair has two images inside, nor one that rounding could miss
+            changed = exchanged(
+                before.found or self._searched(before), now.found or self._searched(now),
+                (before.positions, before.lattice), (now.positions, now.lattice),
+                who.sides.species, who.radii,
+            )  # fmt: skip
+            return self._table(before, now, changed)
+        parts = [compared(self._rows(before), self._rows(now), self.pairs // 2 + 4096)]
+        for kind in np.flatnonzero(before.own != now.own):
+            atoms = np.flatnonzero(who.both & (who.sides.species == kind))
+            low, high = sorted((int(before.own[kind]), int(now.own[kind])))
+            i = np.repeat(atoms, high - low)
+            entered = np.full(len(i), bool(now.own[kind] > before.own[kind]))
+            parts.append(Changed(i, i, np.tile(np.arange(low, high), len(atoms)), entered))
+        return self._table(before, now, Changed._make(map(np.concatenate, zip(*parts, strict=True))))
+
+    def _table(self, before: Moment, now: Moment, changed: Changed) -> FlipTable:
+        """The flips as columns, from indices among the atoms that take part."""
+        distances = [self._distances(one, changed.i, changed.j, changed.rank) for one in (now, before)]
+        thresholds = Thresholds(
+            self.rule.directed, self._who.sides.species, self._who.radii,
+            now.last_in, now.first_out, before.last_in, before.first_out,
+        )  # fmt: skip
+        bound = self.bound + max(before.rounding, now.rounding)
+        return self._ledger.flips(self.frames, changed, (distances[0], distances[1]), thresholds, bound)
+
+    def _distances(self, moment: Moment, i, j, rank) -> np.ndarray:
+        if self.rule.directed:
+            # both of a ± pair are neighbors of an atom
+            rank = np.where(i == j, rank // 2, rank)
+        return image_distances(moment.positions, moment.lattice, i, j, rank)
+
+
+def _participants(
+    rule: Rule,
+    first: Int[np.ndarray, "first"] | None,
+    second: Int[np.ndarray, "second"] | None,
+    species: np.ndarray | None,
+    atoms: int,
+) -> Participants:
+    """Number the atoms that take part, in the order of the file.
+
+    Raises:
+        InputError: an atom that is not there; as many species as atoms are expected.
+    """
+    first = np.arange(atoms) if first is None else first
+    second = first if second is None else second
+    for name, chosen in (("first", first), ("second", second)):
+        if len(chosen) and chosen.max() >= atoms:
+            raise InputError(
+                f"atom {int(chosen.max())} is selected, but frames have {atoms} atoms (from 0)",
+                remedy="Select atoms of this trajectory",
+                where=name,
+            )
+    if species is not None and len(species) != atoms:
+        raise InputError(
+            f"{len(species)} species for frames of {atoms} atoms",
+            remedy="Use the topology that belongs to the trajectory",
+            where="species",
+        )
+    centers, others = np.zeros(atoms, bool), np.zeros(atoms, bool)
+    centers[first], others[second] = True, True
+    labels = np.flatnonzero(centers | others)
+    centers, others = centers[labels], others[labels]
+    if (centers == others).all():
+        # the same array: pairs within one set are searched for from one side only
+        others = centers
+    if isinstance(rule, SpeciesCutoffs):
+        assert species is not None
+        # species of atoms that do not take part count too: a selection may hold none of one
+        kinds, radii = rule.table(list(species))
+        kinds = kinds[labels]
+    else:
+        kinds = np.zeros(len(labels), np.int64)
+        radii = np.array([[float(rule.radius if isinstance(rule, CutoffRule) else rule.reach)]])
+    both = centers & others
+    own = np.bincount(kinds[both], minlength=len(radii))
+    return Participants(labels, Sides(centers, others, kinds), radii, both, own)
+
+
+def _by_place(who: Participants, frame: Frame) -> Participants:
+    """The same atoms numbered by where they are: what is near in space is near in memory."""
+    x, largest = _taken(frame.positions, who.labels)
+    if not np.isfinite(largest) or not who.radius > 0:
+        return who
+    sides, everyone = who.sides, np.ones(len(x), bool)
+    around = Sides(everyone, everyone, sides.species)
+    order = binned(x, lattice_of(frame.box), around, who.radius, 0.0).order
+    others = sides.others[order]
+    centers = others if sides.centers is sides.others else sides.centers[order]
+    ordered = Sides(centers, others, sides.species[order])
+    return replace(who, labels=who.labels[order], sides=ordered, both=who.both[order])
+
+
+def _taken(positions: np.ndarray, labels: np.ndarray) -> tuple[Float[np.ndarray, "taken 3"], float]:
+    """The positions of some atoms, copied, and the largest coordinate: not finite where one is not."""
+    out = np.empty((len(labels), 3))
+    return out, _take(np.require(positions, np.float64, ["C", "W"]), labels, out)
+
+
+@numba.njit(cache=True, nogil=True)
+def _take(positions, labels, out):
+    most0, most1, most2, finite = 0.0, 0.0, 0.0, 0
+    for at in range(labels.shape[0]):
+        i = labels[at]
+        x0, x1, x2 = positions[i, 0], positions[i, 1], positions[i, 2]
+        out[at, 0], out[at, 1], out[at, 2] = x0, x1, x2
+        most0, most1, most2 = max(most0, abs(x0)), max(most1, abs(x1)), max(most2, abs(x2))
+        # nan is larger than nothing
+        finite += int(x0 - x0 == 0.0 and x1 - x1 == 0.0 and x2 - x2 == 0.0)
+    return max(most0, most1, most2) if finite == labels.shape[0] else np.inf
+
+
+def _indices(chosen: Sequence[int] | np.ndarray | None, where: str) -> np.ndarray | None:
+    """Sorted atom numbers, each once."""
+    if chosen is None:
+        return None
+    made = np.asarray(chosen)
+    if made.size == 0:
+        return np.zeros(0, np.int64)
+    if made.ndim != 1 or made.dtype.kind not in "iu" or made.min() < 0:
+        raise InputError(
+            f"expected whole numbers from 0, got {made.dtype} of shape {made.shape}",
+            remedy="Give the indices of the atoms in the trajectory, from 0",
+            where=where,
+        )
+    return np.unique(made.astype(np.int64))

@@ -12,13 +12,18 @@ Source: the algorithm of xdr3dfcoord (F. van Hoesel; GROMACS, libxdrfile), of wh
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numba
 import numpy as np
-from jaxtyping import Float32
+
+from mdnum.errors import InputError
+from mdnum.trajectories.boxes import box_of
+from mdnum.trajectories.frame import Frame
+from mdnum.trajectories.topology import NARROWED, notes_on
+from mdnum.trajectories.trajectory import Trajectory
 
 # magic number, and bytes of the length of the stream: files with more than 2^31 bytes a frame have another
 _MAGIC = {1995: 4, 2023: 8}
@@ -32,21 +37,6 @@ _PLAIN = 9
 _FIRST, _LAST = 9, 72
 # a coordinate this wide is written by itself
 _WIDE = 0xFFFFFF
-
-
-@dataclass(frozen=True)
-class XtcFrame:
-    """A frame as the file has it: nm and ps.
-
-    Attributes:
-        time: in ps.
-        box: lattice vectors as rows, nm.
-        positions: nm.
-    """
-
-    time: float
-    box: Float32[np.ndarray, "3 3"]
-    positions: Float32[np.ndarray, "atoms 3"]
 
 
 def opened(trajectory: Any) -> XtcFile | None:
@@ -105,8 +95,8 @@ class XtcFile:
         """Looks at a frame without decoding it."""
         self._stream(number, look=True)
 
-    def read(self, number: int) -> XtcFrame:
-        """Decodes a frame, once it has been looked at."""
+    def read(self, number: int) -> Any:
+        """A frame as the library decodes it, in nm and ps, once it has been checked."""
         self.check(number)
         if self._library is None:
             from MDAnalysis.lib.formats.libmdaxdr import XTCFile
@@ -116,9 +106,8 @@ class XtcFile:
             # its own search for frames trusts their heads
             self._library.set_offsets(np.array(self._starts[: number + 1], np.int64))
             self._library.seek(number)
-        found = self._library.read()
         self._at = number + 1
-        return XtcFrame(float(found.time), np.array(found.box), np.array(found.x))
+        return self._library.read()
 
     def _start(self, number: int) -> int:
         while len(self._starts) <= number:
@@ -213,3 +202,51 @@ def _walk(stream, atoms, whole, small):
         if small < _FIRST or small > _LAST:
             return -8
     return at if done == atoms and at <= most else -8
+
+
+class XtcTrajectory(Trajectory):
+    """An xtc file, in Å and ps. Its coordinates are integers, and float32 by the time they come here."""
+
+    format = "XTC"
+    reader = "MDAnalysis"
+    bits = 32
+    time = "ps"
+
+    def __init__(self, path: Path, topology: str | Path | None, frames: slice):
+        super().__init__(path, topology, frames)
+        file = XtcFile(path)
+        try:
+            atoms = file.atoms
+        except ValueError as error:
+            raise InputError(
+                f"it is no xtc file, or a damaged one ({error})",
+                remedy="Check that the file is whole and of the kind its name says",
+                where=str(path),
+            ) from None
+        whole = file.whole_frames()
+        # a frame that is cut is one to read
+        self._count = whole + (not file.ends_at(whole))
+        file.close()
+        self._has(atoms)
+        self.notes = (NARROWED, *notes_on(self.table))
+
+    def _raw(self, numbers: Iterator[int]) -> Iterator[tuple[int, Any]]:
+        file = XtcFile(self.path)
+        try:
+            for number in numbers:
+                try:
+                    found = file.read(number)
+                except self._fails as error:
+                    raise self._unreadable(number, error) from error
+                yield number, found
+        finally:
+            file.close()
+
+    def _frame(self, number: int, raw: Any) -> Frame:
+        # in Å by the operations that MDAnalysis makes, so that both see the same numbers
+        from MDAnalysis.lib.mdamath import triclinic_box
+
+        ten = np.float32(10)
+        dimensions: Any = triclinic_box(*raw.box)
+        dimensions[:3] *= ten
+        return Frame(number, float(raw.time), (np.array(raw.x) * ten).astype(np.float64), box_of(dimensions))

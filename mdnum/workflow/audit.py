@@ -1,61 +1,63 @@
-"""`mdnum audit` as a function: every check of a calculator, a verdict, and a report to attach to an issue."""
+"""`mdnum audit`: is this ASE calculator safe to run and to differentiate?
+
+Every check of `mdnum.audit.checks.CHECKS` is asked in its order; the folder fills up check by check, so
+whatever ends an audit, what was found is in it and the rest can be asked later. A check gives codes and
+values, and its sentences are in audit.toml.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
-from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from mdnum import units
 from mdnum.errors import InputError
-from mdnum.workflow.fork_question import Log, Progress, finish
+from mdnum.plain import plain
+from mdnum.registry import unknown
+from mdnum.report.finding import Finding, Texts, Verdict, conclude
+from mdnum.report.section import Code, Key, Page, Plot, Section, Series, cell, pairs, records
+from mdnum.report.words import count, heading, many, number
+from mdnum.store import RunFolder, manifest
+from mdnum.store.answers import Answers, take
+from mdnum.store.atomic import read_text, subfolder, write_text
+from mdnum.workflow import frame
+from mdnum.workflow.frame import Outcome, Progress, Verb, View
 
 if TYPE_CHECKING:
     from ase import Atoms
 
-    from mdnum.audit.base import Check, Part
-    from mdnum.audit.load import Loaded
+    from mdnum.audit.base import CheckResult, Observed
+    from mdnum.audit.check import AuditCheck
+    from mdnum.audit.record import AuditState
+    from mdnum.audit.structures import LoadedCalculator
     from mdnum.audit.subject import CalculatorSubject
-    from mdnum.units import Units
-    from mdnum.workflow.audit_record import AuditRecord
 
-#: Checks in the order in which they are made: what tells most by a call first, and thresholds before those
-#: that may ask at them.
-CHECKS = ("invariance", "smoothness", "forces", "curl", "state", "dynamics")
+TEXTS = Texts(__file__)
+_SCRIPT = "reproduce.py"
+_TABLES = ("curves", "energies", "crossings")
+#: k_B, eV/K (CODATA 2018, exact).
+_BOLTZMANN = 8.617333262e-5
+#: A unit of a system with dimensions where text has one: not in the name of a file.
+_UNIT = re.compile(r"(?<![\w./])(m?)eV(?![A-Za-z0-9_]|\.\w)|Å(?![A-Za-z0-9_])")
+_ROLES = ("first", "second", "third", "bad", "muted", "ink")
 
 
 class AuditStopped(KeyboardInterrupt):
     """Somebody pressed control-C after a check was done: what had been found is in the folder.
 
     Args:
-        result: the audit without the checks that were not done.
+        outcome: the audit without the checks that were not done.
     """
 
-    def __init__(self, result: AuditResult):
+    def __init__(self, outcome: Outcome):
         super().__init__("stopped")
-        self.result = result
-
-
-@dataclass(frozen=True)
-class AuditResult:
-    """A finished audit.
-
-    Attributes:
-        folder: the audit folder.
-        parts: what each check found, by its name.
-        summary: what summary.json says, findings included.
-    """
-
-    folder: Path
-    parts: Mapping[str, Part]
-    summary: dict[str, Any]
-
-    @property
-    def findings(self) -> list[dict[str, str]]:
-        """All findings, errors first."""
-        return self.summary["findings"]
+        self.outcome = outcome
 
 
 def audit(
@@ -71,7 +73,7 @@ def audit(
     resume: str | Path | None = None,
     report: bool = True,
     progress: Progress | None = None,
-) -> AuditResult:
+) -> Outcome:
     """Ask a calculator whether it is safe to run and to differentiate.
 
     How much is asked is counted in calls of the calculator and does not depend on how fast it answers: some
@@ -82,12 +84,12 @@ def audit(
             out where an audit of one that was named in words is resumed. The Python that it names is run.
         structure: ASE's atoms or a file that ASE reads; by default what comes with the calculator, or one
             that is built for it.
-        checks: words of `CHECKS`; default all.
+        checks: names of `CHECKS`; default all.
         temperature: K, of kT and of the run; default the system's own, or 300.
         timestep: of the run, fs (τ of a system in reduced units); default a fraction of the fastest
             vibration.
         steps: of the run; default 200.
-        time: minutes, after which nothing more is asked; what was not asked by then is told, and can be
+        time: minutes, after which nothing more is asked; what was not asked by then is listed, and can be
             resumed.
         out: the new audit folder; default runs/audit-<name>-<n>.
         resume: the folder of an audit that was killed, stopped or short of time: the checks that it holds are
@@ -95,111 +97,210 @@ def audit(
         report: write report.html.
         progress: called now and then with what is done, of how much, and a dictionary of figures.
 
+    Returns:
+        an outcome whose `result` holds what each check found, by its name.
+
     Raises:
         InputError: no such calculator, structure or check; something that a resumed audit has already.
         FolderError: the folder cannot be used.
         AuditStopped: a KeyboardInterrupt came after a check was done; what was found till then has been
-            written, its page included, and is the exception's `result`.
+            written, its page included, and is the exception's `outcome`.
     """
-    from mdnum.audit.base import TIME_UP, TimeUp
+    from mdnum.audit.record import AuditState, encoded, kept
     from mdnum.deadline import Deadline
-    from mdnum.workflow import audit_record
 
     deadline = Deadline(time)
-    if resume is None:
-        if calculator is None:
-            raise InputError("no calculator is named", remedy="Name one, or resume an audit")
-        loaded = _loaded(calculator)
-        _internal(timestep, loaded.units)
-        question = {
-            "checks": list(_wanted(checks)), "temperature": temperature, "timestep": timestep, "steps": steps,
-        }  # fmt: skip
-        record = audit_record.begin(
-            loaded, out, _structure(structure, loaded), question, words=isinstance(calculator, str)
-        )
-    else:
-        given = {
-            "structure": structure, "checks": checks, "temperature": temperature, "timestep": timestep,
-            "steps": steps, "out": out,
-        }  # fmt: skip
-        if words := [word for word, value in given.items() if value is not None]:
+    if resume is not None:
+        given = {"structure": structure, "checks": checks, "temperature": temperature, "timestep": timestep,
+                 "steps": steps, "out": out}  # fmt: skip
+        if names := [name for name, value in given.items() if value is not None]:
             raise InputError(
-                f"an audit is resumed as it was asked for, and {words[0]} is given",
-                remedy=f"Leave out {', '.join(words)}, or begin another audit",
+                f"an audit is resumed as it was asked for, and {names[0]} is given",
+                remedy=f"Leave out {', '.join(names)}, or begin another audit",
             )
-        record = audit_record.open_again(resume, calculator, _loaded)
-    folder, during, why = record.folder, None, ""
+        with closing(take(resume, "audit")) as folder:
+            state = kept(folder)
+            loaded = _same(calculator, state, folder.path)
+            folder.write_anew(_TABLES)
+            for file in (folder.path / "structures").glob("failed-*.extxyz"):
+                if re.fullmatch(r"failed-\d+\.extxyz", file.name) and file.name not in state.failed:
+                    manifest.remove(file)
+            return _ask_all(folder, loaded, state, deadline, report, progress)
+    if calculator is None:
+        raise InputError("no calculator is named", remedy="Name one, or resume an audit")
+    loaded = _loaded(calculator)
+    _internal(timestep, loaded.units)
+    atoms, wanted = _structure(structure, loaded), _wanted(checks)
+    kT = 300.0 * _BOLTZMANN if loaded.kT is None else loaded.kT
+    kT = kT if temperature is None else temperature * loaded.units.k_B
+    state = AuditState(
+        loaded.name, isinstance(calculator, str), encoded(atoms), kT, loaded.units.name, wanted, temperature,
+        timestep, steps,
+    )  # fmt: skip
+    with frame.new_folder("audit", f"audit-{loaded.stem}", out) as folder:
+        _write_structures(folder, {"structure": atoms})
+        return _ask_all(folder, loaded, state, deadline, report, progress)
+
+
+def _ask_all(
+    folder: RunFolder,
+    loaded: LoadedCalculator,
+    state: AuditState,
+    deadline: Any,
+    report: bool,
+    progress: Progress | None,
+) -> Outcome:
+    """Asks the checks that are not done, keeping each answer, and finishes the folder."""
+    from mdnum.audit.base import TIME_UP, TimeUp
+    from mdnum.audit.check import Settings
+    from mdnum.audit.checks import CHECKS
+    from mdnum.audit.subject import CalculatorSubject
+    from mdnum.audit.thresholds import find_thresholds
+
+    answers = Answers(folder, state)
+    answers.save()
+    subject = CalculatorSubject(
+        loaded.name, loaded.make, state.atoms, kT=state.kT, folder=folder.path / "structures",
+        units=loaded.units,
+    )  # fmt: skip
+    subject.meter.deadline = deadline
+    if state.thresholds is not None:
+        subject.known["thresholds"] = state.thresholds
+    settings = Settings(_internal(state.timestep, loaded.units), state.steps)
+    log = frame.Log(folder, progress)
+    earlier, state.during, state.why = state.cut, None, ""
+    for name in state.left:
+        check = CHECKS[name](settings)
+        log(0, 0, {"phase": name})
+        state.during = name
+        try:
+            result = _repeatable(_ask(check, subject, log), subject, state.results)
+        except KeyboardInterrupt:
+            if not state.results:
+                raise
+            state.why = "stopped"
+            break
+        except TimeUp:
+            state.why = TIME_UP
+            break
+        _keep_evidence(folder, loaded, check)
+        if any(reason == TIME_UP for _, reason in result.skipped):
+            # asked again, and not as far: what was known stays known
+            again = earlier if earlier is not None and earlier.name == name else result
+            state.cut, state.why = max(again, result, key=lambda one: one.asked), TIME_UP
+            break
+        state.results.append(result)
+        if state.cut is not None and state.cut.name == name:
+            state.cut = None
+        if name == "smoothness":
+            state.thresholds = find_thresholds(subject)
+        state.failed = sorted(path.name for path in (folder.path / "structures").glob("failed-*.extxyz"))
+        state.during = next(iter(state.left), None)
+        answers.save()
+        summary = plain(_summary(state))
+        _judge(View(folder, summary, state)).store(folder, summary)
+    if state.cut is not None and state.during is None:
+        state.cut = None
+    answers.save()
+    frame.store(folder, _summary(state), _tables(state))
+    outcome = frame.finish(
+        folder, report=report, result={one.name: one for one in state.shown}, progress=progress
+    )
+    if state.why == "stopped":
+        raise AuditStopped(outcome)
+    return outcome
+
+
+def _ask(check: AuditCheck, subject: CalculatorSubject, log: frame.Log) -> CheckResult:
+    """A check's answer; where the calculator fails and it cannot continue, the failure as a finding."""
+    from mdnum.audit.base import CheckResult, finding
+    from mdnum.audit.subject import CalculatorError
+
     try:
-        subject = _subject(record)
-        subject.meter.deadline = deadline
-        told = Log(folder, progress)
-        for check in _checks(record, subject):
-            told(0, 0, {"phase": check.name})
-            try:
-                part = _in_units(
-                    _repeatable(_ask(check, subject, told), subject, record.parts), subject.units
-                )
-            except KeyboardInterrupt:
-                if not record.parts:
-                    raise
-                during, why = check.name, "stopped"
-                break
-            except TimeUp:
-                during, why = check.name, TIME_UP
-                if record.cut is not None and record.cut.name == check.name:
-                    record.add(record.cut, check, subject, whole=False)
-                break
-            cut = any(reason == TIME_UP for _, reason in part.skipped)
-            record.add(part, check, subject, whole=not cut)
-            if cut:
-                during, why = check.name, TIME_UP
-                break
-        folder.finalize()
-        record.write(during, why)
-    except BaseException:
-        folder.close()
-        raise
-    found = {part.name: part for part in record.parts}
-    result = AuditResult(folder.path, found, finish(folder, report, progress))
-    if why == "stopped":
-        raise AuditStopped(result)
-    return result
+        return check(subject, log)
+    except CalculatorError as error:
+        values = {"check": check.name, "why": error.message}
+        values["file"] = error.structure.name if error.structure else ""
+        saved = "saved" if error.structure else None
+        return CheckResult(
+            (["failed"], values),
+            [finding("CALCULATOR_FAILED", "error", saved, **values)],
+            skipped=[(f"the rest of {check.name}", error.message)],
+            name=check.name,
+            title=check.title,
+        )
 
 
-def _wanted(checks: str | Sequence[str] | None) -> tuple[str, ...]:
-    import difflib
+def _repeatable(
+    result: CheckResult, subject: CalculatorSubject, before: Iterable[CheckResult]
+) -> CheckResult:
+    """A result with the finding that one question has had two answers, where no other has it yet."""
+    if any(one.code == "NOT_REPEATABLE" for each in (*before, result) for one in each.findings):
+        return result
+    return replace(result, findings=[*subject.repeats.findings(subject.kT), *result.findings])
+
+
+def _keep_evidence(folder: RunFolder, loaded: LoadedCalculator, check: AuditCheck) -> None:
+    """Structures that show a finding, to the last bit, and a script that shows it without mdnum."""
+    from mdnum.audit.record import STRUCTURES, script
+
+    _write_structures(folder, check.structures)
+    saved = sorted((folder.path / STRUCTURES).glob("*-before.extxyz"))
+    if saved:
+        names = [path.name.removesuffix("-before.extxyz") for path in saved]
+        write_text(folder.path / _SCRIPT, script(loaded.name, names, loaded.units))
+
+
+def _write_structures(folder: RunFolder, structures: Mapping[str, Atoms]) -> None:
+    from mdnum.audit.subject import exact_extxyz
+
+    for name, atoms in structures.items():
+        write_text(subfolder(folder.path, "structures") / f"{name}.extxyz", exact_extxyz(atoms))
+
+
+def _wanted(checks: str | Sequence[str] | None) -> list[str]:
+    from mdnum.audit.check import in_order
+    from mdnum.audit.checks import CHECKS
 
     if checks is None:
-        return CHECKS
+        return in_order(list(CHECKS))
     texts = (checks,) if isinstance(checks, str) else checks
-    words = [word.strip() for text in texts for word in text.split(",") if word.strip()]
-    for word in words:
-        if word not in CHECKS:
-            close = difflib.get_close_matches(word, CHECKS, n=1)
-            hint = f"Did you mean {close[0]}? " if close else ""
-            raise InputError(f"no check {word!r}", remedy=f"{hint}There are {', '.join(CHECKS)}")
-    if not words:
+    names = [name.strip() for text in texts for name in text.split(",") if name.strip()]
+    for name in names:
+        if name not in CHECKS:
+            raise unknown("check", name, CHECKS)
+    if not names:
         raise InputError("no check is named", remedy=f"There are {', '.join(CHECKS)}")
-    return tuple(name for name in CHECKS if name in words)
+    return in_order(list(dict.fromkeys(names)))
 
 
-def _loaded(calculator: str | Callable[[], Any]) -> Loaded:
-    from mdnum.audit.load import Loaded, load_calculator
+def _loaded(calculator: str | Callable[[], Any]) -> LoadedCalculator:
+    from mdnum.audit.structures import LoadedCalculator, load_calculator
 
     if isinstance(calculator, str):
         return load_calculator(calculator)
     if not callable(calculator):
         raise InputError(
             f"that is a {type(calculator).__name__}, neither words nor a function that makes a calculator",
-            remedy="Say lambda: LennardJones(), so that a new one can be made for each check",
+            remedy="Give lambda: LennardJones(), so that a new one can be made for each check",
         )
     name = getattr(calculator, "__name__", type(calculator).__name__)
     name = "calculator" if name == "<lambda>" else name
-    return Loaded(name, name, calculator)
+    return LoadedCalculator(name, name, calculator)
 
 
-def _structure(structure: Atoms | str | Path | None, loaded: Loaded) -> Atoms:
-    """Atoms; what they are is in their info under "origin", where it is known."""
+def _same(calculator: str | Callable[[], Any] | None, state: AuditState, path: Path) -> LoadedCalculator:
+    """The calculator of an audit that is resumed."""
+    if calculator is None and not state.named:
+        raise InputError("the calculator of this audit has no name", remedy="Give it again", where=str(path))
+    if isinstance(calculator, str) and state.named and calculator != state.name:
+        raise InputError(
+            f"that is an audit of {state.name}, not of {calculator}", remedy="Leave out the calculator"
+        )
+    return _loaded(state.name if calculator is None else calculator)
+
+
+def _structure(structure: Atoms | str | Path | None, loaded: LoadedCalculator) -> Atoms:
     from ase import Atoms
 
     from mdnum.audit.structures import default_structure, read_structure
@@ -213,116 +314,299 @@ def _structure(structure: Atoms | str | Path | None, loaded: Loaded) -> Atoms:
     return found
 
 
-def _subject(record: AuditRecord) -> CalculatorSubject:
-    from mdnum.audit.subject import CalculatorSubject
-
-    loaded, folder = record.loaded, record.folder.path / "structures"
-    return CalculatorSubject(
-        loaded.name, loaded.make, record.atoms, kT=record.kT, folder=folder, units=loaded.units
-    )
-
-
-def _checks(record: AuditRecord, subject: CalculatorSubject) -> list[Check]:
-    """The checks that are asked for and not done, in their order."""
-    from mdnum.audit.curl import Curl
-    from mdnum.audit.dynamics import Dynamics
-    from mdnum.audit.forces import Forces
-    from mdnum.audit.invariance import Invariance
-    from mdnum.audit.smoothness import Smoothness
-    from mdnum.audit.state import State
-
-    steps, timestep = record.question["steps"], _internal(record.question["timestep"], subject.units)
-    made: dict[str, Callable[[], Check]] = {
-        "smoothness": Smoothness,
-        "invariance": Invariance,
-        "forces": Forces,
-        "curl": Curl,
-        "state": lambda: State(record.thresholds),
-        "dynamics": lambda: Dynamics(record.thresholds, timestep, steps),
-    }
-    return [made[name]() for name in record.left]
-
-
-#: A unit of a system with dimensions where text has one: not in the name of a file.
-_UNIT = re.compile(r"(?<![\w./])(m?)eV(?![A-Za-z0-9_]|\.\w)|Å(?![A-Za-z0-9_])")
-
-
-def _in_units(part: Part, units: Units) -> Part:
-    """A part with the words of a unit system: checks say eV and Å, which are ε and σ in reduced units."""
-    if units.energy == "eV":
-        return part
-
-    def unit(found: re.Match[str]) -> str:
-        return units.length if found[0] == "Å" else f"{found[1]}{units.energy}"
-
-    def told(value: Any) -> Any:
-        if isinstance(value, str):
-            return _UNIT.sub(unit, value)
-        if isinstance(value, Mapping):
-            return {told(key): told(item) for key, item in value.items()}
-        return [told(item) for item in value] if isinstance(value, list | tuple) else value
-
-    curves = [
-        replace(
-            one,
-            title=told(one.title),
-            x_label=told(one.x_label),
-            y_label=told(one.y_label),
-            lines=told(one.lines),
-            marks=told(one.marks),
-        )
-        for one in part.curves
-    ]
-    return replace(
-        part,
-        says=told(part.says),
-        findings=told(list(part.findings)),
-        tables=told(part.tables),
-        curves=curves,
-        skipped=[(told(what), told(why)) for what, why in part.skipped],
-    )
-
-
-def _internal(timestep: float | None, units: Units) -> float | None:
+def _internal(timestep: float | None, given: units.Units) -> float | None:
     """A time step in length * sqrt(mass / energy), of one in fs, or in τ for reduced units."""
     if timestep is None:
         return None
     if not timestep > 0:
         raise InputError(f"a time step of {timestep:g}; expected one above 0", remedy="Correct --timestep")
-    return timestep * units.time_factor / (1000.0 if units.time == "ps" else 1.0)
+    return timestep * given.time_factor / (1000.0 if given.time == "ps" else 1.0)
 
 
-def _repeatable(part: Part, subject: CalculatorSubject, before: Sequence[Part]) -> Part:
-    """A part with the finding that one question has had two answers, where no part has it yet."""
-    told = {one["code"] for each in (*before, part) for one in each.findings}
-    if "NOT_REPEATABLE" in told:
-        return part
-    return replace(part, findings=[*subject.ledger.findings(subject.kT), *part.findings])
+# -- what is in the folder -------------------------------------------------------------------------
 
 
-def _ask(check: Check, subject: CalculatorSubject, told: Log) -> Part:
-    """A check's answer; of a calculator that fails where a check cannot go on, the failure as a finding."""
-    from mdnum.audit.base import Part
-    from mdnum.audit.subject import CalculatorError
-    from mdnum.references.findings import finding
+def _summary(state: AuditState) -> dict[str, Any]:
+    """The content of summary.json, without what is judged."""
+    from mdnum.audit.verdict import answers
 
-    began = perf_counter()
-    try:
-        return check(subject, told)
-    except CalculatorError as error:
-        saved = f" The structure is saved as {error.structure.name}." if error.structure else ""
-        failed = finding(
-            "CALCULATOR_FAILED",
-            "error",
-            "the calculator fails on a structure near the one it was asked about",
-            f"During the check of {check.name} it {error.message}.{saved}",
-            "Run it on that structure by itself to see where it fails.",
+    atoms, given = state.atoms, units.get(state.units)
+    said = answers(state.shown, state.checks)
+    why = state.why or "not finished"
+    left = [name for name in state.left if state.during and name not in {one.name for one in state.shown}]
+    rest = [{"what": f"the check of {name}", "why": why, "part": name} for name in left]
+    found = [(one, one.name) for one in state.shown]
+    unfinished = "stopped" if state.why == "stopped" else "unfinished"
+    status = "complete" if state.during is None else unfinished
+    return _in_units(
+        {
+            "system": state.name,
+            "calculator": state.name,
+            "atoms": len(atoms),
+            "formula": atoms.get_chemical_formula(),
+            "periodic": atoms.pbc.tolist(),
+            "structure": atoms.info.get("origin"),
+            "kT": state.kT,
+            "units": state.units,
+            "safe_to_run": said["run"],
+            "safe_to_differentiate": said["differentiate"],
+            "parts": [
+                {
+                    "name": one.name, "title": one.title, "says": _says(one), "tables": one.tables,
+                    "numbers": one.numbers, "asked": one.asked, "possible": one.possible,
+                    "seconds": one.seconds,
+                }
+                for one, _ in found
+            ],
+            "left_out": rest
+            + [{"what": what, "why": why, "part": name} for one, name in found for what, why in one.skipped],
+            "causes": [
+                {"code": head.code, "below": [one.code for one in below]}
+                for head, below in _by_cause([one for each in state.shown for one in each.findings])
+            ],
+            "status": status,
+            "seconds": state.seconds,
+        },
+        given,
+    )  # fmt: skip
+
+
+def _tables(state: AuditState) -> dict[str, dict[str, np.ndarray]]:
+    """Points of the figures, and what checks recorded."""
+    rows: list[tuple[str, str, str, float, float]] = []
+    tables: dict[str, dict[str, np.ndarray]] = {}
+    for result in state.shown:
+        for place, chart in enumerate(result.charts, 1):
+            for line, values in chart.lines.items():
+                points = zip(chart.x, values, strict=True)
+                rows += [(result.name, f"{result.name}-{place}", line, x, y) for x, y in points]
+        for name, columns in result.recorded.items():
+            if next(iter(columns.values()), ()):
+                tables[name] = {column: np.array(values) for column, values in columns.items()}
+    if rows:
+        columns = zip(*rows, strict=True)
+        names = ("part", "curve", "line", "x", "y")
+        tables["curves"] = {
+            name: np.array(column, float if name in "xy" else str)
+            for name, column in zip(names, columns, strict=True)
+        }
+    return tables
+
+
+def _in_units(value: Any, given: units.Units) -> Any:
+    """Text with the names of a unit system: checks say eV and Å, which are ε and σ in reduced units."""
+    if given.energy == "eV":
+        return value
+
+    def unit(found: re.Match[str]) -> str:
+        return given.length if found[0] == "Å" else f"{found[1]}{given.energy}"
+
+    if isinstance(value, str):
+        return _UNIT.sub(unit, value)
+    if isinstance(value, Mapping):
+        return {_in_units(key, given): _in_units(item, given) for key, item in value.items()}
+    return [_in_units(item, given) for item in value] if isinstance(value, list | tuple) else value
+
+
+def _says(result: CheckResult) -> str:
+    names, values = result.says
+    return " ".join(TEXTS(name, **values) for name in names)
+
+
+# -- what it means ---------------------------------------------------------------------------------
+
+
+def _by_cause(found: Sequence[Observed]) -> list[tuple[Observed, list[Observed]]]:
+    """(finding, those that may follow from it) of each that is listed by itself."""
+    from mdnum.audit.verdict import heads
+
+    above = heads([(one.code, one.severity) for one in found])
+    return [
+        (one, [other for k, other in enumerate(found) if k != place and above[k] == place])
+        for place, one in enumerate(found)
+        if above[place] == place
+    ]
+
+
+def _finding(one: Observed, section: str, cause: str) -> Finding:
+    """The sentences of what was found; of a check of another package, those that it gave."""
+    if one.code not in TEXTS.entries:
+        given = {name: str(one.values.get(name, "")) for name in ("title", "text", "remedy")}
+        return Finding(one.code, one.severity, **given, values=one.values, section=section, cause=cause)
+    made = TEXTS.finding(
+        one.code, *one.variants, severity=one.severity, section=section, cause=cause, **one.values
+    )
+    # ways of writing a structure down have one text for all
+    return made if made.text else replace(made, text=TEXTS("invariance_finding", **one.values))
+
+
+def _judge(view: View) -> Verdict:
+    """Findings, errors first, and both answers in one sentence."""
+    state: AuditState = view.extra
+    given, titles = units.get(state.units), {}
+    for result in state.shown:
+        titles |= {id(one): result.title for one in result.findings}
+    found = []
+    groups = _by_cause([one for each in state.shown for one in each.findings])
+    for head, below in groups:
+        found.append(_finding(head, titles[id(head)], ""))
+        found += [_finding(one, titles[id(one)], head.code) for one in below]
+    texts = ("title", "text", "remedy", "values")
+    found = [replace(one, **{name: _in_units(getattr(one, name), given) for name in texts}) for one in found]
+    headline = _in_units(_headline(state, [one for one in found if not one.cause]), given)
+    return conclude(found, headline=headline, best="good", judged=True)
+
+
+def _headline(state: AuditState, found: Sequence[Finding]) -> str:
+    """Both answers, what they do not rest on, and the worst that was found."""
+    from mdnum.audit.base import TIME_UP
+    from mdnum.audit.verdict import answers, largely_unasked, to_come
+
+    said = answers(state.shown, state.checks)
+    slugs = {question: answer.replace(" ", "_") for question, answer in said.items()}
+    asked = [TEXTS(f"{question}_{slug}") for question, slug in slugs.items() if slug != "not_asked"]
+    if len(set(slugs.values())) == 1:
+        head = TEXTS(f"same_{slugs['run']}", name=state.name)
+    elif len(asked) == 1:
+        head = TEXTS("one", name=state.name, answer=asked[0])
+    else:
+        head = TEXTS("both", name=state.name, run=asked[0], differentiate=asked[1])
+    begun = {one.name for one in state.shown}
+    left = [TEXTS("check_left", check=name) for name in state.checks if name not in begun]
+
+    def ways(results: Iterable[CheckResult]) -> list[str]:
+        return [
+            TEXTS("rest_of_check", asked=one.asked, possible=one.possible, check=one.name) for one in results
+        ]
+
+    if state.shown and not asked and to_come(state.shown, state.checks):
+        head = TEXTS("nothing_yet", name=state.name, ways=", ".join([*ways(state.shown), *left]))
+        return _unfinished(state, head, TIME_UP)
+    rest = ", ".join([*ways(one for one in state.shown if largely_unasked(one)), *left])
+    if rest:
+        beside = "as far as asked" in said.values()
+        head = TEXTS("with_rest_beside" if beside else "with_rest", head=head, rest=rest)
+    severe = sorted(
+        (one for one in found if one.severity != "info"),
+        # where one question has two answers, no other finding of its severity is worth as much
+        key=lambda one: (one.severity != "error", one.code != "NOT_REPEATABLE"),
+    )
+    titles = list(dict.fromkeys(one.title for one in severe))
+    if len(titles) > 3:
+        titles[2:] = [TEXTS("more_findings", n=len(titles) - 2)]
+    if titles:
+        head = TEXTS("found", head=head, titles="; ".join(titles))
+    elif state.shown:
+        head = TEXTS("found_nothing", head=head, checks=len(state.shown))
+    else:
+        head = TEXTS("nothing_asked", head=head)
+    return _unfinished(state, head, TIME_UP)
+
+
+def _unfinished(state: AuditState, headline: str, time_up: str) -> str:
+    if state.during is None:
+        return headline
+    name = {"stopped": "stopped", time_up: "time_up"}.get(state.why, "unfinished")
+    return TEXTS(name, check=state.during, headline=headline)
+
+
+# -- how it is shown -------------------------------------------------------------------------------
+
+
+def _page(view: View, verdict: Verdict) -> Page:
+    state, summary = view.extra, view.summary
+    given = units.get(state.units)
+    found = [f"{one['title']} ({_ways(one)}): {one['says']}" for one in summary["parts"]]
+    sections = [Section("What each check found", found, terminal=True)]
+    left = [(heading(one["what"]), one["why"]) for one in summary["left_out"] if one["why"]]
+    if left:
+        sections.append(Section("Not asked", [replace(pairs(left), shown=6)], terminal=True))
+    if state.during is not None:
+        sections[-1] = replace(
+            sections[-1], parts=[*sections[-1].parts, TEXTS("how_to_go_on", folder=str(view.folder.path))]
         )
-        return Part(
-            check.name,
-            check.name.capitalize(),
-            f"The calculator failed: it {error.message}.",
-            findings=[failed],
-            skipped=[(f"the rest of {check.name}", error.message)],
-            seconds=perf_counter() - began,
-        )
+    if (script := view.folder.path / _SCRIPT).exists():
+        code = Code("A script that shows it without mdnum", read_text(script))
+        sections.append(Section("Reproduce", [code]))
+    for result in state.shown:
+        parts = [
+            *(_plot(result, place, given) for place in range(len(result.charts))),
+            *(
+                _marked(_in_units(rows, given), _in_units(title, given))
+                for title, rows in result.tables.items()
+                if rows
+            ),
+        ]
+        sections.append(Section(result.title, parts))
+    sections.append(Section("What was asked about", [pairs(list(_subject(summary, given)))]))
+    return Page(
+        title=f"Audit of {state.name}",
+        about=f"{state.name}, {summary['formula']}, {many(summary['atoms'], 'atom')}",
+        keys=list(_keys(summary, verdict, given)),
+        sections=sections,
+        provenance=view.folder.provenance,
+    )
+
+
+def _ways(part: Mapping[str, Any]) -> str:
+    return TEXTS("ways_asked" if part["asked"] == part["possible"] else "ways_of", **part)
+
+
+def _marked(rows: Sequence[Mapping[str, Any]], title: str) -> Any:
+    """A table with what went wrong on top, where it is seen."""
+    order = sorted(rows, key=lambda row: not any(value is False for value in row.values()))
+    bad = frozenset(n for n, row in enumerate(order) if any(value is False for value in row.values()))
+    return replace(records(order, title, shown=8), bad=bad)
+
+
+def _plot(result: CheckResult, place: int, given: units.Units) -> Plot:
+    chart = result.charts[place]
+    few = len(chart.x) < 40
+    series = tuple(
+        Series(label, np.array(chart.x), np.array(line, float), "line+points" if few else "line", role)  # type: ignore[arg-type]
+        for (label, line), role in zip(_in_units(chart.lines, given).items(), _ROLES * 9, strict=False)
+    )
+    log_x = chart.log_y and "step" in chart.x_label and all(x > 0 for x in chart.x)
+    words = {name: _in_units(getattr(chart, name), given) for name in ("title", "x_label", "y_label")}
+    return Plot(
+        f"{result.name}-{place + 1}", **words, series=series,
+        x_scale="log" if log_x else "linear",
+        y_scale="log" if chart.log_y else "linear",
+        verticals=tuple((value, _in_units(word, given)) for word, value in chart.marks.items()),
+    )  # fmt: skip
+
+
+def _keys(summary: Mapping[str, Any], verdict: Verdict, given: units.Units) -> Iterator[Key]:
+    yield Key("To run", summary["safe_to_run"], "a simulation with it")
+    yield Key("To differentiate", summary["safe_to_differentiate"], "through it")
+    severe = [one.severity for one in verdict.findings if not one.cause and one.severity != "info"]
+    yield Key("Findings", count(len(severe)), many(severe.count("error"), "error"))
+    numbers = {part["name"]: part["numbers"] for part in summary["parts"]}
+    if (dynamics := numbers.get("dynamics", {})).get("drift") is not None:
+        yield Key("Drift", number(dynamics["drift"], 2, signed=True), dynamics["drift_unit"])
+    if "largest_difference" in (forces := numbers.get("forces", {})):
+        unit = f"from differences, {given.energy}/{given.length}"
+        yield Key("Forces", number(forces["largest_difference"], 1), unit)
+    if "told_apart" in (ways := numbers.get("invariance", {})):
+        differ = f"{count(ways['told_apart'])} of {count(ways['ways'])}"
+        yield Key("Answers differ", differ, "ways to write it down")
+
+
+def _subject(summary: Mapping[str, Any], given: units.Units) -> Iterator[tuple[str, str]]:
+    axes = [axis for axis, yes in zip("abc", summary["periodic"], strict=True) if yes]
+    periodic = f"periodic along {', '.join(axes)}" if axes else "not periodic"
+    yield "Calculator", summary["calculator"]
+    yield "Structure", f"{summary['formula']}, {count(summary['atoms'])} atoms, {periodic}"
+    if summary.get("structure"):
+        yield "Origin", summary["structure"]
+    yield "kT", f"{number(summary['kT'], 4)} {given.energy}"
+    yield "Took", f"{cell(summary['seconds'])} s"
+
+
+def _load(folder: RunFolder) -> AuditState:
+    from mdnum.audit.record import kept
+
+    return kept(folder)
+
+
+VERBS = {"audit": Verb(_judge, _page, load=_load)}

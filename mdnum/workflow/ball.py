@@ -1,42 +1,44 @@
-"""`mdnum ball` as a function: bounce, compare variants and gradients, judge, report."""
+"""`mdnum ball` as a function: bounce a ball, compare variants and gradients, judge, show."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from mdnum.errors import InputError
-from mdnum.store import RunFolder
-from mdnum.store.naming import default_folder
+from mdnum.report.finding import Finding, Verdict, conclude
+from mdnum.report.words import count, listed, number
+from mdnum.workflow import frame
+from mdnum.workflow.ball_page import (
+    TEXTS,
+    applied,
+    decision,
+    ended,
+    first_step,
+    located,
+    margin_ratio,
+    page,
+    parameters,
+    time_of,
+)
+from mdnum.workflow.frame import Outcome, Progress, Verb, View
 
 if TYPE_CHECKING:
-    from mdnum.ball.problem import Problem
+    from mdnum.ball.problem import BallProblem
     from mdnum.ball.rollout import BallRun
     from mdnum.systems.ball_system import BallSystem
     from mdnum.systems.build_ball import BallSimulation
 
-Progress = Callable[[int, int, dict[str, Any]], None]
-
 #: Balls times steps of which every state is kept, and residuals of stop decisions kept.
 _STATES, _RESIDUALS = 20_000_000, 5_000_000
-
-
-@dataclass(frozen=True)
-class BallResult:
-    """A finished run of the ball.
-
-    Attributes:
-        folder: the run folder.
-        run: every decision, and every state where there was room for them.
-        summary: what summary.json says, findings and verdict included.
-    """
-
-    folder: Path
-    run: BallRun
-    summary: dict[str, Any]
+#: Relative difference from which on two derivatives disagree.
+_DISAGREE = 0.01
+#: Variants that a finding names one by one.
+_NAMED = 4
 
 
 def bounce(
@@ -48,7 +50,7 @@ def bounce(
     against: Sequence[str | Mapping[str, Any]] = (),
     report: bool = True,
     progress: Progress | None = None,
-) -> BallResult:
+) -> Outcome:
     """Run a ball's system and its variants, record every contact and stop decision, and write a report.
 
     Args:
@@ -61,29 +63,23 @@ def bounce(
         progress: called now and then with step, steps and a dictionary of figures.
 
     Returns:
-        the run's folder, the run and its summary.
+        the run's folder, summary and page; `result` is the `BallRun`.
 
     Raises:
         InputError: the system cannot be run. FolderError: the folder cannot be used.
     """
-    from mdnum.provenance import collect
     from mdnum.systems.build_ball import build_ball
+    from mdnum.workflow import ball_record
 
     simulation = build_ball(_loaded(system, overrides, against), steps=steps)
-    name = simulation.system.name
-    folder = RunFolder.create(default_folder(name) if out is None else out, world="ball")
-    try:
-        folder.write_system(simulation.system.to_toml())
-        folder.write_provenance(collect(simulation.system))
-        run, summary = _fill(folder, simulation, progress)
-        folder.finalize()
-        folder.write_summary(summary)
-    except BaseException:
-        folder.close()
-        raise
-    _say(progress, run.steps, "report" if report else "check")
-    _judge(folder, report)
-    return BallResult(folder.path, run, folder.summary)
+    with frame.new_folder("ball", simulation.system.name, out, system=simulation.system) as folder:
+        began = time.perf_counter()
+        run, rate = _simulate(simulation.problem, progress)
+        made, apart = _differentiated(simulation, run, progress)
+        summary = ball_record.summarize(simulation, run) | made
+        summary |= {"steps_per_second": rate, "seconds": time.perf_counter() - began}
+        frame.store(folder, summary, ball_record.tables(run) | {"separations": apart})
+    return frame.finish(folder, report=report, result=run, progress=progress)
 
 
 def _loaded(
@@ -119,82 +115,64 @@ def _changes(text: str) -> dict[str, str]:
     return {key.strip(): value.strip()}
 
 
-def _fill(
-    folder: RunFolder, simulation: BallSimulation, progress: Progress | None
-) -> tuple[BallRun, dict[str, Any]]:
-    """Runs base and variants and puts what they say into the folder's tables and the summary."""
-    from mdnum.workflow import ball_exact, ball_record, ball_tables
-
-    problem = simulation.problem
-    began = time.perf_counter()
-    run, rate = _simulate(problem, progress)
-    ball_tables.write(folder, run)
-    _say(progress, run.steps, "gradient")
-    gradient = gradients(problem, simulation.system.spec.gradient)
-    variants = []
-    for variant in simulation.variants:
-        _say(progress, run.steps, f"variant {variant.name}")
-        # without histories: the program is then the one that its gradient runs, and is compiled once
-        other = variant.problem.run(keep=run.kept)
-        parted = ball_record.parted(run, other)
-        folder.append("separations", ball_tables.separations(variant, parted))
-        theirs = gradients(variant.problem, simulation.system.spec.gradient, first=True)
-        found = ball_record.compared(variant, parted, other, gradient, theirs)
-        variants.append({**found, "loss": loss(variant.problem, theirs)})
-    summary = ball_record.summarize(simulation, run)
-    summary |= {
-        "loss": loss(problem, gradient),
-        "gradient": gradient,
-        "exact": ball_exact.exact(simulation.system, run, gradient),
-        "variants": variants,
-        "steps_per_second": rate,
-        "seconds": time.perf_counter() - began,
-    }
-    return run, summary
-
-
-def _simulate(problem: Problem, progress: Progress | None) -> tuple[BallRun, float | None]:
+def _simulate(problem: BallProblem, progress: Progress | None) -> tuple[BallRun, float | None]:
     """The run, and steps per second after the part that holds the compilation (None for a short one)."""
     marks: list[tuple[float, int]] = []
 
+    def rate() -> float | None:
+        if len(marks) < 2 or marks[-1][0] == marks[0][0]:
+            return None
+        return (marks[-1][1] - marks[0][1]) / (marks[-1][0] - marks[0][0])
+
     def note(made: int, steps: int) -> None:
         marks.append((time.perf_counter(), made))
-        info: dict[str, Any] = {"phase": "run"}
-        if (rate := _rate(marks)) is not None:
-            info["steps_per_second"] = rate
-        if progress is not None:
-            progress(made, steps, info)
+        speed = rate()
+        frame.say(progress, "run", made, steps, **({} if speed is None else {"steps_per_second": speed}))
 
-    _say(progress, 0, "compile")
-    balls = _balls(problem)
-    decisions = problem.steps * (_cap(problem) + 1)
+    frame.say(progress, "compile")
+    world = problem.world
+    rule = getattr(world.contact, "stop", None) or getattr(world.integrator, "stop", None)
+    cap = 0 if rule is None else rule.max_iter
     run = problem.run(
-        history=_cap(problem) > 0 and decisions <= _RESIDUALS,
-        keep=balls * problem.steps <= _STATES,
+        history=cap > 0 and problem.steps * (cap + 1) <= _RESIDUALS,
+        keep=np.size(problem.y0) * problem.steps <= _STATES,
         progress=note,
     )
-    return run, _rate(marks)
+    return run, rate()
 
 
-def _rate(marks: Sequence[tuple[float, int]]) -> float | None:
-    if len(marks) < 2 or marks[-1][0] == marks[0][0]:
-        return None
-    return (marks[-1][1] - marks[0][1]) / (marks[-1][0] - marks[0][0])
+def _differentiated(
+    simulation: BallSimulation, run: BallRun, progress: Progress | None
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Loss, derivatives, closed form and variants; and the separations from the variants."""
+    from mdnum.ball.compare import first_difference
+    from mdnum.workflow import ball_record
+
+    problem, asked = simulation.problem, simulation.system.spec.gradient
+    frame.say(progress, "gradient", run.steps)
+    gradient = gradients(problem, asked)
+    variants, apart = [], []
+    for variant in simulation.variants:
+        frame.say(progress, f"variant {variant.name}", run.steps)
+        # without histories: the program is then the one that its gradient runs, and is compiled once
+        other = variant.problem.run(keep=run.kept)
+        found = first_difference(run, other)
+        apart.append(ball_record.separations(variant.name, found))
+        theirs = gradients(variant.problem, asked, first=True)
+        described = ball_record.compared(variant, found, other, gradient, theirs)
+        variants.append({**described, "loss": loss(variant.problem, theirs)})
+    empty = {"variant": np.zeros(0, str), "step": np.zeros(0, int), "separation": np.zeros(0)}
+    rows = {name: np.concatenate([one[name] for one in apart] or [none]) for name, none in empty.items()}
+    made = {
+        "loss": loss(problem, gradient),
+        "gradient": gradient,
+        "exact": ball_record.exact(simulation.system, run, gradient),
+        "variants": variants,
+    }
+    return made, rows
 
 
-def _balls(problem: Problem) -> int:
-    import numpy as np
-
-    return int(np.size(problem.y0))
-
-
-def _cap(problem: Problem) -> int:
-    """The most iterations of a solve; 0 where nothing is solved."""
-    rule = getattr(problem.world.contact, "stop", None) or getattr(problem.world.integrator, "stop", None)
-    return 0 if rule is None else rule.max_iter
-
-
-def gradients(problem: Problem, asked: Any, first: bool = False) -> list[dict[str, Any]]:
+def gradients(problem: BallProblem, asked: Any, first: bool = False) -> list[dict[str, Any]]:
     """Each derivative that was asked for, as a plain mapping.
 
     Args:
@@ -202,7 +180,7 @@ def gradients(problem: Problem, asked: Any, first: bool = False) -> list[dict[st
         asked: the [gradient] table.
         first: only the first method.
     """
-    from mdnum.ball.gradients import compare
+    from mdnum.gradients.ball import compare
 
     if not asked.of:
         return []
@@ -210,11 +188,11 @@ def gradients(problem: Problem, asked: Any, first: bool = False) -> list[dict[st
     found: list[dict[str, Any]] = [
         {
             "method": one.method,
-            "says": one.says,
+            "says": one.description,
             "value": float(one.value),
             "gradient": {name: float(value) for name, value in one.gradient.items()},
             "depends": {name: bool(value) for name, value in one.depends.items()},
-            "why": dict(one.why),
+            "why": dict(one.notes),
             "details": dict(one.details),
             "refused": False,
         }
@@ -228,25 +206,238 @@ def gradients(problem: Problem, asked: Any, first: bool = False) -> list[dict[st
     return found
 
 
-def loss(problem: Problem, gradient: Sequence[Mapping[str, Any]]) -> float:
+def loss(problem: BallProblem, gradient: Sequence[Mapping[str, Any]]) -> float:
     """The loss, taken from a derivative of the program itself where there is one: it is compiled already."""
     same = ("unrolled", "frozen", "event-aware")
     known = [made["value"] for made in gradient if made["method"] in same and not made["refused"]]
     return known[0] if known else problem.value()
 
 
-def _judge(folder: RunFolder, report: bool) -> None:
-    """Puts findings and verdict into the summary, and writes the report where it is wanted."""
-    if report:
-        from mdnum.report.ball.html import write_report
-
-        write_report(folder)
-    else:
-        from mdnum.report.ball.findings import record
-
-        record(folder)
+# --- judged -------------------------------------------------------------------------------------------
 
 
-def _say(progress: Progress | None, step: int, phase: str) -> None:
-    if progress is not None:
-        progress(step, 0, {"phase": phase})
+def judge(view: View) -> Verdict:
+    """Findings, and what is right, from the folder alone."""
+    summary = view.summary
+    rules = (
+        _finite, _ledger, _finite_gradient, _independent, _ambiguous, _cap, _disagree, _forks, _iterations,
+        _resting,
+    )  # fmt: skip
+    found = [finding for rule in rules for finding in rule(view)]
+    sizes = {"balls": summary["balls"], "steps": summary["steps"]}
+    return conclude(
+        [*found, *view.kept(TEXTS.entries)],
+        _evidence(view, {finding.code for finding in found}),
+        headline=TEXTS("headline", contacts=summary["flips_entered"], **sizes),
+        best="good",
+    )
+
+
+def _evidence(view: View, codes: set[str]) -> Iterator[str]:
+    summary, exact = view.summary, view.summary["exact"] or {}
+    flips = summary["flips_entered"] + summary["flips_left"]
+    if "LEDGER_INCOMPLETE" not in codes:
+        yield TEXTS("flips", flips=flips, steps=summary["steps"])
+    solves = ended(view)
+    if solves and not located(view):
+        ways = listed([f"{word} {count(n)}" for word, n in solves.items()])
+        yield TEXTS("solves", solves=sum(solves.values()), ways=ways)
+    if not summary["ambiguous"]:
+        yield TEXTS("rounding")
+        ratio = margin_ratio(view)
+        if np.any(np.isfinite(ratio)):
+            yield TEXTS("nearest_flip", ratio=float(ratio[np.isfinite(ratio)].min()))
+        if summary["smallest_stop_margin"] is not None:
+            yield TEXTS("nearest_stop", margin=summary["smallest_stop_margin"])
+    if exact:
+        yield TEXTS("exact", end=exact["height_error"], most=exact["height_error_largest"])
+    for name, slope in (exact.get("gradient") or {}).items():
+        met = [one["method"] for one in applied(view) if not differs(one["gradient"].get(name), slope)]
+        if met:
+            yield TEXTS("met", names=name, methods=listed(met))
+
+
+def differs(first: float | None, second: float | None) -> bool:
+    """Whether two derivatives differ by more than one percent of the larger; missing ones differ."""
+    if first is None or second is None:
+        return first is not second
+    return abs(first - second) > _DISAGREE * max(abs(first), abs(second))
+
+
+def _finite(view: View) -> Iterator[Finding]:
+    broken = view.summary["not_finite"]
+    if broken is None and ended(view).get("not finite"):
+        broken = first_step(view, "not finite")
+    if broken is not None:
+        yield TEXTS.finding("NOT_FINITE", step=broken)
+
+
+def _ledger(view: View) -> Iterator[Finding]:
+    series, contacts = view.table("steps"), view.table("contacts")
+    change = series["entered"].astype(np.int64) - series["left"].astype(np.int64)
+    wrong = series["contacts"] != series["contacts"][0] + np.cumsum(change) - change[0]
+    flips = int(series["entered"].sum(dtype=np.int64) + series["left"].sum(dtype=np.int64))
+    order = np.lexsort((contacts["step"], contacts["ball"]))
+    ball, entered = contacts["ball"][order], contacts["entered"][order].astype(bool)
+    section = "Contacts"
+    if wrong.any():
+        step = int(series["step"][np.argmax(wrong)])
+        yield TEXTS.finding("LEDGER_INCOMPLETE", "balance", step=step, section=section)
+    elif flips != len(ball):
+        yield TEXTS.finding("LEDGER_INCOMPLETE", "rows", flips=flips, rows=len(ball), section=section)
+    elif np.any((ball[1:] == ball[:-1]) & (entered[1:] == entered[:-1])):
+        yield TEXTS.finding("LEDGER_INCOMPLETE", "twice", section=section)
+
+
+def _finite_gradient(view: View) -> Iterator[Finding]:
+    found = [
+        f"d/d{name} by {made['method']}"
+        for made in applied(view)
+        for name, value in made["gradient"].items()
+        if value is None or not np.isfinite(value)
+    ]
+    if found:
+        yield TEXTS.finding("GRADIENT_NOT_FINITE", which=listed(found), section="Gradient")
+
+
+def _independent(view: View) -> Iterator[Finding]:
+    def unused(made: Mapping[str, Any]) -> tuple[str, ...]:
+        return tuple(name for name, depends in (made.get("depends") or {}).items() if not depends)
+
+    own = {f"by {made['method']}": unused(made) for made in applied(view)}
+    theirs = {f"in variant {variant['name']}": unused(variant) for variant in view.summary["variants"]}
+    places = {place: names for place, names in (own | theirs).items() if names}
+    if places:
+        groups: dict[tuple[str, ...], list[str]] = {}
+        for place, names in places.items():
+            groups.setdefault(names, []).append(place)
+        told = "; ".join(f"along {listed(names)} {listed(where)}" for names, where in groups.items())
+        implicit = "by implicit" in places
+        variants = ["only_implicit" if len(places) == 1 else "implicit"] if implicit else []
+        variants += ["variant"] * (not any(own.get(place) for place in own))
+        names = listed(list(dict.fromkeys(name for names in places.values() for name in names)))
+        finding = TEXTS.finding(
+            "LOSS_INDEPENDENT", *variants, names=names, places=listed(list(places)), told=told,
+            section="Gradient",
+        )  # fmt: skip
+        yield finding
+    zero: dict[str, list[str]] = {}
+    for made in applied(view):
+        for name, value in made["gradient"].items():
+            if value == 0 and (made.get("depends") or {}).get(name, True):
+                zero.setdefault(name, []).append(made["method"])
+    for name, methods in zero.items():
+        yield TEXTS.finding("ZERO_GRADIENT", name=name, methods=listed(methods), section="Gradient")
+
+
+def _ambiguous(view: View) -> Iterator[Finding]:
+    section = "Margins of decisions"
+    if contacts := view.summary["ambiguous_contacts"]:
+        yield TEXTS.finding("AMBIGUOUS_CONTACTS", contacts=contacts, section=section)
+    if stops := view.summary["ambiguous_stops"]:
+        yield TEXTS.finding("AMBIGUOUS_STOPS", stops=stops, section=section)
+
+
+def _cap(view: View) -> Iterator[Finding]:
+    solves = ended(view)
+    if capped := solves.get("cap", 0):
+        yield TEXTS.finding(
+            "SOLVER_CAP", section="Iterations per step", capped=capped, solves=sum(solves.values()),
+            step=first_step(view, "cap"), cap=(view.system.get("stop") or {}).get("max_iter", 0),
+        )  # fmt: skip
+
+
+def _disagree(view: View) -> Iterator[Finding]:
+    exact = (view.summary["exact"] or {}).get("gradient") or {}
+    rows = {
+        name: {made["method"]: made["gradient"][name] for made in applied(view)
+               if made["gradient"].get(name) is not None}
+        for name in parameters(view)
+    }  # fmt: skip
+
+    def told(names: Sequence[str]) -> str:
+        sides = {name: rows[name] | ({"closed form": exact[name]} if name in exact else {}) for name in names}
+        return "; ".join(
+            f"dloss/d{name}: " + ", ".join(f"{method} {number(value)}" for method, value in row.items())
+            for name, row in sides.items()
+        )
+
+    apart = [
+        name for name, row in rows.items() if any(differs(x, y) for x in row.values() for y in row.values())
+    ]
+    off = [
+        name
+        for name, row in rows.items()
+        if row and name not in apart and name in exact and differs(next(iter(row.values())), exact[name])
+    ]
+    if apart:
+        right = [
+            f"{method} on {name}"
+            for name in apart
+            for method, value in rows[name].items()
+            if name in exact and not differs(value, exact[name])
+        ]
+        known = any(name in exact for name in apart)
+        yield TEXTS.finding(
+            "METHODS_DISAGREE", *(["right"] if right else ["none"] if known else []), section="Gradient",
+            names=listed([f"dloss/d{name}" for name in apart]), told=told(apart),
+            right=listed(right) if right else "",
+        )  # fmt: skip
+    if off:
+        section = "Against the closed form"
+        yield TEXTS.finding("OFF_CLOSED_FORM", names=listed(off), told=told(off), section=section)
+
+
+def _forks(view: View) -> Iterator[Finding]:
+    own = (applied(view) or [{"gradient": {}}])[0]["gradient"]
+    forked = [variant for variant in view.summary["variants"] if variant["fork"] is not None]
+
+    def rounding(variant: Mapping[str, Any]) -> bool:
+        changes = variant["changes"]
+        return bool(changes) and all(str(key).startswith("precision.") for key in changes)
+
+    def moved(variant: Mapping[str, Any]) -> bool:
+        return any(differs(value, own[name]) for name, value in variant["gradient"].items() if name in own)
+
+    for precise in (True, False):
+        group = [variant for variant in forked if rounding(variant) == precise]
+        if not group:
+            continue
+        told = " ".join(
+            TEXTS("fork", name=one["name"], what=decision(one), step=one["fork"], margin=one["margin"],
+                  there=one["margin_there"])
+            for one in group[:_NAMED]
+        )  # fmt: skip
+        words = ["precision"] * precise + ["others"] * (len(group) > _NAMED)
+        words += ["moved"] * (precise and any(map(moved, group)))
+        values: dict[str, Any] = {"variants": len(group), "told": told, "others": len(group) - _NAMED}
+        yield TEXTS.finding("FORKED", *words, section="Variants", **values)
+
+
+def _iterations(view: View) -> Iterator[Finding]:
+    found = [variant for variant in view.summary["variants"] if variant["iterations_differ"]]
+    if found:
+        told = listed(
+            [TEXTS("differs_at", name=one["name"], steps=one["iterations_differ"]) for one in found]
+        )
+        counted = "impacts" if located(view) else "iterations"
+        yield TEXTS.finding("ITERATIONS_DIFFER", counted=counted, told=told, section="Variants")
+
+
+def _resting(view: View) -> Iterator[Finding]:
+    series, section = view.table("steps"), "Heights and contacts"
+    if ended(view).get("rest"):
+        step = first_step(view, "rest")
+        rest = (view.summary["exact"] or {}).get("rest_time")
+        words = ["exact"] * (rest is not None)
+        time = float(time_of(view, np.array(step)))
+        yield TEXTS.finding("RESTING", *words, step=step, time=time, rest=rest, section=section)
+        return
+    off = series["contacts"] < view.summary["balls"]
+    last = int(np.flatnonzero(off)[-1]) + 1 if off.any() else 0
+    if len(off) - last > max(10, 0.05 * view.summary["steps"]):
+        since = int(series["step"][last])
+        yield TEXTS.finding("RESTING", "floor", step=since, section=section)
+
+
+VERBS = {"ball": Verb(judge, page)}

@@ -1,19 +1,157 @@
-"""What the summary of a ball's run says: counts, and how its variants compare."""
+"""What a run of the ball leaves in its folder: tables of every decision, a summary, the closed form."""
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
-from mdnum.ball.compare import Difference, first_difference
-from mdnum.ball.integrators import EventLocated
-from mdnum.ball.rollout import BallRun
+from mdnum.ball.compare import BallDifference
+from mdnum.ball.contacts import Penalty, Projection
+from mdnum.ball.exact import ExactImpact, ExactPenalty
+from mdnum.ball.rollout import BallRun, residual_bound
 from mdnum.ball.state import Reason
+from mdnum.ball.stopping import FixedCount
+from mdnum.systems import ball
+from mdnum.systems.ball_system import BallSystem
 from mdnum.systems.build_ball import BallSimulation, BallVariant
-from mdnum.workflow.ball_tables import ambiguous_flips, ambiguous_stops, rule_of, solved
+
+#: Balls whose heights are kept in the folder, and that are compared with the exact motion.
+FOLLOWED = 8
+#: Codes of `Reason`, from what says least to what says most about a step.
+_WORST = (Reason.NONE, Reason.FIXED, Reason.TOLERANCE, Reason.REST, Reason.CAP, Reason.NOT_FINITE)
+
+
+def tables(run: BallRun) -> dict[str, dict[str, np.ndarray]]:
+    """The rows of every table."""
+    made = {"steps": steps(run), "contacts": contacts(run), "solver": decisions(run)}
+    return made | ({"heights": heights(run)} if run.kept else {})
+
+
+def steps(run: BallRun) -> dict[str, np.ndarray]:
+    """A row per state 0..steps: contacts, flips, the solver's end, margins, mean height and energy."""
+    entered, left = run.contacts.counts(run.steps)
+    inside = run.contact.sum(axis=1)
+    first = inside[0] - entered[1] + left[1]
+    rows, kept = run.steps + 1, run.kept
+    residual, margin = _of_batch(run)
+    nearest = np.abs(run.height.astype(np.float64)).min(axis=1) if kept else np.full(run.steps, np.nan)
+    ambiguous = np.bincount(run.contacts.step[ambiguous_flips(run)], minlength=rows)
+    ambiguous[1:] += ambiguous_stops(run)
+    y = run.y.astype(np.float64) if kept else np.full((rows, 1), np.nan)
+    return {
+        "step": np.arange(rows),
+        "time": run.time,
+        "contacts": np.concatenate([[first], inside]),
+        "entered": entered,
+        "left": left,
+        "iterations": np.concatenate([[0], run.iterations.reshape(run.steps, -1).max(axis=1)]),
+        "reason": np.array(["none", *_words(run)]),
+        "residual": np.concatenate([[np.nan], residual]),
+        "stop_margin": np.concatenate([[np.nan], margin]),
+        "min_margin": np.concatenate([[np.nan], nearest]),
+        "ambiguous": ambiguous,
+        "mean_height": y.mean(axis=1),
+        "energy": run.energy.mean(axis=1) if kept else np.full(rows, np.nan),
+    }
+
+
+def contacts(run: BallRun) -> dict[str, np.ndarray]:
+    """A row per contact flip."""
+    flips = run.contacts
+    lift = 0.0 if run.world.lift is None else float(run.world.lift)
+    return {
+        "step": flips.step,
+        "ball": flips.subject[:, 0],
+        "entered": flips.entered,
+        "height": np.where(flips.entered, 0.0, lift) - flips.margin,
+        "margin": flips.margin,
+        "velocity": flips.extra["velocity"],
+        "bound": flips.bound,
+        "ambiguous": ambiguous_flips(run),
+    }
+
+
+def decisions(run: BallRun) -> dict[str, np.ndarray]:
+    """A row per stop decision of the steps that had something to solve.
+
+    Every one where one rule stops all balls and histories were kept; else the last one of each solve, and
+    the one before.
+    """
+    rule = rule_of(run)
+    if rule is None:
+        names = ("step", "ball", "iteration", "residual", "margin", "stopped")
+        return {name: np.zeros(0) for name in names} | {"reason": np.zeros(0, str)}
+    busy = solved(run)
+    if run.history is not None and run.iterations.ndim == 1:
+        return _histories(run, rule, busy)
+    at = np.argwhere(busy)
+    row = at[:, 0]
+    subject = at[:, 1] if at.shape[1] > 1 else np.full(len(at), -1)
+    pick = tuple(at.T)
+    count, reason = run.iterations[pick], run.reason[pick]
+    residual, margin, before = (
+        getattr(run, name)[pick].astype(np.float64) for name in ("residual", "margin", "before")
+    )
+    earlier = np.isfinite(before)
+    columns = {
+        "step": (row + 1, row[earlier] + 1),
+        "ball": (subject, subject[earlier]),
+        "iteration": (count, count[earlier] - 1),
+        # the threshold is the same for both, unless a solve is entered above another one
+        "residual": (residual, (residual + margin)[earlier] - before[earlier]),
+        "margin": (margin, before[earlier]),
+        "stopped": (_stopped(reason), np.zeros(int(earlier.sum()), bool)),
+        "reason": (_names(reason), np.full(int(earlier.sum()), "")),
+    }
+    order = np.lexsort([np.concatenate(columns[name]) for name in ("iteration", "ball", "step")])
+    return {name: np.concatenate(parts)[order] for name, parts in columns.items()}
+
+
+def _histories(run: BallRun, rule: Any, busy: np.ndarray) -> dict[str, np.ndarray]:
+    assert run.history is not None
+    rows = np.flatnonzero(busy)
+    history = run.history[rows]
+    number = np.broadcast_to(np.arange(history.shape[1], dtype=np.int32), history.shape)
+    made = number <= run.iterations[rows][:, None]
+    first = np.broadcast_to(history[:, :1], history.shape)
+    threshold = np.asarray(rule.threshold(jnp.asarray(first), jnp.asarray(number)))
+    with np.errstate(invalid="ignore"):
+        margin = (threshold - history).astype(np.float64)
+    last = number == run.iterations[rows][:, None]
+    reason = np.broadcast_to(run.reason[rows][:, None], history.shape)
+    return {
+        "step": np.broadcast_to(rows[:, None] + 1, history.shape)[made],
+        "ball": np.full(int(made.sum()), -1),
+        "iteration": number[made],
+        "residual": history[made].astype(np.float64),
+        "margin": margin[made],
+        "stopped": (last & _stopped(reason))[made],
+        "reason": np.where(last, _names(reason), "")[made],
+    }
+
+
+def heights(run: BallRun) -> dict[str, np.ndarray]:
+    """Height and velocity of the first balls at every step."""
+    count = min(run.balls, FOLLOWED)
+    shape = (run.steps + 1, count)
+    return {
+        "step": np.broadcast_to(np.arange(run.steps + 1)[:, None], shape).ravel(),
+        "ball": np.broadcast_to(np.arange(count), shape).ravel(),
+        "y": run.y[:, :count].astype(np.float64).ravel(),
+        "v": run.v[:, :count].astype(np.float64).ravel(),
+    }
+
+
+def separations(name: str, found: BallDifference) -> dict[str, np.ndarray]:
+    """A row per step: how far the heights of a variant are from those of the run."""
+    size = len(found.separation)
+    return {"variant": np.full(size, name), "step": np.arange(size), "separation": found.separation}
+
+
+# --- summary ------------------------------------------------------------------------------------------
 
 
 def summarize(simulation: BallSimulation, run: BallRun) -> dict[str, Any]:
@@ -25,12 +163,9 @@ def summarize(simulation: BallSimulation, run: BallRun) -> dict[str, Any]:
     margins = np.concatenate([run.margin[busy], run.before[busy]]).astype(np.float64)
     margins = np.abs(margins[np.isfinite(margins)])
     first = run.first_contact[run.first_contact > 0]
-    broken = _first_not_finite(run)
+    finite = np.all(np.isfinite(run.y.astype(float)) & np.isfinite(run.v.astype(float)), axis=1)
+    broken = None if finite.all() else int(np.argmin(finite)) if run.kept else run.steps
     flips, stops = int(ambiguous_flips(run).sum()), int(ambiguous_stops(run).sum())
-    findings = [
-        {field: getattr(one, field) for field in ("code", "severity", "title", "text", "remedy")}
-        for one in simulation.system.warnings
-    ]
     return {
         "world": "ball",
         "system": simulation.system.name,
@@ -53,49 +188,37 @@ def summarize(simulation: BallSimulation, run: BallRun) -> dict[str, Any]:
         "smallest_stop_margin": float(margins.min()) if len(margins) else None,
         "not_finite": broken,
         "status": "complete" if broken is None else "failed",
-        "findings": findings,
+        # remarks on the system itself, which judging the run keeps
+        "findings": simulation.system.warnings,
     }
-
-
-def parted(run: BallRun, other: BallRun) -> Difference:
-    """Where two runs part.
-
-    Counts that do not count the same (iterations of a solver, impacts inside a step, nothing) are no
-    decisions of one kind: then contacts alone are compared.
-    """
-    if _counted(run) != _counted(other):
-        none = np.zeros(run.steps, np.int32)
-        run, other = (dataclasses.replace(one, iterations=none) for one in (run, other))
-    return first_difference(run, other)
 
 
 def compared(
     variant: BallVariant,
-    found: Difference,
+    found: BallDifference,
     other: BallRun,
     gradient: Sequence[Mapping[str, Any]],
     theirs: Sequence[Mapping[str, Any]],
 ) -> dict[str, Any]:
-    """Where a variant parts from the run, and what that does to the loss and its gradient.
+    """Where a variant diverges from the run, and what that does to the loss and its gradient.
 
     Args:
         variant: what was changed.
-        found: where it parts from the run.
+        found: where it diverges from the run.
         other: the run with the change.
         gradient, theirs: derivatives of both, the first method's first.
     """
-    fork = None if found.fork is None else found.fork
     own, their = (dict(made[0]["gradient"]) if made else {} for made in (gradient, theirs))
-    separation = found.separation
+    forked, separation = found.fork is not None, found.separation
     return {
         "name": variant.name,
         "changes": dict(variant.changes),
         "seed": found.seed,
-        "fork": fork,
+        "fork": found.fork,
         "channel": found.channel or None,
-        "ball": None if fork is None or found.ball < 0 else found.ball,
-        "margin": None if fork is None else found.margins[0],
-        "margin_there": None if fork is None else found.margins[1],
+        "ball": found.ball if forked and found.ball >= 0 else None,
+        "margin": found.margins[0] if forked else None,
+        "margin_there": found.margins[1] if forked else None,
         "separation_end": float(separation[-1]) if len(separation) else None,
         "iterations_differ": found.iterations_differ,
         "contacts_differ": found.contacts_differ,
@@ -107,18 +230,128 @@ def compared(
     }
 
 
-def _counted(run: BallRun) -> str:
-    """What the iterations of a run are."""
-    if rule_of(run) is not None:
-        return "iterations"
-    return "impacts" if isinstance(run.world.integrator, EventLocated) else "nothing"
+def exact(system: BallSystem, run: BallRun, gradient: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
+    """Errors against the closed form, or None where there is none.
 
+    There is one for a ball above the floor under a constant acceleration downward, with an impact or a
+    projection (the ball with restitution) or a sharp penalty (the ball on a spring).
 
-def _first_not_finite(run: BallRun) -> int | None:
-    """The first state (of those kept) that holds a number which is not finite."""
-    fine = np.isfinite(run.y.astype(np.float64)).all(axis=1) & np.isfinite(run.v.astype(np.float64)).all(
-        axis=1
-    )
-    if fine.all():
+    Args:
+        system: what the file says.
+        run: of it.
+        gradient: derivatives, of which those of the final height are compared.
+    """
+    spec, contact = system.spec, system.spec.contact
+    pull = spec.flight.gravity
+    if isinstance(spec.flight.control, ball.ConstantControl):
+        pull -= spec.flight.control.value
+    elif not isinstance(spec.flight.control, ball.NoControl):
         return None
-    return int(np.argmin(fine)) if run.kept else run.steps
+    y0, v0 = run.y[0].astype(np.float64), run.v[0].astype(np.float64)
+    spring = isinstance(contact, ball.PenaltyContact)
+    if pull <= 0 or (spring and (contact.eps > 0 or contact.damping**2 == 4 * contact.k)):
+        return None
+    if contact.hysteresis is not None or not run.kept or np.any(y0 < 0) or np.any((y0 == 0) & (v0 == 0)):
+        return None
+    count = min(run.balls, FOLLOWED)
+    motions: list[ExactPenalty | ExactImpact] = [
+        ExactPenalty(y0[n], v0[n], pull, contact.k, contact.damping)
+        if isinstance(contact, ball.PenaltyContact)
+        else ExactImpact(y0[n], v0[n], pull, contact.restitution)
+        for n in range(count)
+    ]
+    begins = [float(motion.first_contact().value) for motion in motions]
+    right = np.stack([motion.height(run.time).value for motion in motions], axis=1)
+    off = np.abs(run.y[:, :count].astype(np.float64) - right)
+    found: dict[str, Any] = {
+        "model": type(motions[0]).__name__,
+        "balls": count,
+        "height_error": float(off[-1].max()),
+        "height_error_largest": float(off.max()),
+        "height_error_before_contact": float(off[run.time < min(begins)].max()),
+        "first_contact_time": begins[0],
+        "first_contact_step": int(run.first_contact[0]),
+    }
+    if isinstance(motions[0], ExactImpact) and motions[0].restitution < 1:
+        found["rest_time"] = float(motions[0].rest_time().value)
+    if count < run.balls or spec.loss.kind == "residual-penetration" or spec.loss.target is not None:
+        return found
+    # the loss is a height; one over the steps does not count the start
+    times = run.time[-1:] if spec.loss.kind == "final-height" else run.time[1:]
+    known = [motion.height(times).gradient for motion in motions]
+    slopes = {
+        name: float(np.mean([one[name] for one in known])) for name in known[0] if name in spec.gradient.of
+    }
+    found["gradient"] = slopes
+    found["gradient_error"] = {
+        made["method"]: {name: made["gradient"][name] - slopes[name] for name in slopes}
+        for made in gradient
+        if not made.get("refused")
+    }
+    return found
+
+
+# --- parts --------------------------------------------------------------------------------------------
+
+
+def rule_of(run: BallRun) -> Any:
+    """The rule that stops this run's solver, or None where nothing is solved."""
+    contact = run.world.contact
+    if isinstance(contact, Projection):
+        return contact.stop
+    return getattr(run.world.integrator, "stop", None) if isinstance(contact, Penalty) else None
+
+
+def solved(run: BallRun) -> np.ndarray:
+    """Steps (and balls, where each has a solve of its own) with something to solve or locate."""
+    if rule_of(run) is None:
+        return run.reason != Reason.NONE.value
+    if isinstance(run.world.contact, Penalty):
+        return np.ones(run.iterations.shape, bool)
+    touched = run.contact if run.iterations.ndim == 2 else run.contact.any(axis=1)
+    return touched | (run.iterations > 0)
+
+
+def ambiguous_flips(run: BallRun) -> np.ndarray:
+    """Contact flips that another rounding could have dated otherwise; an exact height is not one."""
+    return run.contacts.ambiguous & (run.contacts.bound > 0)
+
+
+def ambiguous_stops(run: BallRun) -> np.ndarray:
+    """Stop decisions of each step that another order of the residual's sum could have made otherwise."""
+    rule = rule_of(run)
+    if rule is None or isinstance(rule, FixedCount):
+        return np.zeros(run.steps, np.int64)
+    share = residual_bound(run.world, 1.0, 1 if run.iterations.ndim == 2 else run.balls)
+    busy = solved(run)
+    residual = run.residual.astype(np.float64)
+    near = np.zeros(busy.shape, bool)
+    for margin in (run.margin.astype(np.float64), run.before.astype(np.float64)):
+        near |= np.isfinite(margin) & (np.abs(margin) <= share * (residual + np.abs(run.margin - margin)))
+    return (near & busy).reshape(run.steps, -1).sum(axis=1)
+
+
+def _of_batch(run: BallRun) -> tuple[np.ndarray, np.ndarray]:
+    """Residual and stop margin of each step; of the ball nearest to its tolerance where each has its own."""
+    residual, margin = run.residual.astype(np.float64), run.margin.astype(np.float64)
+    if residual.ndim == 1:
+        return residual, margin
+    near = np.where(np.isfinite(margin), np.abs(margin), np.inf).argmin(axis=1)[:, None]
+    return np.take_along_axis(residual, near, 1)[:, 0], np.take_along_axis(margin, near, 1)[:, 0]
+
+
+def _words(run: BallRun) -> np.ndarray:
+    rank = np.zeros(max(Reason) + 1, np.int64)
+    rank[[code.value for code in _WORST]] = np.arange(len(_WORST))
+    worst = rank[run.reason.reshape(run.steps, -1)].max(axis=1)
+    # a step without contact ends its solve before it begins
+    busy = solved(run).reshape(run.steps, -1).any(axis=1)
+    return np.where(busy, np.array([code.word for code in _WORST])[worst], Reason.NONE.word)
+
+
+def _names(reason: np.ndarray) -> np.ndarray:
+    return np.array([code.word for code in Reason])[reason]
+
+
+def _stopped(reason: np.ndarray) -> np.ndarray:
+    return np.isin(reason, [Reason.TOLERANCE.value, Reason.FIXED.value])

@@ -1,67 +1,92 @@
-"""`mdnum conform` as a function: a neighbor list through the conformance suite, into a folder."""
+"""`mdnum conform`: does a neighbor list list the right pairs? The conformance suite, into a folder."""
 
 from __future__ import annotations
 
-import json
 import re
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from time import monotonic
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
+from annotated_types import Ge, Le
 
-from mdnum.errors import FolderError, InputError
-from mdnum.store import RunFolder, expect, manifest, restoring
-from mdnum.store.atomic import read_text, write_text
-from mdnum.store.naming import default_folder
-from mdnum.workflow.fork_question import Log, Progress, finish
+from mdnum.deadline import Deadline
+from mdnum.errors import InputError
+from mdnum.references.conformance.case import AREAS
+from mdnum.references.conformance.judge import CODES, DOUBLE, SILENT, SINGLE
+from mdnum.references.conformance.lists import LIMITS, PairList
+from mdnum.references.conformance.results import CaseAnswers, Failed, Report
+from mdnum.report.finding import Finding, Texts, Verdict, conclude
+from mdnum.report.section import Code, Figure, Key, Page, Section, Table, pairs
+from mdnum.report.svg import BAD, FIRST, MUTED, SECOND
+from mdnum.report.words import count, listed, many, number
+from mdnum.store import RunFolder, answers, files
+from mdnum.store.files import read_text, write_text
+from mdnum.workflow import frame
+from mdnum.workflow.frame import Outcome, Progress, Verb, View
 
 if TYPE_CHECKING:
-    from mdnum.references.conformance.answers import Answers
-    from mdnum.references.conformance.lists import PairList
-    from mdnum.references.conformance.suite import Report
+    from matplotlib.figure import Figure as Canvas
 
-#: Roundoff by the word for it.
-PRECISIONS = {"float64": 2.0**-53, "float32": 2.0**-24}
-#: Words of `limits`, and the limit that each of them is.
-LIMITS = {
-    "minimum-image": "minimum_image",
-    "orthorhombic": "orthorhombic",
-    "along-axes": "along_axes",
-    "all-axes": "all_axes",
-    "periodic": "periodic",
-    "free": "free",
-    "wrapped": "wrapped",
-    "fixed-cell": "fixed_cell",
-    "right-handed": "right_handed",
-    "lower-triangular": "lower",
-    "whole-cell": "whole_cell",
-}
+TEXTS = Texts(__file__)
+#: Roundoff by the name of the precision.
+PRECISIONS = {"float64": DOUBLE, "float32": SINGLE}
 #: Random cases that can be asked for: they are drawn before the first is asked, some 300 a second.
 MOST_CASES = 100_000
-#: What a function, and a list that is kept, are to do.
+#: Areas of a list that is kept and brought up to date.
+_IN_USE = ("motion", "wrapping", "strain", "rule")
 _RETURNS = "(i, j), (i, j, shift), (i, j, shift, distance) or a mapping with i and j: an entry for each pair"
-_CONTRACT = {
-    False: f"Give a function of (positions, cell, pbc, r_cut) that returns {_RETURNS}",
-    True: f"Let allocate and update return {_RETURNS}",
-}
 
 
 @dataclass(frozen=True)
-class ConformResult:
-    """A finished examination.
+class Options:
+    """What an examination was begun with."""
+
+    cases: Annotated[int, Ge(0), Le(MOST_CASES)]
+    seed: int = 0
+    large: bool = True
+    full: bool | None = None
+    precision: Literal["float64", "float32"] | None = None
+    superset: bool | None = None
+    limits: tuple[str, ...] = ()
+
+    def declared(self, tested: PairList) -> PairList:
+        """A list with what its user declares about it.
+
+        Raises:
+            InputError: a precision, a limit or a number of cases that there is not.
+        """
+        if not 0 <= self.cases <= MOST_CASES:
+            raise InputError(f"{self.cases:,} random cases", remedy=f"Ask for 0 to {MOST_CASES:,}")
+        if self.precision not in (None, *PRECISIONS):
+            raise InputError(f"precision = {self.precision!r}", remedy=f"Give one of {', '.join(PRECISIONS)}")
+        unknown = [word for word in self.limits if word not in LIMITS]
+        if unknown:
+            raise InputError(f"no limit is called {unknown[0]!r}", remedy=f"Give some of {', '.join(LIMITS)}")
+        unit = PRECISIONS.get(self.precision or "")
+        tested = tested.with_options(full=self.full, superset=self.superset, unit=unit)
+        limits: Any = {LIMITS[word]: True for word in self.limits}
+        return replace(tested, limits=replace(tested.limits, **limits))
+
+
+@dataclass
+class Examination(CaseAnswers):
+    """What answers.json holds, and an examination is resumed from.
 
     Attributes:
-        folder: the conform folder.
-        report: what was asked, what failed, and the conventions that were found out.
-        summary: what summary.json says, findings included.
+        word: what names the list; empty where it has no name.
+        tested: name and version of the list.
+        options: that it was begun with.
+        seconds: that were spent.
     """
 
-    folder: Path
-    report: Report
-    summary: dict[str, Any]
+    word: str = field(kw_only=True)
+    tested: tuple[str, str | None] = field(kw_only=True)
+    options: Options = field(kw_only=True)
+    seconds: Annotated[float, Ge(0)] = 0.0
 
 
 def conform(
@@ -79,10 +104,10 @@ def conform(
     resume: str | Path | None = None,
     report: bool = True,
     progress: Progress | None = None,
-) -> ConformResult:
+) -> Outcome:
     """Put a neighbor list through the conformance suite.
 
-    The folder is filled as answers come: one that was stopped, however, is gone on with by `resume`.
+    The folder is filled as answers come: one that was stopped, however, is resumed by `resume`.
 
     Args:
         pairs: a name (`references.conformance.known`), `package.module:function`, `file.py:function`, or a
@@ -99,232 +124,94 @@ def conform(
         limits: what it does not claim to do, words of `LIMITS`: such cases are not asked.
         time: minutes, after which no case is begun and no failure shrunk.
         out: the new folder; default runs/conform-<name>-<n>.
-        resume: a folder to go on with instead, with the options that it was begun with.
+        resume: a folder to resume instead, with the options that it was begun with.
         report: write report.html.
         progress: called now and then with cases done, cases and a dictionary of words.
+
+    Returns:
+        the outcome; its result is the `references.conformance.Report`.
 
     Raises:
         InputError: there is no such list, or it cannot be called, or what it returns is no list of pairs; or
             it is not the one that a folder was begun with.
         FolderError: the folder cannot be used.
     """
-    from mdnum.deadline import Deadline
-    from mdnum.provenance import surroundings
+    from mdnum.references.conformance.loading import from_object, load
     from mdnum.references.conformance.suite import CASES, Examiner, examine
 
     deadline = Deadline(time)
-    # what it holds is read by the one process that goes on from it
-    folder = None if resume is None else _taken(Path(resume))
-    examiner = None
-    try:
-        kept = None if folder is None else _kept(folder.path)
-        if kept is None:
-            options = {"cases": CASES if cases is None else cases, "seed": seed, "large": large, "full": full,
-                       "precision": precision, "superset": superset, "limits": list(limits)}  # fmt: skip
-            _refuse_many(options["cases"])
-        else:
-            options = kept.options
-            pairs = pairs or kept.words
+    with ExitStack() as stack:
+        folder = state = None
+        if resume is not None:
+            folder = answers.take(resume, "conform")
+            stack.callback(folder.close)
+            state = answers.restored(folder, Examination)
+            pairs = pairs or state.word
+        options = state.options if state is not None else Options(
+            CASES if cases is None else cases, seed, large, full, precision, superset, limits  # type: ignore
+        )  # fmt: skip
         if not pairs:
             raise InputError("no list is given", remedy="Give a name, package.module:function or a function")
-        tested = _declared(
-            _loaded(pairs),
-            options["full"],
-            options["precision"],
-            options["superset"],
-            tuple(options["limits"]),
-        )
-        if kept is not None and [tested.name, tested.version] != kept.tested:
-            was, now = (
-                " ".join(filter(None, words)) for words in (kept.tested, (tested.name, tested.version))
-            )
-            raise InputError(
-                f"was begun with {was}, not {now}", where=str(resume), remedy="Begin in a new folder"
-            )
+        tested = options.declared(load(pairs) if isinstance(pairs, str) else from_object(pairs))
+        name = tested.name, tested.version
+        if state is not None and state.tested != name:
+            was, now = (" ".join(filter(None, words)) for words in (state.tested, name))
+            remedy = "Begin in a new folder"
+            raise InputError(f"was begun with {was}, not {now}", where=str(resume), remedy=remedy)
         examiner = Examiner(tested, reuse=True, apart=True)
+        stack.callback(examiner.session.close)
         if (why := examiner.unusable()) is not None:
-            raise InputError(why, where=tested.name, remedy=_CONTRACT[tested.kept])
-        if folder is not None:
-            folder.write_anew(("areas", "failures"))
+            calls = "Let allocate and update return" if tested.kept else (
+                "Give a function of (positions, cell, pbc, r_cut) that returns"
+            )  # fmt: skip
+            raise InputError(why, where=tested.name, remedy=f"{calls} {_RETURNS}")
+        if folder is None:
+            slug = f"conform-{tested.name.replace(':', '-')}"
+            folder = stack.enter_context(frame.new_folder("conform", slug, out))
         else:
-            path = default_folder(f"conform-{_slug(tested.name)}") if out is None else out
-            folder = RunFolder.create(path, world="conform")
-            folder.write_provenance(surroundings() | {"list": tested.name, "list_version": tested.version})
-        keeper = _Keeper(folder, examiner.report, tested, options, kept)
-        found = examine(
+            folder.write_anew(("areas", "failures"))
+        state = state or Examination(word=tested.word, tested=name, options=options)
+        found, kept = examiner.report, answers.Answers(folder, state)
+        kept.save()
+        due = 0.0
+
+        def saved(urgent: bool) -> None:
+            """Keeps an answer; scripts and summary follow now and then."""
+            nonlocal due
+            kept.save(urgent)
+            if (now := monotonic()) >= due:
+                found.seconds = state.seconds
+                stopped = _summary(found, _write_scripts(folder, found), state.options.seed)
+                folder.write_summary(stopped | {"status": "stopped"})
+                # most of the time is for asking
+                due = monotonic() + max(10.0, 20 * (monotonic() - now))
+
+        examine(
             tested,
-            cases=options["cases"],
-            seed=options["seed"],
-            large=options["large"],
+            cases=options.cases,
+            seed=options.seed,
+            large=options.large,
             apart=True,
-            progress=Log(folder, progress),
+            progress=frame.logged(folder, progress),
             examiner=examiner,
             deadline=deadline,
-            answers=keeper.answers,
+            answers=state,
+            saved=saved,
         )
-        keeper.write(ended=True)
-    except BaseException:
-        if examiner is not None:
-            examiner.session.close()
-        if folder is not None:
-            folder.close()
-        raise
-    return ConformResult(folder.path, found, finish(folder, report, progress))
+        kept.save()
+        found.seconds = state.seconds
+        summary = _summary(found, _write_scripts(folder, found), options.seed)
+        names = ("area", "asked", "passed", "failed", "refused", "skipped")
+        tables = {"areas": _columns(summary["areas"], names)}
+        if found.failed:
+            names = ("code", "area", "case", "atoms", "steps", "step", "text", "script")
+            tables["failures"] = _columns(summary["failures"], names)
+        frame.store(folder, summary, tables)
+        return frame.finish(folder, report=report, result=found, progress=progress)
 
 
-@dataclass(frozen=True)
-class _Kept:
-    """What a folder holds to go on from.
-
-    Attributes:
-        words: that name the list; None where it had none.
-        tested: name and version of the list.
-        options: that it was begun with.
-        seconds: that were spent.
-        answers: that it gave.
-    """
-
-    words: str | None
-    tested: list[str | None]
-    options: dict[str, Any]
-    seconds: float
-    answers: Answers
-
-
-def _taken(path: Path) -> RunFolder:
-    """A folder that only this process goes on with.
-
-    Raises:
-        FolderError: nothing that can be gone on from, or another process writes it.
-    """
-    folder = RunFolder.open(path)
-    if not (path / "answers.json").is_file():
-        raise FolderError(
-            "holds no examination to go on with", where=str(path), remedy="Begin in a new folder"
-        )
-    folder.world = "conform"
-    folder.take()
-    return folder
-
-
-def _kept(path: Path) -> _Kept:
-    """What a folder holds to go on from, each of its values of the kind that it was.
-
-    Raises:
-        FolderError: it holds something else.
-    """
-    from mdnum.references.conformance.answers import Answers
-
-    file = path / "answers.json"
-    text = read_text(file)
-    with restoring(file):
-        told = json.loads(text)
-        expect(isinstance(told, dict), "no answers")
-        words, tested, options, seconds = (told[name] for name in ("list", "tested", "options", "seconds"))
-        expect(words is None or (isinstance(words, str) and words), "no name of a list")
-        expect(isinstance(tested, list) and len(tested) == 2, "no name and version of a list")
-        expect(isinstance(tested[0], str) and isinstance(tested[1], str | None), "no name and version")
-        expect(type(seconds) in (int, float) and 0 <= seconds < np.inf, "no seconds")
-        names = ("cases", "seed", "large", "full", "precision", "superset", "limits")
-        options = {name: options[name] for name in names}
-        for name in ("cases", "seed"):
-            expect(type(options[name]) is int, f"options.{name} is {options[name]!r}")
-        for name, kind in (("large", bool), ("full", bool | None), ("superset", bool | None)):
-            expect(isinstance(options[name], kind), f"options.{name} is {options[name]!r}")
-        expect(options["precision"] in (None, *PRECISIONS), f"precision is {options['precision']!r}")
-        expect(isinstance(options["limits"], list) and set(options["limits"]) <= set(LIMITS), "limits")
-        answers = Answers(told, str(file))
-    try:
-        _refuse_many(options["cases"])
-    except InputError as error:
-        raise FolderError(error.message, where=str(file), remedy="Begin in a new folder") from error
-    return _Kept(words, tested, options, float(seconds), answers)
-
-
-def _refuse_many(cases: int) -> None:
-    if not 0 <= cases <= MOST_CASES:
-        raise InputError(f"{cases:,} random cases", remedy=f"Ask for 0 to {MOST_CASES:,}")
-
-
-class _Keeper:
-    """Fills a folder while answers come: a kill, however hard, leaves what was found till then.
-
-    Args:
-        kept: what the folder held, of one that is gone on with.
-    """
-
-    def __init__(self, folder: RunFolder, found: Report, tested: PairList, options: Any, kept: _Kept | None):
-        from mdnum.references.conformance.answers import Answers
-
-        self._folder, self._found, self._seed = folder, found, options["seed"]
-        self._head = {
-            "list": tested.word,
-            "tested": [tested.name, tested.version],
-            "options": options,
-        }
-        self._before = 0.0 if kept is None else kept.seconds
-        self._began, self._due, self._due_in_words = monotonic(), 0.0, 0.0
-        self.answers = Answers() if kept is None else kept.answers
-        self.answers.saved = self._put
-        self._write_answers()
-
-    def _put(self, urgent: bool) -> None:
-        """One more answer; what fails is on disk at once, the rest within a second."""
-        now = monotonic()
-        if urgent or now >= self._due:
-            self._write_answers()
-            # most of the time is for asking
-            self._due = monotonic() + max(1.0, 20 * (monotonic() - now))
-        if now >= self._due_in_words:
-            self.write(ended=False)
-            self._due_in_words = monotonic() + max(10.0, 20 * (monotonic() - now))
-
-    def write(self, ended: bool) -> None:
-        """Scripts, summary and, at the end, tables."""
-        found = self._found
-        found.seconds = self._before + monotonic() - self._began
-        scripts = _write_scripts(self._folder, found)
-        if ended:
-            self._write_answers()
-            _write_tables(self._folder, found, scripts)
-            self._folder.finalize()
-        status = "stopped" if not ended or found.left or not found.whole else "complete"
-        self._folder.write_summary(_summary(found, scripts, self._seed) | {"status": status})
-
-    def _write_answers(self) -> None:
-        seconds = self._before + monotonic() - self._began
-        text = json.dumps(self._head | {"seconds": seconds} | self.answers.plain(), allow_nan=False)
-        write_text(self._folder.path / "answers.json", text)
-
-
-def _loaded(pairs: Any) -> PairList:
-    from mdnum.references.conformance.lists import PairList
-    from mdnum.references.conformance.loading import from_object, load
-
-    if isinstance(pairs, PairList):
-        return pairs
-    return load(pairs) if isinstance(pairs, str) else from_object(pairs)
-
-
-def _declared(
-    tested: PairList, full: bool | None, precision: str | None, superset: bool | None, limits: tuple[str, ...]
-) -> PairList:
-    """A list with what its user says about it."""
-    from dataclasses import replace
-
-    if precision is not None and precision not in PRECISIONS:
-        raise InputError(f"precision = {precision!r}", remedy=f"Give one of {', '.join(PRECISIONS)}")
-    unknown = [word for word in limits if word not in LIMITS]
-    if unknown:
-        raise InputError(f"no limit is called {unknown[0]!r}", remedy=f"Give some of {', '.join(LIMITS)}")
-    tested = tested.with_options(full=full, superset=superset, unit=PRECISIONS.get(precision or ""))
-    declared: Any = {LIMITS[word]: True for word in limits}
-    return replace(tested, limits=replace(tested.limits, **declared))
-
-
-def _slug(name: str) -> str:
-    """A name that a folder can have."""
-    return name.replace(":", "-")
+def _columns(rows: list[dict[str, Any]], names: tuple[str, ...]) -> dict[str, np.ndarray]:
+    return {name: np.array([row[name] for row in rows], None if rows else int) for name in names}
 
 
 def _script(code: str) -> str:
@@ -334,46 +221,83 @@ def _script(code: str) -> str:
 
 def _write_scripts(folder: RunFolder, found: Report) -> list[str]:
     """Writes a script for each failure, and removes those of mdnum that stand for none; their names."""
-    from mdnum.references.conformance.judge import CODES
     from mdnum.references.conformance.reproduction import script
 
     scripts = []
-    for number, failed in enumerate(found.failed, 1):
-        scripts.append(f"reproduce-{number}-{_script(failed.code)}")
+    for n, failed in enumerate(found.failed, 1):
+        scripts.append(f"reproduce-{n}-{_script(failed.code)}")
         lines = script(found.tested, failed, found.how, found.superset, found.reach(failed.case))
         path = folder.path / scripts[-1]
-        # what a link leads to is not looked at
+        # what a link leads to is not examined
         same = path.is_file() and not path.is_symlink()
-        if not (same and manifest.digest(path) == manifest.digest_of(lines.encode())):
+        if not (same and files.digest(path) == files.digest_of(lines.encode())):
             write_text(path, lines)
-    made = manifest.load(folder.path)
-    mine = re.compile(rf"reproduce-\d+-({'|'.join(re.escape(_script(code)) for code in CODES)})")
-    for name in made.files if made is not None else ():
-        if mine.fullmatch(name) and name not in scripts:
-            manifest.remove(folder.path / name)
+    listed = files.load(folder.path)
+    own = re.compile(rf"reproduce-\d+-({'|'.join(re.escape(_script(code)) for code in CODES)})")
+    for name in listed.files if listed is not None else ():
+        if own.fullmatch(name) and name not in scripts:
+            files.remove(folder.path / name)
     return scripts
 
 
-def _write_tables(folder: RunFolder, found: Report, scripts: list[str]) -> None:
-    """Puts areas and failures into tables."""
-    names = ("asked", "passed", "failed", "refused", "skipped")
-    folder.append(
-        "areas",
-        {
-            "area": np.array(list(found.areas)),
-            **{
-                name: np.array([getattr(tally, name) for tally in found.areas.values()], int)
-                for name in names
-            },
-        },
-    )
-    if found.failed:
-        rows = [_failure(failed, name) for failed, name in zip(found.failed, scripts, strict=True)]
-        folder.append("failures", {key: np.array([row[key] for row in rows]) for key in rows[0]})
+def _summary(found: Report, scripts: list[str], seed: int) -> dict[str, Any]:
+    """The content of summary.json, without headline and findings."""
+    tested = found.tested
+    why = {area: sorted(tally.why.items(), key=lambda one: -one[1]) for area, tally in found.areas.items()}
+    return {
+        "world": "conform",
+        "question": "conform",
+        "system": tested.name,
+        "about": tested.description,
+        "package": tested.package,
+        "version": tested.version,
+        "kept": tested.kept,
+        "full": found.how.full,
+        "shift_sign": found.how.sign,
+        "precision": "float64" if found.how.unit == DOUBLE else "float32",
+        "superset": found.superset,
+        "found_out": found.found_out,
+        "single": found.single and found.single.name,
+        "ties": {"counted": found.ties[0], "not_counted": found.ties[1]},
+        "keeps_order": found.keeps_order,
+        "shifts": found.shifts,
+        "aliased": found.aliased,
+        "known": dict(tested.known),
+        "refusals": [
+            {
+                "why": refusal.exception,
+                "case": refusal.case.name,
+                "atoms": refusal.case.atoms,
+                "uneven": refusal.uneven,
+                "answers": refusal.answers,
+            }
+            for refusal in found.refusals
+        ],
+        "questions": found.questions,
+        "left": found.left,
+        "padding": found.padding,
+        "padding_stated": found.stated,
+        "rule": {"motions": found.motions, "calls": found.calls},
+        "asked": found.asked,
+        "wrong": found.wrong,
+        "silent": sum(tally.silent for tally in found.areas.values()),
+        "conforms": found.conforms,
+        "areas": [
+            {"area": area, "about": AREAS[area], "passed": tally.passed, "silent": tally.silent}
+            | asdict(tally)
+            | {"why": [{"why": text, "cases": cases} for text, cases in why[area]]}
+            for area, tally in found.areas.items()
+        ],
+        "failures": [_failure(failed, name) for failed, name in zip(found.failed, scripts, strict=True)],
+        "large": None if found.large is None else {"atoms": found.large[0], "seconds": found.large[1]},
+        "seed": seed,
+        "seconds": found.seconds,
+        "findings": [],
+        "status": "stopped" if found.left or not found.whole else "complete",
+    }
 
 
-def _failure(failed: Any, script: str) -> dict[str, Any]:
-    """A failure as a row."""
+def _failure(failed: Failed, script: str) -> dict[str, Any]:
     return {
         "code": failed.code,
         "area": failed.case.area,
@@ -383,74 +307,272 @@ def _failure(failed: Any, script: str) -> dict[str, Any]:
         "step": failed.worst.step,
         "text": failed.worst.text,
         "script": script,
+        "alone": failed.alone,
     }
 
 
-def _summary(found: Report, scripts: list[str], seed: int) -> dict[str, Any]:
-    """The content of summary.json, without headline and findings."""
-    tested = found.tested
-    names = ("asked", "passed", "failed", "silent", "refused", "skipped")
-    return {
-        "world": "conform",
-        "question": "conform",
-        "system": tested.name,
-        "about": tested.about,
-        "package": tested.package,
-        "version": tested.version,
-        "kept": tested.kept,
-        "full": found.how.full,
-        "shift_sign": found.how.sign,
-        "precision": "float64" if found.how.unit == PRECISIONS["float64"] else "float32",
-        "superset": found.superset,
-        "found_out": found.found_out,
-        "single": None if found.single is None else found.single.name,
-        "ties": {"counted": found.ties[0], "not_counted": found.ties[1]},
-        "keeps_order": found.keeps_order,
-        "shifts": found.shifts,
-        "aliased": found.aliased,
-        "known": dict(tested.known),
-        "refusals": [
-            {
-                "why": one.words,
-                "case": one.case.name,
-                "atoms": one.case.atoms,
-                "uneven": list(one.uneven),
-                "answers": list(one.answers),
-            }
-            for one in found.refusals
-        ],
-        "questions": found.questions,
-        "left": found.left,
-        "padding": found.padding,
-        "padding_said": found.said,
-        "rule": {"motions": found.motions, "calls": found.calls},
-        "asked": found.asked,
-        "wrong": found.wrong,
-        "silent": sum(tally.silent for tally in found.areas.values()),
-        "conforms": found.conforms,
-        "areas": [
-            {"area": area, "about": _about(area), "why": _most(tally.why), "codes": tally.codes}
-            | {name: getattr(tally, name) for name in names}
-            for area, tally in found.areas.items()
-        ],
-        "failures": [
-            _failure(failed, name) | {"alone": failed.alone}
-            for failed, name in zip(found.failed, scripts, strict=True)
-        ],
-        "large": None if found.large is None else {"atoms": found.large[0], "seconds": found.large[1]},
-        "seed": seed,
-        "seconds": found.seconds,
-        "findings": [],
-        "status": "complete",
+def _cases(summary: Mapping[str, Any], code: str) -> int:
+    """Cases whose worst failure has a code."""
+    return sum(row["codes"].get(code, 0) for row in summary["areas"])
+
+
+def _total(summary: Mapping[str, Any], name: str) -> int:
+    return sum(row[name] for row in summary["areas"])
+
+
+def judge(view: View) -> Verdict:
+    """Headline, evidence and findings of an examination, from its folder alone."""
+    summary = view.summary
+    asked, wrong, left = summary["asked"], summary["wrong"], summary["left"]
+    values = {
+        "name": view.name,
+        "asked": asked,
+        "wrong": wrong,
+        "right": _total(summary, "passed"),
+        "answered": asked - _total(summary, "refused") - _cases(summary, "RAISED"),
+        **{code.lower(): _cases(summary, code) for code in SILENT},
     }
+    if not asked:
+        said = "nothing_asked"
+    elif not values["answered"]:
+        said = "nothing_answered"
+    elif not wrong:
+        said = "conforms"
+    elif summary["silent"] < wrong:
+        said = "failed"
+    else:
+        codes = [code.lower() for code in SILENT if values[code.lower()]]
+        said = f"silent_{codes[0]}" if len(codes) == 1 else "silent"
+    headline = TEXTS(said, **values)
+    if left:
+        headline = TEXTS(
+            "so_far", headline=headline, done=summary["questions"] - left, questions=summary["questions"]
+        )
+    findings = [*_failures(summary), *_conduct(summary, values["answered"])]
+    return conclude(findings, _evidence(view), headline=headline, best="good", judged=True)
 
 
-def _about(area: str) -> str:
-    from mdnum.references.conformance.case import AREAS
+def _evidence(view: View) -> Iterator[str]:
+    summary = view.summary
+    worst = sorted((row for row in summary["areas"] if row["failed"]), key=lambda row: -row["failed"])[:4]
+    if worst:
+        areas = [f"{row['area']} ({count(row['failed'])} of {count(row['asked'])})" for row in worst]
+        yield TEXTS("where", areas=listed(areas))
+    if summary["failures"]:
+        atoms = min(row["atoms"] for row in summary["failures"])
+        yield TEXTS("scripts", scripts=len(summary["failures"]), atoms=atoms)
+    if summary["rule"]["motions"]:
+        lost = any(row["failed"] for row in summary["areas"] if row["area"] == "rule")
+        how = "stated" if summary["padding_stated"] else "shown" if summary["padding"] else "unknown"
+        name = "rule_failed" if lost else f"rule_{how}"
+        yield TEXTS(name, **summary["rule"], padding=summary["padding"])
+    if summary["status"] == "stopped":
+        yield TEXTS("stopped", folder=view.folder.path.name)
+    for name in ("refused", "skipped"):
+        if cases := _total(summary, name):
+            yield TEXTS(name, cases=cases)
 
-    return AREAS[area]
+
+def _failures(summary: Mapping[str, Any]) -> Iterator[Finding]:
+    """A finding for each code of the failures, below the one that may be its cause."""
+    by_code: dict[str, list[Mapping[str, Any]]] = {}
+    for row in summary["failures"]:
+        by_code.setdefault(row["code"], []).append(row)
+    severity = {code: TEXTS.entries[code]["severity"] for code in by_code}
+    causes = [code for code, rows in by_code.items() if any(row["alone"] for row in rows)]
+    for code, rows in by_code.items():
+        # one that fails by itself shows more than a smaller one that does not
+        first = min(rows, key=lambda row: (not row["alone"], row["atoms"], row["steps"]))
+        areas = [row["area"] for row in summary["areas"] if row["codes"].get(code)]
+        asked = sum(1 for row in summary["areas"] if row["asked"])
+        values = {name: first[name] for name in ("atoms", "step", "steps", "case", "script")}
+        values |= {"cases": _cases(summary, code), "text": first["text"].rstrip(". ")}
+        everywhere = len(areas) == asked > 2
+        values["areas"] = "every area" if everywhere else listed(areas)
+        seen = TEXTS("failure", **values)
+        cause = ""
+        if not first["alone"]:
+            seen += f" {TEXTS('not_alone')}"
+            as_bad = (one for one in causes if severity[one] in ("error", severity[code]))
+            cause = next(as_bad, "")
+        if code in summary["known"]:
+            seen += f" {summary['known'][code]}"
+        rounding = all(row["text"].startswith("within rounding") for row in rows)
+        ends = any("exit" in row["text"].lower() for row in rows)
+        variants = ["rounding"] * rounding + ["exit"] * ends
+        yield TEXTS.finding(
+            code, *variants, seen=seen, **values, section="Failures, reproduced", cause=cause
+        )  # fmt: skip
 
 
-def _most(why: Mapping[str, int]) -> list[dict[str, Any]]:
-    """Reasons of not answering, the most frequent first."""
-    return [{"why": text, "cases": count} for text, count in sorted(why.items(), key=lambda one: -one[1])]
+def _conduct(summary: Mapping[str, Any], answered: int) -> Iterator[Finding]:
+    """What is nobody's mistake and good to know."""
+    ties = summary["ties"]
+    if ties["counted"] and ties["not_counted"]:
+        yield TEXTS.finding("TIES", **ties, section="Conventions")
+    if "float32" in summary["found_out"]:
+        yield TEXTS.finding("SINGLE_PRECISION", case=summary["single"], section="Conventions")
+    if summary["keeps_order"] is False:
+        yield TEXTS.finding("ORDER", section="Conventions")
+    if summary["aliased"] is not None:
+        yield TEXTS.finding("ALIASED", case=summary["aliased"])
+    for refusal in summary["refusals"]:
+        if refusal["uneven"]:
+            words = {"exception": refusal["why"].rstrip(". "), "case": refusal["case"]}
+            yield TEXTS.finding("UNEVEN_REFUSALS", **words, how=listed(refusal["uneven"]))
+    reasons = [
+        (row, one) for row in summary["areas"] for one in row["why"] if row["refused"] and ": " in one["why"]
+    ]
+    often = max(reasons, key=lambda each: each[1]["cases"], default=({"area": ""}, {"why": ""}))
+    total, section = _total(summary, "refused"), "Cases by what they are about"
+    values = {"refused": total, "exception": often[1]["why"].rstrip(". "), "area": often[0]["area"]}
+    if not answered:
+        variants = ["time"] * (not summary["asked"]) + ["first"] * bool(reasons)
+        yield TEXTS.finding("NOTHING_ANSWERED", *variants, **values, section=section)
+    elif reasons:
+        others = [one for one in summary["refusals"] if one["answers"]]
+        also = " ".join(
+            TEXTS("answers", exception=one["why"].rstrip(". "), case=one["case"], how=listed(one["answers"]))
+            for one in others
+        )  # fmt: skip
+        variants = ["many"] * (total > 0.2 * summary["asked"]) + ["also"] * bool(also)
+        yield TEXTS.finding("REFUSES", *variants, **values, also=also, section=section)
+
+
+def page(view: View, verdict: Verdict) -> Page:
+    """Everything else that is shown."""
+    summary = view.summary
+    skipped, silent = _total(summary, "skipped"), summary["silent"]
+    kinds = many(len(summary["failures"]), "kind")
+    keys = [
+        Key("Right", count(_total(summary, "passed")), f"of {many(summary['asked'], 'case')}"),
+        Key(
+            "Wrong", count(summary["wrong"] - silent), f"{kinds}, shrunk" if summary["wrong"] > silent else ""
+        ),
+        Key("No answer", count(silent), "ends the process, takes too long or raises"),
+        Key("Not asked", count(skipped), "outside of what it claims"),
+    ]
+    if summary["large"]:
+        seconds = f"{number(summary['large']['seconds'], 2)} s"
+        keys.append(Key("Largest", f"{count(summary['large']['atoms'])} atoms", seconds))
+    package = f"{summary['package'] or ''} {summary['version'] or ''}".strip()
+    sections = [
+        Section("Cases by what they are about", [_figure(summary), *_tables(summary)], terminal=True),
+        Section("Conventions", [TEXTS("conventions"), pairs(list(_conventions(summary)))]),
+        Section("What was run", [pairs(list(_what(summary, package)))]),
+    ]
+    if summary["failures"]:
+        rows = [(row["script"], row["atoms"], row["steps"], row["text"]) for row in summary["failures"]]
+        table = Table(("script", "atoms", "steps", "what is wrong"), rows)
+        # a name of a file, wherever else the table would have it
+        codes = [
+            Code(
+                f"{row['code']}: {row['case']} ({row['area']})",
+                read_text(view.folder.path / Path(row["script"]).name),
+            )
+            for row in summary["failures"]
+        ]  # fmt: skip
+        sections.insert(
+            1, Section("Failures, reproduced", [TEXTS("reproduced"), table, *codes], terminal=True)
+        )
+    about = ", ".join(filter(None, [summary["about"] or "A neighbor list", package]))
+    return Page(
+        f"{view.name}: conformance", f"{about}, against an exact oracle.", keys, sections,
+        provenance=view.folder.provenance,
+    )  # fmt: skip
+
+
+def _tables(summary: Mapping[str, Any]) -> Iterator[Table]:
+    """A row for each area: of lists at one moment, and of lists in use."""
+    columns = (
+        "area",
+        "asked",
+        "right",
+        "wrong",
+        "no answer",
+        "refused",
+        "not asked",
+        "about",
+        "not answered",
+    )
+    for title, used in (("a list asked once", False), ("a list in use", True)):
+        rows = [
+            (
+                row["area"],
+                row["asked"],
+                row["passed"],
+                row["failed"] - row["silent"] or None,
+                row["silent"] or None,
+                row["refused"] or None,
+                row["skipped"] or None,
+                row["about"],
+                "; ".join(f"{one['why']} ({count(one['cases'])})" for one in row["why"][:3]),
+            )
+            for row in summary["areas"]
+            if (row["area"] in _IN_USE) == used
+        ]
+        if rows:
+            bad = frozenset(n for n, row in enumerate(rows) if row[3] or row[4])
+            yield Table(columns, rows, title, bad=bad)
+
+
+def _figure(summary: Mapping[str, Any]) -> Figure:
+    rows = [row for row in summary["areas"] if row["asked"]]
+
+    def draw(figure: Canvas) -> None:
+        axes = figure.subplots()
+        # a share of each area: one of 100,000 atoms counts as much as 500 drawn at random
+        left, asked = np.zeros(len(rows)), np.array([row["asked"] for row in rows])
+        place = np.arange(len(rows))[::-1]
+        for label, cases, color in (
+            ("right", [row["passed"] for row in rows], FIRST),
+            ("refused", [row["refused"] for row in rows], MUTED),
+            ("no answer", [row["silent"] for row in rows], SECOND),
+            ("wrong", [row["failed"] - row["silent"] for row in rows], BAD),
+        ):
+            # a case that fails is never too small to be seen
+            share = np.where(np.array(cases) > 0, np.maximum(np.array(cases) / asked, 0.006), 0.0)
+            axes.barh(place, share, left=left, height=0.6, color=color, alpha=0.75, lw=0, label=label)
+            left += share
+        axes.set_yticks(place, [f"{row['area']} ({row['failed']:,} of {row['asked']:,})" for row in rows])
+        axes.set_xlim(0, 1.0)
+        axes.set_xlabel("share of the cases asked")
+        axes.legend(loc="lower center", bbox_to_anchor=(0.45, 1.0), ncols=4, frameon=False, fontsize=8)
+
+    alt = ", ".join(f"{row['area']} {row['failed']} of {row['asked']}" for row in rows) or "none asked"
+    return Figure("areas", TEXTS("figure"), TEXTS("figure_alt", areas=alt), draw, 0.9 + 0.27 * len(rows))
+
+
+def _conventions(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """What kind of list it is."""
+    more = "pairs of its skin" if summary["kept"] else "pairs beyond the cutoff"
+    both = "every pair from both of its atoms" if summary["full"] else "every pair once"
+    yield "Lists", f"{both}, with {more}" if summary["superset"] else both
+    atom = "added to atom j" if summary["shift_sign"] > 0 else "added to atom i"
+    yield "Shifts", atom if summary["shifts"] else "none given: images are counted, and not told apart"
+    yield "Decides in", summary["precision"]
+    counted, not_counted = summary["ties"]["counted"], summary["ties"]["not_counted"]
+    if counted and not_counted:
+        yield "At exactly the cutoff", f"{count(counted)} pairs count, {count(not_counted)} do not"
+    elif counted or not_counted:
+        yield (
+            "At exactly the cutoff",
+            "counts as inside (r ≤ r_cut)" if counted else "does not count (r < r_cut)",
+        )
+    if summary["keeps_order"] is not None:
+        yield "Asked again", "same rows, same order" if summary["keeps_order"] else "other order of rows"
+    if summary["found_out"]:
+        yield "Found out by asking", listed(summary["found_out"])
+
+
+def _what(summary: Mapping[str, Any], package: str) -> Iterator[tuple[str, str]]:
+    yield "List", summary["about"] or summary["system"]
+    if package:
+        yield "Package", package
+    yield "Kind", "allocated once and updated" if summary["kept"] else "made anew at every question"
+    yield "Random cases", f"drawn by hypothesis, seed {summary['seed']}"
+    yield "Oracle", TEXTS("oracle")
+    yield "Time", f"{number(summary['seconds'], 3)} s"
+
+
+VERBS = {"conform": Verb(judge, page)}

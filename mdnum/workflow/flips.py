@@ -1,9 +1,12 @@
-"""`mdnum flips` as a function: anybody's trajectory to a ledger of flips, what it says, and a report."""
+"""`mdnum flips`: anybody's trajectory to a ledger of flips; for two trajectories, see flips_compare."""
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Mapping, Sequence
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,33 +14,31 @@ import numpy as np
 
 from mdnum.errors import InputError
 from mdnum.store import RunFolder
-from mdnum.workflow.flips_open import (
-    FlipsResult,
-    about,
-    cut_short,
-    default_rules,
-    leave,
-    new_folder,
-    refuse_topology_first,
-    sample_of,
-    selected,
-    source,
-    told_resolution,
-)
-from mdnum.workflow.flips_words import rules
-from mdnum.workflow.fork_question import Log, Progress, finish
+from mdnum.store.tables import TableStream
+from mdnum.workflow.flips_page import judge, page
+from mdnum.workflow.flips_shared import FolderLog, about, ending, plain_box, selected, stem
+from mdnum.workflow.frame import Outcome, Progress, Verb, finish, new_folder, store
+from mdnum.workflow.interrupt import asked_to_stop
 
 if TYPE_CHECKING:
-    from mdnum.trajectories.frame import Frame
-    from mdnum.trajectories.resolution import Resolution
+    from mdnum.trajectories.follow import Followed, Groups, Pass
+    from mdnum.trajectories.history import History
     from mdnum.trajectories.rules import Rule
-    from mdnum.trajectories.source import Trajectory
-    from mdnum.workflow.flips_record import Followed, Groups, Pass
+    from mdnum.trajectories.statistics import Classes, Statistics
+    from mdnum.trajectories.topology import AtomTable
+    from mdnum.trajectories.trajectory import Trajectory
 
-#: Frames within which a flip that is taken back is chatter, unless another number is asked for.
+#: Frames within which a flip that is reversed is chatter, unless another number is asked for.
 WINDOW = 5
 # displacement between frames over what velocities say, above which they cannot belong to the positions
 _TOO_FAR = 1.1
+# rows of the ledger held at once, and rows that wait to be handed over together: a call costs more than a row
+_PART_ROWS, _ROWS_HELD = 1_500_000, 20_000
+# an odd number, so that the parts of a crystal's regular labels are alike
+_SPREAD = 1_000_003
+# files that hold positions and nothing on what the atoms are
+_BARE = frozenset({"xtc", "trr", "dcd", "nc", "ncdf", "netcdf", "trj", "mdcrd", "crdbox", "trz", "h5md"})
+_PAIRS = 'Write pairs of species with a length each, for example --pairs "O-H=2.5,O-O=3.5"'
 
 
 def flips(
@@ -55,21 +56,21 @@ def flips(
     out: str | Path | None = None,
     report: bool = True,
     progress: Progress | None = None,
-) -> FlipsResult:
+) -> Outcome:
     """Finds which pairs entered or left a threshold between the frames of a file, and what follows.
 
     Args:
         trajectory: a file that MDAnalysis or ASE reads, or the folder of an mdnum run; a slice of its frames
             may stand behind an @ ("run.xtc@100:", "run.xtc@::10").
-        other: another one of the same atoms: where do the two part?
+        other: another one of the same atoms: where do the two diverge?
         topology: what the atoms are, where the trajectory does not say.
         cutoffs: lengths in the file's unit, a rule each; default the cutoff of the mdnum run that the file
             belongs to.
         pairs: cutoffs by pair of species, a rule each: "O-H=2.5,O-O=3.5".
         nearest: numbers of neighbors, a rule each: the k nearest of every atom.
         most: neighbors an atom can have inside a cutoff; the nearest are kept.
-        between: two selections in MDAnalysis's language; only pairs with an atom in each are looked at.
-        window: frames within which a flip that is taken back is chatter, and up to which a stay outside is
+        between: two selections in MDAnalysis's language; only pairs with an atom in each are examined.
+        window: frames within which a flip that is reversed is chatter, and up to which a stay outside is
             overlooked in an intermittent contact.
         format: of the files, where their names do not tell.
         out: the new folder; default runs/flips-<name>-<n>.
@@ -81,118 +82,199 @@ def flips(
             exception: what came before is kept, and the summary names the frame.
         FolderError: the folder cannot be used.
     """
+    from mdnum.trajectories.follow import follow
+    from mdnum.trajectories.resolution import infer
+    from mdnum.trajectories.source import open_trajectory
+
     if window < 1:
         raise InputError(f"window = {window}; expected at least 1 frame")
     asked = rules(cutoffs, pairs, nearest, most)
     if other is not None:
-        refuse_topology_first(trajectory, other, topology)
         from mdnum.workflow.flips_compare import compare
 
-        return compare(
-            (trajectory, other), topology, asked, between, format=format, out=out, report=report,
-            progress=progress,
-        )  # fmt: skip
-    opened = source(trajectory, topology, format)
-    asked = asked or default_rules(opened)
+        _refuse_topology_first(trajectory, other, topology)
+        a, b = (open_trajectory(path, topology, format=format) for path in (trajectory, other))
+        return compare(a, b, asked or _default_rules(a), between, out=out, report=report, progress=progress)
+    opened = open_trajectory(trajectory, topology, format=format)
+    asked = asked or _default_rules(opened)
     groups = selected(opened, between)
-    folder = new_folder(opened, "flips", out)
-    try:
-        return _look(folder, opened, asked, groups, between, window, report, progress)
-    except BaseException:
-        leave(folder)
-        raise
-
-
-def _look(
-    folder: RunFolder,
-    trajectory: Trajectory,
-    asked: tuple[Rule, ...],
-    groups: Groups,
-    between: tuple[str, str] | None,
-    window: int,
-    report: bool,
-    progress: Progress | None,
-) -> FlipsResult:
-    from mdnum.trajectories.resolution import infer_from
-    from mdnum.workflow import flips_numbers, flips_record
-    from mdnum.workflow.flips_differing import plain_box
-
-    log = Log(folder, progress)
-    sample = sample_of(trajectory)
-    resolution = infer_from(sample, trajectory.bits, trajectory.format)
-    found = flips_record.follow(folder, trajectory, asked, groups, resolution.bound, log)
-    began = time.perf_counter()
-    for rows in flips_record.neighbor_rows(found):
-        folder.append("neighbors", rows)
-    frames = _frames(folder)
-    steps = _steps(frames, trajectory.time != "frame")
-    labels = flips_numbers.labels(trajectory.table)
-    told = []
-    for number, one in enumerate(found.rules):
-        counted = flips_numbers.count(
-            folder, number, found.frames, labels, one.rule.directed, window, log
-        )  # fmt: skip
-        mine = frames["rule"] == number
-        pairs = frames["pairs"][mine]
-        columns = flips_numbers.curves(counted, pairs, steps["interval"])
-        folder.append("lifetimes", {"rule": np.full(len(pairs_of(columns)), number), **columns})
-        busiest = {name: getattr(counted.busiest, name) for name in counted.busiest.__dataclass_fields__}
-        words = {
-            name: flips_numbers.atom_words(trajectory.table, busiest[of])
-            for name, of in (("first", "i"), ("second", "j"))
-        }
-        folder.append("busiest", {"rule": np.full(len(words["first"]), number), **busiest, **words})
-        _append_residues(folder, number, counted, labels)
-        rows = {name: values[mine] for name, values in frames.items()}
-        told.append(
-            _rule(one, rows, steps, found)
+    sample = opened.sample()
+    resolution = infer(sample, opened.bits, opened.format)
+    rows = _HeldRows()
+    passes = follow(opened, asked, groups, resolution, rows.add)
+    # no folder for a file whose first frame cannot be used
+    found, interrupted, began = next(passes), False, time.perf_counter()
+    with new_folder("flips", f"flips-{stem(opened)}", out) as folder:
+        log = FolderLog(folder, progress)
+        with asked_to_stop() as stop:
+            while True:
+                rows.checkpoint(folder, found.frames)
+                told = {"phase": "run", "unit": "frames", "flips": rows.flips}
+                log(found.frames, opened.count or 0, told)
+                if interrupted := stop():
+                    break
+                if next(passes, None) is None or found.stopped is not None:
+                    break
+        rows.checkpoint(folder, found.frames, force=True)
+        read = time.perf_counter()
+        frames = folder.read("frames")
+        steps = _steps(frames, opened.time != "frame")
+        told = [
+            _rule_told(folder, number, one, found, frames, steps, opened, groups, window, log)
             | {"grid": _grid(sample, resolution, one, groups)}
-            | flips_numbers.told(counted)
-        )
-        for name, coded in (("by_species", labels.species), ("by_residue_name", labels.residue_names)):
-            if coded is not None:
-                told[-1][name] = [_as_asked(row, coded, groups) for row in told[-1][name]]
-    folder.finalize()
-    folder.drop_checkpoint()
-    folder.write_summary(
-        {
-            **about(trajectory, "flips"),
-            "between": None if between is None else list(between),
+            for number, one in enumerate(found.rules)
+        ]
+        leaps = found.leaps
+        summary = {
+            **about(opened, "flips", between),
             "box": plain_box(sample[0].box),
             "frames": found.frames,
             **steps,
             "window": window,
-            "resolution": told_resolution(resolution, trajectory),
+            "resolution": resolution,
             "rules": told,
             "velocities_odd": bool(found.moved > _TOO_FAR),
-            "leaps": _leaps(found),
-            "stopped": None if found.stopped is None else str(found.stopped),
-            "cut_short": cut_short(found.stopped, trajectory),
-            "interrupted": found.interrupted,
-            "seconds": {"frames": found.seconds, "statistics": time.perf_counter() - began},
-            "findings": [],
-            "status": "stopped" if found.stopped is not None or found.interrupted else "complete",
-        }
-    )
-    return FlipsResult(folder.path, finish(folder, report, progress))
+            "leaps": None if not leaps else {
+                "frames": len(leaps), **dict(zip(("frame", "atom", "distance"), leaps[0], strict=True)),
+            },
+            "cut_short": _cut_short(found.stopped, opened),
+            **ending(found.stopped, interrupted),
+            "seconds": {"frames": read - began, "statistics": time.perf_counter() - read},
+        }  # fmt: skip
+        store(folder, summary, {})
+        folder.drop_checkpoint()
+        return finish(folder, report=report, result=found, progress=progress)
 
 
-def pairs_of(columns: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Any column: they are equally long."""
-    return next(iter(columns.values()))
+VERBS = {"flips": Verb(judge, page)}
 
 
-def _frames(folder: RunFolder) -> dict[str, np.ndarray]:
-    names = ("rule", "time", "pairs", "near", "entered", "left", "ambiguous", "min_margin")
-    return folder.read("frames", [*names, "fewest", "neighbors", "most"])
+# ---- what is asked for
+
+
+def rules(
+    cutoffs: Sequence[float] = (),
+    pairs: Sequence[str | Mapping[tuple[str, str], float]] = (),
+    nearest: Sequence[int] = (),
+    most: int | None = None,
+) -> tuple[Rule, ...]:
+    """The membership rules asked for, in this order; arguments as of `flips`.
+
+    Raises:
+        InputError: a word is not understood, a rule comes twice, or `most` has no cutoff to go with.
+    """
+    from mdnum.trajectories.rules import Capped, CutoffRule, Nearest, SpeciesCutoffs
+
+    if most is not None and not cutoffs:
+        raise InputError(
+            "--most keeps the nearest of those inside a cutoff, and there is no cutoff",
+            remedy="Add --cutoff R; for the K nearest without a cutoff write --nearest K",
+        )
+    found: list[Rule] = [CutoffRule(radius) if most is None else Capped(radius, most) for radius in cutoffs]
+    found += [SpeciesCutoffs(one if isinstance(one, Mapping) else _species_cutoffs(one)) for one in pairs]
+    found += [Nearest(k) for k in nearest]
+    names = [one.name for one in found]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise InputError(f"the rule {twice[0]!r} is asked for twice", remedy="Keep one of them")
+    return tuple(found)
+
+
+def _species_cutoffs(words: str) -> dict[tuple[str, str], float]:
+    """Lengths by pair of species of "O-H=2.5,O-O=3.5"."""
+    found: dict[tuple[str, str], float] = {}
+    for part in words.split(","):
+        pair, equals, value = part.partition("=")
+        first, dash, second = (one.strip() for one in pair.partition("-"))
+        try:
+            length = float(value)
+        except ValueError:
+            length = math.nan
+        if not (equals and dash and first and second) or "-" in second or not length > 0:
+            raise InputError(
+                f"--pairs {words!r}: {part.strip()!r} is not of the form A-B=LENGTH", remedy=_PAIRS
+            )
+        if {(first, second), (second, first)} & set(found):
+            raise InputError(f"--pairs {words!r} gives {first}-{second} twice", remedy="Keep one of them")
+        found[first, second] = length
+    return found
+
+
+def _default_rules(trajectory: Trajectory) -> tuple[Rule, ...]:
+    """The cutoff with which mdnum made the file, from the system.toml beside it."""
+    radius = None
+    try:
+        system = tomllib.loads((trajectory.path.parent / "system.toml").read_text(encoding="utf-8"))
+        radius = system.get("cutoff", {}).get("radius")
+    except (OSError, tomllib.TOMLDecodeError, AttributeError):
+        # no run of mdnum's
+        pass
+    if not isinstance(radius, int | float):
+        unit = f" in {trajectory.length}" if trajectory.length else ""
+        raise InputError(
+            "no rule says which pairs count",
+            remedy=f'Add --cutoff R{unit}, --pairs "O-H=2.5,O-O=3.5" or --nearest K',
+            where=str(trajectory.path),
+        )
+    return rules([float(radius)])
+
+
+def _refuse_topology_first(first: str | Path, second: str | Path, topology: str | Path | None) -> None:
+    """Refuses "TOPOLOGY TRAJECTORY", the order that other programs have."""
+    names = [str(one).rpartition("@")[0] or str(one) for one in (first, second)]
+    bare = [Path(one).suffix.lower().lstrip(".") in _BARE for one in names]
+    if topology is None and not bare[0] and bare[1]:
+        raise InputError(
+            f"two paths are two trajectories to compare, and {Path(names[0]).name} looks like the "
+            f"topology of {Path(names[1]).name}",
+            remedy=f"Write mdnum flips {second} -s {first}",
+        )
+
+
+# ---- the ledger, and what is counted from it
+
+
+def _cut_short(error: InputError | None, trajectory: Trajectory) -> bool:
+    """Whether reading stopped at a frame that is not whole, the last of the file as far as that is known."""
+    from mdnum.trajectories.frame import UnreadableFrame
+
+    if not isinstance(error, UnreadableFrame):
+        return False
+    if "the file ends" in error.message:
+        return True
+    return trajectory.in_file is not None and error.frame >= trajectory.in_file - 1
+
+
+class _HeldRows:
+    """Rows of a folder's tables, appended some hundred frames at a time."""
+
+    def __init__(self) -> None:
+        self._held: dict[str, list[dict[str, np.ndarray]]] = {}
+        self._count = self.flips = 0
+
+    def add(self, table: str, columns: dict[str, np.ndarray]) -> None:
+        """Adds rows, equally long columns."""
+        self._held.setdefault(table, []).append(columns)
+        self._count += len(columns["rule"])
+        self.flips += len(columns["rule"]) * (table == "flips")
+
+    def checkpoint(self, folder: RunFolder, frames: int, force: bool = False) -> None:
+        """Hands over what is held where it is much, or where the folder is due to be made whole."""
+        due = force or folder.checkpoint_due()
+        if due or self._count > _ROWS_HELD:
+            for table, parts in self._held.items():
+                folder.append(
+                    table, {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+                )
+            self._held, self._count = {}, 0
+        if due:
+            folder.checkpoint({"frames": frames}, force=True)
 
 
 def _steps(frames: Mapping[str, np.ndarray], timed: bool) -> dict[str, Any]:
     """Times of the frames: how far apart, evenly or not."""
     times = frames["time"][frames["rule"] == 0]
     steps = np.diff(times)
-    interval = float((times[-1] - times[0]) / len(steps)) if len(steps) else float("nan")
-    even = bool(np.all(np.abs(steps - interval) <= 1e-3 * abs(interval))) if len(steps) else True
+    interval = float((times[-1] - times[0]) / len(steps)) if len(steps) else math.nan
     backward = int(np.count_nonzero(steps <= 0))
     return {
         # frames are counted where their times do not go forward
@@ -201,38 +283,84 @@ def _steps(frames: Mapping[str, np.ndarray], timed: bool) -> dict[str, Any]:
         "first_time": float(times[0]),
         "last_time": float(times[-1]),
         "interval": interval,
-        "even": even,
+        "even": bool(np.all(np.abs(steps - interval) <= 1e-3 * abs(interval))) if len(steps) else True,
         "backward": backward,
     }
 
 
-def _as_asked(row: dict[str, Any], coded: tuple[np.ndarray, Sequence[str]], groups: Groups) -> dict[str, Any]:
-    """A pair of classes in the order of the two selections, where only one order fits them."""
-    if groups[0] is None or groups[1] is None:
-        return row
-    first, second = ({coded[1][at] for at in np.unique(coded[0][group])} for group in groups)
-    a, b = row["first"], row["second"]
-    if (a in first and b in second) or not (b in first and a in second):
-        return row
-    return row | {"first": b, "second": a}
+def histories(folder: RunFolder, rule: int, frames: int) -> Iterator[tuple[int, int, History]]:
+    """(part, parts, history of some of the pairs) until every pair of a rule had its turn.
+
+    The ledger is in the order of frames and may be larger than memory; a part has all flips of its pairs.
+    """
+    from mdnum.trajectories.history import History
+
+    streams = {name: TableStream(folder.path, name, folder.world) for name in ("members", "flips")}
+    parts = max(1, -(-sum(stream.flushed for stream in streams.values()) // _PART_ROWS))
+
+    def columns(name: str, part: int, kinds: Mapping[str, Any]) -> dict[str, np.ndarray]:
+        found: dict[str, list[np.ndarray]] = {name: [np.zeros(0, kind)] for name, kind in kinds.items()}
+        for batch in streams[name].batches(["rule", *kinds]):
+            rows = {name: batch[name].to_numpy() for name in ("rule", *kinds)}
+            mine = rows["rule"] == rule
+            if parts > 1:
+                mine &= (rows["i"].astype(np.int64) * _SPREAD + rows["j"]) % parts == part
+            for name in kinds:
+                found[name].append(rows[name][mine])
+        return {name: np.concatenate(some) for name, some in found.items()}
+
+    pair = {"i": np.int64, "j": np.int64, "rank": np.int64}
+    for part in range(parts):
+        flips = columns("flips", part, {"frame": np.int64, "entered": bool, **pair, "ambiguous": bool})
+        yield part, parts, History.of(flips, columns("members", part, pair), frames)
 
 
-def _leaps(found: Pass) -> dict[str, Any] | None:
-    """Atoms that are further from one frame to the next than can be; None where none is."""
-    if not found.leaps:
-        return None
-    frame, atom, distance = found.leaps[0]
-    return {"frames": len(found.leaps), "frame": frame, "atom": atom, "distance": distance}
-
-
-def _rule(
-    one: Followed, rows: Mapping[str, np.ndarray], steps: Mapping[str, Any], found: Pass
+def _rule_told(
+    folder: RunFolder,
+    number: int,
+    one: Followed,
+    found: Pass,
+    frames: Mapping[str, np.ndarray],
+    steps: Mapping[str, Any],
+    trajectory: Trajectory,
+    groups: Groups,
+    window: int,
+    log: FolderLog,
 ) -> dict[str, Any]:
-    """Counts of one rule, and what velocities say about the frames' distance in time."""
+    """What one rule's ledger says, worked out pair by pair; its tables go into the folder."""
+    from mdnum.trajectories.statistics import Labels, Statistics
+
+    assert one.neighbors is not None
+    labels, total = Labels.of(trajectory.table), None
+
+    def append(table: str, columns: Mapping[str, Any]) -> None:
+        length = len(next(iter(columns.values())))
+        folder.append(table, {"rule": np.full(length, number), **columns})
+
+    for part, parts, history in histories(folder, number, found.frames):
+        counted, stays = Statistics.of(history, labels, one.rule.directed, window)
+        append("contacts", vars(stays))
+        total = counted if total is None else total + counted
+        log(part + 1, parts, {"phase": "counting contacts", "unit": "parts"})
+    assert total is not None, "there is at least one part"
+    rows = {name: values[frames["rule"] == number] for name, values in frames.items()}
+    seen = np.flatnonzero(one.neighbors.seen)
+    append("neighbors", {"neighbors": seen, "counted": one.neighbors.seen[seen]})
+    append("lifetimes", total.curves(rows["pairs"], steps["interval"]))
+    busiest = vars(total.busiest)
+    words = {
+        name: _atom_words(trajectory.table, busiest[of]) for name, of in (("first", "i"), ("second", "j"))
+    }
+    append("busiest", {**busiest, **words})
+    if total.residues is not None and labels.residues is not None:
+        between, within = total.residues.between, total.residues.within
+        busy = np.flatnonzero(between + within)
+        busy = busy[np.argsort(-(between + within)[busy], kind="stable")]
+        names = [labels.residues.names[at] for at in busy]
+        append("residues", {"residue": names, "between": between[busy], "within": within[busy]})
     entered, left = int(rows["entered"].sum()), int(rows["left"].sum())
-    frames = len(rows["pairs"])
-    margins = rows["min_margin"]
-    return {
+    count, margins = len(rows["pairs"]), rows["min_margin"]
+    told = {
         "rule": one.rule.name,
         "directed": one.rule.directed,
         "pairs_first": int(rows["pairs"][0]),
@@ -241,37 +369,71 @@ def _rule(
         "entered": entered,
         "left": left,
         "flips": entered + left,
-        "flips_per_frame": (entered + left) / (frames - 1) if frames > 1 else 0.0,
+        "flips_per_frame": (entered + left) / (count - 1) if count > 1 else 0.0,
         "ambiguous": int(rows["ambiguous"].sum()),
         "near_mean": float(rows["near"].mean()),
         "min_margin": float(np.nanmin(np.abs(margins))) if np.isfinite(margins).any() else None,
         "neighbors": {
-            "fewest": int(rows["fewest"].min()),
-            "mean": float(rows["neighbors"].mean()),
+            "fewest": int(rows["fewest"].min()), "mean": float(rows["neighbors"].mean()),
             "most": int(rows["most"].max()),
         },
         "flux": _flux(one, entered + left, steps, found),
-    }
+        **_counted(total),
+    }  # fmt: skip
+    for name, coded in (("by_species", labels.species), ("by_residue_name", labels.residue_names)):
+        if coded is not None:
+            told[name] = [_as_asked(row, coded, groups) for row in told[name]]
+    return told
 
 
-def _grid(
-    sample: Sequence[Frame], resolution: Resolution, one: Followed, groups: Groups
-) -> dict[str, Any] | None:
+def _counted(total: Statistics) -> dict[str, Any]:
+    """Plain values of what was counted, lengths of time in frames."""
+    from mdnum.trajectories.statistics import Lifetime
+    from mdnum.trajectories.stride import between_frames
+
+    durations, chatter = total.durations, total.chatter
+    between = between_frames(total.strides)
+    return {
+        "pairs_flipped": total.pairs,
+        "images": total.images,
+        "contacts": {name: int(lengths.sum()) for name, lengths in vars(durations).items()},
+        # of the pairs inside at a frame that were examined again, those still inside at the next
+        "stays_over": 1 - durations.leaves / max(durations.exposure, 1),
+        "lifetime": Lifetime.of(durations),
+        "intermittent": Lifetime.of(total.intermittent),
+        "by_species": total.by_species.rows(),
+        "by_residue_name": [] if total.by_residue_name is None else total.by_residue_name.rows(),
+        "chatter": {
+            "window": chatter.window, "undone": chatter.undone,
+            "share": chatter.undone / chatter.flips if chatter.flips else 0.0,
+            "inside": chatter.inside, "outside": chatter.outside,
+        },
+        "stride": {**vars(total.strides), "between": between and asdict(between)},
+    }  # fmt: skip
+
+
+def _atom_words(table: AtomTable, atoms: np.ndarray) -> list[str]:
+    """What atoms are called: "GLY 12 CA", or their names where there are no residues."""
+    rows = ((table.residue_names[at], table.residue_ids[at], table.names[at]) for at in atoms)
+    return [f"{residue} {number} {name}" if residue else str(name) for residue, number, name in rows]
+
+
+def _as_asked(row: dict[str, Any], classes: Classes, groups: Groups) -> dict[str, Any]:
+    """A pair of classes in the order of the two selections, where only one order fits them."""
+    if groups[0] is None or groups[1] is None:
+        return row
+    first, second = ({classes.names[at] for at in np.unique(classes.of[group])} for group in groups)
+    a, b = row["first"], row["second"]
+    if (a in first and b in second) or not (b in first and a in second):
+        return row
+    return row | {"first": b, "second": a}
+
+
+def _grid(sample: Sequence[Any], resolution: Any, one: Followed, groups: Groups) -> Any:
     """What writing positions with so few digits did to the flips, estimated; None where it cannot be."""
     from mdnum.trajectories.grid_effect import grid_effect
 
-    if not one.reach > 0:
-        return None
-    found = grid_effect(resolution, sample, one.reach, *groups, ranked=one.ranked)
-    if found is None:
-        return None
-    return {
-        "missed": found.missed,
-        "invented": found.invented,
-        "ratio": found.ratio,
-        "move": found.move,
-        "words": found.words(),
-    }
+    return grid_effect(resolution, sample, one.reach, *groups, ranked=one.ranked) if one.reach > 0 else None
 
 
 def _flux(one: Followed, flips: int, steps: Mapping[str, Any], found: Pass) -> dict[str, Any] | None:
@@ -280,32 +442,8 @@ def _flux(one: Followed, flips: int, steps: Mapping[str, Any], found: Pass) -> d
     if not one.flux or not steps["timed"] or not duration > 0 or found.moved > _TOO_FAR:
         return None
     crossed, moments = sum(flips for flips, _ in one.flux), sum(moment for _, moment in one.flux)
-    rate = crossed / moments
-    seen = flips / duration
+    rate, seen = crossed / moments, flips / duration
     return {
-        "rate": rate,
-        "error": rate / max(crossed, 1) ** 0.5,
-        "seen": seen,
-        "crossed": crossed,
-        "frames": len(one.flux),
-        "moved": found.moved,
-        "lost": 1.0 - seen / rate if rate > 0 else None,
-    }
-
-
-def _append_residues(folder: RunFolder, number: int, counted: Any, labels: Any) -> None:
-    if counted.residues is None:
-        return
-    between, within = counted.residues
-    busy = np.flatnonzero(between + within)
-    busy = busy[np.argsort(-(between + within)[busy], kind="stable")]
-    words = [labels.residues[1][at] for at in busy]
-    folder.append(
-        "residues",
-        {
-            "rule": np.full(len(busy), number),
-            "residue": words,
-            "between": between[busy],
-            "within": within[busy],
-        },
-    )
+        "rate": rate, "error": rate / max(crossed, 1) ** 0.5, "seen": seen, "crossed": crossed,
+        "frames": len(one.flux), "moved": found.moved, "lost": 1.0 - seen / rate if rate > 0 else None,
+    }  # fmt: skip

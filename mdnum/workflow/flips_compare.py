@@ -3,198 +3,122 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mdnum.errors import InputError
-from mdnum.store import RunFolder
-from mdnum.trajectories.checked import checked
-from mdnum.trajectories.compare import Apart, Difference, apart, growth
-from mdnum.trajectories.far import smallest_radius
-from mdnum.trajectories.resolution import infer_from
-from mdnum.trajectories.rules import Cutoff
+from mdnum.report.browse import Browse, Column, plain_rows
+from mdnum.report.finding import Finding, Texts, Verdict, conclude
+from mdnum.report.section import Key, Page, Plot, Section, Series, Table, pairs
+from mdnum.report.words import count, many, number
+from mdnum.trajectories.compare import ComparedSide, NeighborSets, follow_both, growth_of
+from mdnum.trajectories.follow import atoms_of
+from mdnum.trajectories.resolution import infer
 from mdnum.trajectories.tracker import Tracker
-from mdnum.workflow.flips_differing import Side, other_box, rows
-from mdnum.workflow.flips_open import (
-    FlipsResult,
-    about,
-    default_rules,
-    leave,
-    name_of,
-    new_folder,
-    sample_of,
-    selected,
-    source,
-    told_resolution,
-)
-from mdnum.workflow.fork_question import Log, Progress, finish
+from mdnum.workflow.flips_shared import FolderLog, Written, about, ending, name_of, resolution, selected, stem
+from mdnum.workflow.frame import Outcome, Progress, Verb, View, finish, new_folder, store
 from mdnum.workflow.interrupt import asked_to_stop
 
 if TYPE_CHECKING:
-    from mdnum.trajectories.frame import Frame
     from mdnum.trajectories.rules import Rule
-    from mdnum.trajectories.source import Trajectory
-    from mdnum.workflow.flips_record import Groups
+    from mdnum.trajectories.trajectory import Trajectory
 
-#: Rows of the table of pairs that come to differ.
-ROWS = 1_000
-_FIRST = 8
-# times that differ by less than this, relative, are the same
-_SAME_TIME = 1e-6
+TEXTS = Texts(__file__)
 
-
-@dataclass
-class _Sets:
-    """The neighbor sets of one rule in the two trajectories.
-
-    Attributes:
-        number: of the rule among those asked for.
-        first: what was seen at the first frame whose sets differ.
-        certain: first frame at which a pair differs that no resolution could have moved.
-        rows: pairs told in the table of those that come to differ.
-    """
-
-    number: int
-    rule: Rule
-    sides: list[Side]
-    difference: Difference = field(default_factory=Difference)
-    first: dict[str, Any] | None = None
-    certain: int | None = None
-    rows: int = 0
-
-
-@dataclass
-class _Found:
-    """What the frames showed, position by position.
-
-    Attributes:
-        sets: of every rule.
-        seed: first frame whose positions differ at all.
-        beyond: first frame at which an atom is further apart than the resolution of the two files explains.
-        other_box: the boxes at the first frame at which they are not the same.
-    """
-
-    sets: list[_Sets]
-    frames: int = 0
-    seed: int | None = None
-    beyond: int | None = None
-    other_box: dict[str, Any] | None = None
-    times_differ: int = 0
-    last: Apart = field(default_factory=lambda: Apart(0.0, 0.0, 0))
-    stopped: InputError | None = None
-    interrupted: bool = False
+# frames after a flip in which a leap of the separation shows, and how much larger than any before it must be
+_WINDOW, _LEAP = 10, 5.0
+# rates that differ by less than this factor are alike; r² from which on a separation grows exponentially
+_ALIKE, _FITS = 1.5, 0.8
 
 
 def compare(
-    paths: tuple[str | Path, str | Path],
-    topology: str | Path | None,
+    a: Trajectory,
+    b: Trajectory,
     asked: tuple[Rule, ...],
     between: tuple[str, str] | None,
     *,
-    format: str | None = None,
     out: str | Path | None = None,
     report: bool = True,
     progress: Progress | None = None,
-) -> FlipsResult:
-    """Where two trajectories part; see `mdnum.workflow.flips.flips`.
+) -> Outcome:
+    """Where two trajectories diverge; see `mdnum.workflow.flips.flips`.
 
     Raises:
         InputError: they are not of the same atoms.
     """
-    a, b = (source(path, topology, format) for path in paths)
     if a.atoms != b.atoms:
         raise InputError(
             f"{a.name} has {a.atoms:,} atoms and {b.name} {b.atoms:,}",
             remedy="Compare trajectories of the same atoms",
         )
-    asked = asked or default_rules(a)
-    groups = selected(a, between)
-    folder = new_folder(a, "flips-compare", out)
-    try:
-        return _look(folder, (a, b), asked, groups, between, report, progress)
-    except BaseException:
-        leave(folder)
-        raise
-
-
-def _look(
-    folder: RunFolder,
-    both: tuple[Trajectory, Trajectory],
-    rules: Sequence[Rule],
-    groups: Groups,
-    between: tuple[str, str] | None,
-    report: bool,
-    progress: Progress | None,
-) -> FlipsResult:
-    began = time.perf_counter()
-    resolutions = [infer_from(sample_of(one), one.bits, one.format) for one in both]
-    species = [[str(word) for word in one.species] for one in both]
+    groups, began = selected(a, between), time.perf_counter()
+    resolutions = [infer(one.sample(), one.bits, one.format) for one in (a, b)]
     sets = [
-        _Sets(number, rule, [
-            Side(one, Tracker(rule, groups[0], groups[1], words, 0.0), resolution)
-            for one, words, resolution in zip(both, species, resolutions, strict=True)
+        NeighborSets(rule, [
+            ComparedSide(one, Tracker(rule, *groups, [str(word) for word in one.species]), kept)
+            for one, kept in zip((a, b), resolutions, strict=True)
         ])
-        for number, rule in enumerate(rules)
+        for rule in asked
     ]  # fmt: skip
-    found = _follow(folder, sets, groups, Log(folder, progress))
-    folder.finalize()
-    folder.drop_checkpoint()
-    a, b = both
-    table = folder.read("apart", ["time", "furthest", "bound"])
-    differing = folder.read("differing")
-    told = [
-        {
-            "rule": one.rule.name,
-            "first": one.first,
-            "certain": one.certain,
-            "first_pairs": _first_pairs(one, differing),
-            "growth": _growth(found.frames, one, table),
-        }
-        for one in sets
-    ]
-    folder.write_summary(
-        {
-            **about(a, "flips-compare"),
+    held: list[tuple[str, dict[str, Any]]] = []
+    passes = follow_both(sets, atoms_of(groups), lambda table, rows: held.append((table, rows)))
+    # no folder for files whose first frames cannot be used
+    found, interrupted = next(passes), False
+    with new_folder("flips-compare", f"flips-{stem(a)}", out) as folder:
+        log = FolderLog(folder, progress)
+        total = min((one.count for one in (a, b) if one.count is not None), default=0)
+        with asked_to_stop() as stop:
+            while True:
+                for table, rows in held:
+                    folder.append(table, rows)
+                held.clear()
+                folder.checkpoint({"frames": found.frames})
+                log(found.frames, total, {"phase": "run", "unit": "frames"})
+                if interrupted := stop():
+                    break
+                if next(passes, None) is None:
+                    break
+        folder.checkpoint({"frames": found.frames}, force=True)
+        table = folder.read("apart")
+        told = [
+            {
+                "rule": one.rule.name, "first": one.first, "certain": one.certain,
+                "first_pairs": one.first_pairs, "growth": growth_of(found.frames, one, table),
+            }
+            for one in sets
+        ]  # fmt: skip
+        summary = {
+            **about(a, "flips-compare", between),
             "other": name_of(b),
             "other_file": str(b.path),
             "other_format": b.format,
             "same_species": _alike(a, b),
-            "between": None if between is None else list(between),
-            # the first rule, and all of them
-            **told[0],
             "rules": told,
-            "frames": found.frames,
-            "in_file": [one.count for one in both],
-            # steps, units and numbers of frames are not compared with one another
-            "times_differ": found.times_differ if a.time == b.time else 0,
+            "in_file": [one.count for one in (a, b)],
             "times": [a.time, b.time],
             "timed": a.time != "frame",
-            "resolution": told_resolution(resolutions[0], a),
-            "other_resolution": told_resolution(resolutions[1], b),
-            "seed": found.seed,
-            "beyond": found.beyond,
-            "other_box": found.other_box,
-            "last": {"furthest": found.last.furthest, "typical": found.last.typical},
-            "stopped": None if found.stopped is None else str(found.stopped),
-            "interrupted": found.interrupted,
+            "interval": 1.0,
+            "resolution": resolutions[0],
+            "other_resolution": resolutions[1],
+            **{name: value for name, value in vars(found).items() if name != "stopped"},
+            # steps, units and numbers of frames are not compared with one another
+            "times_differ": found.times_differ if a.time == b.time else 0,
+            **ending(found.stopped, interrupted),
             "seconds": time.perf_counter() - began,
-            "findings": [],
-            "status": "stopped" if found.stopped is not None or found.interrupted else "complete",
         }
-    )
-    return FlipsResult(folder.path, finish(folder, report, progress))
+        store(folder, summary, {})
+        folder.drop_checkpoint()
+        return finish(folder, report=report, result=found, progress=progress)
 
 
 def _alike(a: Trajectory, b: Trajectory) -> bool:
     """Whether the atoms of two files may be the same ones: of one species each, as far as the files say."""
-    if not (a.table.named and b.table.named):
-        return True
     first, second = ([str(one) for one in file.species] for file in (a, b))
-    if first == second:
+    if not (a.table.named and b.table.named) or first == second:
         return True
     # a dump numbers its types: each number stands for one species, and each species has one
     numbered = [all(one.isdigit() for one in words) for words in (first, second)]
@@ -202,133 +126,375 @@ def _alike(a: Trajectory, b: Trajectory) -> bool:
     return numbered[0] != numbered[1] and len(both) == len(set(first)) == len(set(second))
 
 
-def _follow(folder: RunFolder, sets: list[_Sets], groups: Groups, progress: Log) -> _Found:
-    """Reads both once, in step; control-C ends it, and what was compared stays."""
-    with asked_to_stop() as stop:
-        return _followed(folder, sets, groups, progress, stop)
+# ---- findings
 
 
-def _followed(
-    folder: RunFolder, sets: list[_Sets], groups: Groups, progress: Log, stop: Callable[[], bool]
-) -> _Found:
-    atoms = None
-    if groups[0] is not None:
-        atoms = np.unique(np.concatenate([one for one in groups if one is not None]))
-    found, sides = _Found(sets), sets[0].sides
-    before = Apart(0.0, 0.0, 0)
-    counts = [one.trajectory.count for one in sides]
-    total = min((one for one in counts if one is not None), default=0)
-    radius = smallest_radius([one.rule for one in sets])
-    first, second = (
-        checked(one.frames(), atoms, str(one.path), radius=radius, bits=one.bits)
-        for one in (side.trajectory for side in sides)
+@dataclass(frozen=True)
+class _Shown:
+    """A comparison as its sentences need it."""
+
+    view: View
+
+    @property
+    def summary(self) -> Mapping[str, Any]:
+        return self.view.summary
+
+    @property
+    def said(self) -> Written:
+        return Written(self.summary)
+
+    @property
+    def certain(self) -> bool:
+        """Whether anything that differs is beyond what the resolution of the two files explains."""
+        certain = any(one["certain"] is not None for one in self.summary["rules"])
+        return certain or any(self.summary[name] is not None for name in ("beyond", "other_box"))
+
+    @property
+    def differ(self) -> bool:
+        """Whether any sets differ, and anything is certain."""
+        return self.certain and any(one["first"] is not None for one in self.summary["rules"])
+
+    @property
+    def largest(self) -> tuple[str, str]:
+        """(largest separation at any frame, what resolution explains then)."""
+        table = self.view.table("apart")
+        at = int(np.argmax(table["furthest"]))
+        return self.said.length(float(table["furthest"][at])), self.said.length(float(table["bound"][at]))
+
+    def frame(self, at: int | None) -> str:
+        """A frame: its place among those compared, and its numbers in the files if others."""
+        if at is None:
+            return "no frame"
+        a, b = (int(self.view.table("apart")[f"number_{one}"][at]) for one in "ab")
+        if a == b == at:
+            return f"frame {count(at)}"
+        if a == b:
+            return f"frame {count(at)} ({count(a)} in both files)"
+        return f"frame {count(at)} ({count(a)} in A’s file, {count(b)} in B’s)"
+
+    def by_boxes(self, first: Mapping[str, Any]) -> bool:
+        """Whether the boxes differ when the sets come to, and positions not beyond the resolution."""
+        boxes, beyond = self.summary["other_box"], self.summary["beyond"]
+        same = beyond is None or beyond > first["frame"]
+        return boxes is not None and boxes["frame"] <= first["frame"] and same
+
+    def values(self, one: Mapping[str, Any]) -> dict[str, Any]:
+        """Of one rule, for sentences."""
+        first = one["first"] or {}
+        return {
+            "rule": self.said.rule(one), "frames": self.summary["frames"], "pairs": first.get("pairs", 0),
+            "first": self.frame(first.get("frame")), "certain": self.frame(one["certain"]),
+            "seed": self.frame(self.summary["seed"]), "beyond": self.frame(self.summary["beyond"]),
+            "furthest": self.said.length(first.get("furthest")),
+            "before": self.said.length(first.get("furthest_before")),
+            "last": self.said.length(self.summary["last"]["furthest"]),
+            "largest": self.largest[0], "explained": self.largest[1],
+            "sure": first.get("pairs", 0) - first.get("ambiguous", 0),
+        }  # fmt: skip
+
+
+def judge(view: View) -> Verdict:
+    """Headline, evidence and findings of a comparison."""
+    shown = _Shown(view)
+    return conclude(_findings(shown), _evidence(shown), headline=_headline(shown))
+
+
+def _headline(shown: _Shown) -> str:
+    """The verdict on the first rule, and where there are several a sentence on each other."""
+    first, *others = shown.summary["rules"]
+    text = TEXTS(f"head_{_head(shown, first)}", **shown.values(first))
+    if shown.summary["seed"] is None and not any(one["first"] for one in shown.summary["rules"]):
+        return text
+    return " ".join([text, *(_in_short(shown, one) for one in others)])
+
+
+def _head(shown: _Shown, one: Mapping[str, Any]) -> str:
+    summary, first = shown.summary, one["first"]
+    box = "" if summary["other_box"] is None else "_box"
+    if first is None:
+        if summary["seed"] is None:
+            return f"same{box}"
+        if not shown.certain:
+            return "not_shown"
+        return f"same_sets{box}" if summary["beyond"] is None else "positions"
+    if not shown.certain:
+        return "not_shown_sets"
+    if first["ambiguous"] == first["pairs"]:
+        return "sets_never" if one["certain"] is None else "sets_unsure"
+    return "sets_box" if shown.by_boxes(first) else "sets"
+
+
+def _in_short(shown: _Shown, one: Mapping[str, Any]) -> str:
+    return TEXTS("other_same" if one["first"] is None else "other_differ", **shown.values(one))
+
+
+def _evidence(shown: _Shown) -> Iterator[str]:
+    """What the frames show: positions, the sets of the first rule, and in short those of the others."""
+    summary, (one, *others) = shown.summary, shown.summary["rules"]
+    seed, beyond, first, values = summary["seed"], summary["beyond"], one["first"], shown.values(one)
+    if seed is not None:
+        code = "explained" if beyond is None else "at_once" if beyond == seed else "later"
+        yield TEXTS(f"positions_{code}", **values)
+        if seed:
+            yield TEXTS("positions_before")
+    elif first is not None:
+        yield TEXTS("positions_same")
+    if first is not None:
+        yield TEXTS(f"certain_{_certain(one)}", **values)
+        yield TEXTS(f"order_{_order(shown, one)}", **values)
+        yield from _leap(shown, first)
+        yield from _rates(shown, one["growth"])
+    elif beyond is not None:
+        yield TEXTS("order_none", **values)
+    for other in others:
+        yield _in_short(shown, other)
+        if other["first"] is not None:
+            yield TEXTS(f"certain_{_certain(other)}", **shown.values(other))
+
+
+def _certain(one: Mapping[str, Any]) -> str:
+    """Since when the sets differ whatever the files have rounded."""
+    if one["first"]["pairs"] > one["first"]["ambiguous"]:
+        return "some"
+    return "never" if one["certain"] is None else "later"
+
+
+def _order(shown: _Shown, one: Mapping[str, Any]) -> str:
+    """Whether a difference of positions was there before one of sets."""
+    at, beyond, certain = one["first"]["frame"], shown.summary["beyond"], one["certain"]
+    if beyond is not None and beyond < at:
+        return "positions"
+    if shown.by_boxes(one["first"]):
+        return "boxes"
+    if not shown.certain:
+        return "not_shown"
+    if at in (beyond, certain):
+        return "together" if at else "start"
+    return "unknown"
+
+
+def _leap(shown: _Shown, first: Mapping[str, Any]) -> Iterator[str]:
+    """Whether the separation leaps when the sets come to differ, as it does nowhere before."""
+    table, at = shown.view.table("apart"), int(first["frame"])
+    furthest = table["furthest"]
+    # a difference that has just begun grows fast, whatever began it
+    start = max((shown.summary["seed"] or 0) + _WINDOW, at // 2)
+    # what resolution explains does not grow
+    above = (furthest > table["bound"])[start:].all()
+    if at + _WINDOW >= len(furthest) or start + _WINDOW > at or not above:
+        return
+    grown = furthest[_WINDOW:] / np.maximum(furthest[:-_WINDOW], np.finfo(float).tiny)
+    after, before = float(grown[at]), float(grown[start : at - _WINDOW + 1].max())
+    if after > 0:
+        code = "leap" if after > _LEAP * max(before, 1.0) else "no_leap"
+        yield TEXTS(code, window=_WINDOW, after=after, before=before)
+
+
+def _rates(shown: _Shown, grown: Mapping[str, Any]) -> Iterator[str]:
+    rates = {}
+    for name in ("before", "after"):
+        line = grown[name]
+        if line is not None and line["r2"] >= _FITS and line["rate"] > 0:
+            rates[name] = line["rate"]
+            text = number(1 / line["rate"])
+            length = shown.said.time(text) if shown.summary["timed"] else f"{text} frames"
+            yield TEXTS(f"growth_{name}", time=length, frames=line["frames"])
+    if len(rates) == 2:
+        ratio = rates["after"] / rates["before"]
+        code = "faster" if ratio > _ALIKE else "slower" if ratio < 1 / _ALIKE else "alike"
+        yield TEXTS(f"growth_{code}", ratio=ratio)
+
+
+def _findings(shown: _Shown) -> Iterator[Finding]:
+    summary, frames = shown.summary, shown.summary["frames"]
+    if summary["stopped"]:
+        yield TEXTS.finding("STOPPED", frames=frames, error=summary["stopped"])
+    if summary["interrupted"]:
+        yield TEXTS.finding("INTERRUPTED", frames=frames)
+    unsure = [one for one in summary["rules"] if one["first"] and one["certain"] != one["first"]["frame"]]
+    if unsure:
+        made = []
+        for one in unsure:
+            variants = ["minor"] * (not shown.certain) + ["never"] * (one["certain"] is None)
+            made.append(TEXTS.finding("WITHIN_RESOLUTION", *variants, section="Rules", **shown.values(one)))
+        text = " ".join([*(one.text for one in made), TEXTS.entries["WITHIN_RESOLUTION"]["why"]])
+        yield replace(made[0], text=text)
+    boxes, beyond = summary["other_box"], summary["beyond"]
+    if boxes is not None:
+        # two runs at constant pressure have two boxes once they have diverged
+        later = not boxes["axes"] and beyond is not None and 0 < beyond <= boxes["frame"]
+        variants = ["later"] * later + ["axes"] * boxes["axes"]
+        a, b = (shown.said.box(boxes[one]) for one in "ab")
+        yield TEXTS.finding("OTHER_BOX", *variants, frame=shown.frame(boxes["frame"]), a=a, b=b)
+    if shown.differ:
+        yield TEXTS.finding("NO_CAUSE_FROM_FILES")
+    if not summary["same_species"]:
+        yield TEXTS.finding("OTHER_SPECIES")
+    if summary["times_differ"]:
+        yield TEXTS.finding("OTHER_TIMES", frames=summary["times_differ"])
+    if summary["times"][0] != summary["times"][1]:
+        yield TEXTS.finding("NO_TIMES", a=summary["times"][0], b=summary["times"][1])
+    counts = [one for one in summary["in_file"] if one is not None]
+    if len(set(counts)) > 1 and summary["status"] == "complete":
+        yield TEXTS.finding("OTHER_LENGTH", fewer=min(counts), more=max(counts))
+
+
+# ---- page
+
+
+def page(view: View, verdict: Verdict) -> Page:
+    """The page of two trajectories."""
+    summary, shown = view.summary, _Shown(view)
+    table = view.table("apart")
+    size = f"{many(summary['atoms'], 'atom')}, {many(summary['frames'], 'frame')} of both"
+    cannot = [*(["cause"] * shown.differ), "between", "programs"]
+    sections = [
+        Section("Rules", [_rules(shown), *_first_pairs(shown)], terminal=True),
+        Section("Separation", list(_separation(shown, table))),
+        Section("Pairs that differ", list(_differing(shown, table))),
+        Section("What two trajectories do not show", [TEXTS(f"cannot_{one}") for one in cannot]),
+        Section("What was read", [pairs(list(_input(shown, size))), TEXTS("files")]),
+    ]
+    return Page(
+        f"{view.name} and {summary['other']}", f"{size} compared", list(_keys(shown)),
+        [one for one in sections if one.parts], provenance=view.folder.provenance,
+    )  # fmt: skip
+
+
+def _keys(shown: _Shown) -> Iterator[Key]:
+    summary, one, said = shown.summary, shown.summary["rules"][0], shown.said
+
+    def first_frame(at: int | None) -> str:
+        return "never" if at is None else count(at)
+
+    first, seed = one["first"], summary["seed"]
+    at_all = "the same bit for bit" if seed is None else f"at all from {shown.frame(seed)} on"
+    yield Key("Positions differ", first_frame(summary["beyond"]), f"first frame, beyond resolution; {at_all}")
+    yield Key(
+        "Sets differ",
+        first_frame(None if first is None else first["frame"]),
+        f"first frame ({said.rule(one)})",
     )
-    pairs_of_frames = zip(first, second, strict=False)
-    while True:
-        if stop() and found.frames:
-            found.interrupted = True
-            break
-        try:
-            frames = next(pairs_of_frames, None)
-            if frames is None:
-                break
-            # every rule first: a frame that one of them refuses is not looked at by another
-            flips = [
-                [side.step(frame) for side, frame in zip(one.sides, frames, strict=True)] for one in sets
-            ]
-        except InputError as error:
-            if not found.frames:
-                raise
-            found.stopped = error
-            break
-        for one, new in zip(sets, flips, strict=True):
-            if found.frames:
-                one.difference.step(*new)
-            else:
-                one.difference = Difference.of(*(side.tracker.members() for side in one.sides))
-        now = apart(frames[0], frames[1], atoms)
-        if found.seed is None and now.furthest > 0:
-            found.seed = found.frames
-        allowed = sum(side.position_bound(now.periods) for side in sides)
-        if found.beyond is None and now.furthest > allowed:
-            found.beyond = found.frames
-        if found.other_box is None and (boxes := other_box(frames, _boxes_bound(sides))) is not None:
-            found.other_box = {"frame": found.frames, **boxes}
-        scale = max(abs(frames[0].time), abs(frames[1].time))
-        found.times_differ += abs(frames[0].time - frames[1].time) > _SAME_TIME * scale
-        for one in sets:
-            _sets_at(folder, one, found.frames, frames, now, before)
-        _append(folder, found.frames, frames, now, allowed, sets[0])
-        before, found.last = now, now
-        found.frames += 1
-        folder.checkpoint({"frames": found.frames})
-        progress(found.frames, total, {"phase": "run", "unit": "frames"})
-    if not found.frames:
-        raise InputError("no frame is left of what was asked for", remedy="Ask for others")
-    folder.checkpoint({"frames": found.frames}, force=True)
-    return found
+    if first is not None:
+        yield Key("Sets differ for certain", first_frame(one["certain"]), "first frame, beyond resolution")
+        yield Key("Pairs then", count(first["pairs"]), f"{count(first['ambiguous'])} within the resolution")
+        yield Key("Separation then", said.length(first["furthest"]), "furthest atom")
+    yield Key("Separation at the end", said.length(summary["last"]["furthest"]), "furthest atom")
 
 
-def _boxes_bound(sides: list[Side]) -> float:
-    """How far lattice vectors may be apart; formats that round positions may round the box as much."""
-    return sum(side.distance_bound for side in sides)
+def _rules(shown: _Shown) -> Table:
+    columns = ("inside", "sets differ from frame", "pairs then", "undecidable", "for certain from frame")
+    rows = []
+    for one in shown.summary["rules"]:
+        first = one["first"] or {}
+        rows.append(
+            (
+                shown.said.rule(one),
+                *(first.get(name) for name in ("frame", "pairs", "ambiguous")),
+                one["certain"],
+            )
+        )
+    return Table(columns, rows)
 
 
-def _sets_at(
-    folder: RunFolder, one: _Sets, at: int, frames: tuple[Frame, ...], now: Apart, before: Apart
-) -> None:
-    """What one rule's sets show at a frame, and the pairs that are new among those that differ."""
-    difference = one.difference
-    if one.certain is None and len(difference):
-        # all that differ: one that came to differ within the resolution may be beyond it by now
-        standing = rows(sorted(difference.only_a | difference.only_b), difference, one.sides, frames)
-        undecided = int(np.count_nonzero(standing["ambiguous"]))
-        if one.first is None:
-            one.first = {
-                "frame": at, "number": frames[0].index, "time": frames[0].time, "pairs": len(difference),
-                "furthest": now.furthest, "typical": now.typical,
-                "furthest_before": before.furthest if at else None,
-                "typical_before": before.typical if at else None, "ambiguous": undecided,
-            }  # fmt: skip
-        if undecided < len(difference):
-            one.certain = at
-    if new := difference.new[: ROWS - one.rows]:
-        told = rows(new, difference, one.sides, frames) | {"rule": np.full(len(new), one.number)}
-        folder.append("differing", {"frame": np.full(len(new), at), **told})
-        one.rows += len(new)
+def _first_pairs(shown: _Shown) -> Iterator[Table]:
+    unit = f" ({shown.said.unit})" if shown.said.unit else ""
+    columns = ("pair", "inside in", f"r in A{unit}", "r in B", "margin in A", "margin in B")
+    for one in shown.summary["rules"]:
+        rows = [
+            (
+                f"{row['i']}–{row['j']}", f"{row['inside']} only", f"{row['distance_a']:.10g}",
+                f"{row['distance_b']:.10g}", row["margin_a"], row["margin_b"],
+            )
+            for row in one["first_pairs"]
+        ]  # fmt: skip
+        if rows:
+            yield Table(
+                columns,
+                rows,
+                f"{shown.said.rule(one)}: the first pairs to differ, {shown.values(one)['first']}",
+            )
 
 
-def _append(
-    folder: RunFolder, at: int, frames: tuple[Frame, ...], now: Apart, bound: float, one: _Sets
-) -> None:
-    """The row of a frame; pairs are those of the first rule."""
-    row = {
-        "frame": at, "number_a": frames[0].index, "number_b": frames[1].index, "time": frames[0].time,
-        "time_b": frames[1].time, "furthest": now.furthest, "bound": bound, "typical": now.typical,
-        "atom": now.atom, "pairs_a": one.sides[0].tracker.pairs, "pairs_b": one.sides[1].tracker.pairs,
-        "only_a": len(one.difference.only_a), "only_b": len(one.difference.only_b),
-    }  # fmt: skip
-    folder.append("apart", {name: [value] for name, value in row.items()})
+def _axis(
+    shown: _Shown, table: Mapping[str, np.ndarray]
+) -> tuple[str, np.ndarray, tuple[tuple[float, str], ...]]:
+    """(label, values, marks) of an axis along the frames."""
+    timed = shown.summary["timed"] and bool(np.all(np.diff(table["time"]) > 0))
+    x = table["time"] if timed else table["frame"]
+    beyond, first = shown.summary["beyond"], shown.summary["rules"][0]["first"]
+    marks = [(float(x[beyond]), "positions differ")] if beyond else []
+    marks += [(float(x[first["frame"]]), "sets differ")] if first is not None else []
+    return f"time ({shown.summary['time']})" if timed else "frame", x, tuple(marks)
 
 
-def _first_pairs(one: _Sets, rows: dict[str, np.ndarray]) -> list[dict[str, Any]]:
-    """Pairs of the first frame whose sets differ, a few of them, as plain values."""
-    if one.first is None:
-        return []
-    mine = np.flatnonzero((rows["frame"] == one.first["frame"]) & (rows["rule"] == one.number))[:_FIRST]
-    return [{name: values[at].item() if hasattr(values[at], "item") else values[at]
-             for name, values in rows.items()} for at in mine]  # fmt: skip
+def _separation(shown: _Shown, table: Mapping[str, np.ndarray]) -> Iterator[Plot]:
+    if len(table["frame"]) < 2 or not table["furthest"].any():
+        return
+    label, x, marks = _axis(shown, table)
+    series = (
+        Series("furthest atom", x, table["furthest"]),
+        Series("root mean square", x, table["typical"], role="second"),
+        Series("explained by resolution", x, table["bound"], role="muted", dashed=True),
+    )
+    y = f"separation ({shown.said.unit})" if shown.said.unit else "separation"
+    yield Plot(
+        "separation", "Separation of the two", label, y, series, y_scale="log", verticals=marks,
+        caption=TEXTS("caption_separation"),
+    )  # fmt: skip
 
 
-def _growth(frames: int, one: _Sets, table: dict[str, np.ndarray]) -> dict[str, Any]:
-    """Rates at which the separation grows before the sets differ, and from then on."""
-    rule = one.rule
-    limit = 0.1 * (rule.radius if isinstance(rule, Cutoff) else float(table["furthest"].max(initial=0.0)))
-    cut = frames if one.first is None else one.first["frame"]
-    # up to its bound a separation may be made of rounding
-    separation = np.where(table["furthest"] > table["bound"], table["furthest"], 0.0)
-    parts = {}
-    for name, part in (("before", slice(None, cut + 1)), ("after", slice(cut, None))):
-        line = growth(table["time"][part], separation[part], limit)
-        parts[name] = None if line is None else {"rate": line[0], "r2": line[1], "frames": line[2]}
-    return parts
+def _differing(shown: _Shown, table: Mapping[str, np.ndarray]) -> Iterator[Any]:
+    only = (table["only_a"] + table["only_b"]).astype(float)
+    if len(only) > 1 and only.any():
+        label, x, marks = _axis(shown, table)
+        series = (
+            Series("inside in one only", x, only, role="bad"),
+            Series("inside in A", x, table["pairs_a"].astype(float), role="muted", dashed=True),
+        )
+        yield Plot(
+            "differing", "Pairs that differ", label, "pairs", series, y_scale="log", verticals=marks,
+            caption=TEXTS("caption_differing"),
+        )  # fmt: skip
+    rows = shown.view.table("differing")
+    if not len(rows["i"]):
+        return
+    columns: list[tuple[np.ndarray, int | None]] = [
+        (rows[name].astype(int), None) for name in ("frame", "i", "j")
+    ]
+    columns.append(((rows["inside"] == "B").astype(int), None))
+    columns += [(rows[name], 6) for name in ("distance_a", "distance_b", "margin_a", "margin_b")]
+    columns += [(rows[name].astype(int), None) for name in ("ambiguous", "rule")]
+    rules, unit = tuple(shown.said.rule(one) for one in shown.summary["rules"]), shown.said.unit
+    yield TEXTS("browse")
+    yield Browse(
+        name="pairs", row_id="pair-rows", label="Search pairs",
+        placeholder="3-17, atom 5, frame:100..200, undecidable",
+        columns=(
+            Column(0, "frame", kind="count"),
+            Column(1, "pair", kind="pair"),
+            Column(3, "inside in", kind="word", words=("A only", "B only")),
+            Column(4, "r in A", unit, digits=5),
+            Column(5, "r in B", unit, digits=5),
+            Column(6, "margin in A", unit),
+            Column(7, "margin in B", unit),
+            Column(8, "decided", kind="word", words=("yes", "no")),
+            *((Column(9, "rule", kind="word", words=rules),) if len(rules) > 1 else ()),
+        ),
+        rows=plain_rows(columns), words={"undecidable": (8, 1)}, ranges={"frame": 0}, subjects=(1, 2),
+        nouns=("atom", "pair"),
+    )  # fmt: skip
+
+
+def _input(shown: _Shown, size: str) -> Iterator[tuple[str, str]]:
+    summary, unit = shown.summary, shown.said.unit
+    for side, prefix in (("A", ""), ("B", "other_")):
+        file, format, kept = (summary[f"{prefix}{name}"] for name in ("file", "format", "resolution"))
+        yield side, f"{file} ({format}); {resolution(kept, unit)}"
+    yield "Size", size
+    if summary["between"]:
+        yield "Between", " and ".join(f"“{one}”" for one in summary["between"])
+    yield "Took", f"{number(summary['seconds'], 2)} s"
+
+
+VERBS = {"flips-compare": Verb(judge, page)}

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from mdnum.errors import InputError
 from mdnum.store import RunFolder
 from mdnum.store.naming import default_folder
+from mdnum.workflow.frame import Log as Log
 
 if TYPE_CHECKING:
     from mdnum.systems.ball_system import BallSystem
@@ -129,21 +130,3 @@ def finish(folder: RunFolder, report: bool, progress: Progress | None) -> dict[s
     else:
         pages.judge(folder)
     return folder.summary
-
-
-class Log:
-    """Passes progress on, and writes a line of log.txt at each new phase and now and then."""
-
-    def __init__(self, folder: RunFolder, progress: Progress | None):
-        self._folder, self._progress = folder, progress
-        self._last = ("", -1.0)
-
-    def __call__(self, step: int, steps: int, info: dict[str, Any]) -> None:
-        """As a rollout calls it."""
-        phase, share = str(info.get("phase", "run")), 10 * step // steps if steps else 0
-        if (phase, share) != self._last:
-            unit = info.get("unit", "steps")
-            self._folder.log(f"{phase}: {step:,} of {steps:,} {unit}" if steps else phase)
-            self._last = (phase, share)
-        if self._progress is not None:
-            self._progress(step, steps, info)

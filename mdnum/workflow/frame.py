@@ -12,7 +12,6 @@ goes into the folder first: judge and page read the folder alone, so a page can 
 from __future__ import annotations
 
 import importlib
-import importlib.util
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -40,10 +39,10 @@ Progress = Callable[[int, int, dict[str, Any]], None]
 KINDS: dict[str, str] = {
     "md": "mdnum.workflow.run",
     "ball": "mdnum.workflow.ball",
-    "demos": "mdnum.workflow.ball",
+    "demos": "mdnum.workflow.demos",
     "grad": "mdnum.workflow.grad",
     "flips": "mdnum.workflow.flips",
-    "flips-compare": "mdnum.workflow.flips",
+    "flips-compare": "mdnum.workflow.flips_compare",
     "audit": "mdnum.workflow.audit",
     "conform": "mdnum.workflow.conform",
     **dict.fromkeys(("fork", "screen", "compare", "benign"), "mdnum.workflow.fork"),
@@ -203,18 +202,28 @@ def verb_of(folder: RunFolder) -> Verb:
     return importlib.import_module(KINDS[folder.world]).VERBS[folder.world]
 
 
-def on_frame(folder: RunFolder) -> bool:
-    """Whether the verb of a folder has come onto this frame."""
-    module = KINDS.get(folder.world)
-    if module is None or importlib.util.find_spec(module) is None:
-        return False
-    return hasattr(importlib.import_module(module), "VERBS")
-
-
 def say(progress: Progress | None, phase: str, step: int = 0, steps: int = 0, **counts: Any) -> None:
     """Reports a phase, if anybody listens."""
     if progress is not None:
         progress(step, steps, {"phase": phase, **counts})
+
+
+class Log:
+    """Passes progress on, and writes a line of log.txt at each new phase and now and then."""
+
+    def __init__(self, folder: RunFolder, progress: Progress | None):
+        self._folder, self._progress = folder, progress
+        self._last = ("", -1.0)
+
+    def __call__(self, step: int, steps: int, info: dict[str, Any]) -> None:
+        """As a rollout calls it."""
+        phase, share = str(info.get("phase", "run")), 10 * step // steps if steps else 0
+        if (phase, share) != self._last:
+            unit = info.get("unit", "steps")
+            self._folder.log(f"{phase}: {step:,} of {steps:,} {unit}" if steps else phase)
+            self._last = (phase, share)
+        if self._progress is not None:
+            self._progress(step, steps, info)
 
 
 def store(folder: RunFolder, summary: Mapping[str, Any], tables: Mapping[str, Mapping[str, Any]]) -> None:
@@ -244,3 +253,19 @@ def refuse(given: Mapping[str, bool], whose: str, remedy: str) -> None:
     if names:
         what = "is an option" if len(names) == 1 else "are options"
         raise InputError(f"{' and '.join(names)} {what} {whose}", remedy=remedy)
+
+
+def logged(folder: RunFolder, progress: Progress | None) -> Progress:
+    """Passes progress on, and writes a line of log.txt at each new phase and now and then."""
+    last = ("", -1)
+
+    def report(step: int, steps: int, info: dict[str, Any]) -> None:
+        nonlocal last
+        now = str(info.get("phase", "run")), 10 * step // steps if steps else 0
+        if now != last:
+            folder.log(f"{now[0]}: {step:,} of {steps:,} {info.get('unit', 'steps')}" if steps else now[0])
+            last = now
+        if progress is not None:
+            progress(step, steps, info)
+
+    return report

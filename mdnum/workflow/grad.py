@@ -1,50 +1,53 @@
-"""`mdnum grad` as a function: differentiate a loss through a rollout in several ways, compare, report."""
+"""`mdnum grad`: differentiate a loss through a rollout of either world in several ways, and judge them."""
 
 from __future__ import annotations
 
+import io
+import math
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
+
+import numpy as np
 
 from mdnum.errors import InputError
-from mdnum.workflow.fork_question import Log, Progress, finish, is_ball, loaded, opened, steps_of
+from mdnum.plain import plain
+from mdnum.report.finding import Finding, Verdict, conclude
+from mdnum.report.words import listed, percent
+from mdnum.store.atomic import write_bytes
+from mdnum.workflow import frame, grad_page
+from mdnum.workflow.fork_question import Log, is_ball, loaded, steps_of
+from mdnum.workflow.frame import Outcome, Progress, Verb, View
+from mdnum.workflow.grad_page import TEXTS, by, closeness, digits_note, digits_of, magnitude, slope
 
 if TYPE_CHECKING:
-    from mdnum.gradients.base import Problem
+    from mdnum.gradients import Gradient, Method, Problem
+    from mdnum.gradients.diagnose import GradientDiagnosis
+    from mdnum.store import RunFolder
     from mdnum.systems.ball_system import BallSystem
+    from mdnum.systems.build import Simulation
     from mdnum.systems.load import System
 
-
-#: What is left out where no replicas are asked for.
-_STARTS = {
-    "what": "standard error",
-    "why": "other starts of the system, a run and a pass of tangents each",
-    "how": "--replicas 8",
-}
-#: What is left out with --no-half-step.
-_HALF = {
-    "what": "half the time step",
-    "why": "the gradient over the same time in twice as many steps: the digits that hold",
-    "how": "leave out --no-half-step",
-}
-
-
-@dataclass(frozen=True)
-class GradResult:
-    """A finished comparison of gradients.
-
-    Attributes:
-        folder: the gradient folder.
-        gradients: by method, in the order in which they were made; of a ball, those of
-            `mdnum.ball.gradients`.
-        summary: what summary.json says, findings included.
-    """
-
-    folder: Path
-    gradients: dict[str, Any]
-    summary: dict[str, Any]
+ALL = "all"
+#: What is run where nothing was said about methods, and atoms times steps that are run for differences then.
+_QUICK, AFFORDABLE = ("event-aware", "symmetric", "finite-differences"), 6_000_000
+#: Parts of a diagnosis that are always there, and those that are asked for.
+_PARTS, EDGES = ("agreement", "growth", "flips", "trust"), "edges"
+_BRIEF = ("growth", "flips", "spectrum", "scaling", "detective")
+ALSO = ("spectrum", EDGES, "scaling")
+#: Entries of a derivative that summary.json has one by one; the file with those that have more.
+_FEW, ARRAYS = 6, "gradients.npz"
+_BALL_UNITS = {
+    "k": "1/s²", "damping": "1/s", "eps": "m", "tol": "m", "gravity": "m/s²", "h": "s", "y0": "m",
+    "v0": "m/s",
+}  # fmt: skip
+#: Share of a derivative above which single flips decide it, and how many of them count as single.
+_HEAVY, _SINGLE = 0.2, 3
+#: Share of the weight of all flips above which what the guard leaves out matters.
+_LEFT_OUT = 0.01
+#: Relative difference from a closed form within which a derivative is that of the exact motion.
+_CLOSE = 0.01
 
 
 def grad(
@@ -61,22 +64,22 @@ def grad(
     overrides: Mapping[str, Any] | None = None,
     report: bool = True,
     progress: Progress | None = None,
-) -> GradResult:
+) -> Outcome:
     """Differentiate a loss of a rollout by parameters of its system, in several ways, and compare them.
 
     Args:
         system: a loaded system, a shipped name or the path of a system file; of molecular dynamics or a
             ball.
-        of: the loss, a word of `workflow.grad_words.LOSSES` with options behind a colon
-            ("potential:every=10"); of a ball a kind of its [loss] table, default what its file says.
+        of: the loss, a name of `gradients.losses.LOSSES` with options behind a colon
+            ("potential:every=10"); of a ball a kind of its [loss] table, default what its file has.
         wrt: parameters, full or short names, one by one or with commas; of a ball default what the
-            [gradient] table of its file says.
+            [gradient] table of its file has.
         steps: last step; default the system's own, but no more than 500 of molecular dynamics.
-        methods: words of `mdnum.gradients.registry.METHODS`, or "all"; default those that answer within
-            about a minute. What they leave out is said in the summary.
+        methods: names of `gradients.METHODS`, of a ball of `gradients.ball.BALL_METHODS`, or "all"; default
+            those that answer within about a minute, of a ball all. What is left out is in the summary.
         replicas: starts for the standard error of the gradient, at least 2; 0 leaves it out. Each is a run
             and a pass of tangents.
-        also: further parts of the diagnosis, words of `workflow.grad_methods.ALSO`, or "all".
+        also: further parts of the diagnosis, of `ALSO`, or "all".
         half_step: make the run and its gradient at half the time step too, about as much work again as all
             else; without it nothing is called trusted, and digits are not known. A ball has none of it.
         out: the new gradient folder; default runs/grad-<name>-<n>.
@@ -84,118 +87,649 @@ def grad(
         report: write report.html.
         progress: called now and then with what is done, of how much, and a dictionary of figures.
 
+    Returns:
+        folder, summary and page; its result is a `GradientDiagnosis`, of a ball `BallGradients`.
+
     Raises:
         InputError: no such loss, parameter or method, or none of the methods applies.
         NumericalError: the run blew up.
         FolderError: the folder cannot be used.
     """
-    from mdnum.workflow.grad_words import words
-
     if replicas < 0 or replicas == 1:
         raise InputError(f"replicas = {replicas}; a standard error takes at least 2")
-    wanted = words(wrt)
-    chosen = None if methods is None else words(methods)
-    further = words(also)
+    began, names, further = time.perf_counter(), words(wrt), words(also)
+    asked = None if methods is None else words(methods)
+    unknown = [word for word in further if word not in (*ALSO, ALL)]
+    if unknown:
+        raise InputError(f"no part {unknown[0]!r} of a diagnosis", remedy=f"There are {', '.join(ALSO)}")
+    further = ALSO if ALL in further else further
     if is_ball(system):
-        if further:
-            raise InputError(
-                f"{', '.join(further)}: of molecular dynamics, and this system is a ball",
-                remedy="Leave out --also",
-            )
-        if replicas:
-            raise InputError(
-                "replicas are starts of molecular dynamics, and this system is a ball",
-                remedy="Use --methods randomized, an average over noise with its standard error",
-            )
-        from mdnum.workflow.grad_ball import grad_ball
-
-        return grad_ball(
-            system, of, wanted, steps=steps, methods=chosen, out=out, overrides=overrides, report=report,
-            progress=progress,
-        )  # fmt: skip
-    asked = Asked(of, wanted, steps, chosen, replicas, further, half_step)
-    return _molecules(loaded(system, overrides), asked, out, report, progress)
-
-
-@dataclass(frozen=True)
-class Asked:
-    """What is to be differentiated, by what, and what is to be found out beside."""
-
-    of: str | None
-    wrt: tuple[str, ...]
-    steps: int | None
-    methods: tuple[str, ...] | None
-    replicas: int
-    also: tuple[str, ...]
-    half_step: bool
-
-
-def _molecules(
-    system: System, asked: Asked, out: str | Path | None, report: bool, progress: Progress | None
-) -> GradResult:
-    from mdnum.gradients.diagnose.trust import no_half_step
-    from mdnum.workflow import grad_methods, grad_record
-
-    began = time.perf_counter()
-    word, problem, names = _problem(system, asked)
-    impossible = no_half_step(problem.simulation)
-    plan = grad_methods.plan(problem, names, asked.methods, asked.replicas)
-    also = grad_methods.further(asked.also)
-    folder = opened(system, "grad", out, "grad")
-    try:
-        told = Log(folder, progress)
-        found = grad_methods.run(plan, problem, names, told, asked.replicas, also, asked.half_step)
-        grad_record.write(folder, found)
-        folder.finalize()
-        folder.write_summary(
-            grad_record.summarize(problem, word, names, found)
-            | {
-                "left_out": [
-                    *_shorter(system, asked.steps, problem.steps),
-                    *([] if asked.replicas or found.trust is None else [_STARTS]),
-                    *([] if asked.half_step or found.trust is None or impossible else [_HALF]),
-                    *grad_methods.not_asked(also, found),
-                    *plan.left_out,
-                ],
-                "seconds": time.perf_counter() - began,
-            }
+        frame.refuse(
+            {"--also": bool(further)}, "of molecular dynamics: this system is a ball", "Leave it out"
         )
-    except BaseException:
-        folder.close()
-        raise
-    opinions = () if found.agreement is None else found.agreement.opinions
-    made = {one.method: one.found for one in opinions if one.found is not None}
-    return GradResult(folder.path, made, finish(folder, report, progress))
+        remedy = "Use --methods randomized, an average over noise with its standard error"
+        frame.refuse({"--replicas": bool(replicas)}, "of molecular dynamics: this system is a ball", remedy)
+        ball = _ball_system(system, of, names, steps, overrides)
+        chosen = _ball_methods(asked)
+        with frame.new_folder("grad", f"grad-{ball.name}", out, system=ball) as folder:
+            result, summary = _differentiated(ball, chosen, Log(folder, progress))
+            frame.store(folder, {**summary, "seconds": time.perf_counter() - began}, {})
+        return frame.finish(folder, report=report, result=result, progress=progress)
+
+    md = loaded(system, overrides)
+    problem, names = _problem(md, of, names, steps)
+    chosen, left = plan(problem, names, asked, replicas)
+    with frame.new_folder("grad", f"grad-{md.name}", out, system=md) as folder:
+        log = Log(folder, progress)
+        result = _diagnosed(problem, names, chosen, left, further, replicas, half_step, log)
+        summary = _summary(problem, names, result)
+        summary["left_out"] = [*_not_run(md, steps, problem, result, replicas, further, half_step), *left]
+        _keep_arrays(folder, result)
+        tables = {name: part.table for name, part in _tables(result).items() if len(part.table)}
+        frame.store(folder, {**summary, "seconds": time.perf_counter() - began}, tables)
+    return frame.finish(folder, report=report, result=result, progress=progress)
 
 
-def _problem(system: System, asked: Asked) -> tuple[str, Problem, tuple[str, ...]]:
-    """The loss's word, the problem, and full names of the parameters: what cannot be is refused here."""
-    from mdnum.gradients import parameters
-    from mdnum.gradients.base import Problem
+def words(texts: Sequence[str] | str) -> tuple[str, ...]:
+    """Words that were given one by one, or with commas between them."""
+    texts = (texts,) if isinstance(texts, str) else texts
+    return tuple(dict.fromkeys(word.strip() for text in texts for word in text.split(",") if word.strip()))
+
+
+# -- molecular dynamics ------------------------------------------------------------------------------
+
+
+def _problem(
+    system: System, of: str | None, names: Sequence[str], steps: int | None
+) -> tuple[Problem, tuple[str, ...]]:
+    """The problem and full names of the parameters: what is not possible is refused here."""
+    from mdnum.gradients import Problem, parameters
+    from mdnum.gradients.losses import LOSSES, parse
     from mdnum.systems import build
-    from mdnum.workflow.grad_words import LOSSES, loss
 
-    if asked.of is None:
-        raise InputError(
-            "no loss to differentiate",
-            where=system.name,
-            remedy=f"Add --of LOSS. There are {', '.join(LOSSES)}",
-        )
-    last = steps_of(system, asked.steps)
-    simulation = build(system)
-    word, made = loss(asked.of, simulation, last)
-    if not asked.wrt:
-        raise InputError(
-            "no parameter to differentiate by",
-            where=system.name,
-            remedy=f"Add --wrt NAME,NAME. There are {', '.join(parameters.names(simulation))}",
-        )
-    return word, Problem(simulation, made, last), parameters.resolve(simulation, asked.wrt)
+    if of is None:
+        remedy = f"Add --of LOSS. There are {', '.join(LOSSES)}"
+        raise InputError("no loss to differentiate", where=system.name, remedy=remedy)
+    last, simulation = steps_of(system, steps), build(system)
+    loss = parse(of, simulation, last)
+    if not names:
+        remedy = f"Add --wrt NAME,NAME. There are {', '.join(parameters.names(simulation))}"
+        raise InputError("no parameter to differentiate by", where=system.name, remedy=remedy)
+    return Problem(simulation, loss, last), parameters.resolve(simulation, names)
 
 
-def _shorter(system: System, asked: int | None, steps: int) -> list[dict[str, str]]:
-    """That fewer steps were made than the system has, where nobody asked for that."""
+def plan(
+    problem: Problem, names: Sequence[str], asked: Sequence[str] | None, replicas: int = 0
+) -> tuple[list[Method], list[dict[str, str]]]:
+    """The methods to run, and what was not asked for and is not run: what, why, and how to ask.
+
+    Args:
+        problem: of what.
+        names: full names of the parameters.
+        asked: names of methods; None for those that answer soon.
+        replicas: starts of averages; 0 for their own number, and for no average where nothing was asked.
+
+    Raises:
+        InputError: no such method.
+    """
+    from mdnum.gradients import METHODS, method
+
+    if asked is not None:
+        chosen = {one.name: one for one in map(method, METHODS if ALL in asked else asked)}
+        return [_over(one, replicas) for one in chosen.values()], []
+    quick = (*_QUICK, "ensemble") if replicas else _QUICK
+    apply: list[Method] = []
+    left: list[dict[str, str]] = []
+    for name in METHODS:
+        one = method(name)
+        # by some of the parameters is enough
+        reasons = [one.reason_unavailable(problem, [parameter]) for parameter in names]
+        why = _too_long(one, problem, reasons.count(None)) if name in quick else one.description
+        if None not in reasons:
+            left.append({"what": name, "why": reasons[0] or "", "how": ""})
+        elif why:
+            left.append({"what": name, "why": why, "how": f"--methods {name}"})
+        else:
+            apply.append(_over(one, replicas, horizons=False))
+    return apply, left
+
+
+def _too_long(method: Method, problem: Problem, names: int) -> str:
+    """Why a quick method is not run where nothing was said about methods; "" where it is."""
+    runs = getattr(method, "runs", 0) * names + 1
+    if runs * problem.simulation.atoms * problem.steps <= AFFORDABLE or runs == 1:
+        return ""
+    return f"about {runs} more runs of {problem.steps:,} steps"
+
+
+def _over(method: Method, replicas: int, horizons: bool = True) -> Method:
+    """A method that averages over starts, over this many of them; other methods as they are.
+
+    Args:
+        horizons: whether it follows shorter runs too.
+    """
+    from dataclasses import replace
+
+    if not replicas or not hasattr(method, "replicas"):
+        return method
+    changed: Any = method
+    changed = replace(changed, replicas=replace(changed.replicas, count=replicas))
+    return replace(changed, halvings=0) if hasattr(changed, "halvings") and not horizons else changed
+
+
+def _diagnosed(
+    problem: Problem, names: Sequence[str], chosen: list[Method], left: Sequence[Mapping[str, str]],
+    further: Sequence[str], replicas: int, half_step: bool, log: Progress,
+) -> GradientDiagnosis:  # fmt: skip
+    from mdnum.gradients import parameters
+    from mdnum.gradients.diagnose import diagnose
+
+    where = problem.simulation.system.name
+    if not chosen:
+        reasons = "; ".join(f"{one['what']}: {one['why']}" for one in left)
+        raise InputError(f"no method applies: {reasons}", where=where, remedy="Ask for one with --methods")
+    parts = (*_PARTS, *(word for word in further if word != EDGES))
+    scalars = [name for name in names if not np.ndim(parameters.value(problem.simulation, name))]
+
+    def tell(done: int, steps: int, phase: str) -> None:
+        unit = "runs" if phase.endswith(("differences", "replicas")) else "steps"
+        log(done, steps, {"phase": phase, "unit": unit})
+
+    def look(parts: Sequence[str], edges: Sequence[str] = ()) -> GradientDiagnosis:
+        return diagnose(
+            problem, names, parts=parts, methods=chosen, edges_of=edges, replicas=replicas,
+            half_step=half_step, progress=tell,
+        )  # fmt: skip
+
+    found = look(parts, scalars if EDGES in further else ())
+    if found.agreement is None:
+        raise InputError(found.failed["agreement"], where=where)
+    reference = found.agreement.gradient(found.agreement.reference)
+    assert reference is not None
+    if found.growth is not None and not all(np.isfinite(one).all() for one in reference.gradient.values()):
+        from dataclasses import replace
+
+        return replace(found, detective=look(("detective",)).detective)
+    return found
+
+
+def _tables(found: GradientDiagnosis) -> dict[str, Any]:
+    """The parts of a diagnosis that have a table, by its name."""
+    parts = {
+        "growth": found.growth, "flip_contributions": found.flips, "trust": found.trust,
+        "scaling": found.scaling,
+    }  # fmt: skip
+    return {
+        name: part
+        for name, part in parts.items()
+        if part is not None and len(next(iter(part.table.values())))
+    }
+
+
+def _brief(part: Any) -> Any:
+    """A part of a diagnosis without the rows of its table, and without pairs that did not nearly flip."""
+    if part is None:
+        return None
+    return plain(
+        {name: value for name, value in vars(part).items() if name not in ("table", "turns", "columns")}
+    )
+
+
+def _summary(problem: Problem, names: Sequence[str], found: GradientDiagnosis) -> dict[str, Any]:
+    from mdnum.gradients import parameters
+
+    agreement, simulation, loss = found.agreement, problem.simulation, problem.loss
+    assert agreement is not None
+    units, (energy, force) = simulation.units, simulation.jumps()
+    trust = _brief(found.trust)
+    if found.trust is not None:
+        half, turns = found.trust.half, found.trust.turns
+        trust["half"] = {name: brief(one[0] if len(one) == 1 else one) for name, one in half.items()}
+        trust["near"] = None if turns is None else {
+            "turns": len(turns), "within": int(turns.within.sum()),
+            "heaviest": turns.heaviest(found.trust.columns),
+        }  # fmt: skip
+    made = [one for one in agreement.opinions if one.found is not None]
+    return {
+        "world": "grad",
+        "system": simulation.system.name,
+        "about": simulation.system.spec.about,
+        "atoms": simulation.atoms,
+        "steps": problem.steps,
+        "timestep": float(simulation.system.spec.dynamics.timestep),
+        "units": units.name,
+        "loss": {"word": loss.name, "about": loss.label, "unit": loss.unit.format_map(vars(units))},
+        "value": found.value,
+        "parameters": [
+            {
+                "name": name, "unit": parameters.unit(simulation, name),
+                "value": brief(parameters.value(simulation, name)), "entries": _entries(simulation, name),
+            }
+            for name in names
+        ],
+        "energy_jump": float(np.max(np.abs(energy))),
+        "force_jump": float(np.max(np.abs(force))),
+        "reference": agreement.reference,
+        "methods": [_method(one.found) | {"seconds": one.seconds} for one in made if one.found],
+        "comparisons": plain(agreement.comparisons),
+        **{name: _brief(getattr(found, name)) for name in _BRIEF},
+        "trust": trust,
+        "edges": plain(found.edges),
+        "failed": dict(found.failed),
+        "refused": [{"method": one.method, "why": one.missing} for one in agreement.opinions if one.missing],
+        "status": "complete",
+    }  # fmt: skip
+
+
+def _not_run(
+    system: System, asked: int | None, problem: Problem, found: GradientDiagnosis, replicas: int,
+    further: Sequence[str], half_step: bool,
+) -> Iterator[dict[str, str]]:  # fmt: skip
+    """What was left out: what, why, and how to have it."""
+    from mdnum.gradients.diagnose.trust import no_half_step
+
     own = system.spec.dynamics.steps
-    if asked is not None or steps >= own:
-        return []
-    return [{"what": f"{own - steps:,} steps", "why": f"the system has {own:,}", "how": f"--steps {own}"}]
+    if asked is None and problem.steps < own:
+        yield {
+            "what": f"{own - problem.steps:,} steps",
+            "why": f"the system has {own:,}",
+            "how": f"--steps {own}",
+        }
+    if found.trust is not None and not replicas:
+        yield {"what": "standard error", "why": TEXTS("left_starts"), "how": "--replicas 8"}
+    if found.trust is not None and not half_step and not no_half_step(problem.simulation):
+        yield {"what": "half the time step", "why": TEXTS("left_half"), "how": "leave out --no-half-step"}
+    for part in ALSO:
+        if part not in further:
+            yield {"what": part, "why": TEXTS(f"left_{part}"), "how": f"--also {part}"}
+    for part, why in found.failed.items():
+        yield {"what": part, "why": why, "how": ""}
+
+
+def _entries(simulation: Simulation, name: str) -> list[str] | None:
+    """Which pair each entry of a parameter belongs to; None where it has one entry, or one for each atom."""
+    from mdnum.gradients import parameters
+    from mdnum.md.potentials import pair_type
+
+    several = np.ndim(parameters.value(simulation, name)) and not name.startswith("initial.")
+    if not simulation.pairwise or not several:
+        return None
+    species = simulation.system.species
+    found = [""] * simulation.pair_types
+    for i, first in enumerate(species):
+        for j, second in enumerate(species[i:], i):
+            found[int(pair_type(np.array(i), np.array(j), len(species)))] = f"{first}-{second}"
+    return found
+
+
+def _keep_arrays(folder: RunFolder, found: GradientDiagnosis) -> None:
+    """Puts large derivatives into a folder."""
+    opinions = () if found.agreement is None else found.agreement.opinions
+    large = {
+        f"{one.method}/{name}": np.asarray(value)
+        for one in opinions
+        if one.found is not None
+        for name, value in one.found.gradient.items()
+        if np.ndim(value) > 1 or np.size(value) > _FEW
+    }
+    if large:
+        sink = io.BytesIO()
+        np.savez_compressed(sink, **large)  # type: ignore[arg-type]
+        write_bytes(folder.path / ARRAYS, sink.getbuffer())
+
+
+# -- of either world ---------------------------------------------------------------------------------
+
+
+def _method(found: Gradient) -> dict[str, Any]:
+    """What one method found, in plain values."""
+    details = plain(found.details)
+    error = details.pop("error", details.get("standard_error", {}))
+    notes = {
+        name: note
+        for name, note in found.notes.items()
+        if not found.depends.get(name, not found.depends) or not np.any(found.gradient.get(name, 0))
+    } if found.depends else dict(found.notes)  # fmt: skip
+    gradient = {name: brief(value) for name, value in found.gradient.items()}
+    return {
+        "method": found.method, "description": found.description, "kind": found.kind, "value": found.value,
+        "gradient": gradient, "error": error, "notes": notes, "details": details,
+    }  # fmt: skip
+
+
+def brief(value: Any) -> Any:
+    """A number, a few, or the size of many."""
+    array = np.asarray(value, np.float64)
+    if array.ndim == 0:
+        return float(array)
+    if array.ndim == 1 and array.size <= _FEW:
+        return array.tolist()
+    at = np.unravel_index(int(np.argmax(np.abs(array))), array.shape)
+    return {
+        "shape": list(array.shape), "norm": float(np.linalg.norm(array)), "largest": float(array[at]),
+        "at": [int(place) for place in at],
+    }  # fmt: skip
+
+
+# -- a ball ------------------------------------------------------------------------------------------
+
+
+def _ball_methods(asked: Sequence[str] | None) -> list[str]:
+    from mdnum.gradients.ball import BALL_METHODS
+
+    chosen = list(BALL_METHODS) if asked is None or ALL in asked else list(asked)
+    for name in chosen:
+        BALL_METHODS[name]
+    return chosen
+
+
+def _ball_system(
+    system: Any, of: str | None, names: Sequence[str], steps: int | None, overrides: Mapping[str, Any] | None
+) -> BallSystem:
+    """The ball with the loss and the parameters that were asked for in its own tables."""
+    from dataclasses import replace
+
+    from mdnum.systems import BallSystem, ball, ball_checks, load
+
+    kinds = get_args(ball.LossTable.model_fields["kind"].annotation)
+    if of is not None and of not in kinds:
+        raise InputError(f"no loss {of!r} of a ball", remedy=f"There are {', '.join(kinds)}")
+    changes: dict[str, Any] = {} if of is None else {"loss.kind": of}
+    changes |= {"gradient.of": list(names)} if names else {}
+    made = system if isinstance(system, BallSystem) else load(system, overrides, world="ball")
+    known = (*ball_checks.PARAMETERS[made.spec.contact.kind], *ball_checks.ALWAYS)
+    unknown = [name for name in names if name not in known]
+    if unknown or not (names or made.spec.gradient.of):
+        seen = f"no parameter {unknown[0]!r}" if unknown else "no parameter to differentiate by"
+        raise InputError(seen, where=made.name, remedy=f"Add --wrt NAME,NAME. There are {', '.join(known)}")
+    if not isinstance(system, BallSystem):
+        made = load(system, {**(overrides or {}), **changes}, world="ball")
+    elif overrides:
+        remedy = "Load it with the overrides, or give its name"
+        raise InputError("overrides change a system while it is loaded", remedy=remedy, where=system.name)
+    elif changes:
+        made = replace(system, spec=system.against(changes, "asked").variants[-1].spec)
+    return made if steps is None else made.for_steps(steps)
+
+
+def _differentiated(system: BallSystem, methods: list[str], log: Progress) -> tuple[Any, dict[str, Any]]:
+    from mdnum.gradients.ball import compare
+    from mdnum.systems.build_ball import build_ball
+    from mdnum.workflow.ball_record import exact
+
+    spec, problem = system.spec, build_ball(system).problem
+    log(0, 0, {"phase": "run"})
+    run = problem.run()
+    log(0, 0, {"phase": "gradient"})
+    found = compare(problem, spec.gradient.of, methods)
+    rows = [_method(one) for one in found]
+    if not rows:
+        reasons = "; ".join(f"{name}: {why}" for name, why in found.refused.items())
+        raise InputError(f"no method applies: {reasons}", where=system.name)
+    right = (exact(system, run, rows) or {}).get("gradient") or {}
+    made = {one["method"]: one["gradient"] for one in rows}
+    reference = "closed form" if right else "event-aware" if "event-aware" in made else rows[0]["method"]
+    base = right or made[reference]
+    power = "²" if spec.loss.kind == "residual-penetration" or spec.loss.target is not None else ""
+    summary = {
+        "world": "grad",
+        "system": system.name,
+        "about": spec.about,
+        "balls": system.balls,
+        "contact_kind": spec.contact.kind,
+        "integrator": spec.integrator.kind,
+        "steps": spec.integrator.steps,
+        "timestep": spec.integrator.timestep,
+        "units": "ball",
+        "loss": {"word": spec.loss.kind, "about": spec.loss.kind.replace("-", " "), "unit": f"m{power}"},
+        "value": rows[0]["value"],
+        "parameters": [
+            {"name": name, "unit": _BALL_UNITS.get(name, ""), "value": None} for name in spec.gradient.of
+        ],
+        "reference": reference,
+        "exact": dict(right),
+        "methods": rows,
+        "comparisons": [
+            {
+                "name": name, "method": method, "reference": reference, "size": abs(base[name]),
+                "difference": value - base[name], "relative": relative(value, base[name]), "meaning": "",
+            }
+            for method, gradient in made.items()
+            for name, value in gradient.items()
+            if name in base and method != reference
+        ],
+        "contacts": int(run.contacts.step.size),
+        "refused": [{"method": name, "why": why} for name, why in found.refused.items()],
+        "left_out": [],
+        "status": "complete",
+    }  # fmt: skip
+    return found, summary
+
+
+def relative(value: float, right: float) -> float:
+    """The difference over what is right; infinite where only that is 0."""
+    if value == right:
+        return 0.0
+    return abs(value - right) / abs(right) if right else float("inf")
+
+
+# -- what is wrong with a gradient, or should be known about it --------------------------------------
+
+
+def judge(view: View) -> Verdict:
+    """Findings, evidence and headline of a gradient."""
+    trust = view.summary.get("trust") or {}
+    found = [
+        *_not_finite(view), *_no_dependence(view), *_unexplained(view), *_plain_at_a_jump(view),
+        *_loss_jumps(view), *_short(view), *_few_flips(view), *_departs(view), *_grazing(view),
+        *_off_the_motion(view), *_refused(view),
+    ]  # fmt: skip
+    known = view.summary.get("exact") or trust.get("verdict") == "trusted"
+    # the headline has the verdict on trust already
+    worst = [one for one in found if one.severity == "error" or one.code not in ("BEYOND_TRUST", "UNDECIDED")]
+    judged = not any(one.severity in ("warning", "error") for one in worst)
+    return conclude(
+        found, _evidence(view), headline=_headline(view), best="good" if known else "info", judged=judged
+    )
+
+
+def _headline(view: View) -> str:
+    summary, trust = view.summary, view.summary.get("trust") or {}
+    reference = by(summary, summary["reference"])
+    parts = []
+    for one in summary["parameters"][:3]:
+        value = f"{slope(summary, reference, one['name'], 4)} {grad_page.slope_unit(summary, one)}".rstrip()
+        note = digits_note(summary, one["name"])
+        short = one["name"].rpartition(".")[2]
+        parts.append(f"d {summary['loss']['word']} / d {short} = {value}{f' ({note})' if note else ''}")
+    name = trust.get("verdict") or "unasked"
+    if name == "limited" and not trust["horizon"]:
+        name = "limited_anywhere"
+    starts = TEXTS("starts_unknown") if "other starts" in trust.get("unknown", ()) else ""
+    return TEXTS(
+        f"headline_{name}", steps=view.summary["steps"], slopes=listed(parts), horizon=trust.get("horizon"),
+        limit=trust.get("limited_by"), starts=starts,
+    )  # fmt: skip
+
+
+def _evidence(view: View) -> Iterator[str]:
+    summary = view.summary
+    reference = by(summary, summary["reference"])
+    if reference is not None:
+        yield TEXTS("by_method", method=reference["method"], description=reference["description"].rstrip("."))
+    yield from grad_page.trust_sentences(summary) or grad_page.growth_sentences(view)
+    for name, parts in ((summary.get("flips") or {}).get("share") or {}).items():
+        if None not in parts.values() and digits_of(summary, name.partition("[")[0]) != 0:
+            share = percent(round(abs(parts["pair enters"] + parts["pair leaves"]), 6))
+            yield TEXTS("flips_share", share=share, name=name)
+
+
+def _unexplained(view: View) -> Iterator[Finding]:
+    """Methods that should agree and do not."""
+    for row in view.summary["comparisons"]:
+        if row["meaning"] == "unexplained":
+            yield TEXTS.finding(
+                "UNEXPLAINED", section="By method", method=row["method"], reference=row["reference"],
+                name=row["name"], closeness=closeness(row), explained=row["values"].get("explained"),
+            )  # fmt: skip
+
+
+def _plain_at_a_jump(view: View) -> Iterator[Finding]:
+    """Only methods that hold decisions fixed, where flips count."""
+    summary = view.summary
+    kinds = {one["kind"] for one in summary["methods"]}
+    held = [one["method"] for one in summary["methods"] if one["kind"] == "steps"]
+    aware = {"event-aware", "smoothed-differences", "ensemble"} & {
+        one["method"] for one in summary["methods"]
+    }
+    if summary.get("force_jump") and held and not aware and "flow" not in kinds:
+        yield TEXTS.finding(
+            "MISSING_SALTATION", section="By method", jump=summary["force_jump"], methods=listed(held),
+            unit=f"{view.units.energy}/{view.units.length}", held=len(held),
+        )  # fmt: skip
+
+
+def _loss_jumps(view: View) -> Iterator[Finding]:
+    """A loss that itself jumps at a flip, in frames that no average is over."""
+    if any(one["details"].get("loss jumps") for one in view.summary["methods"]):
+        yield TEXTS.finding("LOSS_JUMPS", loss=view.summary["loss"]["word"])
+
+
+def _short(view: View) -> Iterator[Finding]:
+    """A gradient that is not trusted as far as it was asked for."""
+    trust, section = view.summary.get("trust") or {}, "How far it is trusted"
+    if trust.get("verdict") == "limited":
+        limit = trust["limited_by"]
+        variants = [limit.replace(" ", "_"), *["anywhere"] * (not trust["horizon"])]
+        seen = next(one for one in trust["limits"] if one["what"] == limit)
+        yield TEXTS.finding(
+            "BEYOND_TRUST", *variants, section=section, horizon=trust["horizon"], limit=limit,
+            seen=grad_page.limit_sentence(view.summary, seen),
+        )  # fmt: skip
+    elif trust.get("verdict") == "undecided":
+        variants = list(_unknown(view, trust))
+        yield TEXTS.finding("UNDECIDED", *variants, section=section, unknown=listed(trust["unknown"]))
+
+
+def _unknown(view: View, trust: Mapping[str, Any]) -> Iterator[str]:
+    """What to do about each thing that was not examined, as variants of the finding."""
+    unseen = {one["what"] for one in trust["limits"] if one["horizon"] is None}
+    averaged = any(name.startswith("error.") for name in view.table("trust"))
+    if any(one["what"] == "half the time step" for one in view.summary["left_out"]):
+        yield "half"
+    elif "time step" in unseen:
+        yield "noise"
+    elif "near miss" in unseen:
+        yield "near" if by(view.summary, "event-aware") is not None else "aware"
+    if "time step" in unseen and "near miss" in unseen and by(view.summary, "event-aware") is None:
+        yield "aware"
+    if "other starts" in trust["unknown"] and not averaged:
+        yield "starts"
+    if "parameters of many entries" in trust["unknown"]:
+        yield "entries"
+
+
+def _few_flips(view: View) -> Iterator[Finding]:
+    """Derivatives that hang on a flip or two."""
+    totals = (view.summary.get("flips") or {}).get("total") or {}
+    table = view.table("flip_contributions") if totals else {}
+    for name, total in totals.items():
+        added = table.get(f"contribution.{name}")
+        if added is None or not len(added) or not total:
+            continue
+        heavy = np.argsort(-np.abs(added))[:_SINGLE]
+        heavy = heavy[np.abs(added[heavy]) > _HEAVY * abs(total)]
+        if not len(heavy):
+            continue
+        k = heavy[0]
+        none = ["none"] * (digits_of(view.summary, name.partition("[")[0]) == 0)
+        averaged = any(one.startswith("error.") for one in view.table("trust"))
+        yield TEXTS.finding(
+            "FEW_FLIPS", *none, *["averaged"] * averaged, section="Flips on the way", name=name,
+            count=len(heavy), heavy=_HEAVY, i=int(table["i"][k]), j=int(table["j"][k]),
+            step=int(table["step"][k]), speed=abs(float(table["radial_speed"][k])),
+            share=abs(float(added[k]) / total),
+        )  # fmt: skip
+
+
+def _departs(view: View) -> Iterator[Finding]:
+    """Methods that differentiate a forward pass of their own, and where it leaves the run."""
+    for one in view.summary["methods"]:
+        primal = one["details"].get("primal") or {}
+        if primal.get("first state") is not None:
+            decided = primal.get("first decision")
+            yield TEXTS.finding(
+                "ANOTHER_PRIMAL", *["decided"] * (decided is not None), method=one["method"],
+                state=primal["first state"], decision=decided,
+            )  # fmt: skip
+
+
+def _grazing(view: View) -> Iterator[Finding]:
+    """What the guard left out."""
+    details = (by(view.summary, "event-aware") or {"details": {}})["details"]
+    left, applied = details.get("weight left out"), details.get("weight applied")
+    if left and applied is not None and left > _LEFT_OUT * (left + applied):
+        yield TEXTS.finding(
+            "GRAZING", section="Flips on the way", grazing=details["grazing"], share=left / (left + applied),
+            guard=details["guard"],
+        )  # fmt: skip
+
+
+def _not_finite(view: View) -> Iterator[Finding]:
+    where = view.summary.get("detective") or {}
+    variants = []
+    if where.get("found"):
+        variants = ["found" if where["forward"] else "forward", *["pair"] * (where["j"] >= 0)]
+    inputs = ", ".join(f"{value:.4g}" for value in where.get("inputs") or ())
+    for one in view.summary["methods"]:
+        sizes = {name: magnitude(value, math.nan) for name, value in one["gradient"].items()}
+        broken = [name for name, size in sizes.items() if not math.isfinite(size)]
+        if broken:
+            values: dict[str, Any] = {**where, "inputs": inputs, "names": listed(broken)}
+            yield TEXTS.finding("NOT_FINITE", *variants, method=one["method"], **values)
+
+
+def _no_dependence(view: View) -> Iterator[Finding]:
+    """Parameters by which no method finds anything."""
+    for one in view.summary["parameters"]:
+        name = one["name"]
+        sizes = [magnitude(method["gradient"].get(name), math.nan) for method in view.summary["methods"]]
+        if any(sizes):
+            continue
+        # what the reference has first: it leaves nothing out
+        reference = view.summary["reference"]
+        ranked = sorted(view.summary["methods"], key=lambda one: one["method"] != reference)
+        notes = [method["notes"].get(name) for method in ranked]
+        note = next(filter(None, notes), TEXTS("no_note"))
+        yield TEXTS.finding("NO_DEPENDENCE", name=name, note=note)
+
+
+def _off_the_motion(view: View) -> Iterator[Finding]:
+    """Methods that do not give the derivative of the exact motion, where that is known."""
+    if not view.summary.get("exact"):
+        return
+    rows = view.summary["comparisons"]
+    off = [row for row in rows if row["relative"] is None or row["relative"] > _CLOSE]
+    if not off:
+        return
+    methods = list(dict.fromkeys(row["method"] for row in off))
+    each = []
+    for method in methods:
+        named = [f"{row['name']} {closeness(row)}" for row in off if row["method"] == method]
+        each.append(f"{method} ({', '.join(named)})")
+    aware = ["aware"] * ("event-aware" in methods)
+    impact = view.summary["contact_kind"] == "impact" and view.summary["integrator"] != "event-located"
+    yield TEXTS.finding(
+        "NOT_THE_MOTION", *["impact"] * (impact and bool(aware)), *aware, section="By method",
+        methods=len(methods), close=_CLOSE, each=listed(each),
+    )  # fmt: skip
+
+
+def _refused(view: View) -> Iterator[Finding]:
+    refused = view.summary["refused"]
+    if refused:
+        each = " ".join(f"{one['method']}: {one['why'].rstrip('.')}." for one in refused)
+        yield TEXTS.finding("DOES_NOT_APPLY", methods=len(refused), each=each)
+
+
+VERBS = {"grad": Verb(judge, grad_page.page)}

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mdnum.errors import InputError, NumericalError
+from mdnum.plain import plain
 from mdnum.report import analysis
 from mdnum.report.finding import Finding, Verdict, conclude
 from mdnum.store import RunFolder
@@ -95,7 +96,8 @@ def run(
 
 def _compare(folder: RunFolder, result: RunResult) -> None:
     """Puts the comparison of the first and the last frame with ASE into the summary."""
-    from mdnum.references.energy import check_energy
+    from mdnum.references.energy_check import check_energy
+    from mdnum.workflow.check import energy_findings
 
     frames = {}
     for name, positions in zip(("initial", "last"), result.frames, strict=True):
@@ -104,7 +106,7 @@ def _compare(folder: RunFolder, result: RunResult) -> None:
     compared = check_energy(result.simulation, frames)
     summary = folder.summary
     summary["ase"] = compared.worst
-    summary["findings"] = [*summary["findings"], *compared.findings]
+    summary["findings"] = [*summary["findings"], *map(plain, energy_findings(compared))]
     folder.write_summary(summary)
 
 
@@ -261,9 +263,9 @@ def _drift(view: View, run: Record) -> Iterator[Finding]:
     # jumps do not count: what they add follows the number of pairs, up and down
     drift = view.summary.get("energy_drift_without_jumps")
     if drift is None and np.isfinite(left).all():
-        from mdnum.rollout.summary import Line
+        from mdnum.rollout.summary import LineFit
 
-        fitted = Line()
+        fitted = LineFit()
         fitted.add(time, left)
         drift = None if fitted.slope is None else fitted.slope / atoms
     if drift is not None and run.steps > 1 and np.isfinite(left).all():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,9 @@ from ase import Atoms
 from ase.build import bulk
 from ase.calculators.calculator import Calculator, all_changes
 
+from mdnum.audit.base import CheckResult, Observed
 from mdnum.audit.subject import CalculatorSubject
+from mdnum.audit.thresholds import PairThreshold
 
 R_CUT = 3.4
 KT = 0.01
@@ -29,9 +31,23 @@ def chain() -> Atoms:
     return Atoms("ArKrArArKrAr", positions=positions)
 
 
-def subject(make: Callable[[], Calculator], atoms: Atoms | None = None) -> CalculatorSubject:
-    """The subject of an audit."""
-    return CalculatorSubject(make.__name__, make, crystal() if atoms is None else atoms, kT=KT)
+def subject(make: Callable[[], Any], atoms: Atoms | None = None, order: int | None = 4) -> CalculatorSubject:
+    """The subject of an audit, with its cutoff as a walk finds it, of an order; None where it has none."""
+    found = CalculatorSubject("planted", make, crystal() if atoms is None else atoms, kT=KT)
+    end = (R_CUT, ("Ar", "Ar"), order or 0, (0.0,) * 3, (0.0,) * 3, R_CUT, R_CUT, True, 1e-9)
+    found.known["thresholds"] = [] if order is None else [PairThreshold(*end)]
+    return found
+
+
+def codes(result: CheckResult | Iterable[Observed]) -> dict[str, str]:
+    """Severities by code."""
+    return {one.code: one.severity for one in getattr(result, "findings", result)}
+
+
+def values(result: CheckResult, code: str) -> dict[str, Any]:
+    """Values of the one finding of a code, and its variants."""
+    (found,) = [one for one in result.findings if one.code == code]
+    return {**found.values, "variants": found.variants}
 
 
 class Good(Calculator):
@@ -95,11 +111,13 @@ class Good(Calculator):
         return energy, forces
 
 
-class OneImage(Good):
-    """Looks for neighbors one cell away and does not wrap: unwrapped coordinates lose theirs."""
+def but(_base: type[Good] = Good, **methods: Any) -> type[Any]:
+    """The same with some methods of its own."""
+    return type("Planted", (_base,), methods)
 
-    def positions(self, atoms):
-        return atoms.positions
+
+#: Looks for neighbors one cell away and does not wrap: unwrapped coordinates lose theirs.
+OneImage = but(positions=lambda self, atoms: atoms.positions)
 
 
 class FaceDropped(Good):
@@ -144,12 +162,8 @@ class ByLengths(Good):
         return np.array(list(itertools.product(*(range(-n, n + 1) for n in counts)))) @ rows
 
 
-class HardEdge(Good):
-    """A cutoff that cuts."""
-
-    def pair(self, distances):
-        u, slope = super().pair(distances)
-        return u + 0.01, slope
+#: A cutoff that cuts.
+HardEdge = but(pair=lambda self, r: (Good.pair(self, r)[0] + 0.01, Good.pair(self, r)[1]))
 
 
 class Tilted(Good):
@@ -200,12 +214,12 @@ class OneSided(Good):
         return i[keep], j[keep], vectors[keep]
 
 
-class Whirl(Good):
-    """Adds a force that goes round the center of the structure."""
-
-    def extra(self, atoms, energy, forces):
-        arms = atoms.positions - atoms.positions.mean(axis=0)
-        return energy, forces + 1e-3 * np.cross([0.0, 0.0, 1.0], arms)
+#: Adds a force that goes round the center of the structure.
+Whirl = but(
+    extra=lambda self, atoms, e, f: (
+        e, f + 1e-3 * np.cross([0.0, 0.0, 1.0], atoms.positions - atoms.positions.mean(axis=0))
+    )
+)  # fmt: skip
 
 
 class OldPairs(Good):
@@ -327,19 +341,12 @@ class EmptyList(Good):
         return energy, forces
 
 
-class Background(Good):
-    """A term of the whole: the energy of parts is not the sum."""
-
-    def extra(self, atoms, energy, forces):
-        return energy + 0.1 * len(atoms) ** 2 * (not atoms.pbc.any()), forces
+#: A term of the whole: the energy of parts is not the sum.
+Background = but(extra=lambda self, atoms, e, f: (e + 0.1 * len(atoms) ** 2 * (not atoms.pbc.any()), f))
 
 
-class Single(Good):
-    """Works in single precision."""
-
-    def answer(self, atoms):
-        energy, forces = super().answer(atoms)
-        return float(np.float32(energy)), forces.astype(np.float32).astype(float)
+#: Works in single precision.
+Single = but(extra=lambda self, atoms, e, f: (float(np.float32(e)), f.astype(np.float32).astype(float)))
 
 
 class OnlyRectangles(Good):
@@ -369,10 +376,8 @@ class HalfPrecision(Good):
         return energy, (forces / self.unit).astype(np.float16).astype(float) * self.unit
 
 
-class HalfInOtherUnits(HalfPrecision):
-    """The same before a factor, after which every bit of the doubles is used."""
-
-    unit = 0.0433641153087705
+#: The same before a factor, after which every bit of the doubles is used.
+HalfInOtherUnits = but(HalfPrecision, unit=0.0433641153087705)
 
 
 class BrainFloat(Good):
@@ -392,11 +397,8 @@ class Decimals(Good):
         return energy, np.round(forces, self.places)
 
 
-class HalfEnergy(Good):
-    """An energy in a narrow format, the forces in full."""
-
-    def extra(self, atoms, energy, forces):
-        return float(np.float16(energy)), forces
+#: An energy in a narrow format, the forces in full.
+HalfEnergy = but(extra=lambda self, atoms, e, f: (float(np.float16(e)), f))
 
 
 class Drops(Good):
@@ -458,11 +460,8 @@ class TwoEnergies(Good):
         self.results["energy"] = self.other(self.atoms, self.results["free_energy"])
 
 
-class Entropy(TwoEnergies):
-    """They differ by what changes smoothly with the positions, as with smeared electrons."""
-
-    def other(self, atoms, energy):
-        return 1.01 * energy
+#: They differ by what changes smoothly with the positions, as with smeared electrons.
+Entropy = but(TwoEnergies, other=lambda self, atoms, energy: 1.01 * energy)
 
 
 class CutEnergy(TwoEnergies):
@@ -473,11 +472,10 @@ class CutEnergy(TwoEnergies):
         return energy + 0.005 * len(i)
 
 
-class OrderedEnergy(TwoEnergies):
-    """The energy alone depends on the order of the atoms."""
-
-    def other(self, atoms, energy):
-        return energy + 0.01 * float(np.linalg.norm(atoms.positions[0] - atoms.positions[1]))
+#: The energy alone depends on the order of the atoms.
+OrderedEnergy = but(
+    TwoEnergies, other=lambda self, atoms, e: e + 0.01 * np.linalg.norm(np.diff(atoms.positions[:2], axis=0))
+)
 
 
 class SwappedEnergies(TwoEnergies):
@@ -516,20 +514,23 @@ class Keeps(Good):
         return found
 
 
-class KeepsClose(Keeps):
-    """The same with numpy's idea of what is close: 1e-5 of a coordinate."""
+#: The same with numpy's idea of what is close: 1e-5 of a coordinate.
+KeepsClose = but(
+    Keeps,
+    same=lambda self, one, other: (
+        np.allclose(one.positions, other.positions) and np.array_equal(one.cell, other.cell)
+    ),
+)
 
-    def same(self, before, atoms):
-        return np.allclose(before.positions, atoms.positions) and np.array_equal(before.cell, atoms.cell)
 
-
-class KeepsCell(Keeps):
-    """Compares positions to the last bit, and the cell within a tolerance."""
-
-    def same(self, before, atoms):
-        return np.array_equal(before.positions, atoms.positions) and np.allclose(
-            before.cell.array, atoms.cell.array, rtol=1e-4
-        )
+#: Compares positions to the last bit, and the cell within a tolerance.
+KeepsCell = but(
+    Keeps,
+    same=lambda self, one, other: (
+        np.array_equal(one.positions, other.positions)
+        and np.allclose(one.cell.array, other.cell.array, rtol=1e-4)
+    ),
+)
 
 
 class KeepsByRounding(Good):
@@ -547,11 +548,8 @@ class KeepsByRounding(Good):
         return self.table[key]
 
 
-class KeepsByAse(Good):
-    """ASE's own test for changes with another tolerance."""
-
-    def check_state(self, atoms, tol=1e-15):
-        return super().check_state(atoms, tol=1e-5)
+#: ASE's own test for changes with another tolerance.
+KeepsByAse = but(check_state=lambda self, atoms, tol=1e-15: Calculator.check_state(self, atoms, tol=1e-5))
 
 
 class Attached:

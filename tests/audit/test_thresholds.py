@@ -12,9 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import CubicSpline
 
-from mdnum.audit.curve import Curve, bisect
-from mdnum.audit.jumps import find_jumps
-from mdnum.audit.smoothness_words import place
+from mdnum.audit.checks.smoothness import place
+from mdnum.audit.curve import Curve, bisect, find_jumps
 from mdnum.audit.thresholds import STEP, find_thresholds, walk, walk_pairs
 
 BEFORE = float(np.nextafter(R_CUT, 0.0))
@@ -22,8 +21,7 @@ AFTER = float(np.nextafter(R_CUT, 9.0))
 
 
 @pytest.mark.parametrize(
-    ("pair", "inside", "outside"),
-    [(laws.hard, BEFORE, R_CUT), (laws.including, R_CUT, AFTER)],
+    ("pair", "inside", "outside"), [(laws.hard, BEFORE, R_CUT), (laws.including, R_CUT, AFTER)]
 )
 def test_a_hard_cutoff_is_located_to_neighboring_doubles(pair, inside: float, outside: float):
     (found,) = find_thresholds(pair_subject(pair))

@@ -2,28 +2,31 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mdnum.ball.contacts import Impact, Penalty, Projection
-from mdnum.ball.convergence import Convergence, converge
-from mdnum.ball.exact import ExactImpact
-from mdnum.ball.exact_penalty import ExactPenalty
-from mdnum.ball.integrators import (
+from mdnum.ball import (
+    BallVerlet,
     EventLocated,
+    ExactImpact,
+    ExactPenalty,
     ExplicitEuler,
+    Impact,
     ImplicitMidpoint,
+    Penalty,
+    PerInstance,
+    Projection,
     SemiImplicitEuler,
-    VelocityVerlet,
+    World,
+    simulate,
 )
-from mdnum.ball.rollout import simulate
-from mdnum.ball.stopping import PerInstance
-from mdnum.ball.world import World
-from mdnum.errors import InputError
+from mdnum.workflow import demos
 
 # step sizes down to a ten-thousandth
 pytestmark = pytest.mark.slow
-
 # three impacts each by the time 2, none of them near it
 STARTS = np.linspace(0.9, 1.1, 32)
 TIME = 2.0
@@ -31,15 +34,9 @@ COUNTS = (400, 800, 1600)
 STIFFNESS = 100.0
 
 
-def spring(y0):
-    return ExactPenalty(y0, k=STIFFNESS)
-
-
-def test_the_order_of_a_power_is_its_exponent():
-    h = np.array([0.1, 0.05, 0.025])
-    found = Convergence(h, 3 * h**2, 0.5 * h, h)
-    assert abs(found.order() - 2) < 1e-12
-    assert abs(found.order("slope") - 1) < 1e-12
+def converge(*given: Any) -> Any:
+    """As the demonstration of the two Eulers has it."""
+    return demos.load("euler-choice").__globals__["converge"](*given)
 
 
 def test_located_impacts_meet_the_exact_motion_at_every_step():
@@ -67,13 +64,13 @@ def test_each_located_impact_keeps_the_restitution_squared_of_the_energy():
 def test_located_impacts_have_the_exact_derivatives(name):
     world = World.create(Impact(0.8, 0.0), EventLocated(0.01))
     # 2.9 s: eight impacts of the lowest ball, five of the highest
-    found = converge(world, ExactImpact, np.linspace(0.75, 1.15, 9), 2.9, (29,), name=name)
+    found = converge(world, ExactImpact, np.linspace(0.75, 1.15, 9), 2.9, (29,), name)
     assert np.all(found.value < 5e-15)
     assert np.all(found.slope < 1e-10)
     assert np.all(found.largest > 0.1)
 
 
-@pytest.mark.parametrize("scheme", [ExplicitEuler, SemiImplicitEuler, VelocityVerlet])
+@pytest.mark.parametrize("scheme", [ExplicitEuler, SemiImplicitEuler, BallVerlet])
 def test_impacts_at_the_end_of_a_step_are_of_order_one_and_their_derivative_is_zero(scheme):
     """The derivative by y0 is exactly 0.0 at every step size: an error that does not shrink."""
     found = converge(World.create(Impact(), scheme(0.01)), ExactImpact, STARTS, TIME, COUNTS)
@@ -89,19 +86,16 @@ def test_a_projection_is_of_order_one_and_its_derivative_is_zero():
     assert np.all(found.largest == 0.0)
 
 
-@pytest.mark.parametrize("name", ["y0", "v0"])
 @pytest.mark.parametrize("scheme", [ExplicitEuler, SemiImplicitEuler])
-def test_saltation_restores_the_derivative_to_order_one(scheme, name):
-    world = World.create(Impact(), scheme(0.01))
-    found = converge(world, ExactImpact, STARTS, TIME, COUNTS, name=name, saltation=True)
-    assert abs(found.order("slope") - 1) < 0.2
-    assert found.slope[-1] < 0.2
-
-
-def test_saltation_along_other_parameters_is_refused():
-    world = World.create(Impact(), ExplicitEuler(0.01))
-    with pytest.raises(InputError, match="expected y0 or v0"):
-        converge(world, ExactImpact, STARTS[:1], TIME, (10,), name="restitution", saltation=True)
+def test_saltation_restores_the_derivative_to_order_one(scheme):
+    world, saltated = World.create(Impact(), scheme(0.01)), demos.load("saltation").__globals__["saltated"]
+    exact = np.array([float(ExactImpact(y).height(TIME).gradient["v0"]) for y in STARTS])
+    errors = []
+    for count in COUNTS:
+        _, slope = saltated(world.with_values({"h": TIME / count}), jnp.asarray(STARTS), count, "v0")
+        errors.append(np.sqrt(np.mean((np.asarray(slope) - exact) ** 2)))
+    assert abs(-np.polyfit(np.log(COUNTS), np.log(errors), 1)[0] - 1) < 0.2
+    assert errors[-1] < 0.2
 
 
 @pytest.mark.parametrize(
@@ -109,7 +103,7 @@ def test_saltation_along_other_parameters_is_refused():
     [
         (ExplicitEuler, 1),
         (SemiImplicitEuler, 1),
-        (VelocityVerlet, 2),
+        (BallVerlet, 2),
         (ImplicitMidpoint, 2),
     ],
 )
@@ -120,7 +114,8 @@ def test_a_penalty_approaches_the_spring_floor(scheme, order):
     order 2 can afford; the derivative sees a jump in the force's slope there, and is of order 1.
     """
     starts, counts = np.linspace(0.8, 1.2, 32), (400, 800, 1600, 3200)
-    found = converge(World.create(Penalty(STIFFNESS), scheme(0.01)), spring, starts, TIME, counts)
+    world = World.create(Penalty(STIFFNESS), scheme(0.01))
+    found = converge(world, lambda y0: ExactPenalty(y0, k=STIFFNESS), starts, TIME, counts)
     assert abs(found.order() - order) < 0.2
     assert abs(found.order("slope") - 1) < 0.2
 
@@ -131,3 +126,11 @@ def test_a_stiff_penalty_approaches_the_elastic_impact():
     k = np.array([1e4, 1e6, 1e8])
     off = [abs(float(ExactPenalty(1.0, k=one).height(1.7).value) - impact) for one in k]
     assert abs(np.polyfit(np.log(k), np.log(off), 1)[0] + 0.5) < 0.05
+
+
+def test_a_damper_makes_the_force_jump_and_costs_the_derivative_its_order():
+    world = World.create(Penalty(100.0, 3.0), SemiImplicitEuler(0.01))
+    starts, counts = np.linspace(0.8, 1.2, 16), (400, 1600, 6400)
+    found = converge(world, lambda y0: ExactPenalty(y0, k=100.0, damping=3.0), starts, 1.7, counts)
+    assert abs(found.order() - 1) < 0.2
+    assert abs(found.order("slope")) < 0.1 and np.all(found.slope > 0.05)

@@ -16,8 +16,8 @@ CASES = {
         ball.SemiImplicitEuler(2e-3),
         ("k", "damping", "gravity", "h"),
     ),
-    "verlet": (ball.Penalty(1e3), ball.VelocityVerlet(2e-3), ("k", "gravity", "h")),
-    "smooth": (ball.Penalty(1e3, eps=0.01, smooth=True), ball.VelocityVerlet(2e-3), ("k", "eps")),
+    "verlet": (ball.Penalty(1e3), ball.BallVerlet(2e-3), ("k", "gravity", "h")),
+    "smooth": (ball.Penalty(1e3, eps=0.01, smooth=True), ball.BallVerlet(2e-3), ("k", "eps")),
     "midpoint": (ball.Penalty(1e3, damping=0.3), ball.ImplicitMidpoint(2e-3), ("k", "damping", "h")),
     "smooth midpoint": (
         ball.Penalty(1e3, eps=0.01, smooth=True),
@@ -40,7 +40,7 @@ def test_gradients_match_finite_differences_between_events(name):
     contact, integrator, names = CASES[name]
     world = ball.World.create(contact, integrator)
     steps = 400 if not isinstance(integrator, ball.EventLocated) else 60
-    problem = ball.Problem(world, HEIGHTS, 0.0, steps, ball.MeanHeight())
+    problem = ball.BallProblem(world, HEIGHTS, 0.0, steps, ball.MeanHeight())
     value, slopes = problem.value_and_grad([*names, "y0", "v0"])
     assert value == problem.value()
     for parameter, slope in slopes.items():
@@ -49,10 +49,10 @@ def test_gradients_match_finite_differences_between_events(name):
         assert slope == pytest.approx(seen, rel=2e-4, abs=1e-7), parameter
 
 
-@pytest.mark.parametrize("rule", [ball.GlobalSum(1e-4), ball.PerInstance(1e-4), ball.Fixed(12)])
+@pytest.mark.parametrize("rule", [ball.GlobalSum(1e-4), ball.PerInstance(1e-4), ball.FixedCount(12)])
 def test_projection_gradients_go_through_the_iterations_that_ran(rule):
     world = ball.World.create(ball.Projection(0.5, 0.5, rule), ball.SemiImplicitEuler(2e-3))
-    problem = ball.Problem(world, HEIGHTS, 0.0, 700, ball.ResidualPenetration(1))
+    problem = ball.BallProblem(world, HEIGHTS, 0.0, 700, ball.ResidualPenetration(1))
     _, slopes = problem.value_and_grad(["k", "alpha", "gravity"])
     assert slopes["k"] < 0
     for parameter, slope in slopes.items():
@@ -64,7 +64,7 @@ def test_the_unrolled_derivative_is_an_artifact_of_the_tolerance():
         world = ball.World.create(
             ball.Projection(0.5, 0.5, ball.GlobalSum(tol)), ball.SemiImplicitEuler(0.1), gravity=0.0
         )
-        problem = ball.Problem(world, -0.45, 0.0, 1, ball.ResidualPenetration(1))
+        problem = ball.BallProblem(world, -0.45, 0.0, 1, ball.ResidualPenetration(1))
         value, slopes = problem.value_and_grad(["k"])
         n = int(problem.run().iterations[0])
         # n iterations leave p0 (1 - alpha k)^n
@@ -76,14 +76,18 @@ def test_the_unrolled_derivative_is_an_artifact_of_the_tolerance():
 @pytest.mark.slow
 def test_forward_and_reverse_mode_agree():
     for contact, integrator, names in CASES.values():
-        world = ball.World.create(contact, integrator)
-        problem = ball.Problem(world, HEIGHTS, 0.0, 120)
-        loss = problem.function(names)
+        problem = ball.BallProblem(ball.World.create(contact, integrator), HEIGHTS, 0.0, 120)
+
+        @jax.jit
+        def loss(at, world, problem=problem):
+            return ball.loss_of(world.with_values(at), jnp.asarray(HEIGHTS), 0.0, 120, problem.loss)
+
         at = problem.values(names)
-        reverse = jax.grad(loss)(at)
+        reverse = jax.grad(loss)(at, problem.world)
         for name in names:
             zero = {other: jnp.zeros_like(value) for other, value in at.items()}
-            _, forward = jax.jvp(loss, (at,), ({**zero, name: jnp.ones_like(at[name])},))
+            along = {**zero, name: jnp.ones_like(at[name])}
+            _, forward = jax.jvp(lambda x, world=problem.world: loss(x, world), (at,), (along,))
             assert float(forward) == pytest.approx(float(reverse[name]), rel=1e-10, abs=1e-14)
 
 
@@ -92,16 +96,16 @@ def test_the_loss_inside_value_and_grad_is_the_loss_of_the_run():
     """Fenced arithmetic: differentiating does not compile another forward pass."""
     for contact, integrator, names in CASES.values():
         world = ball.World.create(contact, integrator)
-        problem = ball.Problem(world, HEIGHTS, 0.0, 300)
+        problem = ball.BallProblem(world, HEIGHTS, 0.0, 300)
         run = problem.run()
         value, _ = problem.value_and_grad(names)
         assert value == problem.value()
         assert value == float(jnp.mean(jnp.asarray(run.final[0])))
 
 
-def test_told_decisions_pin_the_program():
+def test_imposed_decisions_pin_the_program():
     world = ball.World.create(ball.Projection(0.5, 0.5, ball.GlobalSum(1e-4)), ball.SemiImplicitEuler(0.01))
-    problem = ball.Problem(world, 1.0, 0.0, 300, ball.ResidualPenetration(1))
-    told = jax.tree.map(jnp.asarray, problem.run().told())
+    problem = ball.BallProblem(world, 1.0, 0.0, 300, ball.ResidualPenetration(1))
+    told = jax.tree.map(jnp.asarray, problem.run().decisions())
     free, pinned = problem.value_and_grad(["k"]), problem.value_and_grad(["k"], told)
     assert free == pinned

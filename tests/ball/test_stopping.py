@@ -57,7 +57,7 @@ def test_the_cap_is_named_and_the_margin_says_by_how_much():
 
 
 def test_a_fixed_count_decides_nothing():
-    run = solve([0.45, 0.0], ball.Fixed(7))
+    run = solve([0.45, 0.0], ball.FixedCount(7))
     assert run.iterations[0] == 7
     assert run.ended() == {"fixed": 1}
 
@@ -82,7 +82,7 @@ def test_each_ball_stops_by_itself():
 
 
 def test_hysteresis_starts_above_one_threshold_and_runs_below_another():
-    rule = ball.Hysteresis(ball.GlobalSum(1e-6), 1e-3)
+    rule = ball.HysteresisStop(ball.GlobalSum(1e-6), 1e-3)
     assert solve([0.9e-3], rule).iterations[0] == 0
     assert solve([1.1e-3], rule).iterations[0] == math.ceil(math.log(1e-6 / 1.1e-3) / math.log(0.75))
 
@@ -151,7 +151,7 @@ def test_a_projection_that_cannot_converge_is_refused():
         (lambda: (ball.Impact(0.5), ball.EventLocated(0.1, 2**32)), "max_impacts = 4294967296"),
         (
             lambda: (
-                ball.Projection(0.5, 0.5, ball.Hysteresis(ball.GlobalSum(1e-3), 1e-4)),
+                ball.Projection(0.5, 0.5, ball.HysteresisStop(ball.GlobalSum(1e-3), 1e-4)),
                 ball.ExplicitEuler(0.1),
             ),
             "enter is the larger",

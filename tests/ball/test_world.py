@@ -1,14 +1,15 @@
-"""A step acts on what it is told, and its bits are those of plain numpy in every dtype."""
+"""A step acts on imposed decisions, and its bits are those of plain numpy in every dtype."""
 
 from __future__ import annotations
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from ball import oracles
 
 from mdnum import ball
-from mdnum.ball.state import Decisions
+from mdnum.ball.state import BallDecisions
 from mdnum.errors import InputError
 from mdnum.precision.policy import RolePrecision
 from mdnum.precision.reductions import Sequential
@@ -16,7 +17,7 @@ from mdnum.precision.reductions import Sequential
 SCHEMES = {
     "explicit-euler": ball.ExplicitEuler,
     "semi-implicit-euler": ball.SemiImplicitEuler,
-    "velocity-verlet": ball.VelocityVerlet,
+    "velocity-verlet": ball.BallVerlet,
 }
 STEPS = 400
 Y0, V0 = np.array([0.3, 0.45, 0.0078125]), np.array([0.0, -0.7, 1.1])
@@ -89,33 +90,34 @@ def test_projection_has_the_bits_and_the_iterations_of_numpy(dtype):
 
 ALL = {
     "penalty": (ball.Penalty(900.0, damping=0.5), ball.SemiImplicitEuler(0.01)),
-    "smooth penalty": (ball.Penalty(900.0, eps=0.01, smooth=True), ball.VelocityVerlet(0.01)),
+    "smooth penalty": (ball.Penalty(900.0, eps=0.01, smooth=True), ball.BallVerlet(0.01)),
     "implicit midpoint": (ball.Penalty(900.0, damping=0.5), ball.ImplicitMidpoint(0.01)),
     "projection": (ball.Projection(0.5, 0.5, ball.GlobalSum(1e-6)), ball.ExplicitEuler(0.01)),
-    "projection per ball": (ball.Projection(0.5, 0.5, ball.PerInstance(1e-6)), ball.VelocityVerlet(0.01)),
+    "projection per ball": (ball.Projection(0.5, 0.5, ball.PerInstance(1e-6)), ball.BallVerlet(0.01)),
     "impact": (ball.Impact(0.8), ball.SemiImplicitEuler(0.01)),
     "located impact": (ball.Impact(0.8), ball.EventLocated(0.01)),
 }
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_told_its_own_decisions_a_run_is_bit_identical(name):
+def test_under_its_own_decisions_a_run_is_bit_identical(name):
     world = ball.World.create(*ALL[name])
     start = world.start(Y0, V0)
     free = ball.simulate(world, start, STEPS)
-    told = ball.simulate(world, start, STEPS, told=free.told())
+    told = ball.simulate(world, start, STEPS, imposed=free.decisions())
     np.testing.assert_array_equal(free.y, told.y)
     np.testing.assert_array_equal(free.v, told.v)
     assert ball.first_difference(free, told).seed is None
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_one_step_told_is_the_step_that_decides(name):
+def test_one_step_under_its_decisions_is_the_step_that_decides(name):
     world = ball.World.create(*ALL[name])
 
     @jax.jit
     def both(world, state):
-        return world.advance(state)[0], world.step(state, world.decide(state))
+        own, record = world.advance(state)
+        return own, world.advance(state, imposed=record.decisions)[0]
 
     state = world.start(Y0, V0)
     for _ in range(40):
@@ -131,7 +133,7 @@ def test_one_inverted_contact_is_found(step, index):
     free = ball.simulate(world, start, STEPS)
     contact = free.contact.copy()
     contact[step - 1, index] ^= True
-    planted = ball.simulate(world, start, STEPS, told=Decisions(contact, free.iterations))
+    planted = ball.simulate(world, start, STEPS, imposed=BallDecisions(contact, free.iterations))
     seen = ball.first_difference(free, planted)
     assert (seen.fork, seen.channel, seen.ball) == (step, "contact", index)
     # semi-implicit Euler acts at once: the state of that very step differs
@@ -145,19 +147,11 @@ def test_one_more_solver_iteration_is_found():
     step = int(np.flatnonzero(free.iterations > 5)[3]) + 1
     iterations = free.iterations.copy()
     iterations[step - 1] += 1
-    planted = ball.simulate(world, start, STEPS, told=Decisions(free.contact, iterations))
+    planted = ball.simulate(world, start, STEPS, imposed=BallDecisions(free.contact, iterations))
     seen = ball.first_difference(free, planted)
     assert (seen.fork, seen.channel, seen.ball) == (step, "stop", -1)
     stopped, went_on = seen.margins
     assert stopped == went_on > 0
-
-
-def test_margins_are_positive_in_contact():
-    world = ball.World.create(*ALL["impact"])
-    state = world.start(np.array([1e-4, 1.0]), np.array([-1.0, 0.0]))
-    margins = world.margins(state)
-    np.testing.assert_array_equal(margins > 0, world.decide(state).contact)
-    assert list(np.asarray(margins > 0)) == [True, False]
 
 
 def test_a_ball_does_not_feel_the_batch_it_is_in():
@@ -201,3 +195,32 @@ def test_stochastic_rounding_of_the_state_is_reproducible_and_unbiased():
         policy=RolePrecision(state="bfloat16", arithmetic="float32"),
     )
     assert (ball.simulate(nearest, nearest.start(1.0, 0.5), 64).y == 1.0).all()
+
+
+def held(z: float) -> ball.World:
+    """A spring that holds on to its ball (h √k = z, h = 1), so that the motion is linear."""
+    return ball.World.create(ball.Penalty(z * z), ball.SemiImplicitEuler(1.0), gravity=0.0, hysteresis=1e300)
+
+
+@pytest.mark.parametrize(("z", "bounded"), [(0.5, True), (1.9, True), (2.1, False)])
+def test_whether_an_ulp_stays_an_ulp_is_decided_by_the_discretization(z, bounded):
+    world = held(z)
+    low, high = (ball.simulate(world, world.start(y), 150) for y in (-1.0, np.nextafter(-1.0, 0)))
+    apart = np.abs(low.y - high.y).max()
+    assert apart < 1e-13 if bounded else apart > 1.0
+
+
+def test_singular_values_of_a_symplectic_rollout_multiply_to_one():
+    """One is stretched as much as the other is shrunk, contacts included (semi-implicit Euler keeps area)."""
+    world = ball.World.create(ball.Penalty(1e3), ball.SemiImplicitEuler(5e-3))
+
+    def end(start):
+        state = world.start(start[:1], start[1:])
+        for_each = lambda state, _: (world.advance(state)[0], None)  # noqa: E731
+        state, _ = jax.lax.scan(for_each, state, None, length=400)
+        return jnp.concatenate([state.y, state.v])
+
+    jacobian = np.asarray(jax.jacfwd(end)(jnp.asarray([0.5, 0.0])))
+    large, small = np.linalg.svd(jacobian, compute_uv=False)
+    assert large > 3
+    assert large * small == pytest.approx(1.0, rel=1e-9)

@@ -10,7 +10,6 @@ import pytest
 from forks.harness import balls, made
 
 from mdnum import ball
-from mdnum.ball.determinism import fingerprint
 from mdnum.ball.program import BallProgram, ImposedDecision, cross_decisions, overridden
 from mdnum.errors import InputError
 from mdnum.forks import Twin, fork
@@ -22,6 +21,11 @@ from mdnum.precision import RolePrecision, neighbor
 from mdnum.systems import BallSystem, load
 
 # --- verdicts -----------------------------------------------------------------------------------------
+
+
+def fingerprint(run: ball.BallRun) -> tuple[bytes, ...]:
+    """Every state and decision of a run, bit for bit."""
+    return tuple(getattr(run, name).tobytes() for name in ("y", "v", "contact", "iterations", "reason"))
 
 
 def adjacent(differs, low: float, high: float) -> tuple[float, float]:
@@ -159,9 +163,9 @@ def planted(name: str, pin: ImposedDecision) -> Twin:
 @pytest.mark.parametrize("name", WORLDS)
 def test_a_run_on_which_nothing_in_particular_is_imposed_has_its_own_bits(name, runs):
     world, run = WORLDS[name], runs[name]
-    own = run.told()
-    silent = ball.Decisions(np.full(own.contact.shape, -1, np.int8), np.full_like(own.iterations, -1))
-    assert fingerprint(ball.simulate(world, world.start(STARTS), 60, told=silent)) == fingerprint(run)
+    own = run.decisions()
+    silent = ball.BallDecisions(np.full(own.contact.shape, -1, np.int8), np.full_like(own.iterations, -1))
+    assert fingerprint(ball.simulate(world, world.start(STARTS), 60, imposed=silent)) == fingerprint(run)
 
 
 def early_contact(run: ball.BallRun, number: int) -> ImposedDecision:
@@ -214,7 +218,7 @@ def test_what_a_run_under_imposed_decisions_would_have_decided(runs):
 
 def test_balls_in_another_order_are_compared_ball_by_ball(runs):
     order = (2, 0, 1)
-    problem = ball.Problem(WORLDS["per-instance"], STARTS[list(order)], 0.0, 60)
+    problem = ball.BallProblem(WORLDS["per-instance"], STARTS[list(order)], 0.0, 60)
     run, back = runs["per-instance"], BallProgram(problem, order=order).run(60)
     assert fingerprint(back) == fingerprint(run)
     for name in ("step", "subject", "entered", "margin"):

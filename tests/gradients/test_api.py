@@ -9,9 +9,10 @@ import pytest
 from small_systems import LENNARD_JONES, crystal, make
 
 from mdnum.errors import InputError
-from mdnum.gradients import differentiable, value_and_grad
-from mdnum.gradients.base import Problem
-from mdnum.gradients.losses import Custom, MeanPotential, MeanSquaredDisplacement
+from mdnum.gradients import METHODS, differentiable, method, value_and_grad
+from mdnum.gradients.ball import BALL_METHODS
+from mdnum.gradients.losses import LOSSES, Custom, MeanPotential, MeanSquaredDisplacement
+from mdnum.gradients.problem import Problem
 from mdnum.systems import build
 
 STEPS = 20
@@ -38,7 +39,7 @@ def test_the_keys_are_those_asked_for_and_values_move_the_loss(problem):
 
 def test_jax_differentiates_through_a_users_own_tree(problem):
     told = []
-    loss = differentiable(problem, ("sigma", "epsilon"), "symmetric", told=told.append)
+    loss = differentiable(problem, ("sigma", "epsilon"), "symmetric", watch=told.append)
 
     def mine(tree):
         root, (shift, width) = tree["root"], tree["rest"]
@@ -88,3 +89,9 @@ def test_a_loss_that_is_no_number_is_refused_before_the_run(problem):
     with pytest.raises(InputError, match="int"):
         Problem(problem.simulation, count, STEPS)
     assert Problem(problem.simulation, MeanPotential(), STEPS).loss.name == "potential"
+
+
+def test_every_name_is_that_of_its_method():
+    assert [method(name).name for name in METHODS] == list(METHODS)
+    assert [BALL_METHODS.parse(name).name for name in BALL_METHODS] == list(BALL_METHODS)
+    assert all(map(METHODS.description, METHODS)) and all(map(LOSSES.description, LOSSES))

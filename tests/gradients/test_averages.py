@@ -9,12 +9,10 @@ from scipy.integrate import quad
 from small_systems import LENNARD_JONES, crystal, make
 
 from mdnum.errors import InputError
-from mdnum.gradients.base import Problem
-from mdnum.gradients.boundary import Boundary
-from mdnum.gradients.frames import frames
+from mdnum.gradients.averages import BoundaryTerm, Reweighting, frames
 from mdnum.gradients.losses import MeanPotential, MeanPressure, MeanSquaredDisplacement
-from mdnum.gradients.reweighting import Reweighting, weighed
-from mdnum.gradients.tape import Tape
+from mdnum.gradients.problem import Problem
+from mdnum.gradients.tape import RunTape
 from mdnum.systems import build
 
 
@@ -51,9 +49,9 @@ def quintic(r, onset, radius):
 def test_a_smooth_cutoff_has_no_boundary():
     simulation = liquid({"kind": "quintic", "radius": 2.2, "onset": 1.8})
     problem = Problem(simulation, MeanPotential(every=5), 40)
-    found = Boundary()(problem, ("r_cut", "scale"))
+    found = BoundaryTerm()(problem, ("r_cut", "scale"))
     edge, h = float(simulation.cell.matrix[0][0]), 1e-5
-    seen = [distances(x, edge) for x in frames(Tape(simulation, problem.loss, 40), ()).x]
+    seen = [distances(x, edge) for x in frames(RunTape(simulation, problem.loss, 40), ()).x]
 
     def mean(radius, scale):
         return np.mean([quintic(r * scale, 1.8, radius).sum() for r in seen]) / simulation.atoms
@@ -65,19 +63,19 @@ def test_a_smooth_cutoff_has_no_boundary():
     assert found.details["boundary"] == {"cutoff.radius": 0.0, "box.scale": 0.0}
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_hard_cutoffs_have_the_slopes_of_differences():
     """At the states of one run: pairs counted by numpy on either side of three radii."""
     simulation = liquid({"kind": "hard", "radius": 2.2})
     problem = Problem(simulation, MeanPotential(first=400, every=4), 4400)
-    seen = frames(Tape(simulation, problem.loss, problem.steps), ("cutoff.radius",))
+    seen = frames(RunTape(simulation, problem.loss, problem.steps), ("cutoff.radius",))
     assert not np.any(seen.explicit["cutoff.radius"])
     edge = float(simulation.cell.matrix[0][0])
     found = [distances(x, edge) for x in seen.x]
     h = 0.03
     for radius in (1.5, 1.8, 2.2):
         other = liquid({"kind": "hard", "radius": radius})
-        terms, details = Boundary().terms(other, seen, ("cutoff.radius",))
+        terms, details = BoundaryTerm().terms(other, seen, ("cutoff.radius",))
         near = [r[(r >= radius - h) & (r < radius + h)] for r in found]
         slope = sum(lennard_jones(r).sum() for r in near) / (2 * h * len(seen) * simulation.atoms)
         assert terms["cutoff.radius"].sum() == pytest.approx(slope, rel=0.01), radius
@@ -110,7 +108,7 @@ def pair():
     return Problem(simulation, MeanPotential(every=5), 20_000)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_canonical_averages_have_the_derivatives_of_an_integral(pair):
     names = ("r_cut", "sigma", "epsilon", "temperature", "scale")
     found = Reweighting()(pair, names)
@@ -132,26 +130,10 @@ def test_what_is_no_average_is_refused(pair):
     simulation = pair.simulation
     still = build(make(crystal(), LENNARD_JONES, {"kind": "hard", "radius": 2.2}))
     for method, problem, names, text in (
-        (Boundary(), Problem(simulation, MeanSquaredDisplacement(), 9), ("r_cut",), "compares frames"),
-        (Boundary(), pair, ("v0",), "nothing depends on initial.velocities"),
+        (BoundaryTerm(), Problem(simulation, MeanSquaredDisplacement(), 9), ("r_cut",), "compares frames"),
+        (BoundaryTerm(), pair, ("v0",), "nothing depends on initial.velocities"),
         (Reweighting(), Problem(still, MeanPressure(), 9), ("sigma",), "without a thermostat"),
         (Reweighting(), pair, ("friction",), "does not depend on dynamics.friction"),
     ):
         with pytest.raises(InputError, match=text):
             method(problem, names)
-
-
-@pytest.mark.slow
-def test_weights_of_other_parameters_give_their_average(pair):
-    """A fifth more attraction, against the integral; the effective size says what is left of the frames."""
-    simulation = pair.simulation
-    seen = frames(Tape(simulation, pair.loss, 8000), ()).every(4)
-    changed = pair.at({"potential.epsilon": 1.2}).simulation
-    same, other = weighed(simulation, seen, simulation), weighed(simulation, seen, changed)
-    assert same.effective == pytest.approx(len(seen))
-    assert len(seen) / 2 < other.effective < len(seen)
-    inside = np.array([distances(x, 3.6)[0] for x in seen.x])
-    energy = np.where(inside < 1.5, lennard_jones(inside), 0)
-    # most of the noise is in both averages
-    ratio = 1.2 * (other.weights @ energy) / (same.weights @ energy)
-    assert ratio == pytest.approx(integral(3.6, 1.5, epsilon=1.2) / integral(3.6, 1.5), rel=0.03)

@@ -10,12 +10,11 @@ from gradient_problems import everything
 from small_systems import LENNARD_JONES, crystal, make
 
 from mdnum.errors import InputError
-from mdnum.gradients.base import Problem
-from mdnum.gradients.conservative import EnergyFunction, with_potential
-from mdnum.gradients.forward import Forward
+from mdnum.gradients.forces import EnergyFunction, with_potential
 from mdnum.gradients.parameters import names, value
-from mdnum.gradients.symmetric import EventAware, Symmetric
-from mdnum.gradients.unrolled import Epochs
+from mdnum.gradients.problem import Problem
+from mdnum.gradients.recorded import EventAware, Forward, Symmetric
+from mdnum.gradients.unrolled import Unrolled
 from mdnum.md.displacement import neighbor_vectors
 from mdnum.systems import build
 
@@ -88,7 +87,7 @@ def silicon():
 @pytest.mark.slow
 def test_silicon_has_the_derivatives_of_differences_and_of_jax(silicon):
     found = Symmetric()(silicon, names(silicon.simulation))
-    by_jax = Epochs()(silicon, names(silicon.simulation))
+    by_jax = Unrolled()(silicon, names(silicon.simulation))
     for name, one in found.gradient.items():
         assert np.max(np.abs(by_jax.gradient[name] - one)) <= 1e-9 * np.max(np.abs(one)), name
     # constants are compiled in, so that each value is another program

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 import sympy
 
-from mdnum.gradients.base import Problem
-from mdnum.gradients.forward import Forward
 from mdnum.gradients.losses import Custom
-from mdnum.gradients.symmetric import EventAware, Symmetric
+from mdnum.gradients.problem import Problem
+from mdnum.gradients.recorded import EventAware, Forward, Symmetric
 from mdnum.systems import build
 
 NAMES = ("initial.positions", "initial.velocities", "cutoff.radius", "potential.sigma", "potential.epsilon")

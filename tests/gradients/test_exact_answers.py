@@ -9,15 +9,14 @@ import pytest
 from ase import Atoms
 from small_systems import LENNARD_JONES, make
 
-from mdnum.gradients.base import Problem
-from mdnum.gradients.forward import Forward
 from mdnum.gradients.losses import FinalProjection
-from mdnum.gradients.symmetric import Symmetric
-from mdnum.gradients.tape import Tape
-from mdnum.gradients.unrolled import Epochs, Recursive, Unrolled
+from mdnum.gradients.problem import Problem
+from mdnum.gradients.recorded import Forward, Symmetric
+from mdnum.gradients.tape import RunTape
+from mdnum.gradients.unrolled import Unrolled
 from mdnum.systems import build
 
-METHODS = (Symmetric(), Forward(), Unrolled(), Epochs(), Recursive())
+METHODS = (Symmetric(), Forward(), Unrolled(), Unrolled(snapshots=2))
 
 
 def in_fifty_digits(problem: Problem, changes: dict[str, mp.mpf]) -> mp.mpf:
@@ -74,7 +73,7 @@ def test_four_atoms_have_the_derivatives_of_fifty_digits():
     way = jnp.asarray(np.random.default_rng(5).standard_normal((3, 4)))
     problem = Problem(simulation, FinalProjection(direction=way), 60)
     names = ("sigma", "epsilon", "timestep", "temperature", "scale")
-    tape = Tape(simulation, problem.loss, problem.steps, flips=True)
+    tape = RunTape(simulation, problem.loss, problem.steps, flips=True)
     assert sum(len(stretch.ledger) for stretch in tape.backward()) > 1
     mp.mp.dps = 50
     assert problem.value() == pytest.approx(float(in_fifty_digits(problem, {})), rel=1e-11)

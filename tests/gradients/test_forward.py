@@ -10,14 +10,12 @@ from small_systems import KOB_ANDERSEN, LENNARD_JONES, crystal, make, mixture
 
 from mdnum.errors import InputError
 from mdnum.gradients.adjoint import reverse
-from mdnum.gradients.base import Problem
-from mdnum.gradients.directions import gathered
-from mdnum.gradients.forward import Forward
 from mdnum.gradients.losses import FinalProjection
-from mdnum.gradients.parameters import gradient, resolve, with_values
-from mdnum.gradients.symmetric import EventAware
+from mdnum.gradients.parameters import gathered, gradient, resolve, with_values
+from mdnum.gradients.problem import Problem
+from mdnum.gradients.recorded import EventAware, Forward
 from mdnum.gradients.tangents import by_column, tangents
-from mdnum.gradients.tape import Tape
+from mdnum.gradients.tape import RunTape
 from mdnum.rollout.engine import Engine
 from mdnum.systems import build
 
@@ -31,7 +29,7 @@ def hot():
     dynamics = {"kind": "nve", "timestep": 0.004, "temperature": 3.0, "seed": 3}
     system = make(crystal(), LENNARD_JONES, {"kind": "hard", "radius": 2.0}, dynamics=dynamics)
     simulation = build(system)
-    return Tape(simulation, everything(simulation.atoms), STEPS, flips=True)
+    return RunTape(simulation, everything(simulation.atoms), STEPS, flips=True)
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +105,7 @@ def test_bad_input_says_what_would_do(hot):
     with pytest.raises(InputError, match="324 numbers"):
         Forward()(problem, ("x0",))
     with pytest.raises(InputError, match="without its flips"):
-        next(tangents(Tape(hot.simulation, hot.loss, STEPS), ("potential.sigma",), saltation=True))
+        next(tangents(RunTape(hot.simulation, hot.loss, STEPS), ("potential.sigma",), saltation=True))
 
 
 @pytest.mark.slow

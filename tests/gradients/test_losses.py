@@ -14,7 +14,6 @@ from scipy.interpolate import BSpline
 from small_systems import LENNARD_JONES, crystal, make
 
 from mdnum.errors import InputError
-from mdnum.gradients.base import Problem
 from mdnum.gradients.differences import FiniteDifferences
 from mdnum.gradients.losses import (
     Custom,
@@ -24,7 +23,8 @@ from mdnum.gradients.losses import (
     RadialDistribution,
     VelocityAutocorrelation,
 )
-from mdnum.gradients.symmetric import Symmetric
+from mdnum.gradients.problem import Problem
+from mdnum.gradients.recorded import Symmetric
 from mdnum.rollout.engine import Engine, unwrapped
 from mdnum.systems import build
 

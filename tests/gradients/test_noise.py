@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mdnum.gradients.differences import richardson
-from mdnum.gradients.noise import choose_step, noise_of
+from mdnum.gradients.differences import choose_step, noise_of, richardson
 
 
 @pytest.mark.parametrize("noise", [1e-12, 1e-6])

@@ -10,14 +10,11 @@ from ase.build import bulk
 from small_systems import LENNARD_JONES, crystal, make
 
 from mdnum.errors import InputError
-from mdnum.gradients.base import Gradient, Problem
-from mdnum.gradients.differences import FiniteDifferences
-from mdnum.gradients.ensemble import Ensemble, Replicas, replica
+from mdnum.gradients.differences import FiniteDifferences, ShadowDifferences
+from mdnum.gradients.ensemble import Ensemble, Replicas, SmoothedDifferences, replica
 from mdnum.gradients.losses import Custom, MeanSquaredDisplacement, MeanTemperature
-from mdnum.gradients.shadow import ShadowDifferences
-from mdnum.gradients.smoothed import SmoothedDifferences
-from mdnum.gradients.surrogate import Surrogate
-from mdnum.gradients.symmetric import EventAware, Symmetric
+from mdnum.gradients.problem import Gradient, Method, Problem
+from mdnum.gradients.recorded import EventAware, Surrogate, Symmetric
 from mdnum.systems import build
 
 # so short that the force jumps by 0.8
@@ -25,20 +22,18 @@ HARD = {"kind": "hard", "radius": 1.6}
 
 
 @dataclass(frozen=True)
-class Noisy:
+class Noisy(Method):
     """A made-up gradient: 1, and the number of steps more or less, in turns."""
 
     calls: list[int] = field(default_factory=list)
-    name: str = "noisy"
-    says: str = "one plus noise"
 
-    def why_not(self, problem, names):
-        return None
+    name = "noisy"
+    description = "one plus noise"
 
-    def __call__(self, problem, names, progress=None) -> Gradient:
+    def differentiate(self, problem, names, progress) -> Gradient:
         self.calls.append(problem.steps)
         noise = problem.steps * (-1) ** len(self.calls)
-        return Gradient("noisy", self.says, 0.0, {name: np.asarray(1.0 + noise) for name in names})
+        return self.result(0.0, {name: np.asarray(1.0 + noise) for name in names})
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +70,7 @@ def test_the_horizon_of_noise_is_where_the_error_passes_the_mean(hard):
         Ensemble()(problem, ("v0",))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_wide_differences_of_a_melt_agree_with_the_flow_and_not_with_the_steps():
     """How hot a crystal has become while it melts: replica by replica, what the flips add is some standard
     errors of the difference, and with it nothing is missing. By the radius, plain is exactly 0."""

@@ -8,18 +8,18 @@ import subprocess
 import sys
 from dataclasses import replace
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from gradient_problems import everything
 from small_systems import LENNARD_JONES, crystal, make
 
 from mdnum.errors import InputError, NumericalError
 from mdnum.gradients.adjoint import reverse
-from mdnum.gradients.base import Problem
 from mdnum.gradients.differences import FiniteDifferences
-from mdnum.gradients.losses import Custom, FinalProjection
-from mdnum.gradients.reversible import Reversible, ReversibleTape
-from mdnum.gradients.symmetric import Symmetric
+from mdnum.gradients.losses import FinalProjection
+from mdnum.gradients.problem import Problem
+from mdnum.gradients.recorded import Reversible, Symmetric
+from mdnum.gradients.tape import ReversibleTape
 from mdnum.rollout.engine import Engine
 from mdnum.systems import build
 
@@ -33,18 +33,6 @@ STEPS = 120
 def small(cutoff=HARD, **tables):
     """32 atoms in a box 3.6 wide, in whole numbers."""
     return build(make(crystal(repeat=2), LENNARD_JONES, cutoff, precision={"state": "lattice"}, **tables))
-
-
-def everything(atoms: int) -> Custom:
-    """A loss that looks at all that a frame holds, with weights that no symmetry cancels."""
-    rng = np.random.default_rng(0)
-    way, turn = (jnp.asarray(rng.standard_normal((3, atoms))) for _ in range(2))
-
-    def see(frame, origin, around):
-        moved = jnp.sum(way * (frame.x - origin.x)) + jnp.sum(turn * frame.v * jnp.square(origin.v))
-        return moved + 1e-2 * frame.potential + 1e-2 * frame.virial / around.volume
-
-    return Custom(see=see, every=7, first=5)
 
 
 def problem(simulation, steps: int = STEPS) -> Problem:
@@ -157,7 +145,7 @@ def test_floats_cannot_be_taken_back():
         Reversible()(Problem(simulation, FinalProjection(), 10), ("sigma",))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("bath", (False, True))
 def test_a_hundred_thousand_steps_back_to_the_start(bath):
     """Lists of the way back are built independently; `backward` raises where a bit of the start is wrong."""
@@ -208,7 +196,7 @@ print(digest.hexdigest())
 """
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_instruction_sets_and_optimization_do_not_matter():
     """The same bits of states, decisions and energies from programs that a compiler makes differently."""
     seen = {}

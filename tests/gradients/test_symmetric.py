@@ -12,11 +12,11 @@ from small_systems import KOB_ANDERSEN as BINARY
 from small_systems import LENNARD_JONES, crystal, make, mixture
 
 from mdnum.errors import InputError
-from mdnum.gradients.base import Problem
 from mdnum.gradients.differences import FiniteDifferences, richardson
 from mdnum.gradients.losses import Custom, FinalProjection
-from mdnum.gradients.symmetric import Symmetric
-from mdnum.gradients.tape import Tape
+from mdnum.gradients.problem import Problem
+from mdnum.gradients.recorded import Symmetric
+from mdnum.gradients.tape import RunTape
 from mdnum.systems import build
 
 STEPS = 40
@@ -79,7 +79,7 @@ def test_each_pair_type_has_its_own_derivative():
 def test_made_again_the_run_has_the_bits_it_had(switched):
     kept = Symmetric()(switched, ("x0", "sigma"))
     again = Symmetric(budget=0)(switched, ("x0", "sigma"))
-    assert again.details["made again"] == kept.details["stretches"] > 1
+    assert again.details["run again"] == kept.details["stretches"] > 1
     assert again.value == kept.value
     for name in kept.gradient:
         assert np.array_equal(again.gradient[name], kept.gradient[name])
@@ -89,7 +89,7 @@ def test_the_tape_is_the_run_of_the_rollout(switched):
     """States and decisions that the reverse pass linearizes at, against the run without any gradient."""
     from mdnum.rollout.engine import Engine
 
-    tape = Tape(switched.simulation, switched.loss, STEPS, budget=0)
+    tape = RunTape(switched.simulation, switched.loss, STEPS, budget=0)
     steps = {}
     for segment in Engine(switched.simulation, STEPS).segments():
         for row in range(segment.rows):

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 import mpmath
 import numpy as np
 import pytest
 
-from mdnum.md.cutoffs import BY_NAME, AtCutoff
+from mdnum.md.cutoffs import CUTOFFS, AtCutoff, Cutoff, Level, Undecided, check
 from mdnum.md.potentials import CutPotential, LennardJones
 
 SIGMA, EPSILON, R_CUT, R_ONSET = 1.1, 0.7, 2.6, 2.2
-KINDS = sorted(BY_NAME)
+KINDS = sorted(CUTOFFS)
 
 
 def model(kind):
     one = [jnp.asarray([value]) for value in (SIGMA, EPSILON, R_CUT, R_ONSET)]
-    return CutPotential(LennardJones(*one[:2]), BY_NAME[kind], *one[2:])
+    return CutPotential(LennardJones(*one[:2]), CUTOFFS.parse(kind), *one[2:])
 
 
 def evaluate(kind, r2):
@@ -69,75 +68,6 @@ def test_energy_and_slope_are_those_of_the_closed_form(kind):
             )
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_slope_is_the_derivative_of_the_energy_as_coded(kind):
-    r2 = jnp.linspace(0.9**2, R_CUT**2 * 0.9999, 200)
-    gradient = jax.vmap(jax.grad(lambda x: evaluate(kind, x)[0]))(r2)
-    _, slope = evaluate(kind, r2)
-    assert np.allclose(slope, gradient, rtol=1e-11, atol=1e-12)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_jumps_are_the_limits_from_inside(kind):
-    energy, slope = evaluate(kind, [(R_CUT * (1 - 1e-15)) ** 2])
-    energy_jump, force_jump = model(kind).jumps()
-    assert energy_jump.shape == force_jump.shape == (1,)
-    assert energy_jump[0] == pytest.approx(float(energy[0]), abs=1e-13)
-    assert force_jump[0] == pytest.approx(float(-2 * R_CUT * slope[0]), abs=1e-12)
-    if BY_NAME[kind].smoothness >= 0:
-        assert energy_jump[0] == 0
-    else:
-        assert energy_jump[0] == pytest.approx(float(bare(R_CUT)), rel=1e-14)
-    if BY_NAME[kind].smoothness >= 1:
-        assert force_jump[0] == 0
-    else:
-        # attractive at the cutoff: a pair that enters brings a pull
-        assert force_jump[0] == pytest.approx(float(-mpmath.diff(bare, R_CUT)), rel=1e-12)
-        assert force_jump[0] < 0
-
-
-def one_sided(kind, order, at, side):
-    with mpmath.workdps(60):
-        if side > 0 and at == R_CUT:
-            return mpmath.mpf(0)
-        h = mpmath.mpf(10) ** -20
-        # a one-sided difference: the formula of the side, evaluated on that side only
-        points = [
-            closed_form(kind, mpmath.mpf(at) + side * h * (k + mpmath.mpf(10) ** -8))
-            for k in range(order + 1)
-        ]
-        total = sum((-1) ** (order - k) * mpmath.binomial(order, k) * points[k] for k in range(order + 1))
-        return total / (side * h) ** order
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_smoothness_claimed_is_the_one_there_is(kind):
-    cutoff = BY_NAME[kind]
-    places = [R_CUT] + ([R_ONSET] if cutoff.switches else [])
-    orders = []
-    for place in places:
-        order = -1
-        while order < 6:
-            left, right = (one_sided(kind, order + 1, place, side) for side in (-1, 1))
-            if abs(left - right) > 1e-6 * (abs(left) + abs(right) + EPSILON):
-                break
-            order += 1
-        orders.append(order)
-    assert min(orders) == cutoff.smoothness, orders
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_below_the_onset_a_switched_potential_is_untouched(kind):
-    cutoff = BY_NAME[kind]
-    r2 = np.linspace(0.9, R_ONSET, 50) ** 2 * (1 - 1e-15)
-    energy, slope = evaluate(kind, r2)
-    plain, plain_slope = evaluate("hard", r2)
-    if cutoff.switches:
-        assert np.array_equal(energy, plain) and np.array_equal(slope, plain_slope)
-    elif kind in ("hard", "shifted"):
-        assert np.array_equal(slope, plain_slope)
-
-
 def test_hard_and_shifted_have_the_same_forces_bit_for_bit_and_energies_apart_by_a_constant():
     r2 = np.linspace(0.9, R_CUT, 300) ** 2
     (hard, hard_slope), (shifted, shifted_slope) = evaluate("hard", r2), evaluate("shifted", r2)
@@ -161,24 +91,11 @@ def test_the_switch_is_that_of_jax_md():
     assert np.allclose(ours, theirs, rtol=1e-12, atol=1e-14)
 
 
-def test_the_switch_is_that_of_ase():
-    from ase import Atoms
-    from ase.calculators.lj import LennardJones as Theirs
-
-    atoms = Atoms("Ar2", positions=[[0, 0, 0], [1, 0, 0]])
-    atoms.calc = Theirs(sigma=SIGMA, epsilon=EPSILON, rc=R_CUT, ro=R_ONSET, smooth=True)
-    for r in np.linspace(1.0, R_CUT * 0.999, 20):
-        atoms.positions[1, 0] = r
-        energy, slope = (float(q) for q in evaluate("switched", r * r))
-        assert energy == pytest.approx(atoms.get_potential_energy(), rel=1e-12, abs=1e-14)
-        assert -2 * r * slope == pytest.approx(atoms.get_forces()[1, 0], rel=1e-11, abs=1e-13)
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_constants_of_several_pair_types_do_not_mix(kind):
     sigma, epsilon = jnp.asarray([1.0, 0.8, 0.88]), jnp.asarray([1.0, 1.5, 0.5])
     r_cut = 2.5 * sigma
-    cut = CutPotential(LennardJones(sigma, epsilon), BY_NAME[kind], r_cut, 0.9 * r_cut)
+    cut = CutPotential(LennardJones(sigma, epsilon), CUTOFFS.parse(kind), r_cut, 0.9 * r_cut)
     types = jnp.asarray([2, 0, 1, 1, 2])
     r2 = jnp.asarray([1.2, 1.4, 1.1, 3.6, 4.3])
     energy, slope = cut.evaluate(r2, types, cut.at_cutoff())
@@ -193,9 +110,36 @@ def test_constants_of_several_pair_types_do_not_mix(kind):
         assert float(energy[k]) == float(u) and float(slope[k]) == float(w)
 
 
-def test_the_constants_at_the_cutoff_are_the_bare_potential_there():
-    at = model("hard").at_cutoff()
-    assert isinstance(at, AtCutoff)
-    assert float(at.energy[0]) == pytest.approx(float(bare(R_CUT)), rel=1e-14)
-    assert float(at.slope[0]) == pytest.approx(float(mpmath.diff(bare, R_CUT)), rel=1e-12)
-    assert (float(at.r_cut[0]), float(at.r_onset[0])) == (R_CUT, R_ONSET)
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_cutoff_is_what_it_says(kind):
+    """Slope and energy, jumps and smoothness, and the shortcuts against what follows from the formula."""
+    cutoff = CUTOFFS.parse(kind)
+    check(cutoff)
+    r = np.linspace(1.0, 2.0, 33)[:-1]
+    at = AtCutoff(*map(np.float64, (2.0, 1.6, 0.25, -0.25)))
+    given = (r, r**-2, -2 * r**-3, at)
+    for own, derived in zip(cutoff.reference(*given), Cutoff.reference(cutoff, *given), strict=True):
+        assert np.allclose(own, derived, rtol=1e-12, atol=1e-13)
+    level = cutoff.continuous
+    assert level.energy_jump(at) == 0 and level.force_jump(at) == cutoff.force_jump(at)
+    assert np.allclose(
+        Level(cutoff).cut(r**2, r**-2, -(r**-4), at)[0], level.cut(r**2, r**-2, -(r**-4), at)[0]
+    )
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_balls_hold_the_formula_in_either_writing(kind):
+    flint = pytest.importorskip("flint")
+    cutoff, at = CUTOFFS.parse(kind), AtCutoff(*map(flint.arb, (2.0, 1.6, 0.25, -0.25)))
+    bare = (lambda r2: -2 / (r2 * r2), lambda r2: 1 / r2)
+    own, derived = cutoff.enclose(*bare, at), Cutoff.enclose(cutoff, *bare, at)
+    for r2 in (2.0, 2.5, 2.57, 3.3, 3.99):
+        value = cutoff.cut(np.float64(r2), 1 / r2, -1 / r2**2, AtCutoff(2.0, 1.6, 0.25, -0.25))[1]
+        assert own(flint.arb(r2)).overlaps(derived(flint.arb(r2)))
+        assert float(own(flint.arb(r2)).mid()) == pytest.approx(2 * float(value), rel=1e-12, abs=1e-15)
+    if cutoff.switches:
+        wide = flint.arb(1.6**2, 1e-3)
+        with pytest.raises(Undecided):
+            own(wide)
+        # the union of both sides
+        assert derived(wide).contains(flint.arb(-2 / 1.6**4))

@@ -11,8 +11,8 @@ from oracles import COMPARISONS, exact_inside
 from mdnum.errors import InputError
 from mdnum.md.cell import Cell
 from mdnum.md.decide import PairDecider
-from mdnum.precision import Reach, distance_bound, squared_distance_bound
-from mdnum.precision.exact import zero_bits
+from mdnum.numerics import Reach, distance_bound, squared_distance_bound
+from mdnum.numerics.exact import zero_bits
 
 
 def displacements(dtype, count=20_000, r_cut=2.5):

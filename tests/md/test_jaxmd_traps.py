@@ -20,7 +20,7 @@ from ase.neighborlist import neighbor_list
 
 from mdnum.errors import CapacityError, InputError, NumericalError
 from mdnum.md import jaxmd, manybody
-from mdnum.md.relaxation import relax
+from mdnum.md.jaxmd import relax
 
 pytestmark = pytest.mark.jax_md
 ALWAYS = (True, True, True)
@@ -97,7 +97,7 @@ def test_the_threshold_moves_with_float32_constants(md):
     assert abs(energy(float) / exact - 1) > 1e-9, mended("loses digits of sigma", "scalar() may go")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_malformed_box_is_inverted(md):
     good = jnp.asarray([[9.0, 1.0, 0.5], [0, 9.0, 1.0], [0, 0, 9.0]])
     flags = {}
@@ -115,7 +115,7 @@ def test_malformed_box_is_inverted(md):
         jaxmd.dense_pairs(np.zeros((3, 3)), np.ones((3, 3)), ALWAYS, 1.0)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_cell_list_drops_pairs_outside_the_box(md):
     side, r_list = 12.0, 2.5
     inside = random_points(400, np.eye(3) * side)
@@ -137,7 +137,7 @@ def test_cell_list_drops_pairs_outside_the_box(md):
         assert rows_of(search(points)) == expected
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_shrinking_box_triggers_no_rebuild(md):
     displacement, _ = md.space.periodic_general(jaxmd.scalar(12.0))
     functions = md.partition.neighbor_list(
@@ -178,7 +178,7 @@ def test_a_cutoff_over_half_the_box_has_no_flag(md):
         jaxmd.PairSearch(tilted, ALWAYS, 2.5)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_vmap_of_update_rebuilds_every_time(md):
     displacement, _ = md.space.periodic(jaxmd.scalar(6.0))
     functions = md.partition.neighbor_list(
@@ -223,7 +223,7 @@ def test_the_cutoff_has_no_derivative(md):
     assert float(traced[0]) == 2.5
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_tersoff_forces_are_nan_beside_padding(md):
     atoms = silicon(0.15)
     neighbor = dense_list(atoms, 3.0)
@@ -235,13 +235,13 @@ def test_tersoff_forces_are_nan_beside_padding(md):
     gradient = np.asarray(jax.grad(energy_fn)(positions, neighbor))
     assert np.isnan(gradient).any(), mended(
         "masks the bond order after its power (NaN forces)",
-        "mdnum.md.manybody.tersoff may wrap jax-md's energy function, if its cosines are mended too",
+        "mdnum.md.manybody may wrap jax-md's energy function, if its cosines are mended too",
     )
     cell = jnp.asarray(atoms.cell.array)
     assert np.isfinite(np.asarray(manybody.tersoff().forces(positions, neighbor, cell))).all()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_list_with_a_skin_changes_an_energy_that_does_not_test_its_cutoff(md):
     cell = np.eye(3) * 12.0
     points = jnp.asarray(random_points(100, cell))
@@ -257,7 +257,7 @@ def test_a_list_with_a_skin_changes_an_energy_that_does_not_test_its_cutoff(md):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_tersoff_wrapper_takes_real_coordinates_for_fractional_ones(md):
     atoms = bulk("Si", "diamond", a=5.431, cubic=True) * (3, 3, 3)
     side = jaxmd.scalar(float(atoms.cell.array[0, 0]))
@@ -296,7 +296,7 @@ def test_eam_loader_wants_a_word_and_no_newline_and_rounds_to_float32(md):
     charge, embedding, _, _ = md.energy.load_lammps_eam_parameters(io.StringIO("\n".join([*table, ""])))
     value = float(embedding(jnp.asarray(0.5)))
     assert value != float(numbers[5]) and value == pytest.approx(float(numbers[5]), rel=1e-6), mended(
-        "rounds EAM tables to float32", "mdnum.md.manybody.setfl may go"
+        "rounds EAM tables to float32", "mdnum.md.embedded_atom may go"
     )
     assert float(charge(jnp.asarray(100.0))) == 0.0, mended(
         "returns 0 off its splines", "the NaN of EmbeddedAtom.embed may be reconsidered"
@@ -306,7 +306,7 @@ def test_eam_loader_wants_a_word_and_no_newline_and_rounds_to_float32(md):
         md.energy.load_lammps_eam_parameters(io.StringIO("\n".join(table)))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_eam_counts_the_density_of_the_atom_itself(md):
     side = 6.0
     points = jnp.asarray(random_points(10, np.eye(3) * side, seed=4))
@@ -349,7 +349,7 @@ def test_fire_steps_in_float16(md):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_jax_md_cannot_be_imported_under_strict_promotion():
     script = """
 import jax
@@ -384,7 +384,7 @@ def test_pair_search_equals_ase_in_any_cell(pbc, tilt):
         assert rows_of(search(drifted)) == ase_rows(drifted, cell, pbc, 3.1)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_pair_search_grows_when_atoms_crowd():
     cell = np.eye(3) * 15.0
     search = jaxmd.PairSearch(cell, ALWAYS, 3.0, capacity_multiplier=1.0)
@@ -435,7 +435,7 @@ def test_a_sparse_list_too_small_is_an_error():
         jaxmd.as_neighbor_list(idx, np.zeros((40, 3)), "sparse", capacity=count - 1)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_relaxation_finds_the_crystal_over_a_list_that_must_be_rebuilt():
     atoms = silicon(0.25)
     potential = manybody.stillinger_weber()

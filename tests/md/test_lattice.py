@@ -128,7 +128,7 @@ def test_a_pair_too_close_to_count_stops_the_run(liquid):
     assert segments[-1].closes == "blow-up" and segments[-1].last == 0
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_neither_lists_nor_the_order_of_sums_matter(liquid):
     plain = run(liquid, 400)
     for changed in (

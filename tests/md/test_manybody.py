@@ -18,7 +18,8 @@ from oracles_manybody import L, embedded_atom, energy_and_forces, stillinger_web
 
 from mdnum.errors import InputError, NumericalError
 from mdnum.md import jaxmd, manybody
-from mdnum.md.manybody.setfl import read_setfl
+from mdnum.md.embedded_atom import embedded_atom as made_eam
+from mdnum.md.embedded_atom import read_setfl
 
 COPPER = Path(__file__).parents[2] / "systems" / "copper" / "cu.eam.alloy"
 # relative energy, and forces relative to the largest one; measured 4e-16 and 8e-15 against extended
@@ -72,7 +73,7 @@ def ase_calculator(name: str):
 
 
 CASES = {
-    "eam": (lambda: manybody.embedded_atom(COPPER), lambda a: embedded_atom(a, COPPER), "Cu", 4, 0.05),
+    "eam": (lambda: made_eam(COPPER), lambda a: embedded_atom(a, COPPER), "Cu", 4, 0.05),
     "tersoff": (manybody.tersoff, tersoff, "Si", 3, 0.05),
     # bonds inside the taper and beyond it
     "tersoff, hot": (manybody.tersoff, tersoff, "Si", 3, 0.15),
@@ -82,7 +83,7 @@ CASES = {
 
 
 @pytest.mark.parametrize(
-    "case", [pytest.param(c, marks=pytest.mark.slow) if "hot" in c else c for c in CASES]
+    "case", [pytest.param(c, marks=pytest.mark.nightly) if "hot" in c else c for c in CASES]
 )
 def test_energy_forces_and_stress_agree_with_extended_precision_and_with_ase(case):
     make, oracle, kind, repeat, rattle = CASES[case]
@@ -146,7 +147,7 @@ def test_skin_masked_entries_images_and_folding_do_not_matter(case):
         np.testing.assert_allclose(np.asarray(other_forces), forces, rtol=0, atol=1e-11)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_triclinic_and_slab_agree_with_extended_precision():
     tilted = crystal("Si", 2, 0.1)
     tilted.set_cell(
@@ -217,7 +218,7 @@ def test_smoothness_is_what_a_crossing_shows(case):
 
 
 def test_a_density_off_the_table_is_never_silent():
-    potential = manybody.embedded_atom(COPPER)
+    potential = made_eam(COPPER)
     atoms = crystal("Cu", 4, 0.02)
     cell = jnp.asarray(atoms.cell.array)
     neighbor = jaxmd.as_neighbor_list(dense(atoms, potential.r_cut), atoms.positions)
@@ -253,7 +254,7 @@ def test_the_table_is_the_published_form():
         table.embedding, form.embedding(table.drho * np.arange(len(table.embedding))), rtol=1e-13, atol=1e-13
     )
     # what the spline loses against the form between its points
-    potential = manybody.embedded_atom(COPPER)
+    potential = made_eam(COPPER)
     between = np.linspace(1.9, 5.4, 5_000)
     assert np.abs(np.asarray(potential.phi(jnp.asarray(between))) - form.pair(between)).max() < 1e-6
     assert np.abs(np.asarray(potential.charge(jnp.asarray(between))) - form.density(between)).max() < 1e-8
@@ -273,7 +274,7 @@ def test_a_broken_table_is_refused_in_one_line(tmp_path, change, message):
     path = tmp_path / "broken.alloy"
     path.write_text(change(COPPER.read_text()))
     with pytest.raises(InputError) as caught:
-        manybody.embedded_atom(path)
+        made_eam(path)
     text = str(caught.value)
     assert str(path) in text and "\n" not in text
     assert message in text or (message == "2 words fewer" and "3002 numbers" in text)
@@ -281,9 +282,9 @@ def test_a_broken_table_is_refused_in_one_line(tmp_path, change, message):
 
 def test_another_element_and_a_missing_table_are_refused(tmp_path):
     with pytest.raises(InputError, match="a table for Cu, but the structure holds Al"):
-        manybody.embedded_atom(COPPER, ["Cu", "Al"])
+        made_eam(COPPER, ["Cu", "Al"])
     with pytest.raises(InputError, match="no such potential table"):
-        manybody.embedded_atom(tmp_path / "none.alloy")
+        made_eam(tmp_path / "none.alloy")
     with pytest.raises(InputError, match="known are Si and Si-1989"):
         manybody.tersoff("Ge")
 
@@ -299,7 +300,7 @@ def test_the_1989_constants_differ_from_those_of_1988():
 
 @pytest.mark.jax_md
 @pytest.mark.parametrize(
-    "format", [*(pytest.param(one, marks=pytest.mark.slow) for one in ("dense", "sparse")), "ordered-sparse"]
+    "format", [*(pytest.param(one, marks=pytest.mark.nightly) for one in ("dense", "sparse")), "ordered-sparse"]
 )
 def test_any_jax_md_energy_function_runs_in_every_format(format):
     from ase.calculators.lj import LennardJones

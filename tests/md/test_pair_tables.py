@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 from mdnum.errors import CapacityError, InputError
 from mdnum.md.cell import Cell, wrap_positions
-from mdnum.md.cells import neighbor_table
-from mdnum.md.verlet import BUILDERS, RebuildRule, VerletList, check_radius
+from mdnum.md.neighbors import BUILDERS, RebuildRule, VerletList, check_radius, neighbor_table
 
 FLAGS = st.tuples(st.booleans(), st.booleans(), st.booleans())
 
@@ -108,7 +107,7 @@ def test_the_search_of_jax_md_finds_the_same(configuration):
     check(BUILDERS["jax-md"], positions, cell, min(radius, 0.999 * half))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.jax_md
 @pytest.mark.filterwarnings("ignore:scatter inputs")
 @settings(max_examples=40)
@@ -138,7 +137,7 @@ def test_a_pair_at_the_radius_is_not_lost_between_bins(bins):
     assert tried > 100
 
 
-@pytest.mark.parametrize("builder", ["host", pytest.param("jax-md", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("builder", ["host", pytest.param("jax-md", marks=pytest.mark.nightly)])
 @pytest.mark.jax_md
 @pytest.mark.filterwarnings("ignore:scatter inputs")
 def test_one_atom_has_no_neighbors_and_two_have_each_other(builder):

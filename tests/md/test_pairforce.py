@@ -9,9 +9,9 @@ import pytest
 from oracles import COMPARISONS, all_pairs
 from rollout.harness import liquid, write_system
 
-from mdnum.events import count_set, set_bits
 from mdnum.md.cell import wrap_positions
-from mdnum.md.cutoffs import BY_NAME
+from mdnum.md.cutoffs import CUTOFFS
+from mdnum.numerics import count_set, set_bits
 from mdnum.systems import load
 from mdnum.systems.build import build
 
@@ -102,7 +102,7 @@ def mixture(tilt, pbc=True, seed=3):
 
 
 def tables(kind):
-    onset = {"onset": ONSET * 1.9} if BY_NAME[kind].switches else {}
+    onset = {"onset": ONSET * 1.9} if CUTOFFS.parse(kind).switches else {}
     return {
         "potential": {"kind": "lennard-jones", "pairs": PAIRS, "sigma": 1.0, "epsilon": 1.0},
         "cutoff": {"kind": kind, "radius": 1.9, "pairs": RADII, **onset},
@@ -113,25 +113,25 @@ QUICK = ("hard", "switched", "quintic")
 
 
 @pytest.mark.parametrize(
-    "kind", [pytest.param(k, marks=() if k in QUICK else pytest.mark.slow) for k in BY_NAME]
+    "kind", [pytest.param(k, marks=() if k in QUICK else pytest.mark.nightly) for k in CUTOFFS]
 )
 def test_a_mixture_in_a_tilted_box(tmp_path, kind):
     atoms = mixture(tilt=True)
     compare(build(load(write_system(tmp_path, atoms, **tables(kind)))), kind, atoms)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", BY_NAME)
+@pytest.mark.nightly
+@pytest.mark.parametrize("kind", CUTOFFS)
 @pytest.mark.parametrize("pbc", [(True, True, True), (True, False, True), (False, False, False)])
 def test_one_species_in_boxes_of_every_kind(tmp_path, kind, pbc):
     atoms = liquid(rattle=0.05)
     atoms.pbc = pbc
-    onset = {"onset": ONSET * 1.9} if BY_NAME[kind].switches else {}
+    onset = {"onset": ONSET * 1.9} if CUTOFFS.parse(kind).switches else {}
     path = write_system(tmp_path, atoms, cutoff={"kind": kind, "radius": 1.9, **onset})
     compare(build(load(path)), kind, atoms)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.jax_md
 @pytest.mark.filterwarnings("ignore:scatter inputs")
 def test_the_list_of_jax_md_gives_the_same(tmp_path):
@@ -188,7 +188,7 @@ def shell(shift=0.0):
 
 
 @pytest.mark.parametrize(
-    "compare", [pytest.param(c, marks=pytest.mark.slow if c.startswith("r ") else ()) for c in COMPARISONS]
+    "compare", [pytest.param(c, marks=pytest.mark.nightly if c.startswith("r ") else ()) for c in COMPARISONS]
 )
 def test_at_the_cutoff_the_convention_decides_and_the_energy_follows(tmp_path, compare):
     path = write_system(

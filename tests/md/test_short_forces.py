@@ -11,8 +11,8 @@ import pytest
 import small_systems
 
 from mdnum.md.cell import HostCell, wrap_positions
-from mdnum.precision import PrecisionPolicy
-from mdnum.precision.exact import rounded, zero_bits
+from mdnum.numerics import PrecisionPolicy
+from mdnum.numerics.exact import rounded, zero_bits
 from mdnum.systems.build import Simulation, build
 
 SHORT = {"bfloat16": np.dtype(ml_dtypes.bfloat16), "float16": np.dtype(np.float16)}
@@ -77,9 +77,9 @@ def evaluated(sim: Simulation):
     [
         # widened to float32, where XLA would leave out roundings
         ("bfloat16", "hard", "float32"),
-        pytest.param("bfloat16", "switched", "float32", marks=pytest.mark.slow),
-        pytest.param("bfloat16", "force-shifted", "float64", marks=pytest.mark.slow),
-        pytest.param("float16", "switched", "float64", marks=pytest.mark.slow),
+        pytest.param("bfloat16", "switched", "float32", marks=pytest.mark.nightly),
+        pytest.param("bfloat16", "force-shifted", "float64", marks=pytest.mark.nightly),
+        pytest.param("float16", "switched", "float64", marks=pytest.mark.nightly),
     ],
 )
 def test_forces_and_energies_are_those_of_numpy(dtype, kind, decision):

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mdnum.md.stepper import MdState, PairDynamics
+from mdnum.md.pairforce import MdState, PairDynamics
 from mdnum.rollout.engine import Engine, first_state
 from mdnum.systems.build import build
 

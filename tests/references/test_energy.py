@@ -1,22 +1,32 @@
-"""`mdnum check energy`: agreement to rounding, and planted faults that it must find."""
+"""`mdnum check energy` and `dynamics`: agreement to rounding, and planted faults that they must find."""
 
 from __future__ import annotations
 
 import json
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from ase.build import bulk
 from small_systems import KOB_ANDERSEN, LENNARD_JONES, crystal, make, mixture
 
-from mdnum.references.energy import check_energy
+from mdnum.plain import plain
+from mdnum.references.ase_models import reference
+from mdnum.references.energy_check import _growth, _sudden, check_dynamics, check_energy
 from mdnum.systems import build
+from mdnum.workflow.check import dynamics_findings, energy_findings
 
 HARD = {"kind": "hard", "radius": 2.5}
+SHORT = {"kind": "hard", "radius": 2.2}
 MORSE = {"kind": "morse", "depth": 1.3, "alpha": 5.0, "r0": 1.1}
 SOFT = {"kind": "soft-sphere", "sigma": 2.6, "epsilon": 2.0, "alpha": 2.5}
+
+
+def codes(report) -> list[tuple[str, str]]:
+    findings = energy_findings(report) if hasattr(report, "frames") else dynamics_findings(report)
+    return [(finding.code, finding.severity) for finding in findings]
+
+
 SINGLE = {"state": "float32", "force": "float32", "decision": "float32", "accumulate": "float32"}
 
 
@@ -43,8 +53,8 @@ def test_pair_potentials_meet_the_reference(potential: dict, cutoff: str, ase: b
     assert report.ok and report.worst["ok"]
     # measured 1e-16 to 2e-14; the promise is 1e-12 and 1e-10
     assert frame.energy_rel <= 1e-14 and frame.force_rel <= 1e-13 and frame.stress_rel <= 1e-13
-    assert [one["code"] for one in report.findings] == ([] if ase else ["not-ase"])
-    json.dumps(report.to_dict())
+    assert codes(report) == ([] if ase else [("not-ase", "info")])
+    json.dumps(plain(report))
 
 
 def test_a_mixture_meets_ase():
@@ -91,7 +101,7 @@ def test_float32_is_compared_in_units_of_its_rounding(precision: dict):
     assert report.ok and report.precision == "float32"
     assert 1e-9 < frame.energy_rel < 1e-5  # not float64 in disguise
     assert 0.01 < frame.force_roundings < 5.0 and frame.energy_roundings < 5.0
-    assert [one["code"] for one in report.findings] == ["narrow-precision"]
+    assert codes(report) == [("narrow-precision", "info")]
 
 
 def test_a_force_in_sixteen_bits_has_rounded_terms_at_places_that_are_not():
@@ -135,20 +145,18 @@ def test_planted_faults_are_found(fault: dict):
     atoms = crystal()
     report = check_energy(Faulty(build(make(atoms, LENNARD_JONES, HARD)), **fault), {"initial": atoms})
     assert not report.ok
-    assert [(one["code"], one["severity"]) for one in report.findings] == [("ase-disagrees", "error")]
+    assert codes(report) == [("ase-disagrees", "error")]
 
 
 def test_wrong_constants_are_found_and_the_third_opinion_names_the_culprit():
     """ASE with another sigma: mdnum agrees with numpy, so it is not mdnum that is off."""
-    from mdnum.references.ase_models import reference
-
     atoms = crystal()
     system = make(atoms, LENNARD_JONES, HARD)
     other = reference(make(atoms, {**LENNARD_JONES, "sigma": 1.0 + 1e-7}, HARD))
     report = check_energy(system, {"initial": atoms}, judge=other)
     assert not report.ok
     assert report.frames[0].energy_rel > 1e-8 and report.frames[0].energy_third < 1e-14
-    assert "third evaluation, in plain numpy" in report.findings[0]["text"]
+    assert next(energy_findings(report)).values["energy_third"] < 1e-14
 
 
 def test_a_pair_at_the_cutoff_is_named_as_the_reason():
@@ -158,7 +166,7 @@ def test_a_pair_at_the_cutoff_is_named_as_the_reason():
     report = check_energy(make(atoms, LENNARD_JONES, HARD), {"initial": atoms})
     assert report.frames[0].force_max > 0.01 and not report.ok
     assert report.frames[0].ambiguous == 1
-    assert "within rounding of the cutoff" in report.findings[0]["remedy"]
+    assert next(energy_findings(report)).values["ambiguous"] == 1
     same = check_energy(make(atoms, LENNARD_JONES, {**HARD, "compare": "r2 <="}), {"initial": atoms})
     assert same.ok and same.frames[0].energy != 0.0
 
@@ -167,4 +175,42 @@ def test_worst_is_what_the_summary_needs():
     atoms = crystal()
     report = check_energy(build(make(atoms, LENNARD_JONES, HARD)), {"a": atoms, "b": atoms})
     assert set(report.worst) >= {"energy_rel", "force_max", "stress_max", "force_scale", "ok"}
-    assert SimpleNamespace(**report.worst).ok
+    assert report.worst["ok"]
+
+
+@pytest.mark.parametrize("cutoff", ["hard", "force-shifted"])
+def test_a_hot_crystal_follows_ase(cutoff: str):
+    report = check_dynamics(make(crystal(), LENNARD_JONES, {"kind": cutoff, "radius": 2.2}), steps=60)
+    assert report.ok and len(report.position) == 61
+    assert report.position[-1] <= 1e-12 and report.velocity[-1] <= 1e-11  # measured 4e-15 and 4e-14
+    assert report.is_ase == (cutoff != "force-shifted")
+    assert codes(report) == ([] if report.is_ase else [("not-ase", "info")])
+    json.dumps(plain(report))
+    assert report.rows()[-1]["step"] == 60
+
+
+def test_langevin_is_checked_without_its_bath():
+    bath = {"kind": "langevin", "timestep": 0.004, "temperature": 1.0, "friction": 1.0, "seed": 3}
+    assert check_dynamics(make(crystal(), LENNARD_JONES, SHORT, dynamics=bath), steps=20).ok
+
+
+def test_float32_trajectories_are_measured_as_such():
+    report = check_dynamics(make(crystal(), LENNARD_JONES, SHORT, precision=SINGLE), steps=20)
+    assert report.ok and report.precision == "float32"
+    assert 1e-8 < report.position[-1] < 1e-4
+
+
+@pytest.mark.parametrize("change", [{"epsilon": 1.0 + 1e-5}, {"sigma": 1.0 + 1e-6}])
+def test_wrong_forces_show(change: dict):
+    judge = reference(make(crystal(), {**LENNARD_JONES, **change}, SHORT))
+    report = check_dynamics(make(crystal(), LENNARD_JONES, SHORT), steps=30, judge=judge)
+    assert not report.ok and report.sudden is None
+    assert codes(report) == [("dynamics-differ", "error")]
+
+
+def test_growth_and_sudden_steps():
+    chaotic = [1e-16 * np.exp(0.05 * step) for step in range(100)]
+    assert _growth(chaotic) == pytest.approx(np.exp(0.05))
+    assert _sudden(chaotic, floor=1e-13) is None
+    forked = [*chaotic[:50], *(1e-7 * np.exp(0.05 * step) for step in range(50))]
+    assert _sudden(forked, floor=1e-13) == 50

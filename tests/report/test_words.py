@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 
 from mdnum.report import words
-from mdnum.report.ball.values import cells
 from mdnum.report.words import heading, typeset
 
 
@@ -40,11 +39,6 @@ def test_a_heading_has_a_capital_unless_it_begins_with_a_name():
         "": "",
     }
     assert {text: heading(text) for text in headings} == headings
-
-
-def test_thousands_are_set_apart_in_all_of_a_column_or_in_none():
-    assert cells([6062, 15726, True, None]) == ["6,062", "15,726", "yes", "–"]
-    assert cells([6062, 9999]) == ["6062", "9999"]
 
 
 @pytest.mark.parametrize(

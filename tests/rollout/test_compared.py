@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mdnum.md.cell import Cell, HostCell
-from mdnum.md.verlet import PairTable
+from mdnum.md.neighbors import PairTable
 from mdnum.rollout.compared import Apart, differ, in_user_order
 
 BOXES = {

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mdnum.rollout.crossing import Crossing, Flips
+from mdnum.rollout.compared import CrossRecorder, PairFlips
 
 ATOMS = 6
 
 
-def history(rng, steps: int, chance: float) -> tuple[list[set[int]], Flips]:
+def history(rng, steps: int, chance: float) -> tuple[list[set[int]], PairFlips]:
     """Random decisions of all pairs, and their flips in order."""
     keys = [i * ATOMS + j for i in range(ATOMS) for j in range(i + 1, ATOMS)]
     inside = {key for key in keys if rng.random() < 0.5}
@@ -22,7 +22,7 @@ def history(rng, steps: int, chance: float) -> tuple[list[set[int]], Flips]:
         sets.append(set(inside))
     columns = zip(*rows, strict=True) if rows else ((),) * 5
     dtypes = (np.int64, np.int64, bool, float, float)
-    return sets, Flips(*(np.array(column, dtype) for column, dtype in zip(columns, dtypes, strict=True)))
+    return sets, PairFlips(*(np.array(column, dtype) for column, dtype in zip(columns, dtypes, strict=True)))
 
 
 @pytest.mark.parametrize("chance", [0.0, 0.05, 0.6])
@@ -30,7 +30,7 @@ def test_what_differs_is_the_difference_of_the_sets_at_every_step(chance):
     rng = np.random.default_rng(3)
     sets_a, a = history(rng, 40, chance)
     sets_b, b = history(rng, 40, chance)
-    crossing = Crossing(*(np.array(sorted(sets[0]), np.int64) for sets in (sets_a, sets_b)), ATOMS)
+    crossing = CrossRecorder(*(np.array(sorted(sets[0]), np.int64) for sets in (sets_a, sets_b)), ATOMS)
     known = {one.i * ATOMS + one.j for one in crossing.opening()}
     assert known == sets_a[0] ^ sets_b[0]
     seen, at = [], 0

@@ -135,7 +135,7 @@ def test_kinetic_energies_are_those_of_a_canonical_ensemble(warm):
     assert np.var(kinetic) == pytest.approx(freedom / 2 * 1.3**2, rel=0.35)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_noise_belongs_to_the_atom_and_the_step(bath, tmp_path):
     """Neither the skin nor the order in which the list sorts the atoms has a say."""
     ends = []
@@ -147,7 +147,7 @@ def test_noise_belongs_to_the_atom_and_the_step(bath, tmp_path):
     assert np.max(np.abs(other - ends[0])) > 1e-2
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.jax_md
 @pytest.mark.filterwarnings("ignore:scatter inputs")
 def test_noise_does_not_depend_on_the_builder(bath):

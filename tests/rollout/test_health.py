@@ -8,7 +8,6 @@ import pytest
 from oracles import all_pairs, margins
 from rollout.harness import assert_ledger_is_complete, go, liquid, write_system
 
-from mdnum.rollout.health import rebuild_ledger
 from mdnum.systems import load
 
 R_CUT = 2.0
@@ -143,13 +142,3 @@ def test_settings_reach_the_rule(path):
 
     rule = build(load(path, {"neighbors.rebuild.every": 7, "neighbors.rebuild.delay": 3})).rule
     assert (rule.every, rule.delay, rule.check, rule.skin) == (7, 3, True, 0.3)
-
-
-def test_the_rebuild_channel_has_a_row_for_every_list_that_was_used_up(path, tmp_path):
-    result, folder = go(tmp_path, path, 120, {"neighbors.skin": 0.1})
-    ledger, epochs = rebuild_ledger(folder), folder.read("epochs")
-    assert len(ledger) == result.summary["rebuilds"] > 3
-    # the decision falls at the first step of the next list, with an atom just beyond half the skin
-    assert np.array_equal(ledger.step, epochs["start"][1:])
-    assert np.all(ledger.margin > 0) and np.all(ledger.margin < 0.05)
-    assert not ledger.ambiguous.any()

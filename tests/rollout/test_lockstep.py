@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mdnum.md.verlet import RebuildRule
+from mdnum.md.neighbors import RebuildRule
+from mdnum.rollout.compared import Frame
 from mdnum.rollout.engine import Engine
 from mdnum.rollout.flips import decided_pairs, true_pairs
-from mdnum.rollout.frame import Frame
-from mdnum.rollout.handed import Handed
 from mdnum.rollout.lockstep import lockstep
+from mdnum.rollout.tracks import Handed
 from mdnum.systems.build import Simulation, build
 
 FLOAT32 = {f"precision.{role}": "float32" for role in ("force", "decision", "accumulate")}

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from mdnum.rollout.engine import Engine
+from mdnum.rollout.epoch import Pin, Pins
 from mdnum.rollout.flips import PairRecorder, decided_pairs
 from mdnum.rollout.lockstep import lockstep
-from mdnum.rollout.pins import Pin, Pins
 from mdnum.systems.build import build
 
 

@@ -10,7 +10,7 @@ import pytest
 from rollout.harness import go, liquid, tables_equal, write_system
 
 from mdnum.rollout.engine import _MOST_ROWS, _RECORD_BYTES, Engine
-from mdnum.rollout.epoch import Record
+from mdnum.rollout.epoch import EpochRecord
 from mdnum.systems import load
 from mdnum.systems.build import build
 
@@ -79,7 +79,7 @@ def test_hard_and_shifted_are_the_same_trajectory_with_other_energies(path, tmp_
     assert np.std(x["total"]) > 5 * np.std(y["total"])
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_order_of_the_sum_is_part_of_the_program(path, tmp_path):
     _, one = go(tmp_path / "s", path, STEPS)
     _, other = go(tmp_path / "p", path, STEPS, {"precision.reduction": "pairwise"})
@@ -91,7 +91,7 @@ def test_the_order_of_the_sum_is_part_of_the_program(path, tmp_path):
 
 def record_bytes(engine, words):
     record = jax.eval_shape(lambda: engine.take(0, words))
-    assert isinstance(record, Record)
+    assert isinstance(record, EpochRecord)
     return sum(int(np.prod(leaf.shape)) * leaf.dtype.itemsize for leaf in jax.tree.leaves(record))
 
 

@@ -78,8 +78,8 @@ def test_the_unedited_file_loads(folder: Path):
         (
             "radius = 8.0",
             "radius = 8.0\nonset = 7.0",
-            15,
-            ["unknown key 'onset'", "Known keys are", "compare"],
+            12,
+            ["onset has no meaning for the kind hard"],
         ),
         ('units = "metal"', 'units = "real"', 2, ['units = "real"', '"metal" or "lj"']),
         ('units = "metal"', "", None, ["key 'units' missing", "metal: Å"]),

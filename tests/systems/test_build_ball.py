@@ -9,9 +9,10 @@ import ml_dtypes
 import numpy as np
 import pytest
 
-from mdnum.ball import contacts, integrators, losses, stopping
+from mdnum.ball import contacts, integrators, stopping
+from mdnum.ball import problem as losses
 from mdnum.errors import InputError
-from mdnum.precision.reductions import Blocked, Permuted
+from mdnum.numerics.reductions import Blocked, Permuted
 from mdnum.systems import build_ball, load
 from mdnum.systems.ball import BallSpec
 from mdnum.systems.build_ball import problem, start
@@ -94,7 +95,7 @@ def test_contacts_and_integrators():
     for kind, made in (
         ("explicit-euler", integrators.ExplicitEuler),
         ("semi-implicit-euler", integrators.SemiImplicitEuler),
-        ("velocity-verlet", integrators.VelocityVerlet),
+        ("velocity-verlet", integrators.BallVerlet),
         ("event-located", integrators.EventLocated),
     ):
         world = problem(spec(IMPACT, integrator={**EULER, "kind": kind})).world
@@ -122,7 +123,7 @@ def test_stopping_rules(rule: str, made: type):
     assert type(stop) is made
     assert (float(stop.tol), stop.max_iter) == (1e-3, 7)
     two = problem(spec(SOLVED, stop={"rule": rule, "tol": 1e-3, "enter": 1e-2})).world.contact.stop
-    assert isinstance(two, stopping.Hysteresis)
+    assert isinstance(two, stopping.HysteresisStop)
     assert float(two.enter) == 1e-2
 
 
@@ -152,7 +153,7 @@ def test_build_makes_every_variant_and_takes_other_steps():
     names = [variant.name for variant in built.variants]
     assert names == ["float32", "velocity-verlet", "explicit-euler"]
     assert all(variant.problem.steps == 12 for variant in built.variants)
-    assert isinstance(built.variants[1].problem.world.integrator, integrators.VelocityVerlet)
+    assert isinstance(built.variants[1].problem.world.integrator, integrators.BallVerlet)
     assert built.problem.run().steps == 12
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from mdnum.trajectories.table import Flips, Members
+from mdnum.trajectories.ledger import FlipTable, Members
 
 
-def ledger(inside: np.ndarray, names: list[tuple[int, int, int]]) -> tuple[Flips, Members]:
+def ledger(inside: np.ndarray, names: list[tuple[int, int, int]]) -> tuple[FlipTable, Members]:
     """Flips in the order of frames, and the pairs at the first frame, of decisions by pair and frame.
 
     Args:
@@ -22,7 +22,9 @@ def ledger(inside: np.ndarray, names: list[tuple[int, int, int]]) -> tuple[Flips
     whole = np.array([row[:4] for row in rows], np.int64).reshape(-1, 4)
     nothing = np.full(len(rows), np.nan)
     entered = np.array([row[4] for row in rows], bool)
-    flips = Flips(*whole.T, entered, nothing, nothing, nothing, nothing, nothing, np.zeros(len(rows), bool))
+    flips = FlipTable(
+        *whole.T, entered, nothing, nothing, nothing, nothing, nothing, np.zeros(len(rows), bool)
+    )
     start = np.array([name for name, row in zip(names, inside, strict=True) if row[0]], np.int64)
     start = start.reshape(-1, 3)
     return flips, Members(*start.T, np.zeros(len(start)))

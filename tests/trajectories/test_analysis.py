@@ -13,8 +13,8 @@ from MDAnalysisTests import datafiles
 
 from mdnum.errors import InputError
 from mdnum.trajectories import NeighborFlips
-from mdnum.trajectories.checked import FrameError
-from mdnum.trajectories.rules import Capped, Cutoff, Nearest
+from mdnum.trajectories.frame import FrameError
+from mdnum.trajectories.rules import Capped, CutoffRule, Nearest
 
 warnings.filterwarnings("ignore", module="MDAnalysis")
 
@@ -285,7 +285,7 @@ def test_what_cannot_be_asked_is_refused_before_anything_is_read(water, asked, s
 def test_a_number_may_come_as_an_array(water):
     group = water.atoms[:40]
     for value in (np.array(3.0), np.float32(3.0), np.array([3.0]), 3):
-        assert NeighborFlips(group, value).rules == [Cutoff(3.0)]
+        assert NeighborFlips(group, value).rules == [CutoffRule(3.0)]
 
 
 def test_frames_that_go_backward_are_refused():
@@ -298,7 +298,7 @@ def test_frames_that_go_backward_are_refused():
 
 def test_a_cutoff_wider_than_half_the_box_finds_every_image():
     universe = moving(atoms=4, box=6.0)
-    found = NeighborFlips(universe, rule=Cutoff(7.0)).run()
+    found = NeighborFlips(universe, rule=CutoffRule(7.0)).run()
     shifts, rows, before = images(6.0 * np.eye(3)), [], None
     for count, ts in enumerate(universe.trajectory):
         x, now = ts.positions.astype(np.float64), {}

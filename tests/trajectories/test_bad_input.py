@@ -21,10 +21,8 @@ from MDAnalysisTests import datafiles
 import mdnum
 from mdnum.errors import InputError
 from mdnum.trajectories import NeighborFlips
-from mdnum.trajectories.checked import FrameError, checked
-from mdnum.trajectories.frame import Box, Frame
-from mdnum.trajectories.selection import select
-from mdnum.trajectories.source import UnreadableFrame, open_trajectory
+from mdnum.trajectories.frame import Box, Frame, FrameError, UnreadableFrame, checked
+from mdnum.trajectories.source import open_trajectory, select
 from mdnum.trajectories.xtc import XtcFile
 
 warnings.filterwarnings("ignore", module="MDAnalysis")

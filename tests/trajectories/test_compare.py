@@ -8,14 +8,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from trajectories.membership import ledger, random_membership
 
-from mdnum.trajectories.compare import Difference, apart, displacements, distances, growth, same_lattice
+from mdnum.trajectories.compare import (
+    SetDifference,
+    displacements,
+    distances,
+    growth,
+    same_lattice,
+    separation,
+)
 from mdnum.trajectories.frame import Box, Frame
-from mdnum.trajectories.table import Flips, Members
+from mdnum.trajectories.ledger import FlipTable, Members
 
 
-def of_frame(flips: Flips, frame: int) -> Flips:
+def of_frame(flips: FlipTable, frame: int) -> FlipTable:
     rows = flips.frame == frame
-    return Flips(**{name: getattr(flips, name)[rows] for name in Flips.__dataclass_fields__})
+    return FlipTable(**{name: getattr(flips, name)[rows] for name in FlipTable.__dataclass_fields__})
 
 
 @given(st.integers(0, 10**6), st.integers(1, 30))
@@ -25,7 +32,7 @@ def test_the_difference_carried_along_is_that_of_the_sets(seed: int, differing: 
     b = a.copy()
     b[:differing, 3:] = random_membership(seed + 1)[0][:differing, 3:]
     (flips_a, first_a), (flips_b, first_b) = ledger(a, names), ledger(b, names)
-    found = Difference.of(first_a, first_b)
+    found = SetDifference.of(first_a, first_b)
     assert not len(found) and found.new == []
     before: set[tuple[int, int, int]] = set()
     for frame in range(1, a.shape[1]):
@@ -41,7 +48,7 @@ def test_sets_that_differ_from_the_start() -> None:
         Members(np.array(i), np.array(j), np.array(rank), np.ones(2))
         for i, j, rank in (([0, 0], [1, 2], [0, 0]), ([0, 1], [2, 1], [0, 3]))
     )
-    found = Difference.of(one, other)
+    found = SetDifference.of(one, other)
     assert found.only_a == {(0, 1, 0)} and found.only_b == {(1, 1, 3)} and len(found) == 2
     assert found.new == [(0, 1, 0), (1, 1, 3)]
 
@@ -58,7 +65,7 @@ def test_displacements_go_through_the_boundary_of_any_box() -> None:
     np.testing.assert_allclose(displacements(Frame(0, 0.0, start, box), end), moved, atol=1e-12)
     free = Frame(0, 0.0, start + 100.0, Box())
     np.testing.assert_allclose(displacements(Frame(0, 0.0, start, Box()), free), 100.0, atol=1e-12)
-    found = apart(Frame(0, 0.0, start, box), end, np.array([3, 8]))
+    found = separation(Frame(0, 0.0, start, box), end, np.array([3, 8]))
     sizes = np.linalg.norm(moved[[3, 8]], axis=1)
     assert found.furthest == pytest.approx(sizes.max()) and found.atom == (3, 8)[int(sizes.argmax())]
     assert found.typical == pytest.approx(np.sqrt((sizes**2).mean()))
@@ -101,5 +108,5 @@ def test_an_axis_that_repeats_in_one_frame_only_has_no_images() -> None:
     for boxes in ((every, slab), (slab, every)):
         start, end = Frame(0, 0.0, x, boxes[0]), Frame(0, 0.0, x + np.array([10.0, -20.0, 10.0]), boxes[1])
         np.testing.assert_array_equal(displacements(start, end), [[0, 0, 10.0]])
-        found = apart(start, end)
+        found = separation(start, end)
         assert found.furthest == 10.0 and found.periods == 2

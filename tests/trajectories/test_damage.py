@@ -18,12 +18,19 @@ from MDAnalysisTests import datafiles
 import mdnum
 from mdnum.errors import InputError
 from mdnum.trajectories import NeighborFlips
-from mdnum.trajectories.checked import FrameError, checked
-from mdnum.trajectories.far import far_out, leap, smallest_radius
-from mdnum.trajectories.frame import Box, Frame
+from mdnum.trajectories.frame import (
+    Box,
+    Frame,
+    FrameError,
+    UnreadableFrame,
+    checked,
+    far_out,
+    leap,
+    smallest_radius,
+)
 from mdnum.trajectories.netcdf import head_of
-from mdnum.trajectories.rules import Cutoff, Nearest, SpeciesCutoffs
-from mdnum.trajectories.source import UnreadableFrame, open_trajectory
+from mdnum.trajectories.rules import CutoffRule, Nearest, SpeciesCutoffs
+from mdnum.trajectories.source import open_trajectory
 
 DLPOLY = Path(datafiles.PSF).parent / "dlpoly" / "HISTORY"
 
@@ -70,7 +77,7 @@ def test_floats_that_tell_no_distance_there_are_said_to():
     assert far_out(drifted, radius=2.5, bits=64) is None
     found = far_out(drifted, radius=2.5, bits=32)
     assert found is not None and "float32 tells distances no better than to" in found[2] and found[1] == 60
-    assert smallest_radius([Nearest(3), Cutoff(4.0), SpeciesCutoffs({("A", "B"): 2.0})]) == 2.0
+    assert smallest_radius([Nearest(3), CutoffRule(4.0), SpeciesCutoffs({("A", "B"): 2.0})]) == 2.0
     assert smallest_radius([Nearest(3)]) == np.inf
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mdnum.trajectories.resolution import infer
-from mdnum.trajectories.rules import Cutoff
+from mdnum.trajectories.rules import CutoffRule
 from mdnum.trajectories.source import open_trajectory
 from mdnum.trajectories.tracker import Tracker
 
@@ -66,15 +66,15 @@ def test_lammps_counts_the_same_pairs(tmp_path):
         open_trajectory(tmp_path / f"{name}.lammpstrj", slice=":12") for name in ("exact", "plain")
     )
     assert (exact.length, exact.time, plain.time) == ("σ", "τ", "step")
-    tracker, found = Tracker(Cutoff(2.0)), []
+    tracker, found = Tracker(CutoffRule(2.0)), []
     for frame in exact.frames():
         assert frame.box.pbc.tolist() == [True, True, False] and frame.box.matrix[2, 1] != 0
         tracker.step(frame)
         found.append(tracker.pairs)
     assert found == counted and len(set(found)) > 5
     # six digits of the box, unless told otherwise
-    assert infer(exact).kind == "float64"
-    resolution = infer(plain)
+    assert infer(exact.sample(), 64).kind == "float64"
+    resolution = infer(plain.sample(), 64)
     assert (resolution.kind, resolution.digits) == ("fractions", 6)
     for one, other in zip(exact.frames(), plain.frames(), strict=True):
         # LAMMPS wraps atoms into the box between the two

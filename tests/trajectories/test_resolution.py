@@ -14,9 +14,9 @@ from trajectories.liquid import CUTOFF, liquid, memberships, missed_and_invented
 
 from mdnum.errors import InputError
 from mdnum.trajectories.frame import Box, Frame
-from mdnum.trajectories.grid_effect import effect_on, grid_effect
-from mdnum.trajectories.resolution import infer, infer_from
-from mdnum.trajectories.rules import Capped, Cutoff, Nearest
+from mdnum.trajectories.grid_effect import grid_effect
+from mdnum.trajectories.resolution import infer
+from mdnum.trajectories.rules import Capped, CutoffRule, Nearest
 from mdnum.trajectories.source import open_trajectory
 from mdnum.trajectories.tracker import Tracker
 
@@ -26,6 +26,10 @@ TILTED = np.array([[9.0, 0, 0], [2.3, 8.1, 0], [-1.7, 3.3, 10.9]])
 def frames_of(positions, matrix=TILTED):
     box = Box(np.asarray(matrix, float), np.ones(3, bool))
     return [Frame(k, float(k), np.asarray(x, np.float64), box) for k, x in enumerate(positions)]
+
+
+def of_file(trajectory):
+    return infer(trajectory.sample(), trajectory.bits, trajectory.format)
 
 
 def moving(atoms=40, frames=4, seed=0):
@@ -50,7 +54,7 @@ def moving(atoms=40, frames=4, seed=0):
     ],
 )
 def test_of_real_files(path, topology, kind, step):
-    resolution = infer(open_trajectory(path, topology))
+    resolution = of_file(open_trajectory(path, topology))
     assert (resolution.kind, resolution.step) == (kind, pytest.approx(step))
 
 
@@ -62,12 +66,12 @@ def test_of_real_files(path, topology, kind, step):
 )
 def test_a_decimal_grid_is_found_whatever_its_step(step, seed, atoms):
     positions = np.round(moving(atoms, seed=seed) / step) * step
-    found = infer_from(frames_of(positions))
+    found = infer(frames_of(positions))
     assert (found.kind, found.step) == ("grid", pytest.approx(step))
     if step >= 1e-4:
         # and through float32, as nm
         narrow = (positions / 10).astype(np.float32) * np.float32(10)
-        found = infer_from(frames_of(narrow), bits=32)
+        found = infer(frames_of(narrow), bits=32)
         assert (found.kind, found.step) == ("grid", pytest.approx(step))
 
 
@@ -76,7 +80,7 @@ def test_a_decimal_grid_is_found_whatever_its_step(step, seed, atoms):
 def test_decimals_of_the_box_are_found(step, seed):
     fractions = np.linalg.solve(TILTED.T, moving(seed=seed).reshape(-1, 3).T).T
     positions = ((np.round(fractions / step) * step) @ TILTED).reshape(4, -1, 3)
-    found = infer_from(frames_of(positions))
+    found = infer(frames_of(positions))
     assert (found.kind, found.step) == ("fractions", pytest.approx(step))
 
 
@@ -85,22 +89,22 @@ def test_decimals_of_the_box_are_found(step, seed):
 def test_a_number_of_digits_is_told_from_a_number_of_decimals(digits, seed):
     positions = moving(60, seed=seed)
     written = np.vectorize(lambda x: float(f"{x:.{digits}g}"))(positions)
-    found = infer_from(frames_of(written))
+    found = infer(frames_of(written))
     # numbers from 10 to 99 have two digits before the point
     assert (found.kind, found.digits, found.step) == ("grid", digits, pytest.approx(10.0 ** (2 - digits)))
     off = np.abs(written - positions).max()
     assert off <= found.step / 2 and found.bound(frames_of(written)[0]) > 2 * off
-    fixed = infer_from(frames_of(np.round(positions, digits - 2)))
+    fixed = infer(frames_of(np.round(positions, digits - 2)))
     assert (fixed.digits, fixed.step) == (0, pytest.approx(10.0 ** (2 - digits)))
 
 
 @given(st.integers(0, 10**6), st.sampled_from([1, 2, 40]))
 def test_floats_are_no_grid_however_few_there_are(seed, atoms):
     positions = moving(atoms, seed=seed)
-    assert infer_from(frames_of(positions)).kind == "float64"
+    assert infer(frames_of(positions)).kind == "float64"
     narrow = positions.astype(np.float32)
-    assert infer_from(frames_of(narrow)).kind == "float32"
-    assert infer_from(frames_of(narrow), bits=32).kind == "float32"
+    assert infer(frames_of(narrow)).kind == "float32"
+    assert infer(frames_of(narrow), bits=32).kind == "float32"
 
 
 def test_the_sites_of_a_crystal_are_no_resolution():
@@ -110,10 +114,10 @@ def test_the_sites_of_a_crystal_are_no_resolution():
     frames = [wall.copy() for _ in range(5)]
     for frame in frames[1:]:
         frame[1] += random.normal(size=3)
-    found = infer_from(frames_of(frames, 60 * np.eye(3)))
+    found = infer(frames_of(frames, 60 * np.eye(3)))
     assert found.kind == "float64" and found.moved
-    still = infer_from(frames_of(frames[:1], 60 * np.eye(3)))
-    assert still.kind == "grid" and "may be the structure's" in still.words()
+    still = infer(frames_of(frames[:1], 60 * np.eye(3)))
+    assert still.kind == "grid" and not still.moved
 
 
 @settings(max_examples=100)
@@ -130,7 +134,7 @@ def test_no_distance_is_further_off_than_the_bound(seed, kind, step):
     else:
         kept = (true / 10).astype(np.float32) * np.float32(10)
     frames = frames_of(kept)
-    resolution = infer_from(frames, bits=32 if kind == "float32" else 64)
+    resolution = infer(frames, bits=32 if kind == "float32" else 64)
     assert resolution.kind == kind
     first, second = np.triu_indices(60, 1)
     for frame, x in zip(frames, true, strict=True):
@@ -142,13 +146,13 @@ def test_no_distance_is_further_off_than_the_bound(seed, kind, step):
         # and no wider than it has to be: the worst of 1,770 distances comes within a factor of 4 (float: 12)
         assert np.abs(off).max() > bound / (12 if kind == "float32" else 4)
         if kind == "grid":
-            assert off.std() == pytest.approx(resolution.typical(frame), rel=0.25)
+            assert off.std() == pytest.approx((2 / 12) ** 0.5 * resolution.usual_step(frame), rel=0.25)
 
 
 def test_the_worst_case_is_met():
     # two atoms on the diagonal, half a step off in opposite directions
     frames = frames_of(np.round(moving(30), 2))
-    resolution = infer_from(frames)
+    resolution = infer(frames)
     assert resolution.bound(frames[0]) == pytest.approx(2 * np.sqrt(3) * 0.005, rel=1e-9)
 
 
@@ -163,7 +167,7 @@ def test_what_the_grid_of_an_xtc_does_to_flips(stride, timestep):
     kept = quantized(positions, 0.01)
     missed, invented = missed_and_invented(memberships(positions, length), memberships(kept, length))
     frames = frames_of(kept[:8], length * np.eye(3))
-    resolution = infer_from(frames)
+    resolution = infer(frames)
     assert resolution.step == 0.01
     effect = grid_effect(resolution, frames, CUTOFF)
     assert effect is not None
@@ -171,7 +175,6 @@ def test_what_the_grid_of_an_xtc_does_to_flips(stride, timestep):
         assert missed > 0.35 and invented > 0.5
     assert effect.missed == pytest.approx(missed, abs=0.04)
     assert effect.invented == pytest.approx(invented, abs=0.04)
-    assert f"{100 * effect.missed:.2g} %" in effect.words()
 
 
 @pytest.mark.parametrize(("k", "within"), [(4, 0.03), (12, 0.08)])
@@ -191,17 +194,17 @@ def test_what_the_grid_does_among_the_nearest(k, within, stride, timestep):
     missed, invented = missed_and_invented(true, seen)
     frames = frames_of(kept[:8], length * np.eye(3))
     reach = np.median(np.partition(neighbors(kept[0])[1], k - 1, axis=1)[:, k - 1])
-    effect = grid_effect(infer_from(frames), frames, float(reach), ranked=True)
+    effect = grid_effect(infer(frames), frames, float(reach), ranked=True)
     assert effect is not None and missed > 0.1
     assert effect.missed == pytest.approx(missed, abs=within)
     assert effect.invented == pytest.approx(invented, abs=within)
 
 
-@pytest.mark.parametrize("rule", [Cutoff(CUTOFF), Nearest(4), Capped(CUTOFF, 12)])
+@pytest.mark.parametrize("rule", [CutoffRule(CUTOFF), Nearest(4), Capped(CUTOFF, 12)])
 def test_what_the_file_makes_up_is_marked_as_what_it_cannot_tell(rule):
     positions, length = liquid(20, 0.005, 4)
     true, kept = (frames_of(x, length * np.eye(3)) for x in (positions, quantized(positions, 0.01)))
-    resolution = infer_from(kept)
+    resolution = infer(kept)
     trackers = Tracker(rule), Tracker(rule)
     unmarked = invented = 0
     for one, other in zip(true, kept, strict=True):
@@ -220,17 +223,17 @@ def test_what_rounding_adds_to_displacements_is_taken_off(speed):
     random = np.random.default_rng(0)
     start, velocity = random.uniform(0, 60, (20_000, 3)), speed * random.normal(size=(20_000, 3))
     frames = frames_of([quantized(start + k * velocity, 0.01) for k in range(8)], 60 * np.eye(3))
-    effect = grid_effect(infer_from(frames), frames, CUTOFF, draws=1000)
+    effect = grid_effect(infer(frames), frames, CUTOFF, draws=1000)
     assert effect is not None and effect.move == pytest.approx(speed, rel=0.02 if speed > 0.001 else 0.05)
 
 
 def test_doubles_hide_nothing():
     positions, length = liquid(60, 0.005, 1)
     frames = frames_of(positions[:8], length * np.eye(3))
-    resolution = infer_from(frames)
+    resolution = infer(frames)
     effect = grid_effect(resolution, frames, CUTOFF)
     assert resolution.kind == "float64" and effect is not None
-    assert effect.missed < 1e-6 and "fewer than 1 flip in 1,000" in effect.words()
+    assert effect.missed < 1e-6
     move = np.sqrt(((positions[1:8] - positions[:7]) ** 2).mean())
     assert effect.move == pytest.approx(move, rel=0.05)
 
@@ -240,23 +243,23 @@ def test_wrapping_is_no_motion():
     kept = quantized(positions % length, 0.01)
     frames = frames_of(kept[:8], length * np.eye(3))
     plain = frames_of(quantized(positions, 0.01)[:8], length * np.eye(3))
-    one, other = (grid_effect(infer_from(some), some, CUTOFF) for some in (frames, plain))
+    one, other = (grid_effect(infer(some), some, CUTOFF) for some in (frames, plain))
     assert one is not None and other is not None
     assert one.move == pytest.approx(other.move, rel=0.01)
     assert one.missed == pytest.approx(other.missed, abs=0.02)
 
 
 def test_nothing_to_find_it_from():
-    assert infer_from(frames_of(np.full((2, 3, 3), np.nan))).kind == "unknown"
-    assert infer_from(frames_of(np.zeros((2, 3, 3)))).step == 0.0
-    with pytest.raises(InputError, match="no frame is left"):
-        infer(open_trajectory(datafiles.GRO, slice="5:"))
+    assert infer(frames_of(np.full((2, 3, 3), np.nan))).kind == "unknown"
+    assert infer(frames_of(np.zeros((2, 3, 3)))).step == 0.0
+    with pytest.raises(InputError, match="@5: leaves no frame"):
+        of_file(open_trajectory(datafiles.GRO, slice="5:"))
 
 
 def test_an_atom_at_the_origin_tells_nothing_of_what_a_file_keeps():
     some = frames_of(np.zeros((4, 1, 3)))
-    found = infer_from(some)
-    assert found.kind == "unknown" and "does not tell" in found.words() and "float32" not in found.words()
+    found = infer(some)
+    assert found.kind == "unknown" and not found.told
     # no warning either, of a division by a grid of steps of 0
     breathing = [
         replace(frame, box=Box((9 + 0.1 * k) * np.eye(3), np.ones(3, bool))) for k, frame in enumerate(some)
@@ -264,18 +267,17 @@ def test_an_atom_at_the_origin_tells_nothing_of_what_a_file_keeps():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert grid_effect(found, breathing, 4.0) is None
-    usual = infer(open_trajectory(datafiles.GRO_huge_box))
+    usual = of_file(open_trajectory(datafiles.GRO_huge_box))
     assert (usual.kind, usual.step, usual.told) == ("grid", 0.01, False)
-    assert "as a rule the format keeps multiples of 0.01 Å" in usual.words()
     # told from numbers where there are any
-    assert infer_from(frames_of(np.eye(3)[None].repeat(2, axis=0)), format="GRO").told
+    assert infer(frames_of(np.eye(3)[None].repeat(2, axis=0)), format="GRO").told
 
 
 def test_of_a_real_xtc():
     trajectory = open_trajectory(datafiles.XTC, datafiles.GRO)
     oxygens = np.flatnonzero(trajectory.species == "O")
-    effect = effect_on(trajectory, infer(trajectory), 3.5, oxygens)
+    effect = grid_effect(of_file(trajectory), trajectory.sample(), 3.5, oxygens)
     # 100 ps between two frames: everything has moved far
     assert effect is not None and effect.missed < 0.02 and effect.move > 1.0
     single = open_trajectory(datafiles.XTC, datafiles.GRO, slice="3")
-    assert effect_on(single, infer(single), 3.5, oxygens) is None
+    assert grid_effect(of_file(single), single.sample(), 3.5, oxygens) is None

@@ -12,14 +12,14 @@ from trajectories.test_pairs import as_dict, same
 
 from mdnum.errors import InputError
 from mdnum.trajectories.frame import Box, Frame
-from mdnum.trajectories.rules import NEVER, Capped, Cutoff, Nearest, SpeciesCutoffs
+from mdnum.trajectories.rules import NEVER, Capped, CutoffRule, Nearest, SpeciesCutoffs
 from mdnum.trajectories.tracker import Tracker
 
 
 @pytest.mark.parametrize("radius", [0.0, -1.0, np.nan, np.inf])
 def test_a_radius_is_a_positive_length(radius):
     for make in (
-        Cutoff,
+        CutoffRule,
         lambda r: Capped(r, 3),
         lambda r: SpeciesCutoffs({("O", "H"): r}),
         lambda r: Nearest(2, r),

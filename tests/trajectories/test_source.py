@@ -14,9 +14,8 @@ from MDAnalysis.lib.formats.libdcd import DCDFile
 from MDAnalysisTests import datafiles
 
 from mdnum.errors import InputError
-from mdnum.trajectories.selection import select
-from mdnum.trajectories.slices import chosen, parse_slice, split_path
-from mdnum.trajectories.source import open_trajectory
+from mdnum.trajectories.source import open_trajectory, select
+from mdnum.trajectories.trajectory import chosen, parse_slice, split_path
 
 warnings.filterwarnings("ignore", module="MDAnalysis")
 

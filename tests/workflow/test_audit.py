@@ -15,88 +15,82 @@ from ase import Atoms
 from ase.io import read
 from ase.io import write as write_structure
 from audit import planted
+from audit.planted import but
 from command_line import call
+from other_package import install
 
 import mdnum
-from mdnum.audit.base import Part
-from mdnum.audit.causes import heads
-from mdnum.audit.load import Loaded
-from mdnum.audit.verdict import judge
-from mdnum.cli.audit_print import by_cause, print_rows
+from mdnum.audit.base import CheckResult, finding
+from mdnum.audit.record import STRUCTURES, AuditState, encoded, script
+from mdnum.audit.structures import LoadedCalculator
+from mdnum.audit.verdict import answers, heads
 from mdnum.errors import InputError
-from mdnum.references.findings import finding
-from mdnum.report import write
+from mdnum.plain import plain
 from mdnum.store import RunFolder
-from mdnum.units import LJ, METAL
-from mdnum.workflow import audit_record
-from mdnum.workflow.audit import _in_units
-from mdnum.workflow.fork_question import Log
+from mdnum.units import LJ
+from mdnum.workflow import frame
+from mdnum.workflow.audit import _headline, _in_units
 
 QUICK = "invariance,forces"
+CHECKS = ["invariance", "smoothness", "forces", "curl", "state", "dynamics"]
 
 
 @pytest.fixture(scope="module")
 def good(tmp_path_factory):
-    return mdnum.audit_calculator(
-        planted.Good, planted.crystal(), temperature=120, steps=40, out=tmp_path_factory.mktemp("good") / "a"
-    )
+    out = tmp_path_factory.mktemp("good") / "a"
+    return mdnum.audit_calculator(planted.Good, planted.crystal(), temperature=120, steps=40, out=out)
 
 
 @pytest.fixture(scope="module")
 def bad(tmp_path_factory):
-    return mdnum.audit_calculator(
-        planted.OneImage, planted.crystal(), checks=QUICK, out=tmp_path_factory.mktemp("bad") / "a"
-    )
+    out = tmp_path_factory.mktemp("bad") / "a"
+    return mdnum.audit_calculator(planted.OneImage, planted.crystal(), checks=QUICK, out=out)
+
+
+def codes(outcome) -> set[str]:
+    return {one.code for one in outcome.verdict.findings}
 
 
 @pytest.mark.slow
-def test_what_is_right_is_safe(good):
+def test_what_is_right_is_safe_and_in_the_folder(good):
     summary = good.summary
     assert summary["safe_to_run"] == summary["safe_to_differentiate"] == "yes"
-    assert "6 checks found nothing" in summary["headline"]
-    assert not [one for one in good.findings if one["severity"] != "info"]
-    assert set(good.parts) == {"smoothness", "invariance", "forces", "curl", "state", "dynamics"}
-    assert summary["kT"] == pytest.approx(120 * 8.617333e-5, rel=1e-6)
-
-
-@pytest.mark.slow
-def test_the_folder_has_what_the_page_is_made_of(good):
+    assert "6 checks found nothing" in summary["headline"] and good.verdict.tone == "good"
+    assert list(good.result) == CHECKS and summary["kT"] == pytest.approx(120 * 8.617333e-5, rel=1e-6)
     folder = RunFolder.open(good.folder)
-    assert folder.world == "audit" and folder.summary == good.summary
+    assert folder.world == "audit" and folder.summary == plain(summary)
     energies = folder.read("energies")
     mine = energies["run"] == "run"
     assert mine.sum() == 41 and (~mine).sum() == 81
     np.testing.assert_allclose(energies["total"], energies["potential"] + energies["kinetic"], rtol=1e-12)
-    named = {curve["name"] for part in good.summary["parts"] for curve in part["curves"]}
-    assert set(folder.read("curves")["curve"]) == named
+    charts = {f"{one.name}-{n}" for one in good.result.values() for n, _ in enumerate(one.charts, 1)}
+    assert set(folder.read("curves")["curve"]) == charts
     before = (good.folder / "report.html").read_text()
-    write(good.folder)
+    frame.finish(good.folder)
     assert (good.folder / "report.html").read_text() == before
-    for title in ("Smoothness", "Invariance", "Forces", "Curl", "Memory", "Dynamics"):
-        assert f"<h2>{title}</h2>" in before
-    assert "reproduce.py" not in before and not (good.folder / audit_record.SCRIPT).exists()
+    titles = [section.title for section in good.page.sections]
+    assert {"Smoothness", "Invariance", "Forces", "Curl", "Memory", "Dynamics"} <= set(titles)
+    assert "Reproduce" not in titles and not (good.folder / "reproduce.py").exists()
 
 
-def test_a_mistake_is_evidence_that_others_can_see(bad, tmp_path):
+def test_a_mistake_is_evidence_that_others_can_see(bad):
     """Both ways of writing the structure down are saved to the last bit, with a script beside them."""
     assert bad.summary["safe_to_run"] == "no" and bad.summary["headline"].startswith("Neither run nor")
-    saved = [
-        read(bad.folder / audit_record.STRUCTURES / f"images-{when}.extxyz") for when in ("before", "after")
-    ]
     energies = []
-    for atoms in saved:
+    for when in ("before", "after"):
+        atoms = read(bad.folder / STRUCTURES / f"images-{when}.extxyz")
         assert isinstance(atoms, Atoms)
         atoms.calc = planted.OneImage()
         energies.append(atoms.get_potential_energy())
-    told = next(one for one in bad.findings if one["code"] == "IMAGES")
-    assert f"{abs(energies[1] - energies[0]):.3g} eV" in told["text"]
-    assert "images-before" in told["text"]
-    assert "reproduce.py" in (bad.folder / "report.html").read_text()
+    told = next(one for one in bad.verdict.findings if one.code == "IMAGES")
+    assert told.values["energy"] == pytest.approx(abs(energies[1] - energies[0]), rel=1e-6)
+    assert told.values["slug"] == "images" and "images-before" in told.text
+    assert "Reproduce" in [section.title for section in bad.page.sections]
+    json.loads((bad.folder / "summary.json").read_text(), parse_constant=pytest.fail)
 
 
 def test_the_script_shows_it_without_mdnum(tmp_path):
-    file = tmp_path / "mine.py"
-    file.write_text(
+    (tmp_path / "mine.py").write_text(
         "from ase.calculators.emt import EMT\n"
         "class Late(EMT):\n"
         "    def calculate(self, *words, **more):\n"
@@ -107,16 +101,14 @@ def test_the_script_shows_it_without_mdnum(tmp_path):
         "def make():\n"
         "    return Late()\n"
     )
-    copper = Atoms(
-        "Cu4", positions=[[0, 0, 0], [1.8, 1.8, 0], [1.8, 0, 1.8], [0, 1.8, 1.8]], cell=[3.6] * 3, pbc=True
-    )
-    result = mdnum.audit_calculator(str(file), copper, checks="invariance", out=tmp_path / "a", report=False)
-    assert {"TRANSLATION", "FACES"} <= {one["code"] for one in result.findings}
-    script = (result.folder / audit_record.SCRIPT).read_text()
-    assert "mdnum" not in script
-    done = subprocess.run(
-        [sys.executable, audit_record.SCRIPT], cwd=result.folder, capture_output=True, text=True, check=True
-    )
+    places = [[0, 0, 0], [1.8, 1.8, 0], [1.8, 0, 1.8], [0, 1.8, 1.8]]
+    copper = Atoms("Cu4", positions=places, cell=[3.6] * 3, pbc=True)
+    words = str(tmp_path / "mine.py")
+    outcome = mdnum.audit_calculator(words, copper, checks="invariance", out=tmp_path / "a", report=False)
+    assert {"TRANSLATION", "FACES"} <= codes(outcome)
+    assert "mdnum" not in (outcome.folder / "reproduce.py").read_text()
+    command = [sys.executable, "reproduce.py"]
+    done = subprocess.run(command, cwd=outcome.folder, capture_output=True, text=True, check=True)
     assert "translation: " in done.stdout and "differ by " in done.stdout
 
 
@@ -126,34 +118,29 @@ def test_the_script_shows_it_without_mdnum(tmp_path):
         ("ase.calculators.emt:EMT", "return ase.calculators.emt.EMT()"),
         ("ase.calculators.lj:LennardJones(rc=3.0)", "return ase.calculators.lj.LennardJones(rc=3.0)"),
         ("argon/crystal-108", "return mdnum.MdnumCalculator('argon/crystal-108')"),
+        ("mine.py:Own(a=1)", "return made['Own'](a=1)"),
     ],
 )
 def test_a_script_makes_the_calculator_that_was_named(words, line):
-    assert line in audit_record.script(words, ["images"])
-    compile(audit_record.script(words, ["images"]), "script", "exec")
+    assert line in script(words, ["images"])
+    compile(script(words, ["images"]), "script", "exec")
 
 
-def test_a_calculator_that_fails_is_a_finding_with_its_structure(tmp_path):
-    class Dies(planted.Good):
-        def answer(self, atoms):
-            raise RuntimeError("out of table")
+def _raise(self, atoms):
+    raise RuntimeError("out of table")
 
-    result = mdnum.audit_calculator(Dies, planted.crystal(), checks="forces,curl", out=tmp_path / "a")
-    assert {one["code"] for one in result.findings} == {"CALCULATOR_FAILED"}
-    assert result.summary["safe_to_run"] == "no"
+
+@pytest.mark.parametrize(
+    ("make", "why"),
+    [(but(answer=_raise), "out of table"), (but(extra=lambda self, atoms, e, f: (e, f * np.nan)), "nan")],
+    ids=["raises", "nan"],
+)
+def test_a_calculator_that_fails_is_a_finding_with_its_structure(make, why, tmp_path):
+    outcome = mdnum.audit_calculator(make, planted.crystal(), checks="forces,curl", out=tmp_path / "a")
+    assert codes(outcome) == {"CALCULATOR_FAILED"} and outcome.summary["safe_to_run"] == "no"
+    assert why in outcome.verdict.findings[0].values["why"]
     assert list((tmp_path / "a" / "structures").glob("failed-*.extxyz"))
-    assert "out of table" in (tmp_path / "a" / "report.html").read_text()
-
-
-def test_nan_is_a_finding_with_its_structure(tmp_path):
-    class Nan(planted.Good):
-        def extra(self, atoms, energy, forces):
-            return energy, forces * np.nan
-
-    result = mdnum.audit_calculator(Nan, planted.crystal(), checks="forces", out=tmp_path / "a", report=False)
-    assert "CALCULATOR_FAILED" in {one["code"] for one in result.findings}
-    assert "nan" in result.findings[0]["text"]
-    assert not (tmp_path / "a" / "report.html").exists()
+    assert outcome.result["forces"].says[0] == ["failed"]
 
 
 @pytest.mark.parametrize(
@@ -165,9 +152,10 @@ def test_nan_is_a_finding_with_its_structure(tmp_path):
         ({"calculator": 7}, "that is a int"),
         ({"timestep": -1.0, "checks": "dynamics"}, "expected one above 0"),
         ({"structure": "nowhere.xyz"}, "nowhere.xyz"),
+        ({"time": 0.0}, "--time"),
     ],
 )
-def test_what_cannot_be_asked_is_refused(asked, message, tmp_path):
+def test_what_cannot_be_asked_is_named(asked, message, tmp_path):
     words = {"calculator": planted.Good, "structure": planted.crystal()} | asked
     with pytest.raises(InputError, match=message):
         mdnum.audit_calculator(**words, out=tmp_path / "a")
@@ -176,62 +164,61 @@ def test_what_cannot_be_asked_is_refused(asked, message, tmp_path):
 REST = ("invariance", "forces", "curl", "state", "dynamics")
 
 
-def part(name: str, *found: tuple[str, str]) -> Part:
-    return Part(
-        name, name, f"{name}.", [finding(code, severity, code.lower(), "") for code, severity in found]
-    )
+def part(name: str, *found: tuple[str, str], asked: int = 1, possible: int = 1) -> CheckResult:
+    findings = [finding(code, severity, title=code.lower()) for code, severity in found]  # type: ignore[arg-type]
+    return CheckResult(([], {}), findings, name=name, title=name, asked=asked, possible=possible)
+
+
+def judged(parts: list[CheckResult], wanted: list[str] | None = None) -> tuple[str, str, str]:
+    from mdnum.workflow.audit import _finding
+
+    names = wanted or [one.name for one in parts]
+    state = AuditState("x", True, encoded(Atoms("Ar")), 1.0, "metal", names, None, None, None, parts)
+    found = [_finding(one, "", "") for each in parts for one in each.findings]
+    told = answers(parts, names)
+    return told["run"], told["differentiate"], _headline(state, found)
 
 
 @pytest.mark.parametrize(
-    ("parts", "run", "differentiate", "words"),
+    ("parts", "run", "differentiate", "headline"),
     [
         ([part("forces")], "not asked", "not asked", "x: 1 check found nothing."),
         (
-            [part("smoothness", ("FORCE_JUMP", "warning")), *map(part, REST)],
-            "yes", "with care", "x is safe to run, and to be differentiated with care: force_jump.",
+            [part("smoothness", ("A", "warning")), *map(part, REST)],
+            "with care", "with care", "Use x with care, to run and to differentiate: a.",
         ),
-        ([part("curl", ("CURL", "error"))], "no", "no", "Neither run nor differentiate x as it is: curl."),
-        (
-            [*map(part, ("smoothness", "forces", "curl")), part("dynamics", ("DRIFT", "warning"))],
-            "with care", "yes", "x is to be run with care, and safe to differentiate: drift.",
-        ),
+        ([part("curl", ("B", "error"))], "no", "no", "Neither run nor differentiate x as it is: b."),
         (
             [part("state", *((f"A{n}", "warning") for n in range(5)))],
-            "with care", "with care", "Use x with care, to run and to differentiate: a0; a1; and 3 more "
-            "findings.",
+            "with care", "with care",
+            "Use x with care, to run and to differentiate: a0; a1; and 3 more findings.",
         ),
     ],
 )  # fmt: skip
-def test_findings_add_up_to_two_answers(parts, run, differentiate, words):
-    judged = judge("x", parts)
-    assert (judged.run, judged.differentiate, judged.headline) == (run, differentiate, words)
+def test_findings_add_up_to_two_answers(parts, run, differentiate, headline):
+    assert judged(parts) == (run, differentiate, headline)
 
 
 def test_what_is_largely_unasked_is_not_safe():
-    parts = [part(name) for name in ("smoothness", *REST)]
-    few = replace(parts[1], asked=11, possible=52)
-    judged = judge("x", [parts[0], few, *parts[2:]])
-    assert (judged.run, judged.differentiate) == ("as far as asked", "yes")
-    assert "11 of 52 ways of invariance" in judged.headline and "safe to run" not in judged.headline
+    parts, every = [part(name) for name in ("smoothness", *REST)], ["smoothness", *REST]
+    few = part("invariance", asked=11, possible=52)
+    run, differentiate, headline = judged([parts[0], few, *parts[2:]])
+    assert (run, differentiate) == ("as far as asked", "yes")
+    assert "11 of 52 ways of invariance" in headline and "safe to run" not in headline
     # nearly all of its ways is enough, nothing at all is not
-    nearly = replace(parts[1], asked=50, possible=52)
-    assert judge("x", [parts[0], nearly, *parts[2:]]).run == "yes"
-    nothing = judge("x", [], ["smoothness", *REST])
-    assert nothing.run == nothing.differentiate == "not asked" and "safe" not in nothing.headline
-    assert judge("x", parts[1:2], ["smoothness", *REST]).differentiate == "not asked"
+    assert judged([parts[0], part("invariance", asked=50, possible=52), *parts[2:]])[0] == "yes"
+    run, differentiate, headline = judged([], every)
+    assert run == differentiate == "not asked" and "safe" not in headline
     # nothing is safe as long as a check that it needs has not begun
-    judged = judge("x", [few, *parts[:1]], ["smoothness", *REST])
-    assert (judged.run, judged.differentiate) == ("not asked", "not asked")
-    assert judged.headline == (
-        "x: nothing can be said yet (11 of 52 ways of invariance, 1 of 1 ways of smoothness asked; "
-        "forces, curl, state, dynamics not asked)."
-    )
-    judged = judge("x", [few, *parts[:1], *parts[2:4]], ["smoothness", *REST])
-    assert (judged.run, judged.differentiate) == ("not asked", "yes")
-    assert "safe to differentiate" in judged.headline and "run" not in judged.headline
-    # what was found stands, and so does what it does not rest on
-    judged = judge("x", [part("curl", ("CURL", "warning")), few])
-    assert judged.run == "with care" and "11 of 52" in judged.headline
+    run, differentiate, headline = judged([few, *parts[:1]], every)
+    assert run == differentiate == "not asked" and headline.startswith("x: nothing can be said yet (11 of 52")
+    run, differentiate, headline = judged([few, *parts[:1], *parts[2:4]], every)
+    assert (run, differentiate) == ("not asked", "yes") and "safe to differentiate" in headline
+    # codes that do not bear on a question
+    told = answers([part("smoothness", ("FORCE_JUMP", "warning")), *map(part, REST)], every)
+    assert (told["run"], told["differentiate"]) == ("yes", "with care")
+    told = answers([*parts[:-1], part("dynamics", ("DRIFT", "warning"))], every)
+    assert (told["run"], told["differentiate"]) == ("with care", "yes")
 
 
 def named(*codes: str) -> list[tuple[str, str]]:
@@ -249,7 +236,7 @@ def named(*codes: str) -> list[tuple[str, str]]:
         (named("STALE_STATE", "CURL", "STALE_DYNAMICS", "CURL"), [0, 1, 0, 1]),
         # answers that differ each time explain what differs, those that differ in a last bit do not
         (named("IMAGES", "NOT_REPEATABLE"), [1, 1]),
-        ([("IMAGES", "warning"), ("NOT_REPEATABLE", "warning")], [0, 1]),
+        ([("IMAGES", "warning"), ("NOT_BIT_IDENTICAL", "warning")], [0, 1]),
         # a warning explains no error, and information nothing
         ([("NARROW_CELL", "warning"), ("EXTENSIVE", "error")], [1, 1]),
         ([("STALE_STATE", "info"), ("STALE_DYNAMICS", "info")], [0, 1]),
@@ -259,25 +246,20 @@ def test_what_fails_after_another_goes_below_it(found, above):
     assert heads(found) == above
 
 
-def test_one_mistake_is_one_finding_with_others_below_it(tmp_path, capsys):
-    class NoImagesAlongZ(planted.Good):
-        def shifts(self, atoms):
-            shifts = super().shifts(atoms)
-            return shifts[np.abs(shifts[:, 2]) < 1e-9]
+def test_one_mistake_is_one_finding_with_others_below_it(tmp_path):
+    def shifts(self, atoms):
+        found = planted.Good.shifts(self, atoms)
+        return found[np.abs(found[:, 2]) < 1e-9]
 
-    result = mdnum.audit_calculator(
-        NoImagesAlongZ, planted.crystal(), checks="invariance", out=tmp_path / "a"
+    outcome = mdnum.audit_calculator(
+        but(shifts=shifts), planted.crystal(), checks="invariance", out=tmp_path / "a"
     )
-    (cause,) = result.summary["causes"]
+    (cause,) = outcome.summary["causes"]
     assert cause["code"] == "IMAGES" and {"FACES", "TRANSLATION", "EXTENSIVE"} <= set(cause["below"])
-    assert len(result.findings) == 1 + len(cause["below"]) > 5
-    assert result.summary["headline"].endswith("the answer depends on which image of an atom is given.")
-    page = (tmp_path / "a" / "report.html").read_text()
-    assert page.count('<article class="finding') == 1
-    assert page.index("<code>IMAGES</code>") < page.index("What may follow from it")
-    assert page.index("What may follow from it") < page.index("<code>FACES</code>")
-    (shown,) = by_cause(result.summary)["findings"]
-    assert all(one["title"] in shown["text"] for one in result.findings if one["code"] != "IMAGES")
+    (head,) = [one for one in outcome.verdict.findings if not one.cause]
+    assert head.code == "IMAGES" and len(outcome.verdict.findings) == 1 + len(cause["below"]) > 5
+    assert outcome.summary["headline"].endswith(f"{head.title}.")
+    assert (tmp_path / "a" / "report.html").read_text().count('<article class="finding') == 1
 
 
 def without_times(summary):
@@ -305,7 +287,7 @@ def test_a_killed_audit_is_resumed_and_ends_as_one_that_was_not(tmp_path, monkey
     write_structure("argon.extxyz", Atoms("Ar3", planted.chain().positions[:3]))
     words = ["audit", "mine.py:Killed", "-s", "argon.extxyz", "--checks", "invariance,forces", "-o"]
     asked = []
-    monkeypatch.setattr(Log, "__call__", lambda self, step, steps, info: asked.append(info["phase"]))
+    monkeypatch.setattr(frame.Log, "__call__", lambda self, step, steps, info: asked.append(info["phase"]))
     assert call(*words, "whole") == 0
     expected = json.loads((tmp_path / "whole/summary.json").read_text())
     calls = (tmp_path / "calls").stat().st_size
@@ -323,8 +305,7 @@ def test_a_killed_audit_is_resumed_and_ends_as_one_that_was_not(tmp_path, monkey
     assert "forces not asked" in (tmp_path / "cut/report.html").read_text()
     asked.clear()
     capsys.readouterr()
-    assert call("audit", "--resume", "cut") == 0
-    assert set(asked) == {"forces"}
+    assert call("audit", "--resume", "cut") == 0 and set(asked) == {"forces"}
     resumed = json.loads((tmp_path / "cut/summary.json").read_text())
     assert without_times(resumed) == without_times(expected)
     one, other = (RunFolder.open(name).table("curves") for name in ("cut", "whole"))
@@ -332,6 +313,7 @@ def test_a_killed_audit_is_resumed_and_ends_as_one_that_was_not(tmp_path, monkey
     # nothing is left
     asked.clear()
     assert call("audit", "--resume", "cut") == 0 and not asked
+    assert RunFolder.open("cut").table("curves").equals(other)
     for more in (("-o", "x"), ("--checks", "curl"), ("mine.py:Other",)):
         assert call("audit", "--resume", "cut", *more) == 2
 
@@ -350,66 +332,71 @@ def test_a_deadline_ends_an_audit_and_the_rest_is_resumed(tmp_path, monkeypatch)
 
     monkeypatch.setattr("mdnum.deadline.Deadline", Spent)
     atoms, checks = planted.chain(), "invariance,forces,curl"
-    whole = mdnum.audit_calculator(planted.Good, atoms, checks=checks, out=tmp_path / "whole", report=False)
-    cut = mdnum.audit_calculator(planted.Good, atoms, checks=checks, time=1.0, out=tmp_path / "cut")
+    ask = mdnum.audit_calculator
+    whole = ask(planted.Good, atoms, checks=checks, out=tmp_path / "whole", report=False)
+    cut = ask(planted.Good, atoms, checks=checks, time=1.0, out=tmp_path / "cut", report=False)
     assert cut.summary["status"] == "unfinished"
     ways = cut.summary["parts"][-1]
     assert ways["name"] == "forces" and 0 < ways["asked"] < ways["possible"] == 15
     assert f"{ways['asked']} of 15 ways of forces, curl not asked" in cut.summary["headline"]
     assert {"what": "the check of curl", "why": "the time was up", "part": "curl"} in cut.summary["left_out"]
-    assert f"{ways['asked']} of 15 ways asked" in (tmp_path / "cut/report.html").read_text()
     # asked again, and not as far: nothing that was known is lost
     Spent.looks = 3
-    less = mdnum.audit_calculator(planted.Good, time=1.0, resume=tmp_path / "cut", report=False)
+    less = ask(planted.Good, time=1.0, resume=tmp_path / "cut", report=False)
     assert less.summary["headline"] == cut.summary["headline"]
     with pytest.raises(InputError, match="has no name"):
-        mdnum.audit_calculator(resume=tmp_path / "cut")
-    done = mdnum.audit_calculator(planted.Good, resume=tmp_path / "cut", report=False)
+        ask(resume=tmp_path / "cut")
+    done = ask(planted.Good, resume=tmp_path / "cut", report=False)
     assert without_times(done.summary) == without_times(whole.summary)
-    assert done.parts["forces"].says == whole.parts["forces"].says
-    with pytest.raises(InputError, match="--time"):
-        monkeypatch.undo()
-        mdnum.audit_calculator(planted.Good, atoms, time=0.0, out=tmp_path / "none")
+    assert plain(done.result["forces"].says) == plain(whole.result["forces"].says)
 
 
 #: Units that a calculator without dimensions has none of; kT and file names are no units.
 DIMENSIONS = re.compile(r"(?<![\w./])(m?eV|Å|fs|ps|K)(?![\w.]\w|\w)")
 
 
-def test_an_audit_in_reduced_units_names_no_others(tmp_path, monkeypatch, capsys):
-    """Headline, findings, tables, labels of figures, the script beside the page, and the terminal."""
+def test_an_audit_in_reduced_units_names_no_others(tmp_path, monkeypatch):
+    """Headline, findings, tables, labels of figures, and the script beside the page."""
 
     class Wrong(planted.OneImage, planted.HardEdge):
         def extra(self, atoms, energy, forces):
             return energy, forces + 0.1
 
-    loaded = Loaded("reduced", "reduced", Wrong, units=LJ, kT=0.1)
-    monkeypatch.setattr("mdnum.audit.load.load_calculator", lambda words: loaded)
+    loaded = LoadedCalculator("reduced", "reduced", Wrong, units=LJ, kT=0.1)
+    monkeypatch.setattr("mdnum.audit.structures.load_calculator", lambda words: loaded)
+    monkeypatch.setattr("mdnum.audit.checks.dynamics.find_thresholds", lambda subject: [])
     atoms = planted.crystal()
     atoms.info["origin"] = "8 atoms, nearest distance 2.76 Å"
-    checks = "invariance,forces,curl,state,dynamics"
-    result = mdnum.audit_calculator("reduced", atoms, checks=checks, steps=16, out=tmp_path / "a")
-    codes = {one["code"] for one in result.findings}
-    assert {"IMAGES", "FORCES_NOT_GRADIENT", "NET_FORCE", "ENERGY_JUMP", "NOT_CONSERVED"} & codes
-    print_rows(by_cause(result.summary))
+    checks = "forces,curl,dynamics"
+    outcome = mdnum.audit_calculator("reduced", atoms, checks=checks, steps=16, out=tmp_path / "a")
+    assert {"FORCES_NOT_GRADIENT", "NET_FORCE"} <= codes(outcome)
     page = (tmp_path / "a/report.html").read_text()
-    assert "<svg" in page and "mε/atom/τ" in page and "ε/σ" in page and "reproduce.py" in page
+    assert "<svg" in page and "mε/atom/τ" in page and "ε/σ" in page
     seen = re.sub(r"<(style|script)\b.*?</\1>|<(?!!--)[^>]*>", " ", page, flags=re.DOTALL)
-    for text in (seen, (tmp_path / "a/summary.json").read_text(), capsys.readouterr().out):
+    for text in (seen, (tmp_path / "a/summary.json").read_text()):
         assert not [text[one.start() - 40 : one.end() + 20] for one in DIMENSIONS.finditer(text)]
+    told = _in_units(["0.1 eV/Å", "1 meV", {"curl (eV/Å²)": "eV.py in SteveV failed at 3 eV."}], LJ)
+    assert told == ["0.1 ε/σ", "1 mε", {"curl (ε/σ²)": "eV.py in SteveV failed at 3 ε."}]
 
 
-def test_units_are_replaced_and_names_of_files_are_not():
-    rows = {"Table": [{"curl (eV/Å²)": 1.0, "plane": "x"}]}
-    said = Part("curl", "Curl", "0.1 eV/Å", [finding("CURL", "error", "t", "1 meV", "r")], rows)
-    said = replace(said, skipped=[("a cell 1.6 Å wide", "eV.py in SteveV failed at 3 eV.")])
-    found = _in_units(said, LJ)
-    assert found.says == "0.1 ε/σ" and found.findings[0]["text"] == "1 mε"
-    assert found.skipped[0] == ("a cell 1.6 σ wide", "eV.py in SteveV failed at 3 ε.")
-    assert found.tables["Table"][0] == {"curl (ε/σ²)": 1.0, "plane": "x"}
-    assert _in_units(said, METAL) is said
-
-
-def test_a_summary_is_json_whatever_was_not_finite(bad):
-    text = (bad.folder / "summary.json").read_text()
-    json.loads(text, parse_constant=lambda word: pytest.fail(word))
+def test_another_package_adds_a_check(tmp_path, monkeypatch):
+    """One file: the check, its codes and its sentences; the command line knows it by its entry point."""
+    module = (
+        "from mdnum.audit.base import CheckResult, finding\nfrom mdnum.audit.check import AuditCheck\n"
+        "class Odd(AuditCheck):\n"
+        '    """Has the structure an even number of atoms?"""\n'
+        '    name, title = "odd", "Odd"\n'
+        "    def ask(self, subject, progress):\n"
+        "        told = finding('ODD', 'warning', title='odd', text='Seven.', remedy='Add one.')\n"
+        "        return CheckResult(([], {}), [told] if len(subject.atoms) % 2 else [])\n"
+    )
+    monkeypatch.syspath_prepend(
+        install(tmp_path / "site", "odd-atoms", {"odd": module}, {"mdnum.checks": {"odd": "odd:Odd"}})
+    )
+    atoms = planted.crystal()[:7]
+    outcome = mdnum.audit_calculator(planted.Good, atoms, checks="odd", out=tmp_path / "a", report=False)
+    (told,) = outcome.verdict.findings
+    assert (told.code, told.severity, told.title, told.section) == (
+        "ODD", "warning", "odd", "Odd",
+    )  # fmt: skip
+    assert replace(told, values={}).remedy == "Add one."

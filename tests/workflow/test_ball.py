@@ -1,8 +1,10 @@
-"""`bounce`: the folder it leaves holds what ran, row by row, and the numbers of exact answers."""
+"""`bounce`: the folder holds what ran, row by row; defects that are planted in one are found, and shown."""
 
 from __future__ import annotations
 
+import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +16,10 @@ from mdnum.ball import first_difference
 from mdnum.errors import FolderError, InputError
 from mdnum.store import TABLES, RunFolder
 from mdnum.systems import build_ball, load
-from mdnum.workflow import BallResult, ball_exact, ball_record, bounce, run
+from mdnum.workflow import ball_record, bounce, frame, run
+from mdnum.workflow.ball import VERBS, differs, judge
+from mdnum.workflow.ball_page import TEXTS, page
+from mdnum.workflow.frame import Outcome, View
 
 PROJECTION = """\
 world = "ball"
@@ -46,7 +51,7 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def three(file: Path, tmp_path_factory: pytest.TempPathFactory) -> BallResult:
+def three(file: Path, tmp_path_factory: pytest.TempPathFactory) -> Outcome:
     said: list[str] = []
     made = bounce(
         file,
@@ -88,7 +93,7 @@ def plain(steps: int, tol: float = 1e-4) -> dict[str, Any]:
     return rows
 
 
-def test_the_tables_are_those_of_a_plain_loop(three: BallResult):
+def test_the_tables_are_those_of_a_plain_loop(three: Outcome):
     folder = RunFolder.open(three.folder)
     right = plain(120)
     steps = folder.read("steps")
@@ -105,7 +110,7 @@ def test_the_tables_are_those_of_a_plain_loop(three: BallResult):
     assert np.array_equal(steps["mean_height"], np.mean(np.array(right["y"]), axis=1))
 
 
-def test_every_stop_decision_is_a_row(three: BallResult):
+def test_every_stop_decision_is_a_row(three: Outcome):
     solver = RunFolder.open(three.folder).read("solver")
     right = plain(120)["stops"]
     rows = [(step + 1, n, value) for step, stops in enumerate(right) for n, value in enumerate(stops)]
@@ -120,7 +125,7 @@ def test_every_stop_decision_is_a_row(three: BallResult):
     assert set(solver["reason"][~solver["stopped"]]) == {""}
 
 
-def test_contact_flips_alternate_and_hold_the_compared_height(three: BallResult):
+def test_contact_flips_alternate_and_hold_the_compared_height(three: Outcome):
     contacts = RunFolder.open(three.folder).read("contacts")
     for ball in range(3):
         mine = contacts["ball"] == ball
@@ -131,7 +136,7 @@ def test_contact_flips_alternate_and_hold_the_compared_height(three: BallResult)
     assert np.all(contacts["velocity"][contacts["entered"]] < 0)
 
 
-def test_the_summary_counts_what_the_tables_hold(three: BallResult):
+def test_the_summary_counts_what_the_tables_hold(three: Outcome):
     summary, folder = three.summary, RunFolder.open(three.folder)
     right = plain(120)
     solves = [stops for stops in right["stops"] if stops]
@@ -150,7 +155,7 @@ def test_the_summary_counts_what_the_tables_hold(three: BallResult):
     assert summary == folder.summary
 
 
-def test_a_variant_is_told_where_it_parts(three: BallResult):
+def test_a_variant_is_compared(three: Outcome):
     (found,) = three.summary["variants"]
     right = plain(120)
     # alone each ball stops at 1e-4 by itself: a step with two balls in contact differs first
@@ -164,7 +169,7 @@ def test_a_variant_is_told_where_it_parts(three: BallResult):
     assert change == found["gradient"]["k"] - three.summary["gradient"][0]["gradient"]["k"]
 
 
-def test_a_folder_of_the_ball_is_complete_and_its_own(three: BallResult):
+def test_a_folder_of_the_ball_is_complete_and_its_own(three: Outcome):
     names = {path.name for path in three.folder.iterdir()}
     assert {"system.toml", "provenance.json", "summary.json"} <= names
     assert {f"{name}.parquet" for name in TABLES["ball"]} <= names
@@ -186,9 +191,9 @@ def test_a_rule_per_ball_records_each_ball(file: Path, tmp_path: Path):
         report=False,
     )
     solver = RunFolder.open(made.folder).read("solver")
-    counts = made.run.iterations
+    counts = made.result.iterations
     assert counts.shape == (120, 3)
-    touched = made.run.contact
+    touched = made.result.contact
     assert len(solver["step"]) == touched.sum() + (counts > 0).sum()
     stopped = solver["stopped"]
     where = solver["step"][stopped] - 1, solver["ball"][stopped]
@@ -203,7 +208,7 @@ def test_a_rule_per_ball_records_each_ball(file: Path, tmp_path: Path):
         assert residual * 0.75 == pytest.approx(last[step, ball], rel=1e-9)
     # 1 - alpha k = 3/4 of the penetration is left by an iteration
     for step, ball in np.argwhere(touched):
-        depth = -float(made.run.height[step, ball])
+        depth = -float(made.result.height[step, ball])
         needed = math.ceil(math.log(1e-4 / depth) / math.log(0.75)) if depth >= 1e-4 else 0
         assert counts[step, ball] == needed
 
@@ -229,16 +234,18 @@ def test_where_there_is_no_closed_form_none_is_claimed():
     def exact(**changes: Any) -> dict[str, Any] | None:
         given = {key.replace("__", "."): value for key, value in changes.items()}
         built = build_ball("ball/drop", {"gradient.of": [], "variants": {}, **given}, steps=20)
-        return ball_exact.exact(built.system, built.problem.run(), [])
+        return ball_record.exact(built.system, built.problem.run(), [])
 
     wave = {"flight__control__amplitude": 1.0, "flight__control__period": 1.0}
-    assert exact(contact__damping=1.0) is None
+    assert exact(contact__k=1e4, contact__damping=200.0) is None
     assert exact(contact__eps=0.01) is None
     assert exact(contact__hysteresis=0.01) is None
     assert exact(flight__control__kind="sine", **wave) is None
     assert exact(flight__gravity=0.0) is None
     assert exact(start__height=-0.1) is None
     # a constant push is another gravity
+    damped = exact(contact__damping=1.0)
+    assert damped is not None and damped["height_error"] < 1e-2
     lifted = exact(flight__control__kind="constant", flight__control__value=4.905)
     assert lifted is not None
     assert lifted["model"] == "ExactPenalty"
@@ -255,8 +262,8 @@ def test_a_state_that_stops_being_finite_is_a_failed_run(tmp_path: Path):
     assert made.summary["status"] == "failed"
     bad = made.summary["not_finite"]
     assert 10 < bad < 100
-    assert np.isfinite(made.run.y[:bad].astype(float)).all()
-    assert not np.isfinite(made.run.y[bad].astype(float)).all()
+    assert np.isfinite(made.result.y[:bad].astype(float)).all()
+    assert not np.isfinite(made.result.y[bad].astype(float)).all()
     assert "finite" in made.summary["verdict"]
 
 
@@ -268,9 +275,8 @@ def test_counts_of_different_things_are_not_compared():
     # one counts the impacts inside a step, the other nothing: both touch once, a step apart
     assert (run.iterations.sum(), other.iterations.sum()) == (1, 0)
     assert first_difference(run, other).iterations_differ == 0
-    found = ball_record.parted(run, other)
-    assert (found.iterations_differ, found.channel, found.contacts_differ) == (0, "contact", 2)
-    assert ball_record.parted(run, run).fork is None
+    found = first_difference(run, other)
+    assert (found.channel, found.contacts_differ) == ("contact", 2)
 
 
 def test_a_loaded_system_takes_no_overrides(tmp_path: Path):
@@ -287,3 +293,143 @@ def test_a_loaded_system_takes_no_overrides(tmp_path: Path):
     with pytest.raises(InputError, match="not of the form key=value"):
         bounce(system, out=tmp_path / "x", against=["contact.k"])
     assert not (tmp_path / "x").exists()
+
+
+# --- judged and shown ---------------------------------------------------------------------------------
+
+
+def made(
+    method: str, gradient: dict[str, float | None], depends: dict[str, bool] | None = None
+) -> dict[str, Any]:
+    """A derivative as summary.json has it."""
+    depends = dict.fromkeys(gradient, True) | (depends or {})
+    return {"method": method, "says": "So.", "value": 0.1, "gradient": gradient, "depends": depends,
+            "details": {}, "refused": False}  # fmt: skip
+
+
+SAME: dict[str, Any] = {
+    "name": "low", "changes": {"precision.state": "float32"}, "seed": None, "fork": None, "channel": None,
+    "ball": None, "margin": None, "margin_there": None, "separation_end": 0.0, "iterations_differ": 0,
+    "contacts_differ": 0, "loss": 0.1, "gradient": {"k": -2.5e-5}, "depends": {"k": True},
+}  # fmt: skip
+FORK = {"seed": 3, "fork": 30, "channel": "contact", "ball": 2, "margin": 1e-17, "margin_there": -2e-17}
+
+
+@pytest.fixture(scope="module")
+def good(three: Outcome) -> View:
+    """A run with nothing to find in it: of the real one what its summary says about derivatives goes."""
+    folder = RunFolder.open(three.folder)
+    plain = {"gradient": [made("unrolled", {"k": -2.5e-5})], "variants": [], "exact": None, "findings": []}
+    quiet = {"ambiguous": 0, "ambiguous_contacts": 0, "ambiguous_stops": 0}
+    return View(folder, folder.summary | plain | quiet)
+
+
+def altered(view: View, tables: dict[str, dict[str, np.ndarray]] | None = None, **summary: Any) -> View:
+    return replace(view, summary={**view.summary, **summary}, _tables=tables or {})
+
+
+def codes(view: View) -> dict[str, Any]:
+    return {finding.code: finding for finding in judge(view).findings}
+
+
+def test_every_planted_defect_is_found_and_nothing_else(good: View):
+    own, exact = good.summary["gradient"][0], {"height_error": 1e-9, "height_error_largest": 1e-9}
+    contacts, series = good.table("contacts"), {k: v.copy() for k, v in good.table("steps").items()}
+    short = {name: values[1:] for name, values in contacts.items()}
+    planted: dict[str, View] = {
+        "NOT_FINITE": altered(good, not_finite=17, status="failed"),
+        "LEDGER_INCOMPLETE": altered(good, {"contacts": short, "steps": series}),
+        "GRADIENT_NOT_FINITE": altered(good, gradient=[made("unrolled", {"k": None})]),
+        "LOSS_INDEPENDENT": altered(good, gradient=[made("unrolled", {"k": 0.0}, {"k": False})]),
+        "ZERO_GRADIENT": altered(good, gradient=[made("unrolled", {"k": 0.0})]),
+        "AMBIGUOUS_CONTACTS": altered(good, ambiguous=3, ambiguous_contacts=3),
+        "AMBIGUOUS_STOPS": altered(good, ambiguous=1, ambiguous_stops=1),
+        "SOLVER_CAP": altered(good, ended={"tolerance": 10, "cap": 2}),
+        "METHODS_DISAGREE": altered(good, gradient=[own, made("event-aware", {"k": -2.9e-5})]),
+        "OFF_CLOSED_FORM": altered(good, exact={**exact, "gradient": {"k": -2e-5}}),
+        "FORKED": altered(good, variants=[SAME | FORK | {"gradient": {"k": -1.0}}]),
+        "ITERATIONS_DIFFER": altered(good, variants=[SAME | {"iterations_differ": 4}]),
+        "RESTING": altered(good, ended={"rest": 4}),
+    }
+    assert set(planted) == set(TEXTS.entries) - {"sentences"}
+    assert codes(good) == {}
+    for code, view in planted.items():
+        assert set(codes(view)) == {code}, code
+    # every ball on the floor from step 81 on, which no flip accounts for
+    series["contacts"][81:] = 3
+    found = codes(altered(good, {"contacts": contacts, "steps": series}))
+    assert set(found) == {"LEDGER_INCOMPLETE", "RESTING"} and found["RESTING"].values == {"step": 81}
+
+
+def test_a_good_run_rests_on_evidence(good: View):
+    verdict = judge(good)
+    assert (verdict.tone, len(verdict.evidence)) == ("good", 5)
+    exact = {"gradient": {"k": -2.5001e-5}, "height_error": 2e-14, "height_error_largest": 3e-14}
+    verdict = judge(altered(good, exact=exact))
+    assert verdict.findings == ()
+    assert verdict.evidence[-1] == TEXTS("met", names="k", methods="unrolled")
+
+
+def test_variants_of_a_finding(good: View):
+    own = good.summary["gradient"][0]
+    fragile = SAME | {"name": "fragile", "depends": {"k": False}, "gradient": {"k": -2.5e-5}}
+    finding = codes(altered(good, variants=[fragile]))["LOSS_INDEPENDENT"]
+    assert (finding.values["names"], finding.values["places"]) == ("k", "in variant fragile")
+    implicit = made("implicit", {"k": 0.0}, {"k": False})
+    finding = codes(altered(good, gradient=[implicit]))["LOSS_INDEPENDENT"]
+    assert "fixed point" in finding.text and "branch" not in finding.text
+    both = [implicit, made("unrolled", {"k": 0.0}, {"k": False})]
+    assert "branch" in codes(altered(good, gradient=both))["LOSS_INDEPENDENT"].text
+    exact = {"gradient": {"k": -2.9e-5}, "height_error": 1e-9, "height_error_largest": 1e-9}
+    both = [own, made("event-aware", {"k": -2.9e-5})]
+    finding = codes(altered(good, gradient=both, exact=exact))["METHODS_DISAGREE"]
+    assert finding.values["right"] == "event-aware on k"
+    # precision alone: another gradient is another program; another integrator is one anyway
+    moved = SAME | FORK | {"gradient": {"k": 1.0}}
+    for variant, severity in (
+        (SAME | FORK, "info"), (moved, "warning"), (moved | {"changes": {"integrator.kind": "x"}}, "info"),
+    ):  # fmt: skip
+        assert codes(altered(good, variants=[variant]))["FORKED"].severity == severity
+    assert not differs(1.0, 1.005) and differs(1.0, 1.02) and differs(0.0, 1e-30) and differs(None, 1.0)
+    assert not differs(0.0, 0.0) and not differs(None, None)
+
+
+def test_findings_of_the_system_are_kept_and_own_ones_are_decided_again(good: View):
+    remark = {
+        "code": "STIFF",
+        "severity": "warning",
+        "title": "h √k is 1.95",
+        "text": "Near 2.",
+        "remedy": "",
+    }
+    stale = {**remark, "code": "SOLVER_CAP"}
+    assert set(codes(altered(good, findings=[remark, stale]))) == {"STIFF"}
+
+
+def test_the_page_shows_what_the_folder_holds(three: Outcome, good: View, monkeypatch: pytest.MonkeyPatch):
+    shown = {section.title: section for section in three.page.sections}
+    assert {"Heights and contacts", "Margins of decisions", "Gradient", "Variants", "Contacts"} <= set(shown)
+    folder = RunFolder.open(three.folder)
+    contacts, solver = folder.read("contacts"), folder.read("solver")
+    heights = shown["Heights and contacts"].parts[0]
+    marks = heights.series[-1]
+    assert marks.x.tolist() == pytest.approx((0.01 * contacts["step"][contacts["entered"]]).tolist())
+    stopped, continued = shown["Margins of decisions"].parts[0].series
+    assert np.all(stopped.y > 0) and np.all(continued.y <= 0)
+    assert len(stopped.y) + len(continued.y) == len(solver["step"])
+    table = shown["Contacts"].parts[-1]
+    assert [row[:3] for row in table.rows] == np.stack(
+        [contacts[name].astype(int) for name in ("step", "ball", "entered")], axis=1
+    ).tolist()
+    assert len(shown["Stop decisions"].parts[-1].rows) == len(solver["step"])
+    # written twice, it is the same page; every part of the grammar is there for the derivatives
+    first = frame.finish(folder).folder / "report.html"
+    text = first.read_text(encoding="utf-8")
+    assert frame.finish(folder).page and first.read_text(encoding="utf-8") == text
+    assert json.loads((three.folder / "summary.json").read_text())["headline"]
+    both = [made("unrolled", {"k": -2.5e-5}), made("implicit", {"k": 0.0}, {"k": False})]
+    view = altered(good, gradient=[*both, {**made("smoothed", {}), "refused": True, "value": None}])
+    rows = next(one for one in page(view, judge(view)).sections if one.title == "Gradient").parts[1].rows
+    assert [row[0] for row in rows] == ["unrolled", "implicit", "smoothed"]
+    assert rows[1][2] == "0 (does not depend)" and rows[2][2] == "does not apply"
+    assert VERBS["ball"].judge is judge

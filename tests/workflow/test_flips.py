@@ -1,10 +1,13 @@
-"""`mdnum flips` from a file to a folder: the ledger of a run, boxes and rules, and files that break off."""
+"""`mdnum flips` from a file to a folder: the ledger of a run, boxes and rules, files that break off."""
 
 from __future__ import annotations
 
+import copy
 import signal
+import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import ase
 import numpy as np
@@ -12,14 +15,11 @@ import pytest
 from ase.io import iread, write
 
 import mdnum
-from mdnum import report
 from mdnum.errors import InputError
-from mdnum.report.flips import findings, html
 from mdnum.store import RunFolder
-from mdnum.trajectories.contacts import contacts
-from mdnum.trajectories.history import History
-from mdnum.workflow import flips_numbers
-from mdnum.workflow.flips_words import rules, species_cutoffs
+from mdnum.workflow.flips import rules
+from mdnum.workflow.flips_page import by_velocities, judge, page
+from mdnum.workflow.frame import Outcome, View, finish
 
 
 @pytest.fixture(scope="module")
@@ -37,6 +37,24 @@ def gas(seed: int = 0, frames: int = 30, atoms: int = 24, side: float = 6.0) -> 
         ase.Atoms("OH" * (atoms // 2), start + n * speed, cell=[side] * 3, pbc=True, info={"time": 0.5 * n})
         for n in range(frames)
     ]
+
+
+@pytest.fixture
+def examined(tmp_path: Path):
+    """Examines frames, or a file of this folder."""
+
+    def examine(name: str, frames: list[ase.Atoms] | None = None, **options: Any) -> Outcome:
+        if frames is not None:
+            write(tmp_path / name, frames)
+        count = len(list(tmp_path.glob("f*")))
+        asked = {"cutoffs": [2.5], "report": False, "out": tmp_path / f"f{count}"}
+        return mdnum.flips(f"{tmp_path}/{name}", **{**asked, **options})
+
+    return examine
+
+
+def codes(result: Outcome) -> set[str]:
+    return {one.code for one in result.verdict.findings}
 
 
 def inside(atoms: ase.Atoms, radius: float, reach: int = 2) -> set[tuple[int, int, int]]:
@@ -74,15 +92,15 @@ def test_a_run_of_mdnum_gives_its_own_ledger_row_for_row(crystal: Path, tmp_path
     assert result.summary["resolution"]["kind"] == "float64" and result.summary["status"] == "complete"
 
 
-def test_tables_agree_with_sets_worked_out_one_by_one(tmp_path: Path) -> None:
+def test_tables_agree_with_sets_worked_out_one_by_one(examined) -> None:
     frames = gas(side=5.0, atoms=8, frames=12)
-    write(tmp_path / "gas.extxyz", frames)
-    result = mdnum.flips(tmp_path / "gas.extxyz", cutoffs=[3.1], out=tmp_path / "f", report=False)
+    result = examined("gas.extxyz", frames, cutoffs=[3.1])
     sets = [inside(one, 3.1) for one in frames]
     folder = RunFolder.open(result.folder)
     members, flips, rows = folder.read("members"), folder.read("flips"), folder.read("frames")
     # the box is narrower than two cutoffs: images are there, and counted
     assert {rank for *_, rank in sets[0]} > {0} and result.summary["rules"][0]["images"]
+    assert "IMAGES" in codes(result)
     assert set(zip(members["i"], members["j"], members["rank"], strict=True)) == sets[0]
     for n in range(1, len(frames)):
         at = flips["frame"] == n
@@ -97,22 +115,16 @@ def test_tables_agree_with_sets_worked_out_one_by_one(tmp_path: Path) -> None:
         assert rows["neighbors"][row] == pytest.approx(count.mean())
     stays = folder.read("contacts")
     # every stay of every pair, as frames in the sets
-    inside_frames = {
-        (*pair, n)
-        for *pair, begin, end in zip(
-            stays["i"], stays["j"], stays["rank"], stays["begin"], stays["end"], strict=True
-        )
-        for n in range(begin, end)
-    }
-    assert inside_frames == {(*pair, n) for n, one in enumerate(sets) for pair in one}
+    columns = (stays[name] for name in ("i", "j", "rank", "begin", "end"))
+    there = {
+        (*pair, n) for *pair, begin, end in zip(*columns, strict=True) for n in range(begin, end)
+    }  # fmt: skip
+    assert there == {(*pair, n) for n, one in enumerate(sets) for pair in one}
 
 
-def test_several_rules_and_selections_at_once(tmp_path: Path) -> None:
-    write(tmp_path / "gas.extxyz", gas())
-    result = mdnum.flips(
-        tmp_path / "gas.extxyz", cutoffs=[1.5, 2.5], pairs=["O-H=2"], nearest=[3], out=tmp_path / "f",
-        between=("element O", "element H"), window=3, report=False,
-    )  # fmt: skip
+def test_several_rules_and_selections_at_once(examined) -> None:
+    between: Any = {"between": ("element O", "element H"), "window": 3}
+    result = examined("gas.extxyz", gas(), cutoffs=[1.5, 2.5], pairs=["O-H=2"], nearest=[3], **between)
     told = result.summary["rules"]
     assert [one["rule"] for one in told] == ["r < 1.5", "r < 2.5", "O-H < 2", "3 nearest"]
     assert [one["directed"] for one in told] == [False, False, False, True]
@@ -125,116 +137,163 @@ def test_several_rules_and_selections_at_once(tmp_path: Path) -> None:
     for number, one in enumerate(told):
         assert np.count_nonzero(flips["rule"] == number) == one["flips"]
         assert one["chatter"]["window"] == 3
+    # what several rules have in common is told once
+    titles = [one.code for one in result.verdict.findings]
+    assert len(titles) == len(set(titles))
     # one rule is one ledger, whatever the others
-    alone = mdnum.flips(
-        tmp_path / "gas.extxyz", cutoffs=[2.5], out=tmp_path / "g", report=False,
-        between=("element O", "element H"), window=3,
-    )  # fmt: skip
+    alone = examined("gas.extxyz", **between)
     mine = RunFolder.open(alone.folder).read("flips")
     for name in ("frame", "i", "j", "entered", "distance", "margin"):
         np.testing.assert_array_equal(mine[name], flips[name][flips["rule"] == 1])
     assert alone.summary["rules"][0] == told[1]
     # atoms on both sides: everybody counts its O, and is not counted by them
-    mixed = mdnum.flips(
-        tmp_path / "gas.extxyz", cutoffs=[2.5], between=("all", "element O"), out=tmp_path / "h", report=False
-    )
+    mixed = examined("gas.extxyz", between=("all", "element O"))
     one = mixed.summary["rules"][0]
     inside_by = {row["first"] + row["second"]: row["inside"] / 30 for row in one["by_species"]}
     assert set(inside_by) == {"HO", "OO"}
     assert one["neighbors"]["mean"] == pytest.approx((inside_by["HO"] + 2 * inside_by["OO"]) / 24)
 
 
-def test_the_page_says_what_the_folder_holds(tmp_path: Path) -> None:
-    write(tmp_path / "gas.extxyz", gas())
-    result = mdnum.flips(
-        tmp_path / "gas.extxyz", cutoffs=[2.5], out=tmp_path / "f", between=("element O", "element H")
-    )
-    one = result.summary["rules"][0]
+def test_the_page_holds_what_the_folder_holds(examined) -> None:
+    result = examined("gas.extxyz", gas(), report=True, between=("element O", "element H"))
     text = (result.folder / "report.html").read_text(encoding="utf-8")
-    for words in ("r &lt; 2.5 Å", "“element O” and “element H”", f"{one['flips']} flips of", "O–H"):
+    for words in ("r &lt; 2.5 Å", "“element O” and “element H”", "O–H"):
         assert words in text
     assert {path.stem for path in (result.folder / "figures").iterdir()} >= {"rule0-pairs", "rule0-lifetimes"}
-    _, run = html.load(result.folder, "flips")
-    assert findings.judge(run).tone != "error"
+    assert result.verdict.tone != "error"
+    finish(result.folder)
+    assert (result.folder / "report.html").read_text(encoding="utf-8") == text
     # a planted hole in the ledger is found
-    entered = run.tables["frames"]["entered"]
-    holed = {**run.tables["frames"], "entered": entered + (np.arange(len(entered)) == 9)}
-    run = replace(run, tables={**run.tables, "frames": holed})
-    assert findings.judge(run).findings[0].code == "EVENT_ALGEBRA"
+    folder = RunFolder.open(result.folder)
+    frames = dict(folder.read("frames"))
+    frames["entered"] = frames["entered"] + (np.arange(len(frames["entered"])) == 9)
+    holed = judge(View(folder, result.summary, None, {"frames": frames}))
+    assert holed.findings[0].code == "EVENT_ALGEBRA" and holed.findings[0].values["first"] == 9
 
 
-def test_a_ledger_in_parts_says_what_it_says_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write(tmp_path / "gas.extxyz", gas(5, frames=40))
-    whole = mdnum.flips(tmp_path / "gas.extxyz", cutoffs=[2.5], out=tmp_path / "a", report=False)
-    monkeypatch.setattr(flips_numbers, "_PART_ROWS", 100)
-    parts = mdnum.flips(tmp_path / "gas.extxyz", cutoffs=[2.5], out=tmp_path / "b", report=False)
+def test_a_ledger_in_parts_is_counted_as_whole(examined, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = examined("gas.extxyz", gas(5, frames=40))
+    monkeypatch.setattr(sys.modules["mdnum.workflow.flips"], "_PART_ROWS", 100)
+    parts = examined("gas.extxyz")
     assert whole.summary["rules"] == parts.summary["rules"]
     for table in ("contacts", "lifetimes", "busiest", "neighbors"):
         one, other = (RunFolder.open(result.folder).read(table) for result in (whole, parts))
         order, another = (np.lexsort([rows[name] for name in rows]) for rows in (one, other))
         for name in one:
             np.testing.assert_array_equal(one[name][order], other[name][another])
-    folder = RunFolder.open(whole.folder)
-    flips, members = folder.read("flips"), folder.read("members")
-    pair = [flips[name] for name in ("i", "j", "rank")]
-    first = [members[name] for name in ("i", "j", "rank")]
-    stays = contacts(History.of_columns(flips["frame"], flips["entered"], pair, first, 40))
-    assert len(stays) == sum(whole.summary["rules"][0]["contacts"].values())
+    stays = RunFolder.open(whole.folder).read("contacts")
+    assert len(stays["i"]) == sum(whole.summary["rules"][0]["contacts"].values())
 
 
-def test_what_came_before_an_unreadable_frame_is_kept(tmp_path: Path) -> None:
+def test_what_came_before_an_unreadable_frame_is_kept(tmp_path: Path, examined) -> None:
     frames = gas(frames=20)
     write(tmp_path / "whole.extxyz", frames)
     text = (tmp_path / "whole.extxyz").read_text().splitlines(keepends=True)
     (tmp_path / "cut.extxyz").write_text("".join(text[: 12 * 26 + 9]))
-    cut = mdnum.flips(tmp_path / "cut.extxyz", cutoffs=[2.5], out=tmp_path / "a", report=False)
-    assert cut.summary["status"] == "stopped" and cut.summary["frames"] == 12
-    assert "frame 12" in cut.summary["stopped"]
-    assert cut.summary["findings"][0]["code"] == "STOPPED"
-    sound = mdnum.flips(f"{tmp_path}/whole.extxyz@:12", cutoffs=[2.5], out=tmp_path / "b", report=False)
+    cut = examined("cut.extxyz")
+    assert (cut.summary["status"], cut.summary["frames"], cut.summary["cut_short"]) == ("stopped", 12, True)
+    assert "frame 12" in cut.summary["stopped"] and cut.verdict.findings[0].code == "STOPPED"
+    sound = examined("whole.extxyz@:12")
     for name, values in RunFolder.open(cut.folder).read("flips").items():
         np.testing.assert_array_equal(values, RunFolder.open(sound.folder).read("flips")[name])
-    frames[7].positions[5, 1] = np.nan
-    write(tmp_path / "nan.traj", frames)
-    broken = mdnum.flips(tmp_path / "nan.traj", cutoffs=[2.5], out=tmp_path / "c", report=False)
-    assert broken.summary["frames"] == 7
-    assert "frame 7" in broken.summary["stopped"] and "atom 5" in broken.summary["stopped"]
+    # only a file that breaks off is said to break off
+    text[7 * 26 + 5] = "O 1.0 nought 2.0\n"
+    (tmp_path / "word.extxyz").write_text("".join(text))
+    nan, boxless, fewer = (gas(frames=20) for _ in range(3))
+    nan[7].positions[5, 1] = np.nan
+    boxless[7].pbc = False
+    fewer[7] = fewer[7][:-1]
+    for name, some, said in (
+        ("word.extxyz", None, "nought"), ("nan.traj", nan, "atom 5"), ("box.traj", boxless, "no box"),
+        ("atoms.traj", fewer, "23 atoms"),
+    ):  # fmt: skip
+        broken = examined(name, some)
+        assert broken.summary["frames"] == 7 and not broken.summary["cut_short"]
+        assert "frame 7" in broken.summary["stopped"] and said in broken.summary["stopped"]
+        assert broken.verdict.findings[0].remedy != cut.verdict.findings[0].remedy
     # at the first frame there is nothing to keep, and no folder stays
-    write(tmp_path / "bad.traj", frames[7:])
+    write(tmp_path / "bad.traj", nan[7:])
     with pytest.raises(InputError, match="atom 5"):
-        mdnum.flips(tmp_path / "bad.traj", cutoffs=[2.5], out=tmp_path / "d")
+        mdnum.flips(tmp_path / "bad.traj", cutoffs=[2.5], out=tmp_path / "none")
+    assert not (tmp_path / "none").exists()
 
 
-def test_one_frame_and_no_flips_are_said_in_words(tmp_path: Path) -> None:
-    write(tmp_path / "gas.extxyz", gas())
-    single = mdnum.flips(f"{tmp_path}/gas.extxyz@4", cutoffs=[2.5], out=tmp_path / "a", report=False)
-    assert single.summary["frames"] == 1 and single.summary["rules"][0]["flips"] == 0
-    assert "cannot hold a flip" in single.summary["headline"]
-    still = mdnum.flips(tmp_path / "gas.extxyz", cutoffs=[1e-3], out=tmp_path / "b", report=False)
-    assert "No pair entered or left" in still.summary["headline"]
-
-
-def test_times_that_go_back_or_are_uneven_are_found(tmp_path: Path) -> None:
+def test_one_frame_no_flips_and_odd_times(examined) -> None:
     frames = gas()
-    write(tmp_path / "twice.extxyz", frames[:15] + frames[10:])
-    found = mdnum.flips(tmp_path / "twice.extxyz", cutoffs=[2.5], out=tmp_path / "a", report=False)
-    assert "TIME_GOES_BACK" in {one["code"] for one in found.summary["findings"]}
-    write(tmp_path / "uneven.extxyz", frames[:10] + frames[12:])
-    found = mdnum.flips(tmp_path / "uneven.extxyz", cutoffs=[2.5], out=tmp_path / "b", report=False)
-    assert "UNEVEN_FRAMES" in {one["code"] for one in found.summary["findings"]}
+    single = examined("one.extxyz", frames[4:5])
+    assert single.summary["frames"] == 1 and single.summary["rules"][0]["flips"] == 0
+    assert examined("gas.extxyz", frames, cutoffs=[1e-3]).summary["rules"][0]["flips"] == 0
+    assert "TIME_GOES_BACK" in codes(examined("twice.extxyz", frames[:15] + frames[10:]))
+    assert "UNEVEN_FRAMES" in codes(examined("uneven.extxyz", frames[:10] + frames[12:]))
 
 
-def test_a_coarse_file_says_so(tmp_path: Path) -> None:
+def test_a_coarse_file_is_one(examined) -> None:
     frames = gas(frames=60, atoms=40)
     for one in frames:
         one.positions = np.round(one.positions, 1)
-    write(tmp_path / "coarse.extxyz", frames)
-    found = mdnum.flips(tmp_path / "coarse.extxyz", cutoffs=[2.5], out=tmp_path / "a", report=False)
+    found = examined("coarse.extxyz", frames, cutoffs=[2.0, 2.5])
     assert found.summary["resolution"]["step"] == pytest.approx(0.1)
-    one = found.summary["rules"][0]
+    one = found.summary["rules"][1]
     assert one["ambiguous"] > 0.1 * one["flips"] and one["grid"]["missed"] > 0.01
-    (said,) = [one for one in found.summary["findings"] if one["code"] == "UNDECIDABLE"]
-    assert said["severity"] == "warning" and "% of the flips that happened are hidden" in said["text"]
+    (said,) = [one for one in found.verdict.findings if one.code == "UNDECIDABLE"]
+    assert said.severity == "warning" and said.values["missed"] > 0.01
+    for rule in ("r < 2 Å", "r < 2.5 Å"):
+        assert said.text.count(f"{rule}:") == 1
+    assert said.text.count("may have been on its other side") == 1
+
+
+@pytest.mark.parametrize(
+    ("crossed", "rate", "error", "lost"),
+    [(200, 100.0, 7.0, 0.9), (10, 100.0, 32.0, None), (25, 13.0, 2.6, 0.0), (100, 9.0, 0.9, 0.0)],
+)
+def test_velocities_show_what_is_lost_unless_chance_may(examined, crossed, rate, error, lost) -> None:
+    result = examined("gas.extxyz", gas(frames=12))
+    summary = copy.deepcopy(dict(result.summary))
+    one = summary["rules"][0]
+    one["stride"]["between"] = None
+    one["flux"] = {
+        "rate": rate, "error": error, "seen": 10.0, "crossed": crossed, "frames": 4, "moved": 1.0,
+        "lost": 1 - 10.0 / rate,
+    }  # fmt: skip
+    assert by_velocities(one) == (pytest.approx(lost) if lost else lost)
+    view = View(RunFolder.open(result.folder), summary)
+    verdict = judge(view)
+    assert ("FLUX" in {one.code for one in verdict.findings}) == bool(lost)
+    (section,) = [one for one in page(view, verdict).sections if one.title == "Between the frames"]
+    assert dict(section.parts[0].rows)["Lost by velocities"] == {0.9: "90 %", 0.0: "none beyond chance"}.get(
+        lost, "too few to resolve"
+    )
+
+
+def test_one_atom_and_steps(tmp_path: Path, examined) -> None:
+    one = examined("one.extxyz", [ase.Atoms("Ar", [[0.12, 0.34, 0.56]], cell=[9.0] * 3, pbc=True)])
+    assert one.page.about.startswith("1 atom, 1 frame")
+    rows = []
+    for n in range(3):
+        rows += ["ITEM: TIMESTEP", str(20 * n), "ITEM: NUMBER OF ATOMS", "2", "ITEM: BOX BOUNDS pp pp pp"]
+        rows += ["0 20"] * 3 + ["ITEM: ATOMS id type x y z", "1 1 1.5 1.5 1.5"]
+        rows.append(f"2 1 {4.3 - 0.3 * n} 1.5 1.5")
+    (tmp_path / "l.lammpstrj").write_text("\n".join(rows) + "\n")
+    steps = examined("l.lammpstrj")
+    assert steps.summary["rules"][0]["flips"] == 1 and steps.summary["time"] == "step"
+    assert "20 steps apart" in steps.page.about
+
+
+@pytest.mark.parametrize(
+    ("pbc", "row"),
+    [
+        (False, "no box that repeats"),
+        ([True, False, True], "6 × 6 × 6 Å, repeating along a and c"),
+        (True, "6 × 6 × 6 Å, repeating along a, b and c"),
+    ],
+)
+def test_a_file_without_a_box_or_with_half_of_one(examined, pbc: Any, row: str) -> None:
+    frames = gas(frames=1)
+    frames[0].pbc = pbc
+    found = examined("a.traj", frames)
+    assert ("READING" in codes(found)) == (pbc is not True)
+    (section,) = [one for one in found.page.sections if one.title == "What was read"]
+    assert dict(section.parts[0].rows)["Box"] == row
 
 
 @pytest.mark.slow
@@ -244,50 +303,27 @@ def test_two_runs_that_differ_in_one_number(crystal: Path, tmp_path: Path) -> No
         overrides={"precision.force": "float32"},
     ).folder  # fmt: skip
     found = mdnum.flips(crystal, other, out=tmp_path / "cmp")
-    first = found.summary["first"]
-    sets = []
+    rule = found.summary["rules"][0]
+    first, sets = rule["first"], []
     for path in (crystal, other):
         flips = RunFolder.open(path).read("flips")
         sets.append(set(zip(flips["step"], flips["i"], flips["j"], strict=True)))
     # both start alike: the sets differ first where one of them has a flip that the other has not
     frame = min(step for step, *_ in sets[0] ^ sets[1])
-    assert first["frame"] == frame and found.summary["certain"] == frame
-    pairs = {(one["i"], one["j"]) for one in found.summary["first_pairs"]}
+    assert first["frame"] == frame and rule["certain"] == frame
+    pairs = {(one["i"], one["j"]) for one in rule["first_pairs"]}
     assert pairs == {(i, j) for step, i, j in sets[0] ^ sets[1] if step == frame}
-    for one in found.summary["first_pairs"]:
+    for one in rule["first_pairs"]:
         assert (one["margin_a"] > 0) == (one["inside"] == "A") and (one["margin_b"] > 0) == (
             one["inside"] == "B"
         )
     assert found.summary["seed"] == 1 and 0 < first["furthest_before"] < 1e-5
-    text = (found.folder / "report.html").read_text(encoding="utf-8")
-    assert "A flip that came first is no cause" in text
+    assert "NO_CAUSE_FROM_FILES" in codes(found)
     apart = RunFolder.open(found.folder).read("apart")
     x = [np.array([a.positions for a in iread(p / "trajectory.traj", ":")]) for p in (crystal, other)]
     moved = np.linalg.norm(x[0] - x[1], axis=2)
     # one of the two may have been wrapped a step before the other
     np.testing.assert_allclose(apart["furthest"][:390], moved.max(1)[:390], atol=1e-15)
-    html_again = report.write(found.folder)
-    assert html_again.read_text(encoding="utf-8") == text
-
-
-def test_a_file_and_itself(tmp_path: Path) -> None:
-    write(tmp_path / "gas.extxyz", gas())
-    write(tmp_path / "fewer.extxyz", [one[:20] for one in gas()])
-    found = mdnum.flips(
-        tmp_path / "gas.extxyz", tmp_path / "gas.extxyz", cutoffs=[2.5], out=tmp_path / "a", report=False
-    )
-    assert found.summary["first"] is None and found.summary["seed"] is None
-    assert "same positions" in found.summary["headline"]
-    shifted = mdnum.flips(
-        f"{tmp_path}/gas.extxyz@:20", f"{tmp_path}/gas.extxyz@5:", cutoffs=[2.5], out=tmp_path / "b"
-    )
-    text = (shifted.folder / "report.html").read_text(encoding="utf-8")
-    assert "A flip that came first is no cause" in text and "Sets differ at the first frame" in text
-    assert shifted.summary["first"]["frame"] == 0
-    codes = {one["code"] for one in shifted.summary["findings"]}
-    assert {"OTHER_TIMES", "NO_CAUSE_FROM_FILES"} <= codes
-    with pytest.raises(InputError, match="24 atoms and fewer"):
-        mdnum.flips(tmp_path / "gas.extxyz", tmp_path / "fewer.extxyz", cutoffs=[2.5])
 
 
 def test_words_become_rules() -> None:
@@ -295,32 +331,30 @@ def test_words_become_rules() -> None:
         "r < 8.5, at most 30 neighbors",
         "12 nearest",
     ]
-    assert species_cutoffs("O-H=2.5, O-O = 3.5") == {("O", "H"): 2.5, ("O", "O"): 3.5}
+    (pairs,) = rules((), ["O-H=2.5, O-O = 3.5"])
+    assert pairs == replace(pairs, radii={("O", "H"): 2.5, ("O", "O"): 3.5})
     for words in ("O-H", "O=2", "O-H=x", "O-H=-1", "O-H-O=2", "O-H=2,H-O=3", ""):
         with pytest.raises(InputError, match="--pairs"):
-            species_cutoffs(words)
+            rules((), [words])
     with pytest.raises(InputError, match="--cutoff"):
         rules((), (), (), 5)
     with pytest.raises(InputError, match="twice"):
         rules([2.0, 2.0])
 
 
-def test_control_c_keeps_the_frames_that_were_looked_at(tmp_path: Path) -> None:
-    write(tmp_path / "gas.extxyz", gas())
-
+def test_control_c_keeps_the_frames_that_were_examined(examined) -> None:
     def press(done: int, of: int, told: dict) -> None:
         if done == 7 and told["phase"] == "run":
             signal.raise_signal(signal.SIGINT)
 
-    result = mdnum.flips(tmp_path / "gas.extxyz", cutoffs=[2.5], out=tmp_path / "f", progress=press)
+    result = examined("gas.extxyz", gas(), progress=press)
     assert result.summary["status"] == "stopped" and result.summary["frames"] == 7
-    assert "INTERRUPTED" in [one["code"] for one in result.summary["findings"]]
-    part = mdnum.flips(tmp_path / "gas.extxyz@:7", cutoffs=[2.5], out=tmp_path / "p", report=False)
+    assert "INTERRUPTED" in codes(result)
+    part = examined("gas.extxyz@:7")
     ours, theirs = (RunFolder.open(one.folder).read("flips") for one in (result, part))
     assert len(ours["frame"]) > 0
     for name, values in ours.items():
         np.testing.assert_array_equal(values, theirs[name])
-    assert (result.folder / "report.html").exists() and report.write(result.folder).exists()
     # control-C is what it was before
     with pytest.raises(KeyboardInterrupt):
         signal.raise_signal(signal.SIGINT)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import re
 import signal
 from pathlib import Path
 from typing import Any
@@ -13,22 +13,33 @@ import pytest
 from ase.io import write
 
 import mdnum
-from mdnum.errors import FolderError
-from mdnum.report import write as write_page
+from mdnum.errors import InputError
 from mdnum.store import RunFolder
+from mdnum.trajectories import compare
 from mdnum.trajectories.frame import Box, Frame
-from mdnum.trajectories.rules import Capped, Cutoff, Nearest, Rule
+from mdnum.trajectories.rules import Capped, CutoffRule, Nearest, Rule
 from mdnum.trajectories.tracker import Tracker
-from mdnum.workflow import flips_compare
-from mdnum.workflow.flips_open import FlipsResult
+from mdnum.workflow.flips_compare import TEXTS
+from mdnum.workflow.frame import Outcome
 
 
-def looked(a: Path, b: Path, out: Path, **options: Any) -> FlipsResult:
+def looked(a: Path, b: Path, out: Path, **options: Any) -> Outcome:
     return mdnum.flips(a, b, **{"cutoffs": [4.2], "report": False, "out": out, **options})
 
 
-def finding(result: FlipsResult, code: str) -> dict[str, Any] | None:
-    return next((one for one in result.summary["findings"] if one["code"] == code), None)
+def finding(result: Outcome, code: str) -> Any:
+    return next((one for one in result.verdict.findings if one.code == code), None)
+
+
+def codes_of(result: Outcome) -> set[str]:
+    """Names of the sentences that make up the evidence, by how they begin and end."""
+    told = TEXTS.entries["sentences"]
+    ends = {name: re.split(r"{[^}]*}", text) for name, text in told.items()}
+    return {
+        name
+        for name, parts in ends.items()
+        if any(one.startswith(parts[0]) and one.endswith(parts[-1]) for one in result.verdict.evidence)
+    }
 
 
 def gas(frames: int = 6, atoms: int = 40, side: float = 9.0, pbc: Any = True) -> list[ase.Atoms]:
@@ -67,17 +78,14 @@ def test_one_run_written_twice_is_not_said_to_differ(tmp_path: Path) -> None:
     write(tmp_path / "coarse.extxyz", frames)
     for name in ("digits.extxyz", "wrapped.traj", "coarse.extxyz"):
         found = looked(tmp_path / "a.traj", tmp_path / name, tmp_path / f"f-{name}")
-        summary = found.summary
-        assert summary["seed"] == 0 and summary["beyond"] is None and summary["certain"] is None, name
-        assert summary["headline"].startswith("Nothing here shows that the two differ"), name
-        assert "do not start alike" not in " ".join(summary["concluded"])
-        assert finding(found, "NO_CAUSE_FROM_FILES") is None
-        assert all(one["severity"] == "info" for one in summary["findings"])
-        assert not any("no cause" in one for one in summary["cannot"])
+        summary, rule = found.summary, found.summary["rules"][0]
+        assert summary["seed"] == 0 and summary["beyond"] is None and rule["certain"] is None, name
+        assert found.verdict.headline.startswith("Nothing here shows that the two differ"), name
+        assert "order_start" not in codes_of(found) and finding(found, "NO_CAUSE_FROM_FILES") is None
+        assert found.verdict.tone == "info"
     # on the coarse grid sets do differ, all of it within the resolution
-    assert summary["first"] is not None and summary["first"]["ambiguous"] == summary["first"]["pairs"]
-    said = finding(found, "WITHIN_RESOLUTION")
-    assert said is not None and "no pair ever differs" in said["text"]
+    assert rule["first"] is not None and rule["first"]["ambiguous"] == rule["first"]["pairs"]
+    assert finding(found, "WITHIN_RESOLUTION").severity == "info" and "certain_never" in codes_of(found)
     # half a step along each axis, and not one more
     table = RunFolder.open(found.folder).read("apart")
     assert table["bound"].max() == pytest.approx(np.sqrt(3) * 0.005, rel=1e-3)
@@ -87,11 +95,10 @@ def test_one_run_written_twice_is_not_said_to_differ(tmp_path: Path) -> None:
 def test_positions_beyond_the_resolution_before_any_set(tmp_path: Path) -> None:
     write(tmp_path / "a.extxyz", pairs_at([4.0, 4.0, 4.0, 4.1, 4.3]))
     write(tmp_path / "b.extxyz", pairs_at([4.0, 4.01, 4.05, 4.1, 4.1]))
-    found = looked(tmp_path / "a.extxyz", tmp_path / "b.extxyz", tmp_path / "f").summary
-    assert (found["seed"], found["beyond"], found["first"]["frame"], found["certain"]) == (1, 2, 4, 4)
-    told = " ".join(found["concluded"])
-    assert "Positions differ from frame 1 on and are the same bit for bit before; by more than" in told
-    assert "explains from frame 2 on" in told and "did not begin with a flip" in told
+    found = looked(tmp_path / "a.extxyz", tmp_path / "b.extxyz", tmp_path / "f")
+    summary, rule = found.summary, found.summary["rules"][0]
+    assert (summary["seed"], summary["beyond"], rule["first"]["frame"], rule["certain"]) == (1, 2, 4, 4)
+    assert {"positions_later", "positions_before", "order_positions"} <= codes_of(found)
 
 
 def test_what_is_certain_is_found_among_pairs_that_stay_different(
@@ -101,16 +108,13 @@ def test_what_is_certain_is_found_among_pairs_that_stay_different(
     write(tmp_path / "a.extxyz", pairs_at([4.0, 4.19, 4.19, 4.0]))
     write(tmp_path / "b.extxyz", pairs_at([4.0, 4.21, 4.21, 4.6]))
     found = looked(tmp_path / "a.extxyz", tmp_path / "b.extxyz", tmp_path / "f", report=True)
-    summary = found.summary
-    assert summary["first"]["frame"] == 1 and summary["first"]["ambiguous"] == 1
-    assert summary["certain"] == 3 and summary["certain_frame"] == "frame 3"
-    assert "beyond it from frame 3 on" in summary["headline"]
+    rule = found.summary["rules"][0]
+    assert (rule["first"]["frame"], rule["first"]["ambiguous"], rule["certain"]) == (1, 1, 3)
     said = finding(found, "WITHIN_RESOLUTION")
-    assert said is not None and said["severity"] == "warning" and "frame 3" in said["text"]
-    page = (found.folder / "report.html").read_text(encoding="utf-8")
-    assert "Sets differ for certain" in page
+    assert said.severity == "warning" and said.values["certain"] == "frame 3"
+    assert "certain_later" in codes_of(found) and (found.folder / "report.html").exists()
     # with more pairs than the table has room for, each of them is looked at
-    monkeypatch.setattr(flips_compare, "ROWS", 2)
+    monkeypatch.setattr(compare, "ROWS", 2)
     a, b = pairs_at([4.0, 4.0, 4.0], 3), pairs_at([4.0, 4.0, 4.0], 3)
     for one, r in ((a, 4.19), (b, 4.21)):
         one[1].positions[[1, 5, 7, 9], 2] = round(0.37 + r, 2)
@@ -118,19 +122,19 @@ def test_what_is_certain_is_found_among_pairs_that_stay_different(
     write(tmp_path / "c.extxyz", a)
     write(tmp_path / "d.extxyz", b)
     found = looked(tmp_path / "c.extxyz", tmp_path / "d.extxyz", tmp_path / "g")
-    first = found.summary["first"]
-    assert (first["pairs"], first["ambiguous"], found.summary["certain"]) == (4, 3, 1)
+    rule = found.summary["rules"][0]
+    assert (rule["first"]["pairs"], rule["first"]["ambiguous"], rule["certain"]) == (4, 3, 1)
     assert len(RunFolder.open(found.folder).read("differing")["i"]) == 2
 
 
-@pytest.mark.parametrize("rule", [Nearest(2), Capped(4.0, 2), Cutoff(4.0)])
+@pytest.mark.parametrize("rule", [Nearest(2), Capped(4.0, 2), CutoffRule(4.0)])
 def test_thresholds_of_a_directed_rule_tell_neighbors_from_others(rule: Rule) -> None:
     rng = np.random.default_rng(3)
     box = Box(np.diag([30.0] * 3), np.ones(3, bool))
     tracker = Tracker(rule, np.arange(4, 16))
     tracker.step(Frame(0, 0.0, x := rng.uniform(0, 9, (20, 3)), box))
     stays, enters = tracker.thresholds()
-    if isinstance(rule, Cutoff):
+    if isinstance(rule, CutoffRule):
         assert np.isnan(stays).all() and np.isnan(enters).all()
         return
     assert np.isnan(stays[:4]).all() and np.isnan(enters[16:]).all()
@@ -150,9 +154,10 @@ def test_nearest_neighbors_that_differ_for_certain(tmp_path: Path) -> None:
             for n in range(3)
         ]
         write(tmp_path / f"{name}.traj", frames)
-    found = looked(tmp_path / "a.traj", tmp_path / "b.traj", tmp_path / "f", cutoffs=(), nearest=[1]).summary
-    assert found["first"]["frame"] == 1 and found["certain"] == 1
-    margins = {(one["i"], one["j"]): (one["margin_a"], one["margin_b"]) for one in found["first_pairs"]}
+    found = looked(tmp_path / "a.traj", tmp_path / "b.traj", tmp_path / "f", cutoffs=(), nearest=[1])
+    rule = found.summary["rules"][0]
+    assert rule["first"]["frame"] == 1 and rule["certain"] == 1
+    margins = {(one["i"], one["j"]): (one["margin_a"], one["margin_b"]) for one in rule["first_pairs"]}
     # 0 has 1 nearest at 3.01 in A (2 at 3.5), and 2 at 2.5 in B
     np.testing.assert_allclose(margins[0, 1], [3.5 - 3.01, 2.5 - 3.01], atol=1e-12)
     np.testing.assert_allclose(margins[0, 2], [3.01 - 3.5, 3.01 - 2.5], atol=1e-12)
@@ -161,33 +166,29 @@ def test_nearest_neighbors_that_differ_for_certain(tmp_path: Path) -> None:
 def test_other_boxes_are_said(tmp_path: Path) -> None:
     write(tmp_path / "a.traj", gas())
     write(tmp_path / "slab.traj", gas(pbc=(True, True, False)))
-    found = looked(tmp_path / "a.traj", tmp_path / "slab.traj", tmp_path / "f", report=True)
-    said = finding(found, "OTHER_BOX")
-    assert said is not None and said["severity"] == "warning" and "different axes" in said["title"]
-    assert "repeating along a, b and c" in said["text"] and "repeating along a and b" in said["text"]
-    assert "at the same positions in boxes that differ" in found.summary["headline"]
-    assert found.summary["seed"] is None and found.summary["certain"] == 0
     # the same where the file of the other box rounds
     write(tmp_path / "slab.extxyz", gas(pbc=(True, True, False)))
-    rounded = looked(tmp_path / "a.traj", tmp_path / "slab.extxyz", tmp_path / "r").summary
-    assert rounded["seed"] == 0 and "at the same positions in boxes that differ" in rounded["headline"]
-    assert "because the boxes do" in rounded["concluded"][-1]
+    for name, seed in (("slab.traj", None), ("slab.extxyz", 0)):
+        found = looked(tmp_path / "a.traj", tmp_path / name, tmp_path / f"f-{name}", report=True)
+        said = finding(found, "OTHER_BOX")
+        assert said.severity == "warning" and "different axes" in said.title
+        assert said.values["a"].endswith("along a, b and c") and said.values["b"].endswith("along a and b")
+        assert found.summary["seed"] == seed and found.summary["rules"][0]["certain"] == 0
+        assert "order_boxes" in codes_of(found) and "in boxes that differ" in found.verdict.headline
     wider = gas()
     for one in wider[2:]:
         one.set_cell([9.0, 9.0, 9.25])
     write(tmp_path / "wider.traj", wider)
     found = looked(tmp_path / "a.traj", tmp_path / "wider.traj", tmp_path / "g", cutoffs=[1e-3])
     said = finding(found, "OTHER_BOX")
-    assert said is not None and "from frame 2 on" in said["title"]
-    assert "9 × 9 × 9 Å" in said["text"] and "9 × 9 × 9.25 Å" in said["text"]
-    assert "not the same box" in found.summary["headline"]
+    assert said.values["frame"] == "frame 2" and said.values["b"].startswith("9 × 9 × 9.25 Å")
     # one lattice by other vectors is one box
     skewed = gas()
     for one in skewed:
         one.set_cell([[9.0, 0, 0], [9.0, 9.0, 0], [-9.0, 18.0, 9.0]])
     write(tmp_path / "skewed.traj", skewed)
     found = looked(tmp_path / "a.traj", tmp_path / "skewed.traj", tmp_path / "h")
-    assert finding(found, "OTHER_BOX") is None and found.summary["first"] is None
+    assert finding(found, "OTHER_BOX") is None and found.summary["rules"][0]["first"] is None
 
 
 def test_frames_of_a_slice_are_named_by_their_numbers_in_the_files(tmp_path: Path) -> None:
@@ -197,12 +198,21 @@ def test_frames_of_a_slice_are_named_by_their_numbers_in_the_files(tmp_path: Pat
         one.positions[:, 0] += np.random.default_rng(1).normal(0, 0.5, 40)
     write(tmp_path / "a.traj", frames)
     write(tmp_path / "b.traj", other)
-    found = looked(Path(f"{tmp_path}/a.traj@::2"), tmp_path / "b.traj", tmp_path / "f").summary
-    words = "frame 2 (4 in A’s file, 2 in B’s)"
-    assert found["first"]["frame"] == 2 and f"differ from {words} on" in found["headline"]
-    assert found["first_frame"] == words and f"Positions differ from {words} on" in found["concluded"][0]
-    found = looked(Path(f"{tmp_path}/a.traj@4:"), Path(f"{tmp_path}/a.traj@4:"), tmp_path / "g").summary
-    assert found["beyond"] is None and found["frames"] == 8
+    found = looked(Path(f"{tmp_path}/a.traj@::2"), tmp_path / "b.traj", tmp_path / "f")
+    assert found.summary["rules"][0]["first"]["frame"] == 2
+    assert "differ from frame 2 (4 in A’s file, 2 in B’s) on" in found.verdict.headline
+    found = looked(Path(f"{tmp_path}/a.traj@4:"), Path(f"{tmp_path}/a.traj@4:"), tmp_path / "g")
+    assert found.summary["seed"] is None and found.summary["frames"] == 8
+    assert found.summary["rules"][0]["first"] is None
+    # frames of other times, and another number of atoms
+    shifted = looked(
+        Path(f"{tmp_path}/a.traj@:8"), Path(f"{tmp_path}/a.traj@3:"), tmp_path / "h", report=True
+    )
+    assert shifted.summary["rules"][0]["first"]["frame"] == 0 and "order_start" in codes_of(shifted)
+    assert finding(shifted, "OTHER_TIMES") and finding(shifted, "NO_CAUSE_FROM_FILES")
+    write(tmp_path / "fewer.traj", gas(6, atoms=20))
+    with pytest.raises(InputError, match="40 atoms and fewer"):
+        looked(tmp_path / "a.traj", tmp_path / "fewer.traj", tmp_path / "i")
 
 
 def test_files_that_do_not_say_it_are_of_no_other_species_or_times(tmp_path: Path) -> None:
@@ -225,9 +235,8 @@ def test_files_that_do_not_say_it_are_of_no_other_species_or_times(tmp_path: Pat
 
     for name, row in (("types.lammpstrj", "id type x y z"), ("bare.lammpstrj", "id x y z")):
         found = looked(tmp_path / "a.extxyz", dump(name, row), tmp_path / f"f-{name}")
-        assert {"OTHER_SPECIES", "OTHER_TIMES"}.isdisjoint(one["code"] for one in found.summary["findings"])
-        said = finding(found, "NO_TIMES")
-        assert said is not None and said["severity"] == "info" and "one by one" in said["text"]
+        assert {"OTHER_SPECIES", "OTHER_TIMES"}.isdisjoint(one.code for one in found.verdict.findings)
+        assert finding(found, "NO_TIMES").severity == "info"
     # in another order than the types are
     for one in frames:
         one.symbols[0] = "Ar"
@@ -267,34 +276,12 @@ def test_several_rules_are_compared_as_each_alone(tmp_path: Path) -> None:
     for place, options in enumerate(alone):
         single = looked(*both, tmp_path / f"{place}", **options)
         for name in ("rule", "first", "certain", "growth"):
-            assert rules[place][name] == single.summary[name], (place, name)
+            assert rules[place][name] == single.summary["rules"][0][name], (place, name)
         rows, mine = RunFolder.open(single.folder).read("differing"), table["rule"] == place
         assert mine.any() and not rows["rule"].any()
         for name in set(rows) - {"rule"}:
             np.testing.assert_array_equal(table[name][mine], rows[name])
-    # the first one is what the page is about, the others are named in a sentence each
-    assert found.summary["first"] == rules[0]["first"]
-    assert "Those of r < 2 Å differ from frame" in found.summary["headline"]
+    # the first one is what the headline is about, the others are named in a sentence each
     assert sum(line.startswith(("r < 2 Å: ", "Ar-Ar < 3.1 Å: ", "3 nearest: "))
-               for line in found.summary["concluded"]) == 3  # fmt: skip
-    page = (found.folder / "report.html").read_text(encoding="utf-8")
-    assert "<h2>Rules</h2>" in page and "sets differ from frame" in page
-    assert "<h2>Rules</h2>" not in (write_page(tmp_path / "0")).read_text(encoding="utf-8")
-
-
-def test_a_comparison_of_another_version_is_refused_in_a_line_or_works(tmp_path: Path) -> None:
-    write(tmp_path / "a.traj", gas())
-    found = looked(tmp_path / "a.traj", tmp_path / "a.traj", tmp_path / "f")
-    path = found.folder / "summary.json"
-    summary = json.loads(path.read_text(encoding="utf-8"))
-    # from before there were several rules
-    # an older mdnum wrote no manifest
-    (path.parent / "manifest.json").unlink()
-    path.write_text(json.dumps({name: value for name, value in summary.items() if name != "rules"}))
-    write_page(found.folder)
-    # and from before files' resolution was taken into account
-    old = {name: value for name, value in summary.items() if name not in ("rules", "certain", "beyond")}
-    path.write_text(json.dumps(old))
-    with pytest.raises(FolderError, match="lacks certain, beyond") as caught:
-        write_page(found.folder)
-    assert f"Compare again: mdnum flips {tmp_path / 'a.traj'}" in str(caught.value)
+               for line in found.verdict.evidence) == 3  # fmt: skip
+    assert [row[0] for row in found.page.sections[0].parts[0].rows][:2] == ["r < 4.2 Å", "r < 2 Å"]

@@ -14,7 +14,7 @@ from report.synthetic import TOML, make_run
 
 from mdnum.errors import FolderError
 from mdnum.report import analysis, svg
-from mdnum.rollout.summary import Line
+from mdnum.rollout.summary import LineFit
 from mdnum.store import RunFolder
 from mdnum.workflow import frame
 from mdnum.workflow.run import judge
@@ -289,6 +289,6 @@ def test_runs_in_which_nothing_happens_have_pages(tmp_path, good):
 
 @pytest.mark.parametrize("step", [1e-300, 1e-160, 0.0, 1e160])
 def test_a_time_that_has_no_slope(step):
-    line = Line()
+    line = LineFit()
     line.add(step * np.arange(5), np.arange(5.0))
     assert line.slope is None

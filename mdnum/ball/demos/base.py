@@ -1,44 +1,14 @@
-"""What a demonstration gives back: its numbers, the checks they passed, tables, plots and a conclusion.
-
-Plots are declared, not drawn: the report draws them, and nothing here needs a plotting library.
-"""
+"""Plots as pages that are not on the frame yet declare them; mdnum.report.section has the others."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 Scale = Literal["linear", "log", "symlog"]
 Mark = Literal["line", "points", "steps", "line+points"]
-
-
-@dataclass(frozen=True)
-class Check:
-    """A statement of the demonstration that was tested while it ran.
-
-    Attributes:
-        what: the statement, in words.
-        seen: the number or word that was found.
-        expected: what it was held against, in words ("0.0009765625", "below 1e-12").
-        ok: whether it held.
-    """
-
-    what: str
-    seen: Any
-    expected: str
-    ok: bool
-
-
-@dataclass(frozen=True)
-class Table:
-    """Rows of plain values under named columns."""
-
-    title: str
-    columns: tuple[str, ...]
-    rows: tuple[tuple[Any, ...], ...]
 
 
 @dataclass(frozen=True)
@@ -95,35 +65,3 @@ class Plot:
     caption: str = ""
     verticals: tuple[tuple[float, str], ...] = ()
     horizontals: tuple[tuple[float, str], ...] = ()
-
-
-@dataclass(frozen=True)
-class Demo:
-    """The outcome of one demonstration.
-
-    Attributes:
-        name: such as "sum-order".
-        title: a short heading.
-        question: what it asks, one sentence.
-        answer: what it shows, one to three sentences, with its numbers in words.
-        numbers: the numbers it must show, plain values by name; the first is the headline.
-        checks: statements tested while it ran.
-        in_md: the counterpart in molecular dynamics, one sentence.
-        data: more plain values for `--json` (histories and the like).
-    """
-
-    name: str
-    title: str
-    question: str
-    answer: str
-    numbers: Mapping[str, Any]
-    checks: Sequence[Check]
-    tables: Sequence[Table] = ()
-    plots: Sequence[Plot] = ()
-    in_md: str = ""
-    data: Mapping[str, Any] = field(default_factory=dict)
-
-    @property
-    def ok(self) -> bool:
-        """Whether every check held."""
-        return all(check.ok for check in self.checks)

@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mdnum.ball.contacts import Impact, Penalty, Projection
-from mdnum.ball.integrators import ExplicitEuler, SemiImplicitEuler, VelocityVerlet
+from mdnum.ball.integrators import BallVerlet, ExplicitEuler, SemiImplicitEuler
 from mdnum.ball.rollout import BallRun
 from mdnum.ball.state import BallState
-from mdnum.ball.stopping import Fixed, GlobalSum, Hysteresis, Maximum, PerInstance, Relative
+from mdnum.ball.stopping import FixedCount, GlobalSum, HysteresisStop, Maximum, PerInstance, Relative
 from mdnum.ball.world import World
 from mdnum.errors import InputError
 from mdnum.program import Decision
@@ -186,7 +186,7 @@ class _ExactBall:
     def __init__(self, world: World, start: BallState):
         contact, scheme = world.contact, world.integrator
         served = isinstance(contact, Penalty | Projection | Impact) and isinstance(
-            scheme, ExplicitEuler | SemiImplicitEuler | VelocityVerlet
+            scheme, ExplicitEuler | SemiImplicitEuler | BallVerlet
         )
         if not served or getattr(contact, "smooth", False):
             raise InputError(
@@ -251,7 +251,7 @@ class _ExactBall:
         return *plain, list(self.touching), counts
 
     def _push(self, free: Balls) -> Balls:
-        if isinstance(self.scheme, VelocityVerlet):
+        if isinstance(self.scheme, BallVerlet):
             vs = _plus(self.v, self.half, self.carried)
             self.y = heights = _plus(self.y, self.h, vs)
             self.touching = self._judge(heights, self.touching)
@@ -307,12 +307,12 @@ class _Rule:
     def __init__(self, world: World):
         rule: Any = world.contact.stop  # type: ignore[attr-defined]
         self.enter = None
-        if isinstance(rule, Hysteresis):
+        if isinstance(rule, HysteresisStop):
             self.enter, rule = _held(world, rule.enter), rule.rule
-        if type(rule) not in (GlobalSum, PerInstance, Maximum, Relative, Fixed):
+        if type(rule) not in (GlobalSum, PerInstance, Maximum, Relative, FixedCount):
             raise InputError(f"the exact ball knows no stopping rule {type(rule).__name__}")
         self.rule, self.max_iter = rule, rule.max_iter
-        self.tol = None if isinstance(rule, Fixed) else _held(world, rule.tol)
+        self.tol = None if isinstance(rule, FixedCount) else _held(world, rule.tol)
 
     def measure(self, depths: Balls) -> Balls:
         """The residual, or one for each ball."""

@@ -1,15 +1,11 @@
-"""Cut Lennard-Jones forces in ball arithmetic: an independent writing of md.potentials and md.cutoffs."""
+"""Cut Lennard-Jones forces in ball arithmetic."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Any
 
-from mdnum.errors import InputError
-
-
-class Undecided(Exception):
-    """A ball straddles a threshold: the decision is not proven at this precision."""
+from mdnum.md.cutoffs import CUTOFFS, AtCutoff
 
 
 def pull_of(cutoff: str, sigma: float, epsilon: float, r_cut: float, r_onset: float) -> Callable[[Any], Any]:
@@ -19,12 +15,9 @@ def pull_of(cutoff: str, sigma: float, epsilon: float, r_cut: float, r_onset: fl
     what follows from them is enclosed at the precision in force when this is called.
 
     Args:
-        cutoff: "hard", "shifted", "force-shifted", "switched", "quintic" or "cosine".
+        cutoff: name of a cutoff.
         sigma, r_cut, r_onset: length.
         epsilon: energy.
-
-    Raises:
-        InputError: another cutoff.
     """
     from flint import arb
 
@@ -40,56 +33,11 @@ def pull_of(cutoff: str, sigma: float, epsilon: float, r_cut: float, r_onset: fl
         cube = inverse * inverse * inverse
         return (attract - repel * cube) * (cube * inverse)
 
-    if cutoff in ("hard", "shifted"):
-        return bare
-
     def energy(r2):
         inverse = one / r2
         cube = inverse * inverse * inverse
         return depth * cube * (s6 * cube - 1)
 
-    rc, ro = arb(r_cut), arb(r_onset)
-    b, a = rc * rc, ro * ro
-
-    if cutoff == "force-shifted":
-        slope = rc * bare(b)
-        return lambda r2: bare(r2) - slope / r2.sqrt()
-
-    def beyond(r2) -> bool:
-        """Whether the pair is past the onset; the switch starts smoothly, but its side must be proven too."""
-        if r2 > a:
-            return True
-        if r2 <= a:
-            return False
-        raise Undecided
-
-    if cutoff == "switched":
-        cube = (b - a) * (b - a) * (b - a)
-
-        def switched(r2):
-            if not beyond(r2):
-                return bare(r2)
-            s = (b - r2) * (b - r2) * (b + 2 * r2 - 3 * a) / cube
-            ds = 6 * (b - r2) * (a - r2) / cube
-            return bare(r2) * s + 2 * energy(r2) * ds
-
-        return switched
-
-    if cutoff in ("quintic", "cosine"):
-        width = rc - ro
-
-        def in_distance(r2):
-            if not beyond(r2):
-                return bare(r2)
-            r = r2.sqrt()
-            t = (r - ro) / width
-            if cutoff == "quintic":
-                s = 1 - t * t * t * (10 - t * (15 - 6 * t))
-                ds = -30 * t * t * (1 - t) * (1 - t)
-            else:
-                s = (1 + t.cos_pi()) / 2
-                ds = -(arb.pi() / 2) * t.sin_pi()
-            return bare(r2) * s + energy(r2) * ds / (width * r)
-
-        return in_distance
-    raise InputError(f"the exact program knows no cutoff {cutoff!r}")
+    rc = arb(r_cut)
+    at = AtCutoff(rc, arb(r_onset), energy(rc * rc), rc * bare(rc * rc))
+    return CUTOFFS.parse(cutoff).enclose(bare, energy, at)

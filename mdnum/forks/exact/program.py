@@ -20,9 +20,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mdnum.errors import InputError
-from mdnum.forks.exact.laws import Undecided, pull_of
+from mdnum.forks.exact.laws import pull_of
 from mdnum.forks.exact.tape import DecisionTape
 from mdnum.md.cell import complete
+from mdnum.md.cutoffs import Undecided
 from mdnum.md.integrators import VelocityVerlet
 from mdnum.md.potentials import LennardJones
 from mdnum.precision import PrecisionPolicy, gamma

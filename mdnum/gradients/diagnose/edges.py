@@ -1,6 +1,6 @@
 """The jump of a gradient across the nearest boundaries of decisions on either side of a parameter.
 
-Between two boundaries every run decides alike, and loss and gradient are smooth functions of the parameter.
+StepEnds two boundaries every run decides alike, and loss and gradient are smooth functions of the parameter.
 At a boundary one pair is decided otherwise between two adjacent floats. A step of an optimizer that is longer
 than the distance to the nearest boundary crosses into another program, and what the gradient does there says
 what that is worth.
@@ -8,18 +8,16 @@ what that is worth.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+
 import numpy as np
-from jaxtyping import Float
 
 from mdnum.errors import InputError, NumericalError
 from mdnum.forks.boundaries import NumberLine
 from mdnum.gradients import parameters
-from mdnum.gradients.base import Problem, Progress
-from mdnum.gradients.diagnose.passes import passed
-from mdnum.gradients.diagnose.places import Edge, Edges
-from mdnum.gradients.symmetric import in_phase
+from mdnum.gradients.problem import Problem, Progress, in_phase
+from mdnum.gradients.recorded import passed, tape_of
 from mdnum.gradients.tangents import tangents
-from mdnum.gradients.tape import Tape
 from mdnum.md.cell import HostCell
 from mdnum.precision.ulp import ordinal
 from mdnum.program import Number
@@ -32,14 +30,54 @@ REACH = 0.01
 _FIRST, _FACTOR = 1e-12, 8.0
 
 
+@dataclass(frozen=True)
+class DecisionEdge:
+    """The nearest boundary of decisions on one side of a parameter, and the gradient across it.
+
+    Attributes:
+        side: "below" or "above".
+        runs: that the search took.
+        found: whether one was found within reach; what follows is void where none was.
+        inside, beyond: adjacent floats; the run at `inside` decides as the one asked about, that at `beyond`
+            does not.
+        distance: from the parameter's value to `inside`, in its units.
+        step, i, j: the first decision that differs.
+        value_inside, value_beyond: the loss on either side.
+        gradient_inside, gradient_beyond: derivative by this parameter on either side, by method.
+    """
+
+    side: str
+    runs: int
+    found: bool = False
+    inside: float = float("nan")
+    beyond: float = float("nan")
+    distance: float = float("nan")
+    step: int = -1
+    i: int = -1
+    j: int = -1
+    value_inside: float = float("nan")
+    value_beyond: float = float("nan")
+    gradient_inside: dict[str, float] = field(default_factory=dict)
+    gradient_beyond: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class DecisionEdges:
+    """The nearest boundaries of decisions below and above the value of one parameter."""
+
+    name: str
+    value: float
+    below: DecisionEdge
+    above: DecisionEdge
+
+
 def edges(
     problem: Problem,
     name: str,
     *,
     reach: float = REACH,
-    budget: int = 2**29,
     progress: Progress | None = None,
-) -> Edges:
+) -> DecisionEdges:
     """The nearest boundary below and above a parameter, and the gradients across them.
 
     Where a pair first crosses otherwise is forecast with tangents; then runs are compared, on either side,
@@ -49,7 +87,6 @@ def edges(
         problem: the loss of a rollout of a pair potential.
         name: a parameter of one entry, full or short name.
         reach: how far to look, as a share of the parameter's value.
-        budget: bytes of the recorded run that are kept.
         progress: called with runs done, runs expected, and a phase in words.
 
     Raises:
@@ -74,7 +111,7 @@ def edges(
     line = NumberLine(program, _number(program, full, value), problem.steps, _no_loss)
     ahead = _forecast(problem, full, budget, progress)
     below, above = (_edge(problem, line, full, value, sign, ahead[sign], reach, progress) for sign in (-1, 1))
-    return Edges(full, value, below, above, _sentence(full, value, below, above))
+    return DecisionEdges(full, value, below, above)
 
 
 def _no_loss(*_: object) -> float:
@@ -92,13 +129,13 @@ def _number(program: MdProgram, name: str, value: float) -> Number:
     return Number(name, value, "", at, at, True)
 
 
-def _forecast(problem: Problem, name: str, budget: int, progress: Progress | None) -> dict[int, float]:
+def _forecast(problem: Problem, name: str, progress: Progress | None) -> dict[int, float]:
     """Shifts of the parameter, by sign, at which tangents see the first pair cross; infinite where none."""
     if name == "box.scale":
         # the images move too, which these differences of positions leave out
         return {-1: np.inf, 1: np.inf}
     simulation = problem.simulation
-    tape = Tape(simulation, problem.loss, problem.steps, flips=True, budget=budget)
+    tape = tape_of(problem, True)
     cell, radii = HostCell(simulation.cell), np.asarray(simulation.decider.r_cut)
     nearest = {-1: np.inf, 1: np.inf}
     along = 1.0 if name == "cutoff.radius" else 0.0
@@ -135,7 +172,7 @@ def _edge(
     ahead: float,
     reach: float,
     progress: Progress | None,
-) -> Edge:
+) -> DecisionEdge:
     side = "above" if sign > 0 else "below"
     before = len(line.known)
     end = reach * abs(value)
@@ -158,7 +195,7 @@ def _edge(
         if line.digest(place) != own:
             beyond = place
         elif shift >= end:
-            return _nothing(side, len(line.known) - before)
+            return DecisionEdge(side, len(line.known) - before)
         else:
             inside, shift = place, shift * _FACTOR
     while abs(beyond - inside) > 1:
@@ -173,26 +210,10 @@ def _edge(
     value_near, gradient_near = _gradients(problem, line.at(inside).simulation, name)
     value_far, gradient_far = _gradients(problem, line.at(beyond).simulation, name)
     runs = len(line.known) - before
-    return Edge(
-        side,
-        True,
-        near,
-        far,
-        abs(near - value),
-        step,
-        i,
-        j,
-        value_near,
-        value_far,
-        gradient_near,
+    return DecisionEdge(
+        side, runs, True, near, far, abs(near - value), step, i, j, value_near, value_far, gradient_near,
         gradient_far,
-        runs,
-    )
-
-
-def _nothing(side: str, runs: int) -> Edge:
-    nan = float("nan")
-    return Edge(side, False, nan, nan, nan, -1, -1, -1, nan, nan, {}, {}, runs)
+    )  # fmt: skip
 
 
 def _first(line: NumberLine, inside: int, beyond: int) -> tuple[int, int, int]:
@@ -206,24 +227,10 @@ def _first(line: NumberLine, inside: int, beyond: int) -> tuple[int, int, int]:
 
 def _gradients(problem: Problem, simulation: Simulation, name: str) -> tuple[float, dict[str, float]]:
     """Loss and derivatives by one parameter of another simulation."""
-    tape = Tape(simulation, problem.loss, problem.steps, flips=True)
     there = Problem(simulation, problem.loss, problem.steps)
-    found: dict[str, float] = {}
-    for word, saltation in (("symmetric", False), ("event-aware", True)):
-        made: Float[np.ndarray, ""] = passed(there, [name], saltation=saltation, tape=tape).gradient[name]
-        found[word] = float(made)
+    tape = tape_of(there, True)
+    found = {
+        word: float(passed(there, [name], saltation=saltation, tape=tape).gradient[name])
+        for word, saltation in (("symmetric", False), ("event-aware", True))
+    }
     return tape.value, found
-
-
-def _sentence(name: str, value: float, below: Edge, above: Edge) -> str:
-    told = []
-    for one in (below, above):
-        if not one.found:
-            told.append(f"none within reach {one.side}")
-            continue
-        jump = one.gradient_beyond["event-aware"] - one.gradient_inside["event-aware"]
-        told.append(
-            f"{one.distance:.2g} {one.side} (pair ({one.i}, {one.j}) at step {one.step}; the loss jumps by "
-            f"{one.value_beyond - one.value_inside:.2g}, the gradient by {jump:.2g})"
-        )
-    return f"Boundaries of decisions around {name} = {value:.6g}: {' and '.join(told)}."

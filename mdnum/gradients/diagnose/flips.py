@@ -9,24 +9,54 @@ other.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from mdnum.errors import InputError
 from mdnum.gradients import parameters
-from mdnum.gradients.base import Problem, Progress
-from mdnum.gradients.diagnose.passes import Passed, passed
-from mdnum.gradients.diagnose.places import Flips
-from mdnum.gradients.directions import columns_of
-from mdnum.gradients.symmetric import GUARD, in_phase
+from mdnum.gradients.parameters import columns_of
+from mdnum.gradients.problem import Problem, Progress, in_phase
+from mdnum.gradients.recorded import GUARD, MOST, ReversePass, passed
 from mdnum.gradients.tangents import by_column, tangents
 
-#: Numbers that contributions are worked out by, at most: each is a tangent along the run.
-MOST = 64
 SMOOTH, ENTERS, LEAVES = "smooth", "pair enters", "pair leaves"
+
+
+@dataclass(frozen=True)
+class FlipTerms:
+    """What each flip on the way adds to the gradient, heaviest first.
+
+    A number is a scalar parameter, or an entry of one that has several: "potential.sigma[1]".
+
+    Attributes:
+        table: a row for each flip: `step`, `i` < `j`, `entered`, `margin`, `bound` and `ambiguous` of the
+            decision, `radial_speed` (negative where the pair enters), `weight` (derivative of the loss by the
+            cutoff of this one crossing), `grazing` (slower than the guard and left out: it contributes 0, and
+            its weight is what it would have been) and `contribution.<number>`, which sum to the event-aware
+            gradient minus the symmetric one.
+        flips, grazing: how many.
+        smooth: the gradient between the flips (their decisions held fixed), by number. total: with the flips.
+        share: share of the total that each channel adds, by number, then channel: "smooth", "pair enters",
+            "pair leaves".
+        half: number of flips, heaviest first, that have half of the weight of all, by number.
+        skipped: number of entries of parameters that have too many of them for contributions.
+    """
+
+    table: dict[str, np.ndarray]
+    flips: int
+    grazing: int
+    smooth: dict[str, float]
+    total: dict[str, float]
+    share: dict[str, dict[str, float]]
+    half: dict[str, int]
+    skipped: dict[str, int]
+
+    def contribution(self, number: str) -> np.ndarray:
+        """What each flip adds to the derivative by a number."""
+        return self.table[f"contribution.{number}"]
 
 
 def flips(
@@ -34,115 +64,77 @@ def flips(
     names: Sequence[str],
     *,
     guard: float = GUARD,
-    budget: int = 2**29,
-    made: Passed | None = None,
+    made: ReversePass | None = None,
     progress: Progress | None = None,
-) -> Flips:
+) -> FlipTerms:
     """Contributions of all flips, heaviest first.
 
     Args:
         problem: the loss of a rollout of a pair potential.
         names: parameters, full or short names.
         guard: radial speed below which a crossing grazes, as a share of the rms radial speed of a pair.
-        budget: bytes of the recorded run that are kept.
         made: the event-aware reverse pass, where it has been made; its guard counts then.
-        progress: called with the steps done, all steps, and a phase in words.
+        progress: called with the steps done, all steps, and the name of the phase.
 
     Raises:
         InputError: no such parameter, no pair potential, or only parameters of too many entries.
 
     Error: that of the event-aware gradient.
     """
-    full = parameters.resolve(problem.simulation, names)
     simulation = problem.simulation
-    skipped = {}
-    for name in full:
-        many = int(np.prod(parameters.value(simulation, name).shape))
-        if many > MOST:
-            skipped[name] = f"a tangent for each of its {many} entries would be needed"
+    full = parameters.resolve(simulation, names)
+    sizes = {name: int(np.prod(parameters.value(simulation, name).shape)) for name in full}
+    skipped = {name: size for name, size in sizes.items() if size > MOST}
     kept = [name for name in full if name not in skipped]
     if not kept:
         raise InputError(
-            f"contributions of flips by {', '.join(full)}: {skipped[full[0]]}",
+            f"contributions of flips by {', '.join(full)}: a tangent for each of {sizes[full[0]]} entries "
+            "would be needed",
             remedy="Name a parameter of one entry too",
         )
     if made is None:
-        made = passed(problem, full, guard=guard, budget=budget, progress=progress)
+        made = passed(problem, full, guard=guard, progress=progress)
     columns = columns_of(simulation, kept)
-    words = [str(column) for column in columns]
+    numbers = [str(column) for column in columns]
     moved: list[np.ndarray] = []
     total: Any = None
     for part in tangents(made.tape, kept, guard=made.guard, progress=in_phase(progress, "tangents")):
         assert part.dr is not None and part.dr_cut is not None
         moved.append(part.dr_cut - part.dr)
         total = part.total
-    found = made.crossings[::-1]
-    ledgers = [one.ledger for one in found]
+    crossings = made.crossings[::-1]
 
-    def column(parts: list[np.ndarray], dtype: Any = np.float64) -> np.ndarray:
+    def column(name: str, dtype: Any = np.float64, of_ledger: bool = False) -> np.ndarray:
+        parts = [getattr(one.ledger if of_ledger else one, name) for one in crossings]
         return np.concatenate(parts) if parts else np.zeros(0, dtype)
 
-    weight, grazing = column([one.weight for one in found]), column([one.grazing for one in found], bool)
+    weight, grazing, speed = column("weight"), column("grazing", bool), column("speed")
     each = np.where(grazing[:, None], 0.0, weight[:, None] * np.concatenate(moved))
     # the largest share of what flips add to any of the numbers, so that numbers in other units do not vanish
-    sizes = np.abs(each).sum(axis=0)
-    order = np.argsort(-np.max(np.abs(each) / np.where(sizes > 0, sizes, 1), axis=1), kind="stable")
-    smooth = by_column(made.tape, total)
-    entered = column([one.entered for one in ledgers], bool)
-    whole = {
-        str(one): float(np.asarray(made.gradient[one.name])[one.index]) for one in columns
-    }  # a scalar has the empty index
-    subject = np.concatenate([one.subject for one in ledgers]) if ledgers else np.zeros((0, 2), np.int64)
-    margin, bound = column([one.margin for one in ledgers]), column([one.bound for one in ledgers])
-    result = Flips(
-        column([one.step for one in ledgers], np.int64)[order],
-        subject[order, 0],
-        subject[order, 1],
-        entered[order],
-        margin[order],
-        bound[order],
-        (np.abs(margin) <= bound)[order],
-        column([np.where(np.isinf(one.speed), 0.0, one.speed) for one in found])[order],
-        weight[order],
-        grazing[order],
-        {word: each[order, k] for k, word in enumerate(words)},
-        {word: float(smooth[k]) for k, word in enumerate(words)},
-        whole,
-        {word: _shares(float(smooth[k]), each[:, k], entered, whole[word]) for k, word in enumerate(words)},
-        skipped,
-        "",
-    )
-    return replace(result, says=sentence(result))
-
-
-def _shares(smooth: float, each: np.ndarray, entered: np.ndarray, total: float) -> dict[str, float]:
-    parts = {SMOOTH: smooth, ENTERS: float(each[entered].sum()), LEAVES: float(each[~entered].sum())}
-    return {word: part / total if total != 0 else float("nan") for word, part in parts.items()}
-
-
-def sentence(found: Flips, digits: Mapping[str, int] | None = None) -> str:
-    """What stands out, in a sentence; no share is told of a derivative of which no digit holds.
-
-    Args:
-        found: the contributions.
-        digits: digits that hold, by parameter, where they are known.
-    """
-    if not len(found):
-        return "No pair crossed its cutoff."
-    told = []
-    for word, each in found.contribution.items():
-        if (digits or {}).get(word.partition("[")[0]) == 0:
-            told.append(f"what they make of the derivative by {word} is not told, since no digit of it holds")
-            continue
-        parts = np.sort(np.abs(each))[::-1]
-        if not parts.any():
-            told.append(f"flips add nothing to the derivative by {word}")
-            continue
-        half = int(np.searchsorted(np.cumsum(parts), 0.5 * parts.sum())) + 1
-        added = float(each.sum())
-        total = found.smooth[word] + added
-        share = f"{100 * added / total:.3g} % of" if total != 0 else f"{added:.3g} to"
-        told.append(f"flips make {share} the derivative by {word}, half of that in weight {half} of them")
-    grazed = int(found.grazing.sum())
-    left = f" {grazed} grazed and were left out." if grazed else ""
-    return f"Of {len(found)} flips: {'; '.join(told)}.{left}"
+    sums = np.abs(each).sum(axis=0)
+    order = np.argsort(-np.max(np.abs(each) / np.where(sums > 0, sums, 1), axis=1), kind="stable")
+    entered, margin = column("entered", bool, True), column("margin", of_ledger=True)
+    bound = column("bound", of_ledger=True)
+    subject = column("subject", np.int64, True).reshape(-1, 2)
+    table = {
+        "step": column("step", np.int64, True), "i": subject[:, 0], "j": subject[:, 1], "entered": entered,
+        "margin": margin, "bound": bound, "ambiguous": np.abs(margin) <= bound,
+        "radial_speed": np.where(np.isinf(speed), 0.0, speed), "weight": weight, "grazing": grazing,
+    }  # fmt: skip
+    table |= {f"contribution.{number}": each[:, k] for k, number in enumerate(numbers)}
+    smooth = {
+        number: float(slope) for number, slope in zip(numbers, by_column(made.tape, total), strict=True)
+    }
+    # a scalar has the empty index
+    whole = {str(one): float(np.asarray(made.gradient[one.name])[one.index]) for one in columns}
+    share, half = {}, {}
+    for k, number in enumerate(numbers):
+        parts = (smooth[number], float(each[entered, k].sum()), float(each[~entered, k].sum()))
+        size = whole[number] or float("nan")
+        share[number] = dict(zip((SMOOTH, ENTERS, LEAVES), (part / size for part in parts), strict=True))
+        heaviest = np.cumsum(np.sort(np.abs(each[:, k]))[::-1])
+        half[number] = int(np.searchsorted(heaviest, 0.5 * heaviest[-1])) + 1 if heaviest[-1:].any() else 0
+    return FlipTerms(
+        {name: values[order] for name, values in table.items()},
+        len(order), int(grazing.sum()), smooth, whole, share, half, skipped,
+    )  # fmt: skip

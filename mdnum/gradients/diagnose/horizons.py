@@ -15,12 +15,12 @@ from jaxtyping import Array, Bool, Float, Int
 from mdnum.errors import InputError
 from mdnum.events import Ledger
 from mdnum.gradients import parameters
-from mdnum.gradients.base import Problem, Progress
-from mdnum.gradients.directions import Column, columns_of
 from mdnum.gradients.losses import Loss
-from mdnum.gradients.symmetric import GUARD, in_phase, radial_speed
-from mdnum.gradients.tangents import Tangents, tangents
-from mdnum.gradients.tape import Stretch, Tape
+from mdnum.gradients.parameters import ParameterEntry, columns_of
+from mdnum.gradients.problem import Problem, Progress, in_phase
+from mdnum.gradients.recorded import GUARD, radial_speed
+from mdnum.gradients.tangents import StretchTangents, tangents
+from mdnum.gradients.tape import RunTape, TapeStretch
 
 #: The parameter by which derivatives at half the time step are twice as large.
 TIMESTEP = "dynamics.timestep"
@@ -31,7 +31,7 @@ class Shorter(Loss):
 
     Attributes:
         inner: the loss.
-        table: whether the loss of a run of each horizon looks at each step, shape (steps + 1, horizons).
+        table: whether the loss of a run of each horizon looks at each step.
     """
 
     name = "shorter"
@@ -39,7 +39,6 @@ class Shorter(Loss):
     table: Bool[Array, "rows horizons"] = eqx.field(kw_only=True)
 
     def looks_at(self, steps, last):
-        """Where any of the horizons does."""
         return np.asarray(self.table).max(axis=1)[np.minimum(steps, len(self.table) - 1)]
 
     def observe(self, frame, origin, around):
@@ -55,16 +54,12 @@ class Shorter(Loss):
 
     def value(self, total, frames):
         """That of the longest."""
-        return self.of(total, len(self.counts) - 1)
-
-    @property
-    def counts(self) -> list[int]:
-        """Frames of each horizon."""
-        return np.asarray(self.table).sum(axis=0).tolist()
+        return self.of(total, self.table.shape[1] - 1)
 
     def of(self, total: Any, k: int) -> Float[Array, ""]:
         """The loss of one horizon."""
-        return self.inner.value(jax.tree.map(lambda leaf: leaf[k], total), self.counts[k])
+        frames = int(np.asarray(self.table)[:, k].sum())
+        return self.inner.value(jax.tree.map(lambda leaf: leaf[k], total), frames)
 
 
 class Halved(Loss):
@@ -74,7 +69,6 @@ class Halved(Loss):
     inner: Loss = eqx.field(kw_only=True)
 
     def looks_at(self, steps, last):
-        """Where the loss does, in steps of twice the length."""
         return (steps % 2 == 0) & self.inner.looks_at(steps // 2, last // 2)
 
     def observe(self, frame, origin, around):
@@ -83,16 +77,14 @@ class Halved(Loss):
         )
 
     def value(self, total, frames):
-        """That of the loss."""
         return self.inner.value(total, frames)
 
-    def why_not(self, around):
-        """Where the loss has none."""
-        return self.inner.why_not(around)
+    def reason_unavailable(self, around):
+        return self.inner.reason_unavailable(around)
 
 
 def halved(problem: Problem) -> Problem:
-    """The same loss over the same time, in twice as many steps of half the length."""
+    """The same loss over the same time, in twice the steps of half the length."""
     timestep = parameters.value(problem.simulation, TIMESTEP) / 2
     simulation = parameters.with_values(problem.simulation, {TIMESTEP: timestep})
     return Problem(simulation, Halved(inner=problem.loss), 2 * problem.steps)
@@ -103,28 +95,29 @@ class Horizons:
     """Losses and gradients of runs of several lengths.
 
     Attributes:
-        at: horizons, steps, shape (points,).
+        at: horizons, steps.
         columns: the numbers that are differentiated by.
-        value: the loss, shape (points,). gradient: shape (points, columns).
-        ledger: flips of the run, in the order of their steps.
+        value: the loss, by horizon. gradient: by horizon and column.
+        ledgers: flips of the run, in the order of their steps.
     """
 
     at: Int[np.ndarray, "points"]
-    columns: tuple[Column, ...]
+    columns: tuple[ParameterEntry, ...]
     value: Float[np.ndarray, "points"]
     gradient: Float[np.ndarray, "points columns"]
     ledgers: tuple[Ledger, ...]
 
     def by_name(self) -> dict[str, Float[np.ndarray, "points entries"]]:
         """The gradient by parameter."""
-        out: dict[str, list[int]] = {}
-        for k, column in enumerate(self.columns):
-            out.setdefault(column.name, []).append(k)
-        return {name: self.gradient[:, places] for name, places in out.items()}
+        names = [column.name for column in self.columns]
+        return {
+            name: self.gradient[:, [k for k, one in enumerate(names) if one == name]]
+            for name in dict.fromkeys(names)
+        }
 
 
 def spread(problem: Problem, points: int) -> Int[np.ndarray, "points"]:
-    """Horizons at which the loss of a run so long looks at something, evenly spread, T the last."""
+    """Horizons at which the loss of a run this long looks at something, evenly spread, T the last."""
     steps = np.unique(np.round(np.linspace(0, problem.steps, points + 1)).astype(np.int64))[1:]
 
     def looks(h: int) -> bool:
@@ -144,9 +137,8 @@ def horizons(
     *,
     saltation: bool = True,
     guard: float = GUARD,
-    budget: int = 2**29,
-    each: Callable[[Stretch], None] | None = None,
-    watch: Callable[[Tangents], None] | None = None,
+    each: Callable[[TapeStretch], None] | None = None,
+    watch: Callable[[StretchTangents], None] | None = None,
     progress: Progress | None = None,
 ) -> Horizons:
     """The gradient of the loss of every shorter run from the same start.
@@ -157,10 +149,9 @@ def horizons(
         at: horizons, rising; the last one is how far it is run.
         saltation: whether flips count.
         guard: as a share of the rms radial speed of a pair.
-        budget: bytes of the recorded run that are kept.
         each: called with every stretch when it has been made.
         watch: called with the tangents of every stretch, those of each step among them.
-        progress: called with the steps done, all steps, and a phase in words.
+        progress: called with the steps done, all steps, and the name of the phase.
 
     Raises:
         InputError: no pair potential. NumericalError: the run blew up.
@@ -171,20 +162,13 @@ def horizons(
     rows = np.arange(last + 1)
     table = np.stack([problem.loss.looks_at(rows, int(h)) & (rows <= h) for h in at], axis=1)
     loss = Shorter(inner=problem.loss, table=jnp.asarray(table))
-    tape = Tape(
-        simulation, loss, last, flips=True, budget=budget, each=each, progress=in_phase(progress, "run")
-    )
-    speed = guard * radial_speed(simulation)
+    tape = RunTape(simulation, loss, last, flips=True, each=each, progress=in_phase(progress, "run"))
     total: Any = None
     ledgers = []
     for part in tangents(
-        tape,
-        names,
-        saltation=saltation,
-        guard=speed,
-        states=watch is not None,
+        tape, names, saltation=saltation, guard=guard * radial_speed(simulation), states=watch is not None,
         progress=in_phase(progress, "tangents"),
-    ):
+    ):  # fmt: skip
         total = part.total
         if watch is not None:
             watch(part)
@@ -195,13 +179,8 @@ def horizons(
         value, push = jax.linearize(lambda total, k=k: loss.of(total, k), tape.total)
         values.append(float(value))
         slopes.append(np.asarray(jax.vmap(push)(total), np.float64))
-    return Horizons(
-        at,
-        columns_of(simulation, names),
-        np.array(values),
-        np.stack(slopes),
-        tuple(ledgers),
-    )
+    columns = columns_of(simulation, names)
+    return Horizons(at, columns, np.array(values), np.stack(slopes), tuple(ledgers))
 
 
 def first_difference(a: Horizons, b: Horizons) -> int | None:

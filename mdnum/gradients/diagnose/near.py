@@ -13,7 +13,7 @@ at unit speed.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import jax.numpy as jnp
@@ -21,10 +21,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mdnum.gradients.adjoint import Trace
-from mdnum.gradients.diagnose.plain import Plain
-from mdnum.gradients.directions import directions
-from mdnum.gradients.tangents import Tangents
-from mdnum.gradients.tape import Pace, Stretch
+from mdnum.gradients.parameters import directions
+from mdnum.gradients.tangents import StretchTangents
+from mdnum.gradients.tape import Pace, TapeStretch
 from mdnum.md.cell import HostCell
 from mdnum.systems.build import Simulation
 
@@ -40,32 +39,43 @@ REACH = 2.0
 _NEIGHBORS = 20
 
 
-@dataclass(frozen=True)
-class Turns(Plain):
+@dataclass
+class Turns:
     """Turning points of pairs near their cutoff; a row for each, in the order of steps.
 
     Attributes:
-        step: it lies between this step and the one before, shape (turns,).
-        i, j: the pair, i < j.
+        step: it lies between this step and the one before. row: of that step in its stretch.
+        i, j: the pair, i < j. a, b: the same in the order of the stretch's list. kind: pair type.
         gap: how far it is short of the cutoff, length; negative where the pair is beyond it for a while.
         bend: magnitude of the second derivative of the distance there, length per internal time².
+        unseen: whether it is beyond the cutoff between two steps alone, which decided that it is not.
         weight: derivative of the loss by the cutoff of one crossing there, times its radial speed.
-        moved: how far the cutoff moves ahead of the pair, by number that is differentiated by, shape
-            (turns, columns); NaN before the tangents have been there.
+        moved: how far the cutoff moves ahead of the pair, by number that is differentiated by; NaN before
+            the tangents have been there.
         shift: how far the distance is from that of other runs (another time step, another rounding), the
             largest of them, length; 0 before any was compared.
-        unseen: whether it is beyond the cutoff between two steps alone, which decided that it is not.
+        normal: from a to b. images: lattice vectors from the wrapped to the nearest image of b.
+        part: where between the two steps, 0 to 1. before, after: distances at the two steps.
     """
 
     step: Int[np.ndarray, "turns"]
+    row: Int[np.ndarray, "turns"]
     i: Int[np.ndarray, "turns"]
     j: Int[np.ndarray, "turns"]
+    a: Int[np.ndarray, "turns"]
+    b: Int[np.ndarray, "turns"]
+    kind: Int[np.ndarray, "turns"]
     gap: Float[np.ndarray, "turns"]
     bend: Float[np.ndarray, "turns"]
+    unseen: Bool[np.ndarray, "turns"]
     weight: Float[np.ndarray, "turns"]
     moved: Float[np.ndarray, "turns columns"]
     shift: Float[np.ndarray, "turns"]
-    unseen: Bool[np.ndarray, "turns"]
+    normal: Float[np.ndarray, "turns 3"]
+    images: Float[np.ndarray, "turns 3"]
+    part: Float[np.ndarray, "turns"]
+    before: Float[np.ndarray, "turns"]
+    after: Float[np.ndarray, "turns"]
 
     def __len__(self) -> int:
         return len(self.step)
@@ -126,22 +136,22 @@ class Near:
     simulation: Simulation
     pace: Pace
     rows: int = 0
-    _found: list[Turning] = field(default_factory=list)
-    _at: dict[int, Turning] = field(default_factory=dict)
+    _found: list[Turns] = field(default_factory=list)
+    _at: dict[int, Turns] = field(default_factory=dict)
 
     @property
     def jumps(self) -> bool:
         """Whether a crossing adds anything at all: force or energy of a pair jump."""
         return self.simulation.pairwise and bool(np.any(np.asarray(self.simulation.jumps())))
 
-    def reverse(self, stretch: Stretch, trace: Trace) -> None:
+    def reverse(self, stretch: TapeStretch, trace: Trace) -> None:
         """One stretch of the event-aware reverse pass, last first: its turning points and their weights."""
         if not self.jumps:
             return
         simulation = self.simulation
         self.rows = max(self.rows, len(stretch.x))
         found = turning(simulation, stretch)
-        row, i, j = found.row, found.i, found.j
+        row, a, b = found.row, found.a, found.b
         half = 0.5 * float(simulation.integrator.timestep)
         masses = simulation.masses[stretch.table.order]
         onto_x, onto_v = (np.asarray(part) for part in (trace.x, trace.v))
@@ -149,7 +159,7 @@ class Near:
         def impulse(atom):
             return (onto_v[row, :, atom] + half * onto_x[row, :, atom]) / masses[atom][:, None]
 
-        along = np.sum(found.normal * (impulse(j) - impulse(i)), axis=1)
+        along = np.sum(found.normal * (impulse(b) - impulse(a)), axis=1)
         by_energy, by_virial = (np.asarray(part)[row] for part in trace.frame)
         timestep, share = simulation.integrator.timestep, np.zeros(len(row))
         for step in np.unique(found.step[(by_energy != 0) | (by_virial != 0)]):
@@ -157,11 +167,11 @@ class Near:
         energy, force = (np.asarray(jump)[found.kind] for jump in simulation.jumps())
         radius = np.asarray(simulation.decider.r_cut)[found.kind]
         seen = share * (by_energy * energy + by_virial * force * radius)
-        found = replace(found, weight=force * along + seen)
+        found.weight = force * along + seen
         self._found.append(found)
         self._at[stretch.first] = found
 
-    def tangents(self, part: Tangents) -> None:
+    def tangents(self, part: StretchTangents) -> None:
         """One stretch of the tangents: how far each distance moves."""
         found = self._at.get(part.stretch.first)
         if found is None:
@@ -177,85 +187,36 @@ class Near:
             images = stretch.images[found.row, :, atom].astype(np.float64)
             return rows - np.einsum("cab,ra->rcb", np.asarray(along.matrix), images)
 
-        apart = moved(found.j) - moved(found.i)
+        apart = moved(found.b) - moved(found.a)
         apart = apart + np.einsum("cab,ra->rcb", np.asarray(along.matrix), found.images)
         dr = np.einsum("rcb,rb->rc", apart, found.normal)
         found.moved = np.asarray(along.r_cut).T[found.kind] - dr
 
-    def compared(self, stretch: Stretch, per: int) -> None:
+    def compared(self, stretch: TapeStretch, per: int) -> None:
         """One stretch of another run, which makes `per` steps where this one makes one."""
         cell, place = HostCell(self.simulation.cell), np.argsort(stretch.table.order)
         for found in self._found:
-            for before, distance in ((1, found.distances[0]), (0, found.distances[1])):
+            for before, distance in ((1, found.before), (0, found.after)):
                 row = per * (found.step - before) - stretch.first
                 here = np.flatnonzero((row >= 0) & (row < stretch.rows))
                 if not len(here):
                     continue
                 a, b = (
                     stretch.x[row[here], :, place[label[here]]].astype(np.float64)
-                    for label in (found.first, found.second)
+                    for label in (found.i, found.j)
                 )
                 r = np.linalg.norm(np.stack(cell.displacement(a, b), axis=1), axis=1)
                 found.shift[here] = np.maximum(found.shift[here], np.abs(r - distance[here]))
 
     def turns(self, columns: int) -> Turns:
         """All of them, in the order of their steps."""
-        found = self._found[::-1]
-
-        def column(name: str, dtype: type = np.float64) -> np.ndarray:
-            parts = [getattr(one, name) for one in found]
-            return np.concatenate(parts) if parts else np.zeros(0, dtype)
-
-        moved = [
-            np.full((len(one.step), columns), np.nan) if one.moved is None else one.moved for one in found
-        ]
-        step = column("step", np.int64)
-        order = np.argsort(step, kind="stable")
-        return Turns(
-            step[order],
-            column("first", np.int64)[order],
-            column("second", np.int64)[order],
-            column("gap")[order],
-            column("bend")[order],
-            column("weight")[order],
-            (np.concatenate(moved) if moved else np.zeros((0, columns)))[order],
-            column("shift")[order],
-            column("unseen", bool)[order],
-        )
-
-
-@dataclass
-class Turning:
-    """The turning points of one stretch.
-
-    Attributes:
-        step: the step that each comes before. row: its row in the stretch.
-        i, j: atoms in the order of the stretch's list. first, second: user labels, first < second.
-        kind: pair type.
-        normal: from i to j, shape (turns, 3). images: lattice vectors from the wrapped to the nearest image
-            of j.
-        part: where between the two steps, 0 to 1.
-        distances: at the two steps.
-        gap, bend, unseen, weight, moved, shift: as in `Turns`.
-    """
-
-    step: np.ndarray
-    row: np.ndarray
-    i: np.ndarray
-    j: np.ndarray
-    first: np.ndarray
-    second: np.ndarray
-    kind: np.ndarray
-    normal: np.ndarray
-    images: np.ndarray
-    part: np.ndarray
-    distances: tuple[np.ndarray, np.ndarray]
-    gap: np.ndarray
-    bend: np.ndarray
-    unseen: np.ndarray
-    weight: np.ndarray
-    moved: np.ndarray | None
-    shift: np.ndarray
+        found = [
+            replace(one, moved=np.full((len(one), columns), np.nan)) if one.moved.shape[1] != columns else one
+            for one in self._found[::-1]
+        ] or [_turns([], self.simulation, columns)]
+        parts = {each.name: [getattr(one, each.name) for one in found] for each in fields(Turns)}
+        order = np.argsort(np.concatenate(parts["step"]), kind="stable")
+        return Turns(**{name: np.concatenate(part)[order] for name, part in parts.items()})
 
 
 def hermite(
@@ -282,7 +243,7 @@ def hermite(
     return u, r0 + u * (first + u * (square + u * cube)), (2 * square + 6 * u * cube) / time**2
 
 
-def turning(simulation: Simulation, stretch: Stretch) -> Turning:
+def turning(simulation: Simulation, stretch: TapeStretch) -> Turns:
     """The turning points of pairs near their cutoff within a stretch, from distances and their rates."""
     order, index = stretch.table.order, stretch.table.index
     slots, i = np.nonzero(index < simulation.atoms)
@@ -297,7 +258,7 @@ def turning(simulation: Simulation, stretch: Stretch) -> Turning:
     def apart(x, i, j):
         return np.stack(cell.displacement(x[:, i].T, x[:, j].T), axis=1)
 
-    rows: list[tuple[np.ndarray, ...]] = []
+    rows: list[dict[str, np.ndarray]] = []
     for low in range(0, stretch.rows, _BLOCK):
         high = min(low + _BLOCK, stretch.rows)
         v = stretch.v[low:high].astype(np.float64)
@@ -331,22 +292,37 @@ def turning(simulation: Simulation, stretch: Stretch) -> Turning:
                     side, ends = np.sign(bend), np.stack([r0[turned], r[turned]]) - cut[turned]
                     gap = side * (there - cut[turned])
                     raw = (stretch.x[row][:, b[turned]] - stretch.x[row][:, a[turned]]).T.astype(np.float64)
-                    rows.append((
-                        np.full(len(turned), row), a[turned], b[turned], which[turned],
-                        middle / np.linalg.norm(middle, axis=1, keepdims=True), d[turned] - raw, part,
-                        r0[turned], r[turned], gap, np.abs(bend),
-                        (gap < 0) & (side * ends > 0).all(axis=0),
-                    ))  # fmt: skip
+                    names = {"step": stretch.first + row, "row": row}
+                    rows.append(
+                        {name: np.full(len(turned), value) for name, value in names.items()}
+                        | {
+                            "i": order[a[turned]], "j": order[b[turned]], "a": a[turned], "b": b[turned],
+                            "kind": which[turned], "gap": gap, "bend": np.abs(bend),
+                            "unseen": (gap < 0) & (side * ends > 0).all(axis=0),
+                            "normal": middle / np.linalg.norm(middle, axis=1, keepdims=True),
+                            "images": d[turned] - raw, "part": part, "before": r0[turned], "after": r[turned],
+                        }
+                    )  # fmt: skip
             before = (r, rate, d)
-    if not rows:
-        whole, none, three = np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3))
-        rows.append((whole,) * 4 + (three,) * 2 + (none,) * 5 + (np.zeros(0, bool),))
-    row, a, b, which, normal, lattice, part, r0, r1, gap, bend, unseen = map(
-        np.concatenate, zip(*rows, strict=True)
+    return _turns(rows, simulation)
+
+
+def _turns(rows: list[dict[str, np.ndarray]], simulation: Simulation, columns: int = 0) -> Turns:
+    """Rows as columns; what the reverse pass, tangents and other runs put in is not there yet."""
+    whole, three = ("step", "row", "i", "j", "a", "b", "kind"), ("normal", "images")
+
+    def column(name: str) -> np.ndarray:
+        empty = np.zeros((0, 3) if name in three else 0, np.int64 if name in whole else np.float64)
+        parts = [row[name] for row in rows]
+        return np.concatenate(parts) if parts else empty.astype(bool) if name == "unseen" else empty
+
+    found = {
+        each.name: column(each.name)
+        for each in fields(Turns)
+        if each.name not in ("weight", "moved", "shift")
+    }
+    found["images"] = np.rint(found["images"] @ np.asarray(simulation.cell.inverse, np.float64))
+    count = len(found["step"])
+    return Turns(
+        **found, weight=np.zeros(count), moved=np.full((count, columns), np.nan), shift=np.zeros(count)
     )
-    inverse = np.asarray(simulation.cell.inverse, np.float64)
-    nothing = np.zeros(len(row))
-    return Turning(
-        stretch.first + row, row, a, b, order[a], order[b], which, normal, np.rint(lattice @ inverse), part,
-        (r0, r1), gap, bend, unseen, nothing, None, nothing.copy(),
-    )  # fmt: skip

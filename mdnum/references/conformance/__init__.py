@@ -12,51 +12,33 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from mdnum.references.conformance.adoption import NeighborListConformance
     from mdnum.references.conformance.case import Case, Still
-    from mdnum.references.conformance.lists import KeptList, Limits, PairList
+    from mdnum.references.conformance.lists import LISTS, KeptList, ListLimits, PairList
     from mdnum.references.conformance.loading import from_object, installed, known, load
+    from mdnum.references.conformance.questions import boxes, cases
     from mdnum.references.conformance.reproduction import script
-    from mdnum.references.conformance.strategies import boxes, cases
-    from mdnum.references.conformance.suite import Report, examine
+    from mdnum.references.conformance.results import Report
+    from mdnum.references.conformance.suite import examine
 
 # no module here has the name of what is exported: importing it would put the module in its place
-_WHERE = {
-    "Case": "case",
-    "KeptList": "lists",
-    "Limits": "lists",
-    "NeighborListConformance": "adoption",
-    "PairList": "lists",
-    "Report": "suite",
-    "Still": "case",
-    "boxes": "strategies",
-    "cases": "strategies",
-    "examine": "suite",
-    "from_object": "loading",
-    "installed": "loading",
-    "known": "loading",
-    "load": "loading",
-    "script": "reproduction",
+_HOMES = {
+    "adoption": ("NeighborListConformance",),
+    "case": ("Case", "Still"),
+    "lists": ("LISTS", "KeptList", "ListLimits", "PairList"),
+    "loading": ("from_object", "installed", "known", "load"),
+    "questions": ("boxes", "cases"),
+    "reproduction": ("script",),
+    "results": ("Report",),
+    "suite": ("examine",),
 }
 
 __all__ = [
-    "Case",
-    "KeptList",
-    "Limits",
-    "NeighborListConformance",
-    "PairList",
-    "Report",
-    "Still",
-    "boxes",
-    "cases",
-    "examine",
-    "from_object",
-    "installed",
-    "known",
-    "load",
-    "script",
-]
+    "LISTS", "Case", "KeptList", "ListLimits", "NeighborListConformance", "PairList", "Report", "Still",
+    "boxes", "cases", "examine", "from_object", "installed", "known", "load", "script",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:
-    if name in _WHERE:
-        return getattr(importlib.import_module(f"mdnum.references.conformance.{_WHERE[name]}"), name)
+    for home, names in _HOMES.items():
+        if name in names:
+            return getattr(importlib.import_module(f"{__name__}.{home}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

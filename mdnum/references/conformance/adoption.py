@@ -1,11 +1,11 @@
 """The suite in a library's own tests: a class to subclass, with a test for each area.
 
-    from mdnum.references.conformance import Limits, NeighborListConformance
+    from mdnum.references.conformance import ListLimits, NeighborListConformance
     from mylibrary import neighbor_list
 
     class TestNeighborList(NeighborListConformance):
         pairs = staticmethod(neighbor_list)
-        limits = Limits(minimum_image=True)
+        limits = ListLimits(minimum_image=True)
 
 A failure prints what is wrong and a script of a few atoms that reproduces it.
 """
@@ -17,12 +17,11 @@ from typing import Any, ClassVar
 
 import pytest
 
-from mdnum.references.conformance.case import AREAS, Case, one
+from mdnum.references.conformance import questions
+from mdnum.references.conformance.case import AREAS, Case, once
 from mdnum.references.conformance.catalog import gas
-from mdnum.references.conformance.crowds import LARGE_EDGE, SMALL_EDGE, lattice
-from mdnum.references.conformance.lists import Limits, PairList
+from mdnum.references.conformance.lists import ListLimits, PairList
 from mdnum.references.conformance.loading import from_object, load
-from mdnum.references.conformance.questions import as_kept, questions
 from mdnum.references.conformance.reproduction import script
 from mdnum.references.conformance.suite import Examiner, examine
 
@@ -46,7 +45,7 @@ class NeighborListConformance:
     full: ClassVar[bool | None] = None
     unit: ClassVar[float | None] = None
     superset: ClassVar[bool | None] = None
-    limits: ClassVar[Limits | None] = None
+    limits: ClassVar[ListLimits | None] = None
     cases: ClassVar[int] = 200
     seed: ClassVar[int] = 0
     large: ClassVar[bool] = False
@@ -61,11 +60,11 @@ class NeighborListConformance:
     def asked(self, tested: PairList, area: str) -> list[Case]:
         """The cases of one area."""
         if area == "large":
-            return [lattice(edge) for edge in (SMALL_EDGE, LARGE_EDGE)] if self.large else []
+            return list(questions.large()) if self.large else []
         count = self.cases if area == "random" else 0
         padding = Examiner(tested).report.padding if area == "rule" and tested.kept else None
-        found = questions(replace(tested, affords=1.0), count, self.seed, large=False, padding=padding)
-        return [case for case in found if case.area == area]
+        every = questions.questions(replace(tested, affords=1.0), count, self.seed, padding)
+        return [case for case in every if case.area == area]
 
     @pytest.mark.parametrize("area", AREAS)
     def test_neighbor_list(self, area: str) -> None:
@@ -78,12 +77,12 @@ class NeighborListConformance:
         if not report.asked:
             pytest.skip("; ".join(report.areas[area].why))
         if report.failed:
-            said = [f"{failed.code}: {failed.worst.text}" for failed in report.failed]
-            lines = script(tested, report.failed[0], report.how, report.superset)
+            lines = [f"{failed.code}: {failed.worst.text}" for failed in report.failed]
+            text = script(tested, report.failed[0], report.how, report.superset)
             pytest.fail(
                 f"{report.wrong} of {report.asked} cases about {AREAS[area]}\n"
-                + "\n".join(said)
-                + f"\n\nThis reproduces the first:\n\n{lines}",
+                + "\n".join(lines)
+                + f"\n\nThis reproduces the first:\n\n{text}",
                 pytrace=False,
             )
         if not report.conforms:
@@ -95,6 +94,6 @@ class NeighborListConformance:
     @staticmethod
     def _answers(tested: PairList) -> bool:
         """Whether it answers the plainest of questions, as far as it claims to."""
-        plain = [one("a gas", "few", gas(20, 6.0, 0), 6.0), one("a free gas", "few", gas(20, 3.0, 0))]
-        report = examine(tested, asked=as_kept(tested, plain), large=False, shrink=False)
+        plain = [once("a gas", "few", gas(20, 6.0, 0), 6.0), once("a free gas", "few", gas(20, 3.0, 0))]
+        report = examine(tested, asked=questions.as_kept(tested, plain), large=False, shrink=False)
         return not report.asked or bool(report.failed) or report.conforms

@@ -1,4 +1,7 @@
-"""What a neighbor list gave, whatever form it has: brought into one, or told what is wrong with it."""
+"""The pairs that a neighbor list gave, whatever form they have, as arrays by name.
+
+The scripts that reproduce a failure contain this file as it is: it needs numpy alone.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +10,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy import ndarray
 
-#: Names that the parts of an answer go by in mappings and attributes.
+#: Names of the parts of an answer in mappings and attributes.
 NAMES = {
     "i": ("i", "first", "centers", "idx_i", "senders"),
     "j": ("j", "second", "neighbors", "idx_j", "receivers"),
@@ -17,7 +19,6 @@ NAMES = {
     "distance": ("distance", "distances", "d"),
     "vector": ("vector", "vectors", "D"),
 }
-
 _ROWS = "pairs one by one are to be tuples (i, j) in a list, or rows of an array"
 
 
@@ -31,32 +32,23 @@ class Answer:
 
     Attributes:
         i, j: atoms, shape (rows,).
-        shift: lattice vectors added to atom j, whole numbers of shape (rows, 3); None where it has none.
+        shift: lattice vectors added to atom j, integers of shape (rows, 3); None where it has none.
         distance: length, shape (rows,); None where it has none.
         vector: x_j - x_i of the image, length, shape (rows, 3); None where it has none.
     """
 
-    i: ndarray
-    j: ndarray
-    shift: ndarray | None = None
-    distance: ndarray | None = None
-    vector: ndarray | None = None
+    i: np.ndarray
+    j: np.ndarray
+    shift: np.ndarray | None = None
+    distance: np.ndarray | None = None
+    vector: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.i)
 
     def same(self, other: Answer) -> bool:
-        """Whether two answers have the same rows in the same order."""
-        return all(
-            mine is theirs if mine is None or theirs is None else np.array_equal(mine, theirs)
-            for mine, theirs in (
-                (self.i, other.i),
-                (self.j, other.j),
-                (self.shift, other.shift),
-                (self.distance, other.distance),
-                (self.vector, other.vector),
-            )
-        )
+        """Whether another answer has the same rows in the same order."""
+        return all(map(np.array_equal, vars(self).values(), vars(other).values()))
 
 
 def read(given: Any) -> Answer:
@@ -71,63 +63,56 @@ def read(given: Any) -> Answer:
     Raises:
         Malformed: it is none of these.
     """
-    parts = _parts(given)
-    rows: dict[str, ndarray] = {}
-    for name in ("i", "j"):
-        rows[name] = _indices(parts[name], name)
-    count = len(rows["i"])
-    if len(rows["j"]) != count:
-        raise Malformed(f"i has {count} entries and j has {len(rows['j'])}")
-    for name, width in (("shift", 3), ("distance", 1), ("vector", 3)):
-        if parts.get(name) is not None:
-            rows[name] = _numbers(parts[name], name, count, width)
+    given = parts(given)
+    i, j = _indices(given["i"], "i"), _indices(given["j"], "j")
+    if len(j) != len(i):
+        raise Malformed(f"i has {len(i)} entries and j has {len(j)}")
+    rows = {
+        name: _numbers(given[name], name, (len(i), 3) if name != "distance" else (len(i),))
+        for name in ("shift", "distance", "vector")
+        if given.get(name) is not None
+    }
     if "shift" in rows:
         whole = np.rint(rows["shift"])
         if not np.array_equal(whole, rows["shift"]):
             raise Malformed("shifts are not whole numbers of lattice vectors")
         rows["shift"] = whole.astype(np.int64)
-    return Answer(**rows)
+    return Answer(i, j, **rows)
 
 
-def handed_out(given: Any) -> list[ndarray]:
-    """The arrays of an answer as they lie in the list's memory, where they lie in an array at all.
+def parts(given: Any) -> dict[str, Any]:
+    """What was returned, by the names of `Answer`, with i and j at least.
 
     Raises:
         Malformed: it is no list of pairs.
     """
-    # np.asarray of a tensor on the same device is a view of it, and of a list of numbers none
-    return [np.asarray(part) for part in _parts(given).values() if hasattr(part, "__array__")]
-
-
-def _parts(given: Any) -> dict[str, Any]:
     if given is None:
         raise Malformed("it returned None")
-    if isinstance(given, Mapping):
-        found = {
-            name: next((given[word] for word in words if word in given), None)
-            for name, words in NAMES.items()
-        }
-    elif isinstance(given, list) and all(isinstance(row, tuple) for row in given):
+    if isinstance(given, list) and all(isinstance(row, tuple) for row in given):
         return _one_by_one(given)
+    if isinstance(given, Mapping):
+        named = {
+            name: next((given[key] for key in keys if key in given), None) for name, keys in NAMES.items()
+        }
     elif isinstance(given, Sequence) and not isinstance(given, str):
         return _in_order([_array(part, f"part {n + 1}") for n, part in enumerate(given)])
     elif hasattr(given, "i") and hasattr(given, "j"):
-        found = {
-            name: next((getattr(given, word) for word in words if hasattr(given, word)), None)
-            for name, words in NAMES.items()
+        named = {
+            name: next((getattr(given, key) for key in keys if hasattr(given, key)), None)
+            for name, keys in NAMES.items()
         }
     else:
         return _one_by_one(given)
-    if found["i"] is None or found["j"] is None:
+    if named["i"] is None or named["j"] is None:
         raise Malformed("it has no i and j")
-    return found
+    return named
 
 
 def _one_by_one(given: Any) -> dict[str, Any]:
-    """Rows (i, j); none at all where nothing is given."""
+    """Rows (i, j)."""
     table = _array(given, "the answer")
     if table.size == 0 and table.ndim:
-        return {"i": np.zeros(0, np.int64), "j": np.zeros(0, np.int64)}
+        table = np.zeros((0, 2), np.int64)
     if table.ndim != 2 or table.shape[1] != 2:
         raise Malformed(
             f"it returned {type(given).__name__} of shape {table.shape}, not (i, j), (i, j, shift), ..., a "
@@ -136,30 +121,27 @@ def _one_by_one(given: Any) -> dict[str, Any]:
     return {"i": table[:, 0], "j": table[:, 1]}
 
 
-def _in_order(parts: list[ndarray]) -> dict[str, Any]:
+def _in_order(arrays: list[np.ndarray]) -> dict[str, Any]:
     """Parts of a tuple by their places and shapes."""
-    if not 2 <= len(parts) <= 5:
-        raise Malformed(f"it returned {len(parts)} parts, not (i, j), (i, j, shift), ...; {_ROWS}")
-    found: dict[str, Any] = {"i": parts[0], "j": parts[1]}
-    if len(parts) == 2 and parts[0].ndim == 2 and parts[0].shape[0] == 2:
+    if not 2 <= len(arrays) <= 5:
+        raise Malformed(f"it returned {len(arrays)} parts, not (i, j), (i, j, shift), ...; {_ROWS}")
+    first, second = arrays[:2]
+    if len(arrays) == 2 and first.ndim == 2 and first.shape[0] == 2:
         # an edge index of shape (2, rows) with shifts
-        return {"i": parts[0][0], "j": parts[0][1], "shift": parts[1]}
-    for part in parts[2:]:
-        if part.ndim <= 1:
-            name = "distance"
-        elif "shift" not in found and np.array_equal(np.rint(part), part):
-            name = "shift"
-        else:
-            name = "vector"
-        if name in found:
+        return {"i": first[0], "j": first[1], "shift": second}
+    named: dict[str, Any] = {"i": first, "j": second}
+    for part in arrays[2:]:
+        whole = part.ndim > 1 and "shift" not in named and np.array_equal(np.rint(part), part)
+        name = "distance" if part.ndim <= 1 else "shift" if whole else "vector"
+        if name in named:
             raise Malformed(f"two of its parts look like a {name}; return a mapping with names instead")
         if name == "distance" and part.size and part.dtype.kind in "iu":
             raise Malformed(f"the distances are whole numbers; {_ROWS}")
-        found[name] = part
-    return found
+        named[name] = part
+    return named
 
 
-def _array(part: Any, name: str) -> ndarray:
+def _array(part: Any, name: str) -> np.ndarray:
     try:
         array = np.asarray(part)
     except Exception as error:  # ragged rows, arrays on other devices
@@ -169,7 +151,7 @@ def _array(part: Any, name: str) -> ndarray:
     return array
 
 
-def _indices(part: Any, name: str) -> ndarray:
+def _indices(part: Any, name: str) -> np.ndarray:
     array = _array(part, name)
     if array.size == 0:
         return np.zeros(0, np.int64)
@@ -180,13 +162,12 @@ def _indices(part: Any, name: str) -> ndarray:
     return array.astype(np.int64)
 
 
-def _numbers(part: Any, name: str, count: int, width: int) -> ndarray:
+def _numbers(part: Any, name: str, shape: tuple[int, ...]) -> np.ndarray:
     array = _array(part, name)
-    wanted = (count,) if width == 1 else (count, width)
-    if array.size == 0 and count == 0:
-        return np.zeros(wanted)
-    if array.shape != wanted:
-        raise Malformed(f"{name} has shape {array.shape} where i has {count} entries")
+    if array.size == 0 and shape[0] == 0:
+        return np.zeros(shape)
+    if array.shape != shape:
+        raise Malformed(f"{name} has shape {array.shape} where i has {shape[0]} entries")
     if array.dtype.kind not in "iuf":
         raise Malformed(f"{name} has dtype {array.dtype}, not real numbers")
     return array.astype(np.float64)

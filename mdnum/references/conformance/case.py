@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Ge
 from numpy import ndarray
+from pydantic import FiniteFloat, PlainValidator, StrictBool
 
 from mdnum.references.oracle import PairSet
 
-#: What a case is about, by the word it goes by; in the order in which they are asked and told.
+#: What a case is about, by the name of its area; in the order in which they are asked and reported.
 AREAS: Mapping[str, str] = MappingProxyType(
     {
         "few": "no atom, one, two",
@@ -33,8 +35,27 @@ AREAS: Mapping[str, str] = MappingProxyType(
     }
 )
 
-#: Areas of a list that is kept and brought up to date.
-KEPT = ("motion", "wrapping", "strain", "rule")
+Pbc = tuple[StrictBool, StrictBool, StrictBool]
+
+
+def _rows(value: Any) -> ndarray:
+    rows = np.array(value, np.float64).reshape(-1, 3)
+    if not np.isfinite(rows).all():
+        raise ValueError("coordinates that are not finite")
+    return rows
+
+
+def _vectors(value: Any) -> ndarray:
+    rows = _rows(value)
+    if rows.shape != (3, 3):
+        raise ValueError("not three lattice vectors")
+    return rows
+
+
+#: Arrays that JSON gives back: a double's shortest decimal is that double again.
+Rows = Annotated[ndarray, PlainValidator(_rows)]
+Vectors = Annotated[ndarray, PlainValidator(_vectors)]
+Length = Annotated[FiniteFloat, Ge(0)]
 
 
 @dataclass(frozen=True)
@@ -44,14 +65,14 @@ class Still:
     Attributes:
         positions: length, shape (atoms, 3).
         cell: lattice vectors as rows, length; rows of axes that do not repeat may hold anything finite.
-        fresh: a list that is kept starts anew here, rather than being brought up to date.
-        skin: that it starts anew with, length; None for that of the case.
+        fresh: a list that is kept is allocated here, rather than updated.
+        skin: that it is allocated with, length; None for that of the case.
     """
 
-    positions: ndarray
-    cell: ndarray
-    fresh: bool = False
-    skin: float | None = None
+    positions: Rows
+    cell: Vectors
+    fresh: StrictBool = False
+    skin: Length | None = None
 
     def __post_init__(self) -> None:
         for name in ("positions", "cell"):
@@ -67,7 +88,7 @@ class Case:
     Attributes:
         name: what is special, in words.
         area: a key of `AREAS`.
-        stills: one for a list that is asked once; the steps of a script for one that is kept.
+        stills: one for a list that is asked once; the steps of a sequence for one that is kept.
         pbc: which axes repeat.
         r_cut: cutoff, length.
         skin: of a list that is kept, length; the largest where it changes.
@@ -78,10 +99,12 @@ class Case:
     name: str
     area: str
     stills: tuple[Still, ...]
-    pbc: tuple[bool, bool, bool]
-    r_cut: float
-    skin: float = 0.0
-    known: PairSet | None = field(default=None, repr=False, compare=False)
+    pbc: Pbc
+    r_cut: Length
+    skin: Length = 0.0
+    known: Annotated[PairSet | None, PlainValidator(lambda pairs: pairs)] = field(
+        default=None, repr=False, compare=False
+    )
     motions: int = 0
 
     @property
@@ -95,30 +118,49 @@ class Case:
         return len(self.stills)
 
     def until(self, steps: int) -> Case:
-        """The first steps of it."""
+        """Its first steps."""
         return replace(self, stills=self.stills[:steps])
 
     def only(self, atoms: ndarray) -> Case:
-        """The same with these atoms alone, in this order; a still that lacks some has the others."""
+        """The same with these atoms alone, in this order; where a still lacks some, the others."""
         stills = tuple(
             replace(still, positions=still.positions[atoms[atoms < len(still.positions)]])
             for still in self.stills
         )
         return replace(self, stills=stills, known=None if self.known is None else _among(self.known, atoms))
 
-    def plain(self) -> dict[str, Any]:
-        """For a table: what it is, without its coordinates."""
-        return {
-            "case": self.name,
-            "area": self.area,
-            "atoms": self.atoms,
-            "steps": self.steps,
-            "r_cut": float(self.r_cut),
-            "skin": float(self.skin),
-        }
+    def changed(self, positions: Any = None, cell: Any = None, **other: Any) -> Case:
+        """The same with a function of the positions, and one of the cell, applied at every step."""
+        stills = tuple(
+            replace(
+                still,
+                positions=positions(still.positions) if positions else still.positions,
+                cell=cell(still.cell) if cell else still.cell,
+            )
+            for still in self.stills
+        )
+        return replace(self, **{"stills": stills, "known": None, **other})
+
+    def equals(self, other: Case) -> bool:
+        """Whether another case has the same numbers."""
+        return (self.r_cut, self.skin) == (other.r_cut, other.skin) and all(
+            np.array_equal(a.positions, b.positions) and np.array_equal(a.cell, b.cell)
+            for a, b in zip(self.stills, other.stills, strict=True)
+        )
 
 
-def one(
+def matrix(cell: Any) -> ndarray:
+    """Lattice vectors as rows, of a matrix, of three edges or of the edge of a cube."""
+    cell = np.asarray(cell, np.float64)
+    return np.diag(cell * np.ones(3)) if cell.ndim < 2 else cell
+
+
+def _axes(pbc: bool | Sequence[bool]) -> Pbc:
+    x, y, z = (pbc,) * 3 if isinstance(pbc, bool | np.bool_) else pbc
+    return bool(x), bool(y), bool(z)
+
+
+def once(
     name: str,
     area: str,
     positions: Any,
@@ -128,15 +170,12 @@ def one(
     known: PairSet | None = None,
 ) -> Case:
     """A case of a single still; without a cell, free atoms."""
-    axes = (bool(pbc),) * 3 if isinstance(pbc, bool | np.bool_) else tuple(bool(axis) for axis in pbc)
     if cell is None:
-        cell, axes = np.zeros((3, 3)), (False, False, False)
-    matrix = np.asarray(cell, np.float64)
-    matrix = np.diag(matrix * np.ones(3)) if matrix.ndim < 2 else matrix
-    return Case(name, area, (Still(positions, matrix),), axes, float(r_cut), known=known)  # type: ignore[arg-type]
+        cell, pbc = np.zeros((3, 3)), False
+    return Case(name, area, (Still(positions, matrix(cell)),), _axes(pbc), float(r_cut), known=known)
 
 
-def script(
+def sequence(
     name: str,
     area: str,
     path: Iterable[Any],
@@ -146,13 +185,9 @@ def script(
     pbc: bool | Sequence[bool] = True,
 ) -> Case:
     """A case of several stills: positions, or (positions, cell), one after the other."""
-    stills = []
-    for place in path:
-        positions, box = place if isinstance(place, tuple) else (place, cell)
-        matrix = np.asarray(box, np.float64)
-        stills.append(Still(positions, np.diag(matrix * np.ones(3)) if matrix.ndim < 2 else matrix))
-    axes = (bool(pbc),) * 3 if isinstance(pbc, bool | np.bool_) else tuple(bool(axis) for axis in pbc)
-    return Case(name, area, tuple(stills), axes, float(r_cut), float(skin))  # type: ignore[arg-type]
+    places = (place if isinstance(place, tuple) else (place, cell) for place in path)
+    stills = tuple(Still(positions, matrix(box)) for positions, box in places)
+    return Case(name, area, stills, _axes(pbc), float(r_cut), float(skin))
 
 
 def _among(pairs: PairSet, atoms: ndarray) -> PairSet:
@@ -161,9 +196,6 @@ def _among(pairs: PairSet, atoms: ndarray) -> PairSet:
     new = np.full(most, -1)
     new[atoms] = np.arange(len(atoms))
     i, j, shift = new[pairs.i], new[pairs.j], pairs.shift.copy()
-    turned = i > j
-    shift[turned] *= -1
+    shift[i > j] *= -1
     i, j = np.minimum(i, j), np.maximum(i, j)
-    kept = i >= 0
-    moved = PairSet(i, j, shift, pairs.distance, pairs.inside, pairs.exact)
-    return moved.select(kept)
+    return PairSet(i, j, shift, pairs.distance, pairs.inside, pairs.exact).select(i >= 0)

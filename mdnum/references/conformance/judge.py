@@ -1,21 +1,140 @@
-"""An answer against the truth: what is missing, too much, doubled, misplaced or mismeasured."""
+"""An answer against the truth: what is missing, too much, duplicated, misplaced or mismeasured."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Annotated, Literal, get_args
 
 import numpy as np
+from annotated_types import Ge
 from numpy import ndarray
 
 from mdnum.references.conformance.answer import Answer
-from mdnum.references.conformance.truth import DOUBLE, Truth, keys
+from mdnum.references.conformance.case import Case
+from mdnum.references.oracle import all_pairs, completed, exactly_inside, rounding_bound
 
-_TOLD = 3  # pairs that are named
+SINGLE, DOUBLE = 2.0**-24, 2.0**-53
+_NAMED = 3  # pairs in a message
+#: Ways to be wrong, by how bad they are: the first make energies wrong without a word.
+Code = Literal[
+    "CRASHED",
+    "MISSING",
+    "EXTRA",
+    "DUPLICATE",
+    "SELF",
+    "RANGE",
+    "ONE_SIDED",
+    "SHIFTS",
+    "DISTANCES",
+    "VECTORS",
+    "MALFORMED",
+    "NO_ANSWER",
+    "CHANGED_INPUT",
+    "RAISED",
+]
+CODES: tuple[Code, ...] = get_args(Code)
+#: Those of cases in which nothing came back.
+SILENT = ("CRASHED", "NO_ANSWER", "RAISED")
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Pairs in and around the cutoff at one still.
+
+    Attributes:
+        positions, cell: as the list was given them; rows of axes that do not repeat are zero.
+        i, j, shift, distance: as in `PairSet`, out to the reach that was asked for.
+        tie: the pairs at exactly r_cut.
+        r_cut: length.
+        scale: `rounding_bound` for a unit roundoff of 1, times what fractional coordinates of a skewed cell
+            lose: how far a distance can be off, by the roundoff of the arithmetic.
+        reach: pairs as far as this may be listed, length; the cutoff unless a list holds a skin.
+        inside: by real arithmetic, r < r_cut.
+    """
+
+    positions: ndarray
+    cell: ndarray
+    i: ndarray
+    j: ndarray
+    shift: ndarray
+    distance: ndarray
+    tie: ndarray
+    r_cut: float
+    scale: float
+    reach: float
+    inside: ndarray
+
+    def needed(self, unit: float) -> ndarray:
+        """The pairs that a list of this roundoff cannot be excused for lacking."""
+        return self.distance < self.r_cut - unit * self.scale
+
+    def allowed(self, unit: float) -> ndarray:
+        """The pairs that it may have."""
+        return self.distance <= self.reach + unit * self.scale
+
+
+def truth(case: Case, step: int, *, reach: float | None = None, unit: float = DOUBLE) -> Truth:
+    """The pairs of one still of a case.
+
+    Args:
+        reach: how far pairs may be listed, length; the cutoff by default.
+        unit: the coarsest roundoff that will be asked about.
+    Error: decisions within rounding of the cutoff are those of rational arithmetic; see `all_pairs`.
+    """
+    still, pbc = case.stills[step], np.array(case.pbc)
+    positions, r_cut = still.positions, case.r_cut
+    cell = np.where(pbc[:, None], still.cell, 0.0)
+    scale = rounding_bound(positions, cell, r_cut, unit_roundoff=1.0) * conditioning(cell, pbc)
+    reach = r_cut if reach is None else reach
+    if case.known is not None and case.steps == 1:
+        pairs = case.known
+    else:
+        pairs = all_pairs(positions, still.cell, pbc, r_cut, reach=reach + unit * scale)
+    tie = np.zeros(len(pairs), bool)
+    for row in np.flatnonzero(pairs.exact & ~pairs.inside):
+        i, j, shift = int(pairs.i[row]), int(pairs.j[row]), pairs.shift[row]
+        tie[row] = exactly_inside(positions, cell, i, j, shift, r_cut, closed=True)
+    return Truth(
+        positions, cell, pairs.i, pairs.j, pairs.shift, pairs.distance, tie, r_cut, scale, reach, pairs.inside
+    )
+
+
+def conditioning(cell: ndarray, pbc: ndarray) -> float:
+    """What going through fractional coordinates and back can multiply a rounding error by; at least 1.
+
+    Source: Higham, Accuracy and Stability of Numerical Algorithms, 2nd ed., section 7.1: the condition number
+    of the periodic lattice vectors, each scaled to length 1 because lengths alone cost nothing.
+    """
+    if not pbc.any():
+        return 1.0
+    rows = cell[pbc] / np.linalg.norm(cell[pbc], axis=1)[:, None]
+    return max(1.0, float(np.linalg.cond(rows)))
+
+
+def keys(count: int, i: ndarray, j: ndarray, shift: ndarray | None, *others: tuple) -> list[ndarray]:
+    """One whole number for each row, equal where rows are: of these rows and of others, (i, j, shift) each.
+
+    Args:
+        count: atoms.
+        shift: None to tell rows by their atoms alone.
+    """
+    sets = [(i, j, shift), *others]
+    lengths = np.cumsum([0, *(len(rows[0]) for rows in sets)])
+    key = np.concatenate([np.asarray(rows[0], np.int64) * count + rows[1] for rows in sets])
+    if shift is not None:
+        for axis in range(3):
+            column = np.concatenate([np.asarray(rows[2])[:, axis] for rows in sets])
+            # by rank: shifts of atoms far outside the box are large, but few of them differ
+            _, rank = np.unique(column, return_inverse=True)
+            _, key = np.unique(key, return_inverse=True)
+            key = key * (int(rank.max(initial=0)) + 1) + rank
+    return [key[first:last] for first, last in pairwise(lengths)]
 
 
 @dataclass(frozen=True)
 class Conventions:
-    """How a list speaks, which is nobody's mistake.
+    """What kind of list it is, which is nobody's mistake.
 
     Attributes:
         full: every pair from both of its atoms (True), or once (False).
@@ -35,43 +154,16 @@ class Failure:
     """One way in which an answer is wrong.
 
     Attributes:
-        code: MISSING, EXTRA, DUPLICATE, SELF, ONE_SIDED, SHIFTS, DISTANCES, VECTORS, RANGE, MALFORMED,
-            RAISED, NO_ANSWER, CHANGED_INPUT or CRASHED.
+        code: one of `CODES`.
         text: what was seen, with atoms and numbers.
         count: how many rows.
         step: at which still.
     """
 
-    code: str
+    code: Code
     text: str
-    count: int = 1
-    step: int = 0
-
-    def at(self, step: int) -> Failure:
-        """The same at another still."""
-        return replace(self, step=step)
-
-
-#: Codes by how bad they are: the first is what makes energies wrong without a word.
-CODES = (
-    "CRASHED",
-    "MISSING",
-    "EXTRA",
-    "DUPLICATE",
-    "SELF",
-    "RANGE",
-    "ONE_SIDED",
-    "SHIFTS",
-    "DISTANCES",
-    "VECTORS",
-    "MALFORMED",
-    "NO_ANSWER",
-    "CHANGED_INPUT",
-    "RAISED",
-)
-
-#: Those of cases in which nothing came back.
-SILENT = ("CRASHED", "NO_ANSWER", "RAISED")
+    count: Annotated[int, Ge(0)] = 1
+    step: Annotated[int, Ge(0)] = 0
 
 
 def judge(answer: Answer, truth: Truth, how: Conventions) -> list[Failure]:
@@ -93,139 +185,92 @@ def judge(answer: Answer, truth: Truth, how: Conventions) -> list[Failure]:
             f"({answer.i[row]}, {answer.j[row]})"
         )
         return [Failure("RANGE", text, int(outside.sum()))]
-    rows = _Rows(answer, truth, how)
-    found = rows.failures()
-    # nothing that shifts would mend: a pair told once, an atom that is its own neighbor where it stands
+    found = _compare(answer, truth, how)
+    # nothing that shifts would mend: a pair listed once, an atom that is its own neighbor where it stands
     plain = {failure.code for failure in found} <= {"ONE_SIDED", "SELF"}
-    if found and not plain and answer.shift is not None and not rows.only_atoms().failures():
+    shifted = found and not plain and answer.shift is not None
+    if shifted and not _compare(replace(answer, shift=None), truth, how):
         hint = _shift_hint(answer, truth, how)
         return [Failure("SHIFTS", f"the atoms are right and the shifts are not: {found[0].text}{hint}")]
-    if not found:
-        found = _measures(answer, truth, how)
+    return found or _measures(answer, truth, how)
+
+
+def _compare(answer: Answer, truth: Truth, how: Conventions) -> list[Failure]:
+    """What is wrong with the rows of an answer, matched with those of the truth."""
+    i, j, shifts = answer.i, answer.j, answer.shift is not None
+    shift = how.sign * answer.shift if answer.shift is not None else np.zeros((len(i), 3), np.int64)
+    right = _both(truth) if how.full else (truth.i, truth.j, truth.shift)
+    if not how.full:
+        i, j, shift = _one_way(i, j, shift)
+    key, right_key, turned, own = keys(
+        len(truth.positions),
+        i,
+        j,
+        shift if shifts else None,
+        right,
+        (j, i, -shift),
+        (i, i, np.zeros_like(shift)),
+    )
+    needed_rows, allowed_rows = (
+        np.tile(rows, 2 if how.full else 1) for rows in (truth.needed(how.unit), truth.allowed(how.unit))
+    )
+    labels, number = np.unique(np.concatenate([key, right_key, turned]), return_inverse=True)
+    mine, theirs, mirror = np.split(number, [len(key), len(key) + len(right_key)])
+    have, mirrored = np.bincount(mine, minlength=len(labels)), np.bincount(mirror, minlength=len(labels))
+    needed = np.bincount(theirs[needed_rows], minlength=len(labels))
+    allowed = np.bincount(theirs[allowed_rows], minlength=len(labels))
+    lacking, surplus = np.clip(needed - have, 0, None), np.clip(have - allowed, 0, None)
+    found = []
+
+    def missing(gone: ndarray, what: str) -> str:
+        rows = np.flatnonzero(needed_rows & (gone[theirs] > 0))
+        named = [
+            f"{right[0][row]}-{right[1][row]}{_through(right[2][row])} at "
+            f"{truth.distance[row % len(truth.i)]:.9g}"
+            for row in rows[:_NAMED]
+        ]
+        more = ", ..." if len(rows) > _NAMED else ""
+        return f"{int(gone.sum())} of {int(needed_rows.sum())} rows {what}: {', '.join(named)}{more}"
+
+    # a pair that is there from its other side is a mistake of another kind
+    one_sided = (lacking > 0) & (mirrored > have) & how.full
+    gone = lacking * ~one_sided
+    if gone.any():
+        text = missing(gone, f"missing inside r_cut = {truth.r_cut:.9g}")
+        found.append(Failure("MISSING", text, int(gone.sum())))
+    if one_sided.any():
+        found.append(Failure("ONE_SIDED", missing(one_sided * 1, "from one of its atoms only")))
+    excess = surplus[mine] > 0
+    selfs = excess & (key == own) & (shifts or allowed[mine] == 0)
+    repeated = excess & ~selfs & (allowed[mine] > 0)
+    kinds: tuple[tuple[Code, ndarray], ...] = (
+        ("EXTRA", excess & ~selfs & ~repeated),
+        ("DUPLICATE", repeated),
+        ("SELF", selfs),
+    )
+    for code, rows in kinds:
+        if not rows.any():
+            continue
+        first = int(np.argmax(rows))
+        a, b, image = int(i[first]), int(j[first]), _through(shift[first]) if shifts else ""
+        count = int(surplus[np.unique(mine[rows])].sum())
+        if code == "EXTRA":
+            apart = truth.positions[b] - truth.positions[a] + shift[first] @ truth.cell
+            far = f" at {np.linalg.norm(apart):.9g}," if shifts else ", which are not inside"
+            text = f"{count} rows beyond the cutoff, first {a}-{b}{image}{far} r_cut = {truth.r_cut:.9g}"
+        elif code == "DUPLICATE":
+            times, right_times = int((mine == mine[first]).sum()), int(allowed[mine[first]])
+            text = f"{a}-{b}{image} is listed {times} times instead of {right_times}; {count} rows too many"
+        else:
+            text = f"atoms that are their own neighbors: {count}, first {a}"
+        found.append(Failure(code, text, count))
+    if not found and how.full and not np.array_equal(have, mirrored):
+        row = int(np.argmax((have != mirrored)[mine]))
+        text = (
+            f"within rounding of the cutoff, {i[row]} has {j[row]} as a neighbor, and not the other way round"
+        )
+        found.append(Failure("ONE_SIDED", text, int((have != mirrored).sum())))
     return found
-
-
-class _Rows:
-    """The rows of an answer and of the truth, matched."""
-
-    def __init__(self, answer: Answer, truth: Truth, how: Conventions, shifts: bool = True):
-        self.answer, self.truth, self.how = answer, truth, how
-        i, j, shift = answer.i, answer.j, answer.shift
-        self.shifts = shifts and shift is not None
-        if shift is None or not shifts:
-            shift = np.zeros((len(i), 3), np.int64)
-        shift = how.sign * shift
-        if how.full:
-            right = _both(truth)
-        else:
-            i, j, shift = _one_way(i, j, shift)
-            right = (truth.i, truth.j, truth.shift)
-        self.rows, self.right = (i, j, shift), right
-        mine, theirs, turned, own = keys(
-            len(truth.positions),
-            i,
-            j,
-            shift if self.shifts else None,
-            right,
-            (j, i, -shift),
-            (i, i, np.zeros_like(shift)),
-        )
-        self.key, self.right_key, self.turned, self.own = mine, theirs, turned, own
-        twice = 2 if how.full else 1
-        self.needed = np.tile(truth.needed(how.unit), twice)
-        self.allowed = np.tile(truth.allowed(how.unit), twice)
-
-    def only_atoms(self) -> _Rows:
-        """The same without looking at shifts."""
-        return _Rows(self.answer, self.truth, self.how, shifts=False)
-
-    def failures(self) -> list[Failure]:
-        labels, number = np.unique(
-            np.concatenate([self.key, self.right_key, self.turned]), return_inverse=True
-        )
-        a, b = len(self.key), len(self.key) + len(self.right_key)
-        mine, theirs, turned = number[:a], number[a:b], number[b:]
-        size = len(labels)
-        have = np.bincount(mine, minlength=size)
-        mirrored = np.bincount(turned, minlength=size)
-        needed = np.bincount(theirs[self.needed], minlength=size)
-        allowed = np.bincount(theirs[self.allowed], minlength=size)
-        lacking = np.clip(needed - have, 0, None)
-        surplus = np.clip(have - allowed, 0, None)
-        found = []
-        if lacking.any():
-            # a pair that is there from its other side is a mistake of another kind
-            one_sided = (lacking > 0) & (mirrored > have) & self.how.full
-            gone = lacking * ~one_sided
-            if gone.any():
-                found.append(Failure("MISSING", self._missing(gone, theirs), int(gone.sum())))
-            if one_sided.any():
-                found.append(Failure("ONE_SIDED", self._missing(one_sided * 1, theirs, True)))
-        if surplus.any():
-            found += self._surplus(surplus, allowed, mine)
-        if not found and self.how.full and not np.array_equal(have, mirrored):
-            row = int(np.argmax((have != mirrored)[mine]))
-            i, j, _ = self._named(self.rows, row)
-            text = f"within rounding of the cutoff, {i} has {j} as a neighbor but {j} does not have {i}"
-            found.append(Failure("ONE_SIDED", text, int((have != mirrored).sum())))
-        return found
-
-    def _missing(self, gone: ndarray, theirs: ndarray, one_sided: bool = False) -> str:
-        rows = np.flatnonzero(self.needed & (gone[theirs] > 0))
-        half = len(self.truth.i)
-        total = int(gone.sum())
-        told = []
-        for row in rows[:_TOLD]:
-            i, j, shift = self._named(self.right, row)
-            told.append(f"{i}-{j}{_through(shift)} at {self.truth.distance[row % half]:.9g}")
-        of = f"{total} of {int(self.needed.sum())} rows"
-        what = "from one of its atoms only" if one_sided else f"missing inside r_cut = {self.truth.r_cut:.9g}"
-        return f"{of} {what}: {', '.join(told)}{', ...' if len(rows) > _TOLD else ''}"
-
-    def _surplus(self, surplus: ndarray, allowed: ndarray, mine: ndarray) -> list[Failure]:
-        found = []
-        rows_of = surplus[mine] > 0
-        itself = rows_of & (self.key == self.own)
-        if self.shifts:
-            selfs = itself
-        else:
-            selfs = itself & (allowed[mine] == 0)
-        repeated = rows_of & ~selfs & (allowed[mine] > 0)
-        phantom = rows_of & ~selfs & ~repeated
-        for code, rows in (("EXTRA", phantom), ("DUPLICATE", repeated), ("SELF", selfs)):
-            if not rows.any():
-                continue
-            first = int(np.argmax(rows))
-            i, j, shift = self._named(self.rows, first)
-            count = int(surplus[np.unique(mine[rows])].sum())
-            if code == "EXTRA":
-                text = f"{count} rows beyond the cutoff, first {i}-{j}{self._where(i, j, shift)}"
-            elif code == "DUPLICATE":
-                have = int((mine == mine[first]).sum())
-                text = (
-                    f"{i}-{j}{_through(shift) if self.shifts else ''} is listed {have} times instead of "
-                    f"{int(allowed[mine[first]])}; {count} rows too many in all"
-                )
-            else:
-                told = (
-                    "1 atom is its own neighbor" if count == 1 else f"{count} atoms are their own neighbors"
-                )
-                text = f"{told}, first {i}" if count > 1 else f"{told}: {i}"
-            found.append(Failure(code, text, count))
-        return found
-
-    def _where(self, i: int, j: int, shift: ndarray) -> str:
-        """How far apart two atoms are, as the list tells it, or in the images nearest to each other."""
-        positions, cell = self.truth.positions, self.truth.cell
-        if self.shifts:
-            apart = float(np.linalg.norm(positions[j] - positions[i] + shift @ cell))
-            return f"{_through(shift)} at {apart:.9g}, r_cut = {self.truth.r_cut:.9g}"
-        return f", which are not inside r_cut = {self.truth.r_cut:.9g}"
-
-    @staticmethod
-    def _named(rows: tuple[ndarray, ndarray, ndarray], row: int) -> tuple[int, int, ndarray]:
-        i, j, shift = rows
-        return int(i[row]), int(j[row]), np.asarray(shift)[row]
 
 
 def _through(shift: ndarray) -> str:
@@ -260,14 +305,11 @@ def _shift_hint(answer: Answer, truth: Truth, how: Conventions) -> str:
         shift = answer.shift
         if other is how:
             axes = np.any(truth.cell != 0, axis=1)
-            completed = truth.cell.copy()
-            if not axes.all():
-                free = np.flatnonzero(~axes)
-                basis = np.linalg.svd(np.vstack([truth.cell[axes], np.zeros((1, 3))]))[2]
-                completed[free] = basis[3 - len(free) :]
-            home = np.where(axes, np.floor(np.linalg.solve(completed.T, truth.positions.T).T), 0)
+            home = np.where(
+                axes, np.floor(np.linalg.solve(completed(truth.cell, axes).T, truth.positions.T).T), 0
+            )
             shift = shift + how.sign * (home[answer.i] - home[answer.j]).astype(np.int64)
-        if not _Rows(replace(answer, shift=shift), truth, other).failures():
+        if not _compare(replace(answer, shift=shift), truth, other):
             return text
     return ""
 
@@ -296,7 +338,11 @@ def _measures(answer: Answer, truth: Truth, how: Conventions) -> list[Failure]:
         bent = None
     # a bound for a length near the cutoff; a code may form it from squares of its coordinates' differences
     bound = 2 * bound
-    for code, error, what in (("DISTANCES", off, "distance"), ("VECTORS", bent, "vector")):
+    measured: tuple[tuple[Code, ndarray | None, str], ...] = (
+        ("DISTANCES", off, "distance"),
+        ("VECTORS", bent, "vector"),
+    )
+    for code, error, what in measured:
         if error is None or not (wrong := ~(error <= bound)).any():
             continue
         row = int(np.argmax(np.where(np.isnan(error), np.inf, error)))

@@ -1,18 +1,74 @@
-"""Libraries' neighbor searches as functions of (positions, cell, pbc, r_cut), each complete in itself.
+"""Libraries' neighbor searches by name: functions of (positions, cell, pbc, r_cut), and lists that are kept.
 
-Every function here imports what it needs and names nothing outside itself, because its lines are printed in
-scripts that reproduce a failure without mdnum. It calls its library as a user would and mends nothing: atoms
-outside the box, odd cells and few atoms go in as they are.
+Every function and class here imports what it needs and names nothing outside itself, because its lines are
+printed in scripts that reproduce a failure without mdnum. It calls its library as a user would and mends
+nothing: atoms outside the box, odd cells and few atoms go in as they are.
 """
 
+# pyright: reportOptionalMemberAccess=false, reportOptionalCall=false
+# (attributes begin as None without a type: a script that prints a class knows no Any)
 from __future__ import annotations
 
 from dataclasses import replace
 
-from mdnum.references.conformance.lists import Limits, PairList, source_of
+from mdnum.references.conformance.lists import LISTS as LISTS
+from mdnum.references.conformance.lists import ListLimits, peer
+
+_SINGLE = 2.0**-24
+#: An edge of a box of at most FLT_EPSILON is taken for none (calc_distances.h): a library for Angstrom.
+_OF_MDANALYSIS = ListLimits(
+    minimum_image=True, all_axes=True, lower_triangular=True, right_handed=True, least_cutoff=1e-3
+)
+#: Measured on 512 pairs at the cutoff, release 0.2.29: in a periodic box 92 of 478 rows were one-sided, with
+#: and without a cell list; in free space, where displacement(a, b) is -displacement(b, a), none.
+_JAX_MD_KNOWN = {
+    "ONE_SIDED": "Its periodic displacement, mod(d + L/2, L) - L/2, rounds otherwise from i to j than from j "
+    "to i, and each direction is decided by itself; in free space no pair is one-sided."
+}
+# its box matrix is upper triangular, with vectors as columns
+_OF_JAX_MD = ListLimits(
+    minimum_image=True, all_axes=True, lower_triangular=True, right_handed=True, most_atoms=5_000
+)
 
 
+@peer("numpy-r2", "numpy", full=False, limits=ListLimits(minimum_image=True, most_atoms=5_000))
+def numpy_r2(positions, cell, pbc, r_cut):
+    """Plain numpy, one image of every pair: r² < r_cut²."""
+
+    import numpy as np
+
+    i, j = np.triu_indices(len(positions), 1)
+    d = positions[j] - positions[i]
+    if pbc.any():
+        box = np.where(pbc[:, None], cell, 0.0)
+        fraction = d @ np.linalg.pinv(box)
+        d = d - np.where(pbc, np.rint(fraction), 0.0) @ box
+    squared = (d * d).sum(axis=1)
+    inside = squared < r_cut * r_cut
+    return {"i": i[inside], "j": j[inside]}
+
+
+@peer("numpy", "numpy", full=False, limits=ListLimits(minimum_image=True, most_atoms=5_000))
+def numpy_r(positions, cell, pbc, r_cut):
+    """Plain numpy, one image of every pair: r < r_cut."""
+
+    import numpy as np
+
+    i, j = np.triu_indices(len(positions), 1)
+    d = positions[j] - positions[i]
+    if pbc.any():
+        box = np.where(pbc[:, None], cell, 0.0)
+        fraction = d @ np.linalg.pinv(box)
+        d = d - np.where(pbc, np.rint(fraction), 0.0) @ box
+    squared = (d * d).sum(axis=1)
+    inside = np.sqrt(squared) < r_cut
+    return {"i": i[inside], "j": j[inside]}
+
+
+@peer("ase", "ase", affords=0.3, limits=ListLimits(least_cutoff=0.5))
 def ase_neighbor_list(positions, cell, pbc, r_cut):
+    """ase.neighborlist.neighbor_list."""
+
     from ase import Atoms
     from ase.neighborlist import neighbor_list
 
@@ -21,7 +77,10 @@ def ase_neighbor_list(positions, cell, pbc, r_cut):
     return {"i": i, "j": j, "shift": shift, "distance": distance, "vector": vector}
 
 
+@peer("ase-primitive", "ase", affords=0.3, limits=ListLimits(atoms=1, most_atoms=20_000))
 def ase_primitive_list(positions, cell, pbc, r_cut):
+    """the list under ASE's LennardJones, EAM and Tersoff."""
+
     import numpy as np
     from ase import Atoms
     from ase.neighborlist import NeighborList, PrimitiveNeighborList
@@ -42,7 +101,10 @@ def ase_primitive_list(positions, cell, pbc, r_cut):
     return {"i": i, "j": j, "shift": shift}
 
 
+@peer("vesin", "vesin")
 def vesin_cells(positions, cell, pbc, r_cut):
+    """vesin's cell list, every pair from both atoms."""
+
     from vesin import NeighborList
 
     listed = NeighborList(cutoff=r_cut, full_list=True, algorithm="cell_list")
@@ -50,7 +112,10 @@ def vesin_cells(positions, cell, pbc, r_cut):
     return {"i": i, "j": j, "shift": shift, "distance": distance, "vector": vector}
 
 
+@peer("vesin-half", "vesin")
 def vesin_half(positions, cell, pbc, r_cut):
+    """vesin, every pair once."""
+
     from vesin import NeighborList
 
     listed = NeighborList(cutoff=r_cut, full_list=False)
@@ -58,7 +123,10 @@ def vesin_half(positions, cell, pbc, r_cut):
     return {"i": i, "j": j, "shift": shift, "distance": distance, "vector": vector}
 
 
+@peer("matscipy", "matscipy", limits=ListLimits(whole_cell=True))
 def matscipy_list(positions, cell, pbc, r_cut):
+    """matscipy.neighbours.neighbour_list."""
+
     from ase import Atoms
     from matscipy.neighbours import neighbour_list  # type: ignore
 
@@ -67,7 +135,10 @@ def matscipy_list(positions, cell, pbc, r_cut):
     return {"i": i, "j": j, "shift": shift, "distance": distance, "vector": vector}
 
 
+@peer("pymatgen", "pymatgen", limits=ListLimits(least_cutoff=0.01))
 def pymatgen_points(positions, cell, pbc, r_cut):
+    """pymatgen's find_points_in_spheres."""
+
     import numpy as np
     from pymatgen.core import Lattice  # type: ignore
     from pymatgen.optimization.neighbors import find_points_in_spheres  # type: ignore
@@ -85,7 +156,10 @@ def pymatgen_points(positions, cell, pbc, r_cut):
     return {"i": i[other], "j": j[other], "shift": shift[other].astype(int), "distance": distance[other]}
 
 
+@peer("mdanalysis", "MDAnalysis", full=False, unit=_SINGLE, affords=0.3, limits=_OF_MDANALYSIS)
 def mdanalysis_nsgrid(positions, cell, pbc, r_cut):
+    """MDAnalysis, nsgrid."""
+
     import numpy as np
     from MDAnalysis.lib.distances import self_capped_distance
     from MDAnalysis.lib.mdamath import triclinic_box
@@ -95,7 +169,17 @@ def mdanalysis_nsgrid(positions, cell, pbc, r_cut):
     return {"i": pairs[:, 0], "j": pairs[:, 1], "distance": distance}
 
 
+@peer(
+    "mdanalysis-brute",
+    "MDAnalysis",
+    full=False,
+    unit=_SINGLE,
+    affords=0.3,
+    limits=replace(_OF_MDANALYSIS, most_atoms=20_000),
+)
 def mdanalysis_brute_force(positions, cell, pbc, r_cut):
+    """MDAnalysis, bruteforce."""
+
     import numpy as np
     from MDAnalysis.lib.distances import self_capped_distance
     from MDAnalysis.lib.mdamath import triclinic_box
@@ -107,7 +191,10 @@ def mdanalysis_brute_force(positions, cell, pbc, r_cut):
     return {"i": pairs[:, 0], "j": pairs[:, 1], "distance": distance}
 
 
+@peer("scipy", "scipy", full=False, limits=ListLimits(minimum_image=True, along_axes=True))
 def scipy_tree(positions, cell, pbc, r_cut):
+    """scipy.spatial.KDTree.query_pairs."""
+
     import numpy as np
     from scipy.spatial import KDTree
 
@@ -117,7 +204,10 @@ def scipy_tree(positions, cell, pbc, r_cut):
     return {"i": pairs[:, 0], "j": pairs[:, 1]}
 
 
+@peer("freud", "freud-analysis", unit=_SINGLE, limits=replace(_OF_MDANALYSIS, least_cutoff=0.0, atoms=1))
 def freud_query(positions, cell, pbc, r_cut):
+    """freud.locality.AABBQuery."""
+
     import freud  # type: ignore
     import numpy as np
 
@@ -133,7 +223,11 @@ def freud_query(positions, cell, pbc, r_cut):
     return {"i": found.query_point_indices, "j": found.point_indices, "distance": found.distances}
 
 
+# its documentation asks for wrapped positions and for periodicity along all axes or none
+@peer("torch-sim", "torch-sim-atomistic", affords=0.3, limits=ListLimits(wrapped=True, all_axes=True))
 def torch_sim_pairs(positions, cell, pbc, r_cut):
+    """torch-sim's linked cells."""
+
     import torch  # type: ignore
     from torch_sim.neighbors import torch_nl_linked_cell  # type: ignore
 
@@ -149,7 +243,10 @@ def torch_sim_pairs(positions, cell, pbc, r_cut):
     return {"i": pairs[0].numpy(), "j": pairs[1].numpy(), "shift": shift.numpy()}
 
 
+@peer("nvalchemi-ops", "nvalchemi-toolkit-ops", affords=0.3, limits=ListLimits(whole_cell=True))
 def nvalchemi_pairs(positions, cell, pbc, r_cut):
+    """nvalchemi-ops' cell_list."""
+
     import torch  # type: ignore
     from nvalchemiops.torch.neighbors import cell_list  # type: ignore
 
@@ -163,164 +260,144 @@ def nvalchemi_pairs(positions, cell, pbc, r_cut):
     return {"i": pairs[0].numpy(), "j": pairs[1].numpy(), "shift": shift.numpy()}
 
 
-def jax_md_pairs(positions, cell, pbc, r_cut):
-    from importlib import import_module
+@peer("ase-skin", "ase", affords=0.1, limits=ListLimits(most_atoms=20_000, roomy=1e5, least_cutoff=0.5))
+class AseSkinList:
+    """ase.neighborlist.NeighborList with a skin, which each of two atoms may use up."""
 
-    import jax
-    import jax.numpy as jnp
-    import numpy as np
+    kept = pbc = None
 
-    jax.config.update("jax_enable_x64", True)
-    partition, space = import_module("jax_md.partition"), import_module("jax_md.space")
-    positions, r_cut, skewed = jnp.asarray(positions), jnp.float64(r_cut), False
-    if not pbc.any():
-        displacement, _ = space.free()
-        box = jnp.float64(np.ptp(np.asarray(positions), axis=0).max(initial=0.0) + 4 * r_cut)
-    elif np.count_nonzero(cell - np.diag(np.diag(cell))):
-        skewed, box = True, jnp.asarray(cell.T)
-        displacement, _ = space.periodic_general(box, fractional_coordinates=True)
-        positions = positions @ jnp.asarray(np.linalg.inv(cell))
-    else:
-        box = jnp.asarray(np.diag(cell))
-        # the word for coordinates that may be outside of the box
-        displacement, _ = space.periodic(box, wrapped=False)
-    neighbor = partition.neighbor_list(
-        displacement,
-        box,
-        r_cut,
-        jnp.float64(0.0),
-        fractional_coordinates=skewed,
-        disable_cell_list=not pbc.any(),
-        format=partition.Sparse,
-    )
-    found = neighbor.allocate(positions)
-    if bool(found.did_buffer_overflow):
-        raise ValueError("jax-md says that its list overflowed")
-    i, j = np.asarray(found.idx)
-    real = (i < len(positions)) & (j < len(positions))
-    return {"i": i[real], "j": j[real]}
+    def allocate(self, positions, cell, pbc, r_cut, skin):
+        from ase.neighborlist import NeighborList, NewPrimitiveNeighborList
+
+        self.pbc = pbc
+        self.kept = NeighborList(
+            [r_cut / 2] * len(positions),
+            skin=skin / 2,
+            self_interaction=False,
+            bothways=True,
+            primitive=NewPrimitiveNeighborList,  # type: ignore
+        )
+        return self.update(positions, cell)
+
+    def update(self, positions, cell):
+        import numpy as np
+        from ase import Atoms
+
+        atoms = Atoms(numbers=[1] * len(positions), positions=positions, cell=cell, pbc=self.pbc)
+        self.kept.update(atoms)
+        rows = [self.kept.get_neighbors(atom) for atom in range(len(positions))]
+        i = np.repeat(np.arange(len(rows)), [len(row[0]) for row in rows])
+        j = np.concatenate([row[0] for row in rows] or [np.zeros(0, int)])
+        shift = np.concatenate([row[1].reshape(-1, 3) for row in rows] or [np.zeros((0, 3), int)])
+        return {"i": i, "j": j, "shift": shift}
 
 
-_SINGLE = 2.0**-24
-
-#: An edge of a box of at most FLT_EPSILON is taken for none (calc_distances.h): a library for Angstrom.
-_OF_MDANALYSIS = Limits(minimum_image=True, all_axes=True, lower=True, right_handed=True, least_cutoff=1e-3)
-
-#: Measured on 512 pairs at the cutoff, release 0.2.29: in a periodic box 92 of 478 rows were one-sided, with
-#: and without a cell list; in free space, where displacement(a, b) is -displacement(b, a), none.
-JAX_MD_KNOWN = {
-    "ONE_SIDED": "Its periodic displacement, mod(d + L/2, L) - L/2, rounds otherwise from i to j than from j "
-    "to i, and each direction is decided by itself; in free space no pair is one-sided."
-}
-
-
-def _peer(name, package, function, about, **declared) -> PairList:
-    return PairList(
-        name,
-        lambda: function,
-        package=package,
-        source=source_of(function),
-        call=function.__name__,
-        about=about,
-        **declared,
-    )
-
-
-PEERS: tuple[PairList, ...] = (
-    _peer(
-        "ase",
-        "ase",
-        ase_neighbor_list,
-        "ase.neighborlist.neighbor_list",
-        affords=0.3,
-        limits=Limits(least_cutoff=0.5),
-    ),
-    _peer(
-        "ase-primitive",
-        "ase",
-        ase_primitive_list,
-        "the list under ASE's LennardJones, EAM and Tersoff",
-        affords=0.3,
-        limits=Limits(atoms=1, most_atoms=20_000),
-    ),
-    _peer("vesin", "vesin", vesin_cells, "vesin's cell list, every pair from both atoms"),
-    _peer("vesin-half", "vesin", vesin_half, "vesin, every pair once"),
-    _peer(
-        "matscipy",
-        "matscipy",
-        matscipy_list,
-        "matscipy.neighbours.neighbour_list",
-        limits=Limits(whole_cell=True),
-    ),
-    _peer(
-        "pymatgen",
-        "pymatgen",
-        pymatgen_points,
-        "pymatgen's find_points_in_spheres",
-        limits=Limits(least_cutoff=0.01),
-    ),
-    _peer(
-        "mdanalysis",
-        "MDAnalysis",
-        mdanalysis_nsgrid,
-        "MDAnalysis, nsgrid",
-        full=False,
-        unit=_SINGLE,
-        affords=0.3,
-        limits=_OF_MDANALYSIS,
-    ),
-    _peer(
-        "mdanalysis-brute",
-        "MDAnalysis",
-        mdanalysis_brute_force,
-        "MDAnalysis, bruteforce",
-        full=False,
-        unit=_SINGLE,
-        affords=0.3,
-        limits=replace(_OF_MDANALYSIS, most_atoms=20_000),
-    ),
-    _peer(
-        "scipy",
-        "scipy",
-        scipy_tree,
-        "scipy.spatial.KDTree.query_pairs",
-        full=False,
-        limits=Limits(minimum_image=True, along_axes=True),
-    ),
-    _peer(
-        "freud",
-        "freud-analysis",
-        freud_query,
-        "freud.locality.AABBQuery",
-        unit=_SINGLE,
-        limits=Limits(minimum_image=True, all_axes=True, lower=True, right_handed=True, atoms=1),
-    ),
-    _peer(
-        "torch-sim",
-        "torch-sim-atomistic",
-        torch_sim_pairs,
-        "torch-sim's linked cells",
-        affords=0.3,
-        # its documentation asks for wrapped positions and for periodicity along all axes or none
-        limits=Limits(wrapped=True, all_axes=True),
-    ),
-    _peer(
-        "nvalchemi-ops",
-        "nvalchemi-toolkit-ops",
-        nvalchemi_pairs,
-        "nvalchemi-ops' cell_list",
-        affords=0.3,
-        limits=Limits(whole_cell=True),
-    ),
-    _peer(
-        "jax-md",
-        "jax-md",
-        jax_md_pairs,
-        "jax-md's partition.neighbor_list, allocated each time",
-        affords=0.01,
-        known=JAX_MD_KNOWN,
-        # its box matrix is upper triangular, with vectors as columns
-        limits=Limits(minimum_image=True, all_axes=True, lower=True, right_handed=True, most_atoms=5_000),
-    ),
+@peer(
+    "jax-md-kept",
+    "jax-md",
+    affords=0.01,
+    known=_JAX_MD_KNOWN,
+    limits=replace(_OF_JAX_MD, fixed_cell=True, atoms=1),
 )
-"""Searches that start from nothing at every question."""
+class JaxMdList:
+    """jax-md's partition.neighbor_list, allocated and updated, as its documentation shows."""
+
+    found = neighbor = step = None
+    skewed = free = False
+
+    def allocate(self, positions, cell, pbc, r_cut, skin):
+        from importlib import import_module
+
+        import jax
+        import jax.numpy as jnp
+        import numpy as np
+
+        jax.config.update("jax_enable_x64", True)
+        partition, space = import_module("jax_md.partition"), import_module("jax_md.space")
+        self.free = not pbc.any()
+        self.skewed = not self.free and bool(np.count_nonzero(cell - np.diag(np.diag(cell))))
+        if self.free:
+            displacement, _ = space.free()
+            box = jnp.float64(np.ptp(positions, axis=0).max(initial=0.0) + 8 * r_cut)
+        elif self.skewed:
+            box = jnp.asarray(cell.T)
+            displacement, _ = space.periodic_general(box, fractional_coordinates=True)
+        else:
+            box = jnp.asarray(np.diag(cell))
+            displacement, _ = space.periodic(box, wrapped=False)
+        self.neighbor = partition.neighbor_list(
+            displacement,
+            box,
+            jnp.float64(r_cut),
+            jnp.float64(skin),
+            fractional_coordinates=self.skewed,
+            disable_cell_list=self.free,
+            format=partition.Sparse,
+        )
+        self.found = self.neighbor.allocate(self.placed(positions, cell))
+        # compiled once, as in a run; by itself each update is traced anew and takes a second
+        self.step = jax.jit(lambda found, placed: found.update(placed))
+        return self.pairs(positions)
+
+    def update(self, positions, cell):
+        placed = self.placed(positions, cell)
+        self.found = self.step(self.found, placed)
+        if bool(self.found.did_buffer_overflow):
+            self.found = self.neighbor.allocate(placed)
+        return self.pairs(positions)
+
+    def placed(self, positions, cell):
+        import jax.numpy as jnp
+        import numpy as np
+
+        # a copy: jax may take numpy's memory for its own, and the next positions are written there
+        return jnp.array(positions @ np.linalg.inv(cell) if self.skewed else positions)
+
+    def pairs(self, positions):
+        import numpy as np
+
+        if bool(self.found.did_buffer_overflow):
+            raise ValueError("jax-md says that its list overflowed as it was allocated")
+        i, j = np.asarray(self.found.idx)
+        real = (i < len(positions)) & (j < len(positions))
+        return {"i": i[real], "j": j[real]}
+
+
+@peer("jax-md", "jax-md", JaxMdList, affords=0.01, known=_JAX_MD_KNOWN, limits=_OF_JAX_MD)
+def jax_md_pairs(positions, cell, pbc, r_cut):
+    """jax-md's partition.neighbor_list, allocated each time."""
+    return JaxMdList().allocate(positions, cell, pbc, r_cut, 0.0)
+
+
+@peer("mdnum-verlet", "mdnum", limits=ListLimits(minimum_image=True, atoms=1))
+class MdnumVerletList:
+    """mdnum's own list with a skin: rebuilt before it is used up, box strain counted."""
+
+    listed = built = pbc = None
+
+    def allocate(self, positions, cell, pbc, r_cut, skin):
+        from mdnum.md.neighbors import BUILDERS, RebuildRule, VerletList
+
+        self.pbc = pbc
+        self.listed = VerletList(BUILDERS["host"], RebuildRule(skin), r_cut)
+        self.built = None
+        return self.update(positions, cell)
+
+    def update(self, positions, cell):
+        import numpy as np
+
+        from mdnum.md.cell import Cell, wrap_positions
+
+        box = Cell.create(cell, self.pbc)
+        wrapped, _ = wrap_positions(box, positions)
+        if self.built is None or self.listed.consumed(wrapped, box, *self.built[1:]) >= 1.0:
+            self.built = (self.listed.build(wrapped, box), wrapped, box)
+        rows = self.built[0].unsorted()
+        i, slot = np.nonzero(rows < len(positions))
+        return {"i": i, "j": rows[i, slot]}
+
+
+@peer("mdnum", "mdnum", MdnumVerletList, limits=ListLimits(minimum_image=True, atoms=1))
+def mdnum_host_list(positions, cell, pbc, r_cut):
+    """mdnum's own cell list."""
+    return MdnumVerletList().allocate(positions, cell, pbc, r_cut, 0.0)

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import base64
+import inspect
 import io
-import json
 import textwrap
 import zlib
 from pprint import pformat
 
 import numpy as np
 
-from mdnum.references.conformance.answer import NAMES
+from mdnum.references.conformance import answer
 from mdnum.references.conformance.judge import Conventions
 from mdnum.references.conformance.lists import PairList
-from mdnum.references.conformance.suite import Failed
+from mdnum.references.conformance.results import Failed
 
 _PRINTED = 60  # atoms whose coordinates are written out
 
@@ -46,18 +46,18 @@ def right_pairs(x, cell, reach):
 def check(step, x, cell, given):
     """Compares what the list gave with brute force; returns whether it is right."""
     try:
-        named = as_mapping(given)
-    except NoPairs as error:
+        answer = read(given)
+    except Malformed as error:
         print(f"step {step}: {error}")
         return False
     scale = np.abs(x).max(initial=0.0) + np.abs(np.where(PBC[:, None], cell, 0.0)).sum() + R_CUT
     close = TOLERANCE * scale
     right = right_pairs(x, cell, REACH + close)
     box = np.where(PBC[:, None], cell, 0.0)
-    i, j = (named[name] for name in ("i", "j"))
+    i, j = answer.i, answer.j
     bad = [f"row {n}: ({a}, {b}) with {len(x)} atoms" for n, (a, b) in enumerate(zip(i, j))
            if not (0 <= a < len(x) and 0 <= b < len(x))]
-    shift, told, vector = (named.get(name) for name in ("shift", "distance", "vector"))
+    shift, told, vector = answer.shift, answer.distance, answer.vector
     if told is None and shift is None and vector is not None:
         told = np.linalg.norm(vector, axis=1)
     lengths = collections.defaultdict(list)
@@ -126,7 +126,7 @@ for step, (x, cell, fresh, *skin) in enumerate(STEPS):
 
 _WAITS = 'print("it waits for an answer; Control-C ends it", flush=True)'
 
-_MAPPING = '''
+_ASKED = '''
 def asked(function, *arguments):
     """What the list returns."""
     try:
@@ -134,72 +134,6 @@ def asked(function, *arguments):
     except SystemExit as error:
         print(f"it ends the process: SystemExit: {error}")
         raise SystemExit("the list is wrong")
-
-
-class NoPairs(Exception):
-    """What was returned is no list of pairs."""
-
-
-def as_mapping(given):
-    """The parts of an answer by name: i, j, shift, distance, vector; arrays with a row for each pair."""
-    rows = isinstance(given, list) and all(isinstance(part, tuple) for part in given)
-    if given is None:
-        raise NoPairs("it returned None")
-    if isinstance(given, dict):
-        parts = {name: next((given[word] for word in words if word in given), None)
-                 for name, words in NAMES.items()}
-    elif isinstance(given, (tuple, list)) and not rows:
-        parts = in_order([array(part) for part in given])
-    elif hasattr(given, "i") and hasattr(given, "j"):
-        parts = {name: next((getattr(given, word) for word in words if hasattr(given, word)), None)
-                 for name, words in NAMES.items()}
-    else:
-        table = array(given)
-        if table.size and (table.ndim != 2 or table.shape[1] != 2):
-            raise NoPairs(f"it returned {type(given).__name__} of shape {table.shape}, not rows (i, j)")
-        parts = dict(zip("ij", table.reshape(-1, 2).T))
-    if parts.get("i") is None or parts.get("j") is None:
-        raise NoPairs("it has no i and j")
-    named = {name: array(part) for name, part in parts.items() if part is not None}
-    count = named["i"].size
-    for name, part in named.items():
-        shape = (count,) if name in ("i", "j", "distance") else (count, 3)
-        if part.size == 0 and count == 0:
-            named[name] = part = np.zeros(shape, int)
-        if part.shape != shape:
-            raise NoPairs(f"{name} has shape {part.shape} where i has {count} entries")
-        if part.dtype.kind not in ("iu" if name in ("i", "j") else "iuf"):
-            raise NoPairs(f"{name} has dtype {part.dtype}")
-    if "shift" in named and not np.array_equal(np.rint(named["shift"]), named["shift"]):
-        raise NoPairs("shifts are not whole numbers of lattice vectors")
-    return named
-
-
-def array(part):
-    """A part as an array of numbers."""
-    try:
-        made = np.asarray(part)
-    except Exception as error:
-        raise NoPairs(f"a part is no array: {error}")
-    if made.dtype == object:
-        raise NoPairs(f"a part is no array of numbers but {type(part).__name__}")
-    return made
-
-
-def in_order(parts):
-    """Parts by their places and shapes."""
-    if len(parts) == 2 and parts[0].ndim == 2 and len(parts[0]) == 2:
-        return {"i": parts[0][0], "j": parts[0][1], "shift": parts[1]}
-    if not 2 <= len(parts) <= 5:
-        raise NoPairs(f"it returned {len(parts)} parts, not (i, j), (i, j, shift), ...")
-    named = dict(zip("ij", parts))
-    for part in parts[2:]:
-        whole = "shift" not in named and np.array_equal(np.rint(part), part) if part.ndim > 1 else False
-        name = "distance" if part.ndim < 2 else "shift" if whole else "vector"
-        if name in named or (name == "distance" and part.size and part.dtype.kind in "iu"):
-            raise NoPairs(f"its parts are not i, j, shift, distance, vector: no {name} is looked for")
-        named[name] = part
-    return named
 '''
 
 
@@ -225,16 +159,23 @@ def script(
     title = title.replace("\\", "/").replace('"""', "'''")
     parts = [
         '"""' + "\n".join(textwrap.wrap(title, 100)) + f'\n\n{case_words}\n"""',
-        "import collections\nimport itertools\n\nimport numpy as np",
+        "from __future__ import annotations\n\nimport collections\nimport itertools\n\nimport numpy as np",
         tested.source.strip() or f"# import {tested.call} here: its lines could not be found",
         _numbers(failed, how, reach),
-        _MAPPING.strip(),
+        _answers(),
+        _ASKED.strip(),
         _BRUTE_FORCE.strip(),
         *([_WAITS] if worst.code == "NO_ANSWER" else []),
         (_KEPT if tested.kept else _ONCE).strip().format(call=tested.call),
         'print("the list is right" if fine else "the list is wrong")\nraise SystemExit(not fine)',
     ]
     return "\n\n\n".join(parts) + "\n"
+
+
+def _answers() -> str:
+    """The lines that read what a list returns, which need numpy alone."""
+    text = inspect.getsource(answer)
+    return text[text.index("from collections.abc") :].strip()
 
 
 def _numbers(failed: Failed, how: Conventions, reach: float) -> str:
@@ -247,7 +188,7 @@ def _numbers(failed: Failed, how: Conventions, reach: float) -> str:
         atoms = count
         place = _array(still.positions)
         skin = case.skin if still.skin is None else still.skin
-        anew = f", {skin!r}" if fresh and any(one.skin is not None for one in case.stills) else ""
+        anew = f", {skin!r}" if fresh and any(other.skin is not None for other in case.stills) else ""
         stills.append(f"    ({place},\n     {_array(still.cell)}, {fresh}{anew}),")
     lines = [
         f"R_CUT, SKIN, REACH = {case.r_cut!r}, {case.skin!r}, {reach!r}",
@@ -255,7 +196,6 @@ def _numbers(failed: Failed, how: Conventions, reach: float) -> str:
         f"FULL = {how.full}  # every pair from both of its atoms",
         f"SIGN = {how.sign}  # +1: shifts are added to atom j",
         f"TOWARD = {how.toward}  # +1: vectors point from i to j",
-        f"NAMES = {json.dumps(NAMES)}",
         f"TOLERANCE = {16 * how.unit!r}  # a decision this close to the cutoff is rounding",
         "STEPS = [  # positions, cell (vectors as rows), whether the list starts anew (its skin)",
         *stills,

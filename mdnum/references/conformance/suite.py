@@ -1,42 +1,62 @@
-"""One list through all questions: which it answers as it should, and the first failure of each kind."""
+"""One list through all questions: which it answers correctly, and the first failure of each kind."""
 
 from __future__ import annotations
 
 import itertools
 import re
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from mdnum.deadline import Deadline
-from mdnum.references.conformance.alike import looked_into
-from mdnum.references.conformance.answers import Answers, as_row
-from mdnum.references.conformance.case import AREAS, KEPT, Case, one
+from mdnum.references.conformance.case import AREAS, Case, once
 from mdnum.references.conformance.catalog import gas
-from mdnum.references.conformance.crowds import LARGE_EDGE, SMALL_EDGE, lattice, vast
-from mdnum.references.conformance.judge import CODES, Conventions, Failure, judge, measures_well
-from mdnum.references.conformance.lists import Outcome, PairList, Session
-from mdnum.references.conformance.questions import as_kept, drawn, questions
-from mdnum.references.conformance.remote import RemoteSession
-from mdnum.references.conformance.results import Failed, Report, Tally
-from mdnum.references.conformance.truth import DOUBLE, SINGLE, Truth, truth
+from mdnum.references.conformance.judge import (
+    CODES,
+    DOUBLE,
+    SINGLE,
+    Code,
+    Conventions,
+    Failure,
+    Truth,
+    judge,
+    measures_well,
+    truth,
+)
+from mdnum.references.conformance.lists import PairList
+from mdnum.references.conformance.questions import large as large_questions
+from mdnum.references.conformance.questions import questions
+from mdnum.references.conformance.results import (
+    CaseAnswers,
+    CaseResult,
+    Failed,
+    RefusalKind,
+    Report,
+    Shrunk,
+    alike,
+)
+from mdnum.references.conformance.session import CallOutcome, RemoteSession, Session
+from mdnum.references.conformance.shrink import kind, shrunk
 
 Progress = Callable[[int, int, dict[str, Any]], None]
+Saved = Callable[[bool], None]
 
 #: Random cases by default; a list that is asked for a share of them has fewer.
 CASES = 500
 #: Seconds that the 100,000 atoms may be expected to take.
 _PATIENCE = 30.0
-#: Share of wrong answers above which one that would be right in float32 says nothing about precision.
+#: Share of wrong answers above which one that would be right in float32 shows nothing about precision.
 _MISTAKES = 0.1
 #: Atoms, edge and seed of the crowd that shows how far a list that is kept has all pairs, and its skin.
 _CROWD = (160, 6.0, 130)
 _SKIN = 0.3
 #: How much of the smallest motion a lost pair is followed for.
 _FURTHEST = 2.5
+#: Refusals that are examined; a list with more kinds of them has other worries.
+_REFUSALS = 6
 
 
 class Examiner:
@@ -46,6 +66,11 @@ class Examiner:
         tested: the list.
         reuse: ask one object in all cases.
         apart: call it in a process of its own, which may crash.
+
+    Attributes:
+        report: what was found out, of the cases that it was given to `take`.
+        opening: what became of the plainest questions.
+        refused: the smallest refused case by kind of exception, with the exception in words.
     """
 
     def __init__(self, tested: PairList, reuse: bool = False, apart: bool = False):
@@ -54,19 +79,16 @@ class Examiner:
             RemoteSession(tested, reuse) if apart and tested.word else Session(tested, reuse)
         )
         self.report = Report(tested)
-        # the smallest refused case by the words of the exception, but for numbers
         self.refused: dict[str, tuple[str, Case]] = {}
-        self._refused_at = 0
-        # what became of the plainest questions
-        self.opening: list[tuple[Case, Outcome]] = []
+        self.opening: list[tuple[Case, CallOutcome]] = []
         self._find_conventions()
 
     def _find_conventions(self) -> None:
         """Full or half, signs of shifts and vectors, from a question that nobody gets wrong otherwise."""
         tested, report = self.tested, self.report
         full, sign, toward = tested.full, 1, 1
-        triple = one("a triple through a face", "few", [[0.2, 2, 2], [3.8, 2.1, 2], [0.5, 2.4, 2.2]], 4.0)
-        free = one("a free triple", "few", [[0.2, 2, 2], [-0.2, 2.1, 2], [0.5, 2.4, 2.2]])
+        triple = once("a triple through a face", "few", [[0.2, 2, 2], [3.8, 2.1, 2], [0.5, 2.4, 2.2]], 4.0)
+        free = once("a free triple", "few", [[0.2, 2, 2], [-0.2, 2.1, 2], [0.5, 2.4, 2.2]])
         for case in (triple, free):
             if tested.limits.refusal(case) is not None:
                 continue
@@ -87,21 +109,20 @@ class Examiner:
                     sign, toward = convention.sign, convention.toward
                     break
             break
-        report.how = Conventions(True if full is None else full, sign, toward, tested.unit or DOUBLE)
-        self.superset = bool(tested.superset)
+        report.how = Conventions(full is not False, sign, toward, tested.unit or DOUBLE)
+        report.superset = bool(tested.superset)
         if tested.kept:
-            self._look_at_skin()
-        report.superset = self.superset
+            self._find_padding()
 
-    def _look_at_skin(self) -> None:
+    def _find_padding(self) -> None:
         """Whether a list that is kept gives what its skin holds, and how far it has all pairs.
 
-        Its padding is where the nearest pair is that it lacks, or what it says.
+        Its padding is where the nearest pair is that it lacks, or what it states.
         """
-        report, tested = self.report, self.tested
-        crowd = replace(one("a crowd", "few", gas(*_CROWD), _CROWD[1]), skin=_SKIN)
-        if tested.limits.refusal(crowd) is not None:
-            crowd = replace(one("a free crowd", "few", gas(*_CROWD)), skin=_SKIN)
+        report = self.report
+        crowd = replace(once("a crowd", "few", gas(*_CROWD), _CROWD[1]), skin=_SKIN)
+        if self.tested.limits.refusal(crowd) is not None:
+            crowd = replace(once("a free crowd", "few", gas(*_CROWD)), skin=_SKIN)
         # an object of its own: what it keeps of a crowd must not be part of what the suite finds
         reuse, self.session.reuse = self.session.reuse, False
         outcome = self.session.ask(crowd)[0]
@@ -112,16 +133,16 @@ class Examiner:
         if answer is not None:
             right = truth(crowd, 0, reach=0.45 * _CROWD[1])
             rows = np.concatenate([answer.i, answer.j]) * crowd.atoms + np.concatenate([answer.j, answer.i])
-            there = np.isin(right.i * crowd.atoms + right.j, rows)
-            edge = float(right.distance[~there].min(initial=np.inf))
+            listed = np.isin(right.i * crowd.atoms + right.j, rows)
+            edge = float(right.distance[~listed].min(initial=np.inf))
             below = float(right.distance[right.distance < edge].max(initial=0.0))
-        if tested.superset is None:
+        if self.tested.superset is None:
             # what does not answer is taken for the usual
-            self.superset = answer is None or below > crowd.r_cut + 0.1 * _SKIN
-            report.found_out.append("with its skin" if self.superset else "without its skin")
+            report.superset = answer is None or below > crowd.r_cut + 0.1 * _SKIN
+            report.found_out.append("with its skin" if report.superset else "without its skin")
         if outcome.skin is not None:
-            report.padding, report.said = outcome.skin / _SKIN, True
-        elif self.superset and crowd.r_cut < edge < np.inf:
+            report.padding, report.stated = outcome.skin / _SKIN, True
+        elif report.superset and crowd.r_cut < edge < np.inf:
             # the nearest pair that is lacking lies somewhat beyond the edge
             whole = below < crowd.r_cut + _SKIN <= edge
             report.padding = 1.0 if whole else (edge - crowd.r_cut) / _SKIN
@@ -129,139 +150,107 @@ class Examiner:
     def unusable(self) -> str | None:
         """Why nothing can be learned from it: no plain question had an answer that is one; None otherwise.
 
-        An exception that it means, a crash and a time without an answer are for the suite to tell.
+        A refusal, a crash and a time without an answer are for the suite to report.
         """
-        told = [
+        reasons = [
             f"asked about {case.name}, {outcome.malformed or f'it raised {outcome.raised}'}"
             for case, outcome in self.opening
             if outcome.malformed or (outcome.raised and not outcome.refused)
         ]
-        return told[0] if told and len(told) == len(self.opening) else None
+        return reasons[0] if reasons and len(reasons) == len(self.opening) else None
 
-    def failures(self, case: Case) -> list[Failure]:
-        """What is wrong with the answers to a case, at the first step where anything is; empty if nothing.
+    def failures(self, case: Case) -> tuple[Failure, ...]:
+        """What is wrong with the answers to a case, at the first step where anything is; empty if nothing."""
+        return self.ask(case).failures
 
-        A call that raises counts as a failure; one that refuses does not.
-        """
-        return self.outcome(case)[0]
-
-    def outcome(self, case: Case) -> tuple[list[Failure], Outcome | None]:
-        """(failures, the outcome that ended the case: a refusal, or None)."""
+    def ask(self, case: Case) -> CaseResult:
+        """What becomes of a case. An accidental exception is a failure; a refusal is none."""
         began = time.perf_counter()
         outcomes = self.session.ask(case)
-        self.report.asking += time.perf_counter() - began
-        for step, outcome in enumerate(outcomes):
-            if outcome.aliased and self.report.aliased is None:
-                self.report.aliased = case.name
-            found = self._judged(case, step, outcome)
-            if found:
-                return [failure.at(step) for failure in found], None
-            if outcome.refused:
-                self._refused_at = step
-                self._remember(case.until(step + 1), str(outcome.raised))
-                return [], outcome
-        return [], None
-
-    def told(self, case: Case) -> tuple[list[Failure], Outcome | None, dict[str, Any]]:
-        """`outcome`, and what of it an examination that goes on needs to know, for JSON."""
-        report = self.report
-        ties, asking = list(report.ties), report.asking
-        aliased, single = report.aliased, report.single
-        failures, refused = self.outcome(case)
-        kept = {
-            "case": case.name,
-            "failures": [as_row(one) for one in failures],
-            "refused": None if refused is None else [self._refused_at, str(refused.raised)],
-            "ties": [now - then for now, then in zip(report.ties, ties, strict=True)],
-            "aliased": report.aliased is not aliased,
-            "single": report.single is not single,
-            "seconds": report.asking - asking,
-        }
-        return failures, refused, kept
-
-    def recalled(self, case: Case, kept: Mapping[str, Any]) -> tuple[list[Failure], Outcome | None]:
-        """`outcome` as it was, without asking."""
-        report = self.report
-        report.asking += kept["seconds"]
-        report.ties = [have + more for have, more in zip(report.ties, kept["ties"], strict=True)]
-        if kept["aliased"] and report.aliased is None:
-            report.aliased = case.name
-        if kept["single"]:
-            self._take_for_single(case.until(1))
-        if kept["refused"] is not None:
-            step, words = kept["refused"]
-            self._remember(case.until(step + 1), words)
-            return [], Outcome(raised=words, refused=True)
-        return [Failure(*one) for one in kept["failures"]], None
-
-    def _take_for_single(self, case: Case) -> None:
-        """From here on it is taken for a list in float32, and told to be one."""
-        self.report.how, self.report.single = replace(self.report.how, unit=SINGLE), case
-        self.report.found_out.append("float32")
-
-    def _remember(self, case: Case, words: str) -> None:
-        """Keeps the smallest question that an exception was met at."""
-        kind = re.sub(r"[-+\d.e]+", "#", words)
-        if kind not in self.refused or (case.steps, case.atoms) < (
-            self.refused[kind][1].steps,
-            self.refused[kind][1].atoms,
-        ):
-            self.refused[kind] = words, case
-
-    def _judged(self, case: Case, step: int, outcome: Outcome) -> list[Failure]:
-        if outcome.crashed is not None:
-            return [Failure("CRASHED", outcome.crashed)]
-        if outcome.late is not None:
-            return [Failure("NO_ANSWER", outcome.late)]
-        if outcome.raised is not None:
-            return [] if outcome.refused else [Failure("RAISED", outcome.raised)]
-        if outcome.malformed is not None:
-            return [Failure("MALFORMED", outcome.malformed)]
-        assert outcome.answer is not None
-        changed = (
-            [Failure("CHANGED_INPUT", f"the call wrote to its {outcome.changed}")] if outcome.changed else []
-        )
-        # what is listed may have come as far as the skin lets it, from either side
-        reach = self.report.reach(case) if self.superset else None
+        result = CaseResult(case.name, seconds=time.perf_counter() - began)
         how = self.report.how
+        for step, outcome in enumerate(outcomes):
+            result = replace(result, aliased=result.aliased or outcome.aliased)
+            failures, unit, ties = self._judge(case, step, outcome, how)
+            result = replace(
+                result, ties=ties if step == 0 else result.ties, single=result.single or unit != how.unit
+            )
+            how = replace(how, unit=unit)
+            if failures:
+                return replace(result, failures=tuple(replace(failure, step=step) for failure in failures))
+            if outcome.refused:
+                return replace(result, refused=(step, str(outcome.raised)))
+        return result
+
+    def take(self, case: Case, result: CaseResult) -> None:
+        """Makes what became of a case part of what is known of the list."""
+        self.report.take(case, result)
+        if result.refused is not None:
+            step, words = result.refused
+            case, smallest = case.until(step + 1), re.sub(r"[-+\d.e]+", "#", words)
+            _, known = self.refused.get(smallest, ("", None))
+            if known is None or (case.steps, case.atoms) < (known.steps, known.atoms):
+                self.refused[smallest] = words, case
+
+    def _judge(
+        self, case: Case, step: int, outcome: CallOutcome, how: Conventions
+    ) -> tuple[list[Failure], float, tuple[int, int]]:
+        """(failures, roundoff that the answer was judged by, ties counted and not)."""
+        silent: tuple[tuple[Code, str | None], ...] = (
+            ("CRASHED", outcome.crashed),
+            ("NO_ANSWER", outcome.late),
+            ("RAISED", None if outcome.refused else outcome.raised),
+            ("MALFORMED", outcome.malformed),
+        )
+        for code, text in silent:
+            if text is not None:
+                return [Failure(code, text)], how.unit, (0, 0)
+        answer = outcome.answer
+        if answer is None:
+            return [], how.unit, (0, 0)
+        reach = self.report.reach(case) if self.report.superset else None
         right = truth(case, step, reach=reach, unit=how.unit)
-        found = judge(outcome.answer, right, how)
-        if found and step and self.superset and any(failure.code == "EXTRA" for failure in found):
+        found = judge(answer, right, how)
+        if found and step and reach is not None and any(failure.code == "EXTRA" for failure in found):
             # a box that grows takes listed pairs further apart than any skin: harmless, and no phantoms
-            found = judge(outcome.answer, _with_earlier(case, step, right, reach or case.r_cut), how)
-        # a list that is stale by a hair is not one in single precision
-        new = step == 0 and not case.known and len(outcome.answer) > 0 and self._mostly_right()
-        if found and new and self.tested.unit is None and how.unit == DOUBLE:
-            coarse = replace(how, unit=SINGLE)
-            # whoever measures in double and decides in single loses pairs that it knows to be inside
-            if not measures_well(outcome.answer, right, how) and not judge(
-                outcome.answer, truth(case, step, reach=reach, unit=SINGLE), coarse
-            ):
-                self._take_for_single(case.until(step + 1))
-                found = []
-        if not found and step == 0 and right.tie.any() and how.unit == DOUBLE:
-            self._count_ties(outcome, right)
-        return found + changed
+            found = judge(answer, _with_earlier(case, step, right, reach), how)
+        unit = how.unit
+        # a list that is stale by a hair is not one in single precision, nor one that is wrong anyway; and
+        # whoever measures in double and decides in single loses pairs that it knows to be inside
+        if (
+            found and step == 0 and not case.known and len(answer) > 0
+            and self.report.wrong <= _MISTAKES * (self.report.asked + 1)
+            and self.tested.unit is None and how.unit == DOUBLE and not measures_well(answer, right, how)
+        ):  # fmt: skip
+            coarse = truth(case, step, reach=reach, unit=SINGLE)
+            if not judge(answer, coarse, replace(how, unit=SINGLE)):
+                unit, found = SINGLE, []
+        ties = (0, 0)
+        if not found and step == 0 and unit == DOUBLE and not self.report.superset:
+            ties = _ties(outcome, right)
+        if outcome.changed:
+            found.append(Failure("CHANGED_INPUT", f"the call wrote to its {outcome.changed}"))
+        return found, unit, ties
 
-    def _mostly_right(self) -> bool:
-        """Whether what it was asked so far says anything about its arithmetic."""
-        return self.report.wrong <= _MISTAKES * self.report.asked
 
-    def _count_ties(self, outcome: Outcome, right: Truth) -> None:
-        """Which pairs at exactly the cutoff are there, from cases in which no rounding can blur them."""
-        if self.superset or not _whole(right):
-            return
-        assert outcome.answer is not None
-        rows = set(zip(outcome.answer.i.tolist(), outcome.answer.j.tolist(), strict=True))
-        near = np.abs(right.distance - right.r_cut) > 1e-6
-        for i, j in zip(right.i[right.tie].tolist(), right.j[right.tie].tolist(), strict=True):
-            if near[(right.i == i) & (right.j == j)].any():
-                continue  # another image of the pair is inside
-            self.report.ties[0 if (i, j) in rows or (j, i) in rows else 1] += 1
+def _ties(outcome: CallOutcome, right: Truth) -> tuple[int, int]:
+    """Pairs at exactly the cutoff, listed and not, of a case in which no rounding can blur them."""
+    numbers = np.concatenate([right.positions.ravel(), right.cell.ravel(), [right.r_cut]])
+    if not ((numbers == np.rint(numbers)).all() and np.abs(numbers).max(initial=0.0) < 1e6):
+        return 0, 0  # on small integers no arithmetic rounds
+    assert outcome.answer is not None
+    rows = set(zip(outcome.answer.i.tolist(), outcome.answer.j.tolist(), strict=True))
+    off = np.abs(right.distance - right.r_cut) > 1e-6
+    listed = [
+        (i, j) in rows or (j, i) in rows
+        for i, j in zip(right.i[right.tie].tolist(), right.j[right.tie].tolist(), strict=True)
+        if not off[(right.i == i) & (right.j == j)].any()  # else another image of the pair is inside
+    ]
+    return sum(listed), len(listed) - sum(listed)
 
 
 def _with_earlier(case: Case, step: int, right: Truth, reach: float) -> Truth:
-    """The truth at a step, where pairs that were listed rightly earlier in the list's life may still be."""
+    """The truth at a step, where pairs that were listed correctly earlier in the list's life may still be."""
     rows = [(right.i, right.j, right.shift)]
     for before in range(step - 1, -1, -1):
         if len(case.stills[before].positions) != len(right.positions) or case.stills[before + 1].fresh:
@@ -278,12 +267,6 @@ def _with_earlier(case: Case, step: int, right: Truth, reach: float) -> Truth:
     )
 
 
-def _whole(right: Truth) -> bool:
-    """Whether all numbers are whole and small: then no arithmetic on them rounds."""
-    numbers = np.concatenate([right.positions.ravel(), right.cell.ravel(), [right.r_cut]])
-    return bool((numbers == np.rint(numbers)).all() and np.abs(numbers).max(initial=0.0) < 1e6)
-
-
 def examine(
     tested: PairList,
     *,
@@ -297,7 +280,8 @@ def examine(
     progress: Progress | None = None,
     examiner: Examiner | None = None,
     deadline: Deadline | None = None,
-    answers: Answers | None = None,
+    answers: CaseAnswers | None = None,
+    saved: Saved | None = None,
 ) -> Report:
     """Put a list through the suite.
 
@@ -307,110 +291,92 @@ def examine(
         large: ask about 5,000 and 100,000 atoms, too.
         stop: at the first failure.
         shrink: bring failures down to a few atoms.
-        apart: call it in a process of its own, so that a crash is told as one; needs a list from `load`.
+        apart: call it in a process of its own, so that a crash is reported as one; needs a list from `load`.
         asked: instead of all questions.
         progress: called with (cases done, cases, words).
         examiner: that knows its conventions already, instead of a new one.
         deadline: after which no case is begun; what was not asked by then is counted.
         answers: of an earlier examination of the same questions, which are not asked again; each new one is
             put there.
+        saved: called after each that is put there, with whether it should not be lost.
 
     Returns:
-        what was asked and what came of it. A list may raise, return anything and write to its input: that is
-        told as a failure.
+        what was asked and what became of it. A list may raise, return anything and write to its input: that
+        is reported as a failure.
     """
-    from mdnum.references.conformance.shrink import shrunk
-
     began = time.perf_counter()
     examiner = examiner or Examiner(tested, reuse=True, apart=apart)
     report = examiner.report
-    deadline, answers = deadline or Deadline(), Answers() if answers is None else answers
-    every = list(questions(tested, cases, seed, False, report.padding) if asked is None else asked)
-    if asked is None and apart and tested.word:
-        every += as_kept(tested, vast())
-    edges = (SMALL_EDGE, LARGE_EDGE) if large and asked is None else ()
-    report.questions = total = len(every) + len(edges)
-    seen: set[tuple[str, str]] = set()
-    going = True
-    for number, case in enumerate(itertools.chain(every, map(lattice, edges))):
+    deadline, answers, saved = (
+        deadline or Deadline(),
+        answers or CaseAnswers(),
+        saved or (lambda urgent: None),
+    )
+    far = apart and bool(tested.word)
+    every = list(questions(tested, cases, seed, report.padding, far) if asked is None else asked)
+    crystals = list(large_questions()) if large and asked is None else []
+    report.questions = total = len(every) + len(crystals)
+    stopped = False
+    for number, case in enumerate(itertools.chain(every, crystals)):
         if progress is not None:
             progress(number, total, {"phase": "asking", "unit": "cases"})
-        if going and (answers.of(number, case) is not None or not deadline.passed):
-            failures = _taken(examiner, case, number, answers)
-            if failures:
-                failed = Failed(case.until(failures[0].step + 1), tuple(failures), case)
-                key = (failed.code, case.area)
-                if key not in seen:
-                    seen.add(key)
-                    report.failed.append(failed)
-            going = not (stop and failures)
-        if number + 1 == len(every) and going and not deadline.passed:
-            _order(examiner)
+        result = answers.of(number, case)
+        if not stopped and (result is not None or not deadline.passed):
+            why = tested.limits.refusal(case)
+            if why is None and result is None and case.area == "large":
+                why = _too_long(report, case)
+            if why is not None:
+                report.skip(case, why)
+            else:
+                if result is None:
+                    result = answers.cases[str(number)] = examiner.ask(case)
+                    saved(bool(result.failures))
+                examiner.take(case, result)
+                stopped = stop and bool(result.failures)
+        if number + 1 == len(every) and not stopped and not deadline.passed:
+            report.keeps_order = _keeps_order(examiner)
     if shrink:
         examiner.session.reuse = False
         if not deadline.passed:
-            report.refusals = looked_into(examiner, dict(examiner.refused.values()))
+            report.refusals = _refusals(examiner)
         for number, failed in enumerate(report.failed):
             if progress is not None:
                 progress(number, len(report.failed), {"phase": "shrinking", "unit": "failures"})
-            small = answers.shrunk(failed)
-            if small is None:
-                if deadline.passed:
-                    report.whole = False
-                    continue
-                # a new process: what the list kept from other questions must not be part of it
-                examiner.session.close()
-                small = _deepest(examiner, shrunk(examiner, failed, deadline))
-                if deadline.passed:
-                    report.whole = False
-                else:
-                    answers.put_shrunk(failed, small)
-            report.failed[number] = small
-        report.failed = _distinct(report.failed)
+            report.failed[number] = _shrunk(examiner, failed, deadline, answers, saved)
+        report.failed = distinct(report.failed)
     report.areas = {area: report.areas[area] for area in AREAS if area in report.areas}
     examiner.session.close()
     report.seconds = time.perf_counter() - began
     return report
 
 
-def _taken(examiner: Examiner, case: Case, number: int, answers: Answers) -> list[Failure]:
-    """The failures of a case, counted; asked only where there is no answer yet."""
-    report = examiner.report
-    tally = report.areas.setdefault(case.area, Tally())
-    kept = answers.of(number, case)
-    why = examiner.tested.limits.refusal(case)
-    if why is None and kept is None and case.area == "large":
-        why = _too_long(report, case)
-    if why is not None:
-        tally.skipped += 1
-        tally.why[why] = tally.why.get(why, 0) + 1
-        return []
-    tally.asked += 1
-    if kept is None:
-        failures, refused, kept = examiner.told(case)
-        answers.put(number, kept)
-    else:
-        failures, refused = examiner.recalled(case, kept)
-    if case.area == "large":
-        report.large = (case.atoms, float(kept["seconds"]))
-    if case.motions:
-        report.motions += case.motions
-        report.calls += case.steps
-    if failures:
-        tally.failed += 1
-        code = min((failure.code for failure in failures), key=CODES.index)
-        tally.codes[code] = tally.codes.get(code, 0) + 1
-    elif refused is not None:
-        tally.refused += 1
-        words = str(refused.raised)
-        tally.why[words] = tally.why.get(words, 0) + 1
-    return failures
+def _shrunk(
+    examiner: Examiner,
+    failed: Failed,
+    deadline: Deadline,
+    answers: CaseAnswers,
+    saved: Callable[[bool], None],
+) -> Failed:
+    """A failure on a few atoms: as it was shrunk before, or as far as the time allows."""
+    name = f"{failed.code} {failed.asked.area} {failed.asked.name}"
+    if (kept := answers.shrunk.get(name)) is not None:
+        return Failed(kept.case, kept.failures, kept.alone, asked=failed.asked)
+    if not deadline.passed:
+        # a new process: what the list kept from other questions must not be part of it
+        examiner.session.close()
+        failed = _deepest(examiner, shrunk(examiner, failed, deadline))
+    if deadline.passed:
+        examiner.report.whole = False
+    elif failed.case.known is None:  # pairs that are known in closed form alone are not kept
+        answers.shrunk[name] = Shrunk(failed.case, failed.failures, failed.alone)
+        saved(True)
+    return failed
 
 
 def _deepest(examiner: Examiner, failed: Failed) -> Failed:
     """A pair that is lost just inside the cutoff, followed as far in as it stays lost.
 
-    It moves on the way it went, so that what is told is how near a lost pair can be.
+    It moves on the way it went, so that what is reported is how near a lost pair can be.
     """
     case = failed.case
     if failed.code != "MISSING" or case.area != "rule" or case.steps != 2 or not failed.alone:
@@ -419,25 +385,30 @@ def _deepest(examiner: Examiner, failed: Failed) -> Failed:
     for part in np.arange(1.02, _FURTHEST, 0.04):
         moved = first.positions + part * (last.positions - first.positions)
         further = replace(case, stills=(first, replace(last, positions=moved)))
-        found = tuple(one for one in examiner.failures(further) if one.code == "MISSING" and one.step == 1)
+        found = tuple(
+            failure
+            for failure in examiner.failures(further)
+            if failure.code == "MISSING" and failure.step == 1
+        )
         if not found:
             break
         failed = replace(failed, case=further, failures=found)
     return failed
 
 
-def _order(examiner: Examiner) -> None:
-    """Whether the same question has the same rows in the same order, twice in a row."""
-    for case in (one("order", "reuse", gas(40, 6.0, 120), 6.0), one("order", "reuse", gas(40, 3.0, 120))):
+def _keeps_order(examiner: Examiner) -> bool | None:
+    """Whether the same question has the same rows in the same order, three times; None where it has none."""
+    for case in (once("order", "reuse", gas(40, 6.0, 120), 6.0), once("order", "reuse", gas(40, 3.0, 120))):
         case = replace(case, skin=0.3 if examiner.tested.kept else 0.0)
         if examiner.tested.limits.refusal(case) is None:
             answers = [examiner.session.ask(case)[0].answer for _ in range(3)]
             first = answers[0]
-            if first is not None:
-                examiner.report.keeps_order = all(
-                    other is not None and first.same(other) for other in answers[1:]
-                )
-            return
+            return (
+                None
+                if first is None
+                else all(other is not None and first.same(other) for other in answers[1:])
+            )
+    return None
 
 
 def _too_long(report: Report, case: Case) -> str | None:
@@ -450,30 +421,43 @@ def _too_long(report: Report, case: Case) -> str | None:
     return f"{case.atoms:,} atoms would take more than {_PATIENCE:.0f} s" if expected > _PATIENCE else None
 
 
-def _distinct(failed: list[Failed]) -> list[Failed]:
+def _refusals(examiner: Examiner) -> list[RefusalKind]:
+    """Each kind of refusal, with what is answered of the same question put in another way.
+
+    A new process, or a new object, is asked each.
+    """
+    found = []
+    for words, case in list(examiner.refused.values())[:_REFUSALS]:
+        uneven, answers = [], []
+        for how, even, other in alike(case):
+            if examiner.tested.limits.refusal(other) is None:
+                examiner.session.close()
+                outcomes = examiner.session.ask(other)
+                if len(outcomes) == other.steps and outcomes[-1].answer is not None:
+                    (uneven if even else answers).append(how)
+        found.append(RefusalKind(words, case, tuple(uneven), tuple(answers)))
+    return found
+
+
+def distinct(failed: Iterable[Failed]) -> list[Failed]:
     """The smallest failure of each kind: one mistake is met in many areas, and one script of it is enough.
 
-    Those of a code that need as many atoms, steps and axes that repeat are taken for the same mistake;
-    exceptions and what is no list of pairs, where they say the same but for numbers.
+    Those of a code that need equally many atoms, steps and periodic axes are taken for the same mistake;
+    exceptions and what is no list of pairs, where they are the same in words but for numbers.
     """
-    from mdnum.references.conformance.shrink import kind
+
+    def size(failure: Failed) -> tuple[bool, int, int, int]:
+        return not failure.alone, failure.case.atoms, failure.case.steps, sum(failure.case.pbc)
 
     kept: dict[Any, Failed] = {}
-    for one_failed in sorted(failed, key=_size):
-        case = one_failed.case
-        key: Any = kind(one_failed.worst)
-        if one_failed.code not in ("RAISED", "CRASHED", "MALFORMED"):
+    for failure in sorted(failed, key=size):
+        case = failure.case
+        key: Any = kind(failure.worst)
+        if failure.code not in ("RAISED", "CRASHED", "MALFORMED"):
             key = (key, min(case.atoms, 3), min(case.steps, 2), any(case.pbc))
-            if not one_failed.alone:
+            if not failure.alone:
                 # what was kept from other questions is a mistake of its own, and its case was not shrunk
-                key = (one_failed.code, "not alone")
-        kept.setdefault(key, one_failed)
-    return sorted(kept.values(), key=lambda one: (CODES.index(one.code), list(AREAS).index(one.case.area)))
-
-
-def _size(failed: Failed) -> tuple[bool, int, int, int]:
-    case = failed.case
-    return not failed.alone, case.atoms, case.steps, sum(case.pbc)
-
-
-__all__ = ["CASES", "KEPT", "Examiner", "Failed", "Report", "Tally", "drawn", "examine", "questions"]
+                key = (failure.code, "not alone")
+        kept.setdefault(key, failure)
+    areas = list(AREAS)
+    return sorted(kept.values(), key=lambda one: (CODES.index(one.code), areas.index(one.case.area)))

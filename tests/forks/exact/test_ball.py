@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mdnum.ball import (
+    BallVerlet,
     EventLocated,
     ExplicitEuler,
     GlobalSum,
@@ -20,7 +21,6 @@ from mdnum.ball import (
     PerInstance,
     Projection,
     SemiImplicitEuler,
-    VelocityVerlet,
     World,
     simulate,
 )
@@ -30,7 +30,7 @@ from mdnum.forks.exact.ball import Dyadic, ball_history, ball_horizon
 SCHEMES = {
     "explicit-euler": ExplicitEuler,
     "semi-implicit-euler": SemiImplicitEuler,
-    "velocity-verlet": VelocityVerlet,
+    "velocity-verlet": BallVerlet,
 }
 H, G, START = 0.01, 9.81, 0.71
 
@@ -107,7 +107,7 @@ def test_a_projection_against_fractions(scheme):
 def test_control_and_hysteresis_as_the_program_has_them():
     """Short enough for float64 to decide as exact arithmetic does."""
     control = np.linspace(-3.0, 3.0, 40)
-    world = World.create(Penalty(900.0, 2.0), VelocityVerlet(H), G, control, hysteresis=0.02)
+    world = World.create(Penalty(900.0, 2.0), BallVerlet(H), G, control, hysteresis=0.02)
     start = world.start([0.2, 0.35])
     history, run = ball_history(world, start, 80), simulate(world, start, 80)
     np.testing.assert_array_equal(history.contact, run.contact)

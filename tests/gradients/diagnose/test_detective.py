@@ -12,8 +12,7 @@ from ase import Atoms
 from small_systems import LENNARD_JONES, make
 
 from mdnum.gradients import Problem
-from mdnum.gradients.diagnose.detective import detective
-from mdnum.gradients.diagnose.operations import first_not_finite
+from mdnum.gradients.diagnose.detective import detective, first_not_finite
 from mdnum.gradients.losses import Custom, VelocityAutocorrelation
 from mdnum.gradients.parameters import with_values
 from mdnum.systems import build
@@ -51,7 +50,6 @@ def test_the_pair_whose_second_derivative_overflows_is_named(meeting):
     assert (found.part, found.i, found.j) == ("forces", 0, 1)
     assert found.distance == pytest.approx(APART, rel=1e-3)
     assert found.operation == "mul" and found.source.endswith("LennardJones.evaluate")
-    assert "pair (0, 1)" in found.says
 
 
 @pytest.mark.slow
@@ -74,7 +72,6 @@ def test_a_loss_that_is_not_finite_itself_is_no_fault_of_the_reverse_pass(meetin
     loss = Custom(see=lambda frame, *_: jnp.log(jnp.sum(frame.v)))
     found = detective(Problem(far, loss, 1), ("sigma",), saltation=False)
     assert found.found and not found.forward and found.operation == "log"
-    assert found.says.startswith("The loss itself")
 
 
 @pytest.mark.slow

@@ -10,11 +10,10 @@ from small_systems import LENNARD_JONES, make
 from mdnum.errors import InputError
 from mdnum.gradients import Problem
 from mdnum.gradients.diagnose.growth import CLOCK_STEPS
-from mdnum.gradients.diagnose.jacobian import Jacobian
-from mdnum.gradients.diagnose.spectrum import spectrum
+from mdnum.gradients.diagnose.spectrum import Jacobian, spectrum
 from mdnum.gradients.losses import FinalProjection
 from mdnum.gradients.parameters import with_values
-from mdnum.gradients.tape import Tape
+from mdnum.gradients.tape import RunTape
 from mdnum.rollout.engine import Engine
 from mdnum.systems import build
 
@@ -80,7 +79,7 @@ def test_a_few_vectors_find_the_largest_within_their_residual(problem, dense):
 
 def test_energy_keeping_steps_come_in_pairs(problem):
     """With unit masses every step is symplectic in (x, v): singular values of the map are s and 1/s."""
-    tape = Tape(problem.simulation, problem.loss, STEPS)
+    tape = RunTape(problem.simulation, problem.loss, STEPS)
     identity = Jacobian(tape, 1.0).forward(np.eye(24))
     sizes = np.linalg.svd(identity.basis @ identity.mixing, compute_uv=False) * np.exp(identity.log_scale)
     np.testing.assert_allclose(sizes * sizes[::-1], 1.0, rtol=1e-8)

@@ -12,12 +12,13 @@ import planted_lists
 import pytest
 
 from mdnum.references.conformance.case import Still
-from mdnum.references.conformance.catalog import catalog
-from mdnum.references.conformance.crowds import LARGE_EDGE, SMALL_EDGE, lattice
+from mdnum.references.conformance.catalog import LARGE_EDGE, SMALL_EDGE, catalog, lattice
 from mdnum.references.conformance.loading import from_object
+from mdnum.references.conformance.motions import motions
+from mdnum.references.conformance.questions import drawn, questions
 from mdnum.references.conformance.reproduction import script
-from mdnum.references.conformance.rule import motions
-from mdnum.references.conformance.suite import Examiner, Report, drawn, examine, questions
+from mdnum.references.conformance.results import Report
+from mdnum.references.conformance.suite import Examiner, examine
 
 ROOT = Path(__file__).parents[3]
 # what needs more atoms than the small questions have
@@ -106,7 +107,7 @@ def test_a_padding_of_its_own_hides_no_rule(defect: str, way: str, own: float):
     made = planted_lists.ruled(test, own, filtered=way != "shown", says=way == "said")
     report = _against_the_rule(made, stop=True, shrink=False)
     assert [failed.code for failed in report.failed] == ["MISSING"], f"{report.calls} calls"
-    assert report.said == (way == "said")
+    assert report.stated == (way == "said")
     assert (report.padding is None) == (way == "neither")
     assert report.padding is None or abs(report.padding * 0.3 / own - 1) < 0.01
 
@@ -145,7 +146,7 @@ def test_rows_beyond_4096_are_found_lost():
     assert report.failed[0].code == "MISSING"
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_keys_that_overflow_are_found_at_100_000_atoms():
     """Where the square of the number of atoms is more than 32 bits hold."""
     assert _found("32-bit keys", asked=[lattice(LARGE_EDGE)]).failed
@@ -172,7 +173,7 @@ def test_failures_shrink_and_are_reproduced_without_mdnum(defect, area, atoms, s
     made = planted_lists.planted if defect in planted_lists.SEARCH_DEFECTS else planted_lists.kept
     tested = from_object(made(defect), defect).with_options(full=True)
 
-    cases = [case for case in questions(tested, 40, 0, False) if case.area == area]
+    cases = [case for case in questions(tested, 40, 0) if case.area == area]
     report = examine(tested, asked=cases, shrink=True)
     failed = report.failed[0]
     assert failed.alone
@@ -242,7 +243,7 @@ def test_what_is_told_is_reproduced_whatever_is_returned(spoiled: str, capsys: p
         assert ("the list is wrong" if wanted else "the list is right") in said
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_10_000_clean_cases_raise_no_alarm():
     """Half of them drawn; the other half the same atoms in another order and elsewhere, which rounds anew."""
     asked = [case for seed in range(20) for case in drawn(250, seed)]

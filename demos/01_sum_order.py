@@ -1,0 +1,132 @@
+"""Five terms, two orders, two answers: a float16 sum that decides whether a solver stops."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mdnum.ball import BallRun, GlobalSum, Projection, SemiImplicitEuler, World, simulate
+from mdnum.precision.policy import RolePrecision
+from mdnum.precision.reductions import BY_NAME, Reduction
+from mdnum.precision.running import RunningSum, running_sum_table
+from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
+
+#: The tolerance, and five penetrations (m) whose exact sum it is: one just below it and four that are each
+#: a quarter of its last place.
+TOL = 2.0**-10
+LARGE = TOL - 2.0**-21
+SMALL = 2.0**-23
+TERMS = np.array([LARGE, SMALL, SMALL, SMALL, SMALL], np.float16)
+
+
+def solve(penetrations: np.ndarray, reduction: Reduction) -> BallRun:
+    """One step of balls at rest below the floor: only the solver has something to decide. All in float16."""
+    stop = GlobalSum(TOL, 25, reduction)
+    world = World.create(
+        Projection(k=0.5, alpha=0.5, stop=stop),
+        SemiImplicitEuler(2.0**-7),
+        gravity=0.0,
+        policy=RolePrecision.all("float16"),
+    )
+    return simulate(world, world.start(-penetrations), 1, history=True)
+
+
+def run() -> Demo:
+    """Both orders, every reduction, and what jnp.sum makes of it."""
+    orders = {"large first": TERMS, "small first": TERMS[::-1]}
+    histories = {name: running_sum_table(terms) for name, terms in orders.items()}
+    runs = {name: solve(terms, BY_NAME["sequential"]) for name, terms in orders.items()}
+    residual = {name: float(one.history[0, 0]) for name, one in runs.items() if one.history is not None}
+    stopped = {name: int(one.iterations[0]) == 0 for name, one in runs.items()}
+    hidden = {name: float(jnp.sum(jnp.asarray(terms))) for name, terms in orders.items()}
+    sums = jax.jit(lambda terms: {name: reduction(terms) for name, reduction in BY_NAME.items()})(TERMS)
+    others = {name: float(total) for name, total in sums.items()}
+    large, small = histories["large first"], histories["small first"]
+    seen = residual["large first"], residual["small first"]
+    return Demo(
+        title="The order of a sum decides whether a solver stops",
+        question="Five float16 penetrations add up to exactly the tolerance. Is their sum below it?",
+        answer=(
+            "Large first, each small term is a quarter of the accumulator's last place and is rounded away: "
+            f"{seen[0]:.13f} is below the tolerance and the solver stops. Small first, they add up to one "
+            f"last place: {seen[1]:.10f} is not below, and the solver makes an iteration. jnp.sum gives "
+            f"{hidden['large first']:.10f} both ways, because it adds float16 in float32."
+        ),
+        numbers={
+            "large_first": seen[0],
+            "large_first_stops": stopped["large first"],
+            "small_first": seen[1],
+            "small_first_stops": stopped["small first"],
+            "tolerance": TOL,
+            "jnp_sum": [hidden["large first"], hidden["small first"]],
+            "bits_lost": [large.bits_lost, small.bits_lost],
+            "iterations": [int(one.iterations[0]) for one in runs.values()],
+        },
+        checks=[
+            Claim("large first is one last place below", seen[0], repr(LARGE), seen[0] == LARGE),
+            Claim("large first stops", stopped["large first"], "True", stopped["large first"]),
+            Claim("small first is the tolerance", seen[1], repr(TOL), seen[1] == TOL),
+            Claim("small first goes on", not stopped["small first"], "True", not stopped["small first"]),
+            Claim(
+                "the exact sum is the tolerance",
+                float(large.exact),
+                repr(TOL),
+                large.exact == small.exact == Fraction(TOL),
+            ),
+            Claim(
+                "the solver saw what the table says",
+                [large.result, small.result],
+                "the same bits",
+                (large.result, small.result) == seen,
+            ),
+            Claim(
+                "jnp.sum hides it",
+                list(hidden.values()),
+                f"{TOL!r} twice",
+                set(hidden.values()) == {TOL},
+            ),
+        ],
+        tables=[
+            table(f"{name}, addition by addition", history.columns, history.table())
+            for name, history in histories.items()
+        ]
+        + [
+            table(
+                "every reduction, large first",
+                ("reduction", "sum", "error (last places)", "stops"),
+                tuple((name, total, (total - TOL) * 2.0**21, total < TOL) for name, total in others.items()),
+            )
+        ],
+        plots=[_errors(histories)],
+        in_md=(
+            "The force on an atom is such a sum over its neighbors, in the order of the list; the same table "
+            "can be made of it (running_sum_table of what a Tap has seen)."
+        ),
+        data={
+            "penetrations": TERMS.astype(float),
+            "running": {name: [row.running for row in one.rows] for name, one in histories.items()},
+            "reductions": others,
+        },
+    )
+
+
+def _errors(histories: dict[str, RunningSum]) -> Plot:
+    def missing(history: RunningSum) -> np.ndarray:
+        return np.array([float((Fraction(row.running) - row.exact) * 2**21) for row in history.rows])
+
+    count = np.arange(1, len(TERMS) + 1)
+    return Plot(
+        "accumulator-misses",
+        title="What the accumulator misses after each addition",
+        x_label="additions",
+        y_label="running sum - exact sum (last places of the tolerance)",
+        series=(
+            Series("large first", count, missing(histories["large first"]), "line+points", "bad"),
+            Series("small first", count, missing(histories["small first"]), "line+points", "first"),
+        ),
+        caption="Large first, every small term is lost, and a last place is missing at the end. Small first, "
+        "nothing is.",
+    )

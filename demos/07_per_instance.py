@@ -1,0 +1,190 @@
+"""One ball more below the floor, far from the others: whose solver notices?"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from mdnum.ball import (
+    BallProblem,
+    BallRun,
+    FixedCount,
+    GlobalSum,
+    Maximum,
+    PerInstance,
+    Projection,
+    SemiImplicitEuler,
+    World,
+)
+from mdnum.gradients.ball import scaled
+from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
+
+K = ALPHA = 0.5
+TOL, CAP = 1e-3, 100
+#: Penetrations of the batch, m; together they take 7 iterations, and a little more would take 8.
+BATCH = tuple(TOL * share for share in (3.0, 1.5, 0.2, 0.1, 2.0))
+#: Penetration of the ball that joins them, m: near the tolerance, and below it.
+STRANGER = 0.95 * TOL
+#: Where it is when it has nothing to do with the floor; a batch of the same size is the same program.
+AWAY = -1.0
+
+
+class LeftOf(eqx.Module):
+    """Mean penetration that is left of the first balls of a batch, m, summed over steps."""
+
+    balls: int = eqx.field(static=True)
+
+    def step(self, state, record, dtype):
+        """What this step leaves of them."""
+        return jnp.mean(record.left[: self.balls].astype(dtype))
+
+    def end(self, state, steps, total):
+        """The sum."""
+        return total
+
+
+def rules() -> dict[str, Any]:
+    """The rules that are compared."""
+    return {
+        "global sum": GlobalSum(TOL, CAP),
+        "maximum": Maximum(TOL, CAP),
+        "per instance": PerInstance(TOL, CAP),
+        "fixed count": FixedCount(4),
+    }
+
+
+def batch(rule: Any, depths: tuple[float, ...]) -> BallProblem:
+    """Balls below the floor and one projection; the loss is of the balls of `BATCH` only."""
+    world = World.create(Projection(K, ALPHA, rule), SemiImplicitEuler(1.0), gravity=0.0)
+    return BallProblem(world, -np.array(depths), 0.0, 1, LeftOf(len(BATCH)))
+
+
+def counts(run: BallRun) -> np.ndarray:
+    """Iterations that each ball of the batch went through."""
+    return np.broadcast_to(run.iterations[0], (run.balls,))[: len(BATCH)]
+
+
+def run() -> Demo:
+    """Each rule with the stranger away and below the floor."""
+    found: dict[str, dict[str, Any]] = {}
+    for name, rule in rules().items():
+        alone, joined = (batch(rule, (*BATCH, depth)) for depth in (AWAY, STRANGER))
+        before, after = counts(alone.run()), counts(joined.run())
+        made = [scaled(one, ["k"]) for one in (alone, joined)]
+        found[name] = {
+            "before": before.tolist(),
+            "after": after.tolist(),
+            "coupling": float(np.mean(before != after)),
+            "loss": [one.value for one in made],
+            "grad_k": [one.slopes["k"] for one in made],
+        }
+    total, own = found["global sum"], found["per instance"]
+    drift = _growth()
+    return Demo(
+        title="A sum over the batch couples balls that never meet",
+        question="A ball far from the others sinks below the floor. Do their solvers notice?",
+        answer=(
+            f"Under one sum for the batch all of them do: {total['before'][0]} iterations become "
+            f"{total['after'][0]} and the derivative of their loss by the gain goes from "
+            f"{total['grad_k'][0]:.2g} to {total['grad_k'][1]:.2g}. With a rule for each ball none does. The "
+            "largest term couples only where the stranger is the largest and above the tolerance."
+        ),
+        numbers={
+            "coupling": {name: row["coupling"] for name, row in found.items()},
+            "iterations_before": {name: row["before"] for name, row in found.items()},
+            "iterations_after": {name: row["after"] for name, row in found.items()},
+            "grad_k": {name: row["grad_k"] for name, row in found.items()},
+        },
+        checks=[
+            Claim(
+                "global sum: share of other balls whose count changed",
+                total["coupling"],
+                "1",
+                total["coupling"] == 1,
+            ),
+            Claim("per instance: the same share", own["coupling"], "0", own["coupling"] == 0),
+            Claim(
+                "fixed count: the same share",
+                found["fixed count"]["coupling"],
+                "0",
+                found["fixed count"]["coupling"] == 0,
+            ),
+            Claim(
+                "per instance: their loss and its derivative keep every bit",
+                [own["loss"], own["grad_k"]],
+                "equal pairs",
+                own["loss"][0] == own["loss"][1] and own["grad_k"][0] == own["grad_k"][1],
+            ),
+            Claim(
+                "global sum: the derivative of their loss is that of another number of iterations",
+                total["grad_k"],
+                "n p (3/4)^(n-1) / 2 with n = 7 and 8",
+                all(
+                    np.isclose(slope, -np.mean(BATCH) * n * (1 - ALPHA * K) ** (n - 1) * ALPHA, rtol=1e-12)
+                    for slope, n in zip(total["grad_k"], (7, 8), strict=True)
+                ),
+            ),
+            Claim(
+                "the larger the batch, the more iterations under one sum, and not under one each",
+                [drift["global sum"], drift["per instance"]],
+                "rising; constant",
+                drift["global sum"][-1] > drift["global sum"][0] and len(set(drift["per instance"])) == 1,
+            ),
+        ],
+        tables=[
+            table(
+                "the five balls of the batch, without and with a sixth",
+                ("rule", "iterations before", "after", "coupling", "dloss/dk before", "after"),
+                tuple(
+                    (
+                        name,
+                        _short(row["before"]),
+                        _short(row["after"]),
+                        row["coupling"],
+                        *row["grad_k"],
+                    )
+                    for name, row in found.items()
+                ),
+            )
+        ],
+        plots=[
+            Plot(
+                "iterations-ball",
+                title="Iterations of a ball against the size of its batch",
+                x_label="balls in the batch",
+                y_label="iterations",
+                x_scale="log",
+                series=(
+                    Series("global sum", _SIZES, np.array(drift["global sum"], float), "line+points", "bad"),
+                    Series("per instance", _SIZES, np.array(drift["per instance"], float), "line+points"),
+                ),
+                caption="Equal balls, 0.45 m below the floor: under one sum a ball's own solve depends on "
+                "how many others there are.",
+            )
+        ],
+        in_md=(
+            "The energy of a batch of structures, the residual norm of all constraints, the largest "
+            "displacement in the box: one number for all lets a stranger decide about everybody's next step."
+        ),
+        data=found,
+    )
+
+
+_SIZES = np.array([1.0, 10.0, 100.0])
+
+
+def _growth() -> dict[str, list[int]]:
+    """Iterations of the first of so many equal balls; under a rule for each they are those of any batch."""
+    shared = [batch(GlobalSum(TOL, CAP), (0.45,) * int(size)).run(keep=False) for size in _SIZES]
+    own = batch(PerInstance(TOL, CAP), (0.45,) * (len(BATCH) + 1)).run(keep=False).iterations[0]
+    return {
+        "global sum": [int(one.iterations[0]) for one in shared],
+        "per instance": [int(n) for n in own[: len(_SIZES)]],
+    }
+
+
+def _short(values: list[int]) -> str:
+    return " ".join(str(value) for value in values)

@@ -1,0 +1,205 @@
+"""Work around small closed loops: a force that has an energy does none."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from ase import Atoms
+from jaxtyping import Float
+
+from mdnum.audit.base import CheckResult, Progress, TimeUp, finding
+from mdnum.audit.check import AuditCheck, ask_each
+from mdnum.audit.noise import FEW, NoiseFloor, displaced, settled
+from mdnum.audit.subject import CalculatorSubject
+
+#: Å; the loop with the smaller error counts.
+_RADII = (0.03, 0.003, 0.0003)
+#: Points on a loop: equally spaced ones integrate a smooth periodic function to all orders below this.
+_POINTS = 12
+#: Work over its error from which it is significant.
+_SIGNIFICANT = 10.0
+#: Antisymmetric over symmetric part of the derivative of the forces: below, it is precision.
+_SMALL = 1e-4
+
+Displacement = Float[np.ndarray, "atoms 3"]
+
+
+@dataclass(frozen=True)
+class Loop:
+    """A force carried around a circle in the space of all coordinates.
+
+    Attributes:
+        plane: in words.
+        radius: Å, of the displacement of all atoms together.
+        work: eV.
+        curl: work over area: v·Ju - u·Jv with J the derivative of the forces, eV/Å².
+        error: of the curl, eV/Å².
+        stiffness: size of the symmetric part of J in the plane, eV/Å².
+    """
+
+    plane: str
+    radius: float
+    work: float
+    curl: float
+    error: float
+    stiffness: float
+
+    @property
+    def conservative(self) -> bool:
+        """Whether the curl is zero within its error."""
+        return abs(self.curl) <= _SIGNIFICANT * self.error
+
+    @property
+    def share(self) -> float:
+        """Antisymmetric over symmetric part."""
+        return abs(self.curl) / self.stiffness if self.stiffness else (float("inf") if self.curl else 0.0)
+
+
+class CurlCheck(AuditCheck):
+    """Do the forces work around closed loops?"""
+
+    name, title, order = "curl", "Curl", 40
+    needed_to = ("differentiate",)
+    seed = 0
+
+    def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
+        """The circulation of the forces in planes of all kinds."""
+        rng = np.random.default_rng(self.seed)
+        worker = subject.fresh()
+        atoms, noise = settled(worker, rng, at_least=FEW)
+        skipped: list[tuple[str, str]] = []
+        wanted = list(_planes(worker, atoms, rng))
+
+        def asked(plane: str, u: Displacement, v: Displacement) -> Loop:
+            return agreed([around(worker, atoms, u, v, radius, noise, plane) for radius in _RADII])
+
+        ways = [(f"a loop of {one[0]}", lambda one=one: asked(*one)) for one in wanted]
+        loops = list(ask_each(worker, ways, progress, self.name, skipped, spread=True).values())
+        if not loops:
+            raise TimeUp
+        wrong = [one for one in loops if not one.conservative]
+        worst = max(wrong, key=lambda one: one.share, default=None)
+        limit = max(loops, key=lambda one: (abs(one.curl) + one.error) / max(one.stiffness, 1e-300))
+        values: dict[str, Any] = {"loops": len(loops), "wrong": len(wrong)}
+        values |= {"limit": abs(limit.curl) + limit.error, "stiffness": limit.stiffness}
+        found = []
+        if worst:
+            values |= {
+                "radius": worst.radius, "plane": worst.plane, "work": worst.work, "curl": worst.curl,
+                "error": worst.error, "share": worst.share,
+            }  # fmt: skip
+            found.append(finding("CURL", "error" if worst.share > _SMALL else "warning", **values))
+        return CheckResult(
+            says=(["curl_found" if worst else "curl_none"], values),
+            findings=found,
+            tables={"Work around closed loops": [_row(one) for one in loops]},
+            numbers={
+                "loops": len(loops),
+                "with_work": len(wrong),
+                "largest_curl": max(abs(one.curl) for one in loops),
+                "largest_share": max((one.share for one in wrong), default=0.0),
+                "largest_error": max(one.error for one in loops),
+            },
+            skipped=skipped,
+            asked=len(loops),
+            possible=len(wanted),
+        )
+
+
+def agreed(tried: Sequence[Loop]) -> Loop:
+    """The loop with the smallest error, which is raised where a loop of another radius disagrees.
+
+    A curl is the same on every small circle; what a jump of the forces does to the work around one is not.
+
+    Args:
+        tried: the same plane at several radii.
+    """
+    best = min(tried, key=lambda one: one.error)
+    others = [one.curl for one in tried if _SIGNIFICANT * one.error < abs(best.curl)]
+    spread = max((abs(one - best.curl) for one in others), default=0.0)
+    return replace(best, error=max(best.error, spread))
+
+
+def _planes(
+    subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator
+) -> Iterator[tuple[str, Displacement, Displacement]]:
+    """Two orthonormal displacements each: of all atoms, of one atom, of an atom and one that it feels."""
+    count = len(atoms)
+    if count > 1:
+        for number in range(3):
+            u, v = np.linalg.qr(rng.standard_normal((3 * count, 2)))[0].T
+            yield f"all atoms at random, {number + 1}", u.reshape(count, 3), v.reshape(count, 3)
+
+    def of(who: int, first: int, other: int, second: int) -> tuple[Displacement, Displacement]:
+        u, v = np.zeros((2, count, 3))
+        u[who, first] = v[other, second] = 1.0
+        return u, v
+
+    few = rng.permutation(count)[:2]
+    for first, second in ((0, 1), (1, 2)):
+        for who in few:
+            plane = f"atom {who} ({atoms.symbols[who]}) in {'xyz'[first]}{'xyz'[second]}"
+            yield plane, *of(who, first, who, second)
+    if count < 2:
+        return
+    who = int(rng.integers(count))
+    step = np.zeros((count, 3))
+    step[who] = (0.01, 0.007, -0.004)
+    answer = np.linalg.norm(subject.forces(displaced(atoms, step)) - subject.forces(atoms), axis=1)
+    answer[who] = -1.0
+    for other in np.argsort(-answer)[:2]:
+        for first, second in ((0, 1), (2, 0)):
+            plane = f"atom {who} along {'xyz'[first]} and atom {other} along {'xyz'[second]}"
+            yield plane, *of(who, first, other, second)
+
+
+def around(
+    subject: CalculatorSubject,
+    atoms: Atoms,
+    u: Displacement,
+    v: Displacement,
+    radius: float,
+    noise: NoiseFloor,
+    plane: str = "",
+) -> Loop:
+    """The work of the forces around x + radius (u cos t + v sin t).
+
+    Args:
+        atoms: the center.
+        u, v: orthogonal unit vectors.
+        radius: Å.
+        noise: of the forces there.
+        plane: in words.
+
+    Error:
+        what a part of the points gives otherwise, and the noise of the forces.
+    """
+    angles = 2 * np.pi * np.arange(_POINTS) / _POINTS
+    forces = [
+        subject.forces(displaced(atoms, radius * (np.cos(angle) * u + np.sin(angle) * v))) for angle in angles
+    ]
+    along_u = np.array([float(np.sum(force * u)) for force in forces])
+    along_v = np.array([float(np.sum(force * v)) for force in forces])
+    tangential = -np.sin(angles) * along_u + np.cos(angles) * along_v
+    work = 2 * np.pi * radius * float(np.mean(tangential))
+    # what a half or a third of the points give: a jump of the forces on the loop sets them apart
+    parts = [np.mean(tangential[first::every]) for every in (2, 3) for first in range(every)]
+    unsure = 2 * np.pi * radius * float(np.max(np.abs(np.array(parts) - np.mean(tangential))))
+    # the first harmonics are the derivative of the forces in the plane
+    uu = 2 * float(np.mean(along_u * np.cos(angles))) / radius
+    vv = 2 * float(np.mean(along_v * np.sin(angles))) / radius
+    uv = float(np.mean(along_u * np.sin(angles) + along_v * np.cos(angles))) / radius
+    area = np.pi * radius**2
+    rounding = noise.force + np.finfo(float).eps * float(np.max(np.abs([along_u, along_v])))
+    error = unsure + 2 * np.pi * radius * rounding / np.sqrt(_POINTS)
+    return Loop(plane, radius, work, work / area, error / area, float(np.sqrt((uu**2 + vv**2) / 2 + uv**2)))
+
+
+def _row(one: Loop) -> dict[str, Any]:
+    return {
+        "plane": one.plane, "radius (Å)": one.radius, "work (eV)": one.work, "curl (eV/Å²)": one.curl,
+        "error": one.error, "stiffness (eV/Å²)": one.stiffness, "no work": one.conservative,
+    }  # fmt: skip

@@ -1,0 +1,414 @@
+"""Forces against differences of the energy, with a step that the calculator's own noise decides."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import islice
+from typing import Any
+
+import numpy as np
+from ase import Atoms
+from jaxtyping import Float
+
+from mdnum.audit import transformations
+from mdnum.audit.base import Chart, CheckResult, Observed, Progress, TimeUp, finding
+from mdnum.audit.check import AuditCheck, ask_each
+from mdnum.audit.noise import FEW, NoiseFloor, direction, displaced, precision, settled, steps
+from mdnum.audit.subject import CalculatorError, CalculatorSubject, no_rounding, only_trying, rms
+
+#: Å; each step of the ladder is a quarter of the one before: 0.064 Å down to 1e-6 Å.
+_LADDER = 0.064 * 0.25 ** np.arange(9)
+#: Difference over estimated error from which forces and energy disagree.
+_SIGNIFICANT = 10.0
+#: Of the root mean square force: below, a disagreement is one of tables or precision.
+_SMALL = 1e-4
+#: Of the root mean square force: noise above a tenth of it leaves nothing to be said of forces, and above the
+#: other is more than single precision explains.
+_DROWNED, _LOUD = 0.1, 1e-3
+_DIRECTIONS, _ATOMS = 3, 4
+#: How many times the noise the difference of two energies may change by.
+_ALLOWED = 40.0
+#: Of kT: a change of it below is one of precision rather than of physics; a jump of it, or a difference
+#: between two ways of writing one structure down, above the other is an error.
+_SMALL_OFFSET, _LARGE_OFFSET = 1e-6, 1e-3
+#: Å to either side, for the derivative of that difference, and the error of it, roughly.
+_STEP, _CENTRAL = 1e-3, 1e-3
+
+Displacement = Float[np.ndarray, "atoms 3"]
+
+
+@dataclass(frozen=True)
+class Slope:
+    """The derivative of the energy along a direction, by differences and from the forces.
+
+    Attributes:
+        direction: in words.
+        difference: by differences of the energy, eV/Å.
+        error: of it, estimated from two steps and the noise, eV/Å.
+        force: the same from the forces, eV/Å.
+        step: Å, the one chosen.
+        gaps: |difference - force| at each step of the ladder, without extrapolation, eV/Å.
+        jump: energy step between the two nearest points, eV; 0 where there is none.
+    """
+
+    direction: str
+    difference: float
+    error: float
+    force: float
+    step: float
+    gaps: Float[np.ndarray, "steps"]
+    jump: float
+
+    @property
+    def gap(self) -> float:
+        """|difference - force|, eV/Å."""
+        return abs(self.difference - self.force)
+
+    @property
+    def agrees(self) -> bool:
+        """Whether force and difference are the same within the error of the difference."""
+        return self.gap <= _SIGNIFICANT * self.error
+
+
+class ForcesCheck(AuditCheck):
+    """Are the forces the derivative of the energy, and of which one?
+
+    The error of a difference is |D(h) - D(h/4)| after extrapolation plus the measured noise over the step; of
+    a ladder of steps the one with the smallest error is taken. A difference that grows like 1/h is a step of
+    the energy, not a wrong force, and is reported as such.
+    """
+
+    name, title, order = "forces", "Forces", 30
+    needed_to = ("run", "differentiate")
+    seed = 0
+
+    def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
+        """Forces against central differences, extrapolated, and sums that must vanish."""
+        rng = np.random.default_rng(self.seed)
+        worker = subject.fresh()
+        atoms, noise = settled(worker, rng, at_least=FEW)
+        forces = worker.forces(atoms)
+        scale = rms(forces)
+        skipped: list[tuple[str, str]] = []
+        wanted = list(_directions(atoms, rng))
+        ways = [
+            (f"moving {what}", lambda what=what, line=line: slope(worker, atoms, line, forces, noise, what))
+            for what, line in wanted
+        ]
+        found = ask_each(worker, ways, progress, self.name, skipped, spread=True)
+        if not found:
+            raise TimeUp
+        slopes, sums = list(found.values()), list(_sums(atoms, forces, noise))
+        wrong_sums = list(_judged_sums(sums, scale))
+        if wrong_sums or not all(one.agrees for one in slopes):
+            # the forces at the structure itself, which all directions are compared with
+            worker.again(atoms, forces=forces)
+        # of directions in which one atom moves: to within what differences typically tell its force
+        single = [one.error for one in slopes if not one.direction.startswith("all")]
+        known = float(np.median(single)) if single else 0.0
+        drowned = _drowned(worker, atoms, noise, known, scale)
+        unclear = [
+            one
+            for place, one in found.items()
+            # as much as a force of the drowned size does along a direction in which more atoms move
+            if one.agrees
+            and max(one.error, one.gap) > _DROWNED * scale * float(np.linalg.norm(wanted[place][1]))
+        ]
+        first = min(found)
+        observed = [
+            *drowned,
+            *_judged(slopes, scale),
+            *wrong_sums,
+            *([] if any(one.severity == "error" for one in drowned) else precision(worker, atoms, noise)),
+            *_two_energies(worker, atoms, noise, wanted[first][1], found[first]),
+        ]
+        values = _values(slopes, unclear, scale)
+        if unclear and not observed:  # otherwise that is why
+            observed.append(finding("NOISE_FLOOR", "warning", "some", **values))
+        clear = len(slopes) > len(unclear)
+        says = ["forces_right", "forces_unclear"] if unclear else ["forces_right"]
+        if values["wrong"]:
+            says = ["forces_wrong"]
+        elif known > _DROWNED * scale or not clear:
+            says = ["forces_drowned"]
+        return CheckResult(
+            says=(says, values),
+            findings=observed,
+            tables={
+                "Derivative of the energy along a direction": [_row(one) for one in slopes],
+                "Sums that must vanish": sums,
+            },
+            charts=[_chart(slopes)],
+            numbers={
+                "directions": len(slopes),
+                "disagree": values["wrong"],
+                "could_not_tell": len(unclear),
+                "largest_difference": values["gap"],
+                "largest_error": values["error"],
+                "rms_force": scale,
+                "step": _worst(slopes).step,
+                "noise_energy": noise.energy,
+                "noise_force": noise.force,
+            },
+            skipped=skipped,
+            asked=len(slopes),
+            possible=len(wanted),
+        )
+
+
+def _values(slopes: list[Slope], unclear: list[Slope], scale: float) -> dict[str, Any]:
+    clear = [one for one in slopes if not any(one is other for other in unclear)] or slopes
+    return {
+        "directions": len(slopes),
+        "clear": len(clear),
+        "wrong": sum(not one.agrees for one in slopes),
+        "gap": max(one.gap for one in slopes),
+        "error": max(one.error for one in slopes),
+        "clear_gap": max(one.gap for one in clear),
+        "clear_error": max(one.error for one in clear),
+        "scale": scale,
+        "unclear": len(unclear),
+        "unclear_direction": unclear[0].direction if unclear else "",
+        "unclear_gap": max((max(one.error, one.gap) for one in unclear), default=0.0),
+    }
+
+
+def _worst(slopes: list[Slope]) -> Slope:
+    return max(slopes, key=lambda one: one.gap / one.error)
+
+
+def _directions(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Displacement]]:
+    """Displacements of all atoms at random, and of a few atoms along each axis; the furthest moves by 1."""
+    for number in range(_DIRECTIONS):
+        yield f"all atoms at random, {number + 1}", direction(len(atoms), rng)
+    for who in sorted(rng.permutation(len(atoms))[:_ATOMS]):
+        for axis in range(3):
+            line = np.zeros((len(atoms), 3))
+            line[who, axis] = 1.0
+            yield f"atom {who} ({atoms.symbols[who]}) along {'xyz'[axis]}", line
+
+
+def slope(
+    subject: CalculatorSubject,
+    atoms: Atoms,
+    line: Displacement,
+    forces: Displacement,
+    noise: NoiseFloor,
+    what: str = "",
+) -> Slope:
+    """The derivative of the energy along a line by differences, with its error, beside that of the forces.
+
+    Args:
+        atoms: where.
+        line: displacement per Å of step.
+        forces: the calculator's at `atoms`.
+        noise: of the energy there.
+        what: the direction in words.
+    """
+    plus, minus = (
+        np.array([subject.energy(displaced(atoms, sign * step * line)) for step in _LADDER])
+        for sign in (1, -1)
+    )
+    central = (plus - minus) / (2 * _LADDER)
+    # the error of a central difference goes with the square of the step, which is a quarter each time
+    better = (16 * central[1:] - central[:-1]) / 15
+    spread = np.abs(np.diff(better))
+    rounding = 2 * noise.energy / _LADDER[2:]
+    error = spread + rounding + 1e-15 * np.abs(better[1:])
+    force = -float(np.sum(forces * line))
+    best, doubt = _best(better[1:] - force, error, rounding)
+    # what a smooth energy has beside its slope goes with the third power of the step, a 64th each time
+    off = np.abs(2 * _LADDER * (central - better[best + 1]))
+    odd = np.append(False, off[1:] > 0.25 * off[:-1])
+    rung = int(np.argmax(np.where(odd, off, 0.0)))
+    if odd[rung] and no_rounding(off[rung], plus[rung], 0.0, None, subject.kT):
+        for sign, energies in ((1, plus), (-1, minus)):
+            subject.again(displaced(atoms, sign * _LADDER[rung] * line), float(energies[rung]))
+    # a difference that grows like 1/h down to the smallest h shows a step of the energy
+    sizes = 2 * _LADDER[-4:] * (central - force)[-4:]
+    steady = np.ptp(sizes) < 0.3 * abs(sizes[-1]) and abs(sizes[-1]) > 30 * noise.energy
+    return Slope(
+        what,
+        float(better[best + 1]),
+        # a force has its own rounding
+        doubt + noise.force * float(np.sqrt(np.sum(line**2))),
+        force,
+        float(_LADDER[best + 2]),
+        np.abs(central - force),
+        float(sizes[-1]) if steady else 0.0,
+    )
+
+
+def _best(
+    gaps: Float[np.ndarray, "steps"], error: Float[np.ndarray, "steps"], rounding: Float[np.ndarray, "steps"]
+) -> tuple[int, float]:
+    """(the step that counts, the error there): the smallest error's, unless others do not bear it out.
+
+    Where the energy jumps at flips, two steps may hold the same jumps by chance, and agree on a wrong slope.
+    A wrong force is as wrong at every step that can tell, and at the shorter ones above all.
+
+    Args:
+        gaps: difference minus force at each step, the longest first.
+        error: of the differences, estimated.
+        rounding: the part of it that noise explains.
+    """
+    best = int(np.argmin(error))
+    wrong = abs(gaps[best])
+    if wrong <= _SIGNIFICANT * error[best]:
+        return best, float(error[best])
+    shorter = np.arange(len(gaps)) > best
+    clears = shorter & (_SIGNIFICANT * rounding < 0.5 * wrong) & (np.abs(gaps) < 0.5 * wrong)
+    if clears.any():
+        best = int(np.argmin(np.where(clears, error, np.inf)))
+        return best, float(error[best])
+    same = (np.abs(gaps - gaps[best]) < 0.2 * wrong) & (_SIGNIFICANT * error < wrong)
+    return best, float(error[best] if same.sum() > 1 else max(error[best], wrong / _SIGNIFICANT))
+
+
+def _sums(atoms: Atoms, forces: Displacement, noise: NoiseFloor) -> Iterator[dict[str, Any]]:
+    """Net force, and net torque where nothing repeats: by symmetry of space both are zero."""
+    size = float(np.sum(np.abs(forces)))
+    allowed = 40 * (noise.force * np.sqrt(len(atoms)) + np.finfo(float).eps * size)
+    yield {
+        "sum": "net force (eV/Å)",
+        "found": float(np.linalg.norm(forces.sum(axis=0))),
+        "rounding explains": float(allowed),
+    }
+    if not atoms.pbc.any() and len(atoms) > 1:
+        arms = atoms.positions - atoms.positions.mean(axis=0)
+        reach = float(np.max(np.linalg.norm(arms, axis=1)))
+        yield {
+            "sum": "net torque (eV)",
+            "found": float(np.linalg.norm(np.cross(arms, forces).sum(axis=0))),
+            "rounding explains": float(allowed * max(reach, 1.0)),
+        }
+
+
+def _judged_sums(sums: list[dict[str, Any]], scale: float) -> Iterator[Observed]:
+    for row, code in zip(sums, ("NET_FORCE", "NET_TORQUE"), strict=False):
+        if row["found"] > row["rounding explains"]:
+            severity = "error" if row["found"] > _SMALL * scale else "warning"
+            yield finding(code, severity, size=row["found"], allowed=row["rounding explains"])
+
+
+def _drowned(
+    worker: CalculatorSubject, atoms: Atoms, noise: NoiseFloor, known: float, scale: float
+) -> list[Observed]:
+    """A finding where forces, or what differences can tell of them, are lost in noise that is no rounding."""
+    stairs = steps(worker, atoms)  # which are another finding
+    size = max(noise.force, 0.0 if stairs.energy else known)
+    if size <= max(_DROWNED * scale, stairs.force):
+        size = noise.typical
+    if not scale or size <= max(_LOUD * scale, stairs.force):
+        return []
+    # forces that are known well are not tested where the energy is not
+    severity = "error" if max(noise.force, noise.typical) > _DROWNED * scale else "warning"
+    values = {"force": noise.force, "energy": noise.energy, "scale": scale, "known": known}
+    return [finding("NOISE_FLOOR", severity, **values)]
+
+
+def _judged(slopes: list[Slope], scale: float) -> Iterator[Observed]:
+    if jumps := [one for one in slopes if one.jump]:
+        worst = max(jumps, key=lambda one: abs(one.jump))
+        yield finding("ENERGY_STEP", "error", direction=worst.direction, nearest=_LADDER[-1], jump=worst.jump)
+    if wrong := [one for one in slopes if not one.agrees and not one.jump]:
+        worst = max(wrong, key=lambda one: one.gap)
+        yield finding(
+            "FORCES_NOT_GRADIENT",
+            "error" if worst.gap > _SMALL * scale else "warning",
+            direction=worst.direction,
+            difference=-worst.difference,
+            step=worst.step,
+            error=worst.error,
+            force=-worst.force,
+            gap=worst.gap,
+            share=worst.gap / scale if scale else float("inf"),
+            wrong=len(wrong),
+            directions=len(slopes),
+        )
+
+
+def _row(one: Slope) -> dict[str, Any]:
+    return {
+        "moved": one.direction, "by differences (eV/Å)": one.difference, "error": one.error,
+        "by forces (eV/Å)": one.force, "difference": one.gap, "step (Å)": one.step,
+        "agree": one.agrees and not one.jump,
+    }  # fmt: skip
+
+
+def _chart(slopes: list[Slope]) -> Chart:
+    """Difference of forces and differences by step: a valley where all is well, a plateau where it is not."""
+    shown = slopes[:_DIRECTIONS]
+    worst = _worst(slopes)
+    if worst not in shown:
+        shown = [*shown, worst]
+    return Chart(
+        "Forces against differences of the energy, by step",
+        "step (Å)",
+        "difference (eV/Å)",
+        _LADDER[::-1].tolist(),
+        {one.direction: one.gaps[::-1].tolist() for one in shown},
+        log_y=True,
+    )
+
+
+# -- calculators that know two energies: the one forces belong to, and the one that a run logs
+
+
+def _two_energies(
+    subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor, line: Displacement, along: Slope
+) -> Iterator[Observed]:
+    """A finding where `energy` and `free_energy` differ by what is not constant.
+
+    Every other check is about the free energy, which forces belong to by ASE's definition; where the two
+    differ by a constant at most, what they find holds for both.
+
+    Args:
+        subject: what has been asked about it so far counts as well.
+        atoms: a structure away from thresholds.
+        line: a displacement of it, per Å.
+        along: the slope along it.
+    """
+    if subject.energies(atoms)[1] is None:
+        return
+
+    def offset(there: Atoms) -> float:
+        free, other = subject.energies(there)
+        return 0.0 if other is None else other - free
+
+    # where it may not change: between ways to write a structure down, and at a threshold of two particles
+    rng = np.random.default_rng(0)
+    kinds = (transformations.translated, transformations.imaged, transformations.permuted)
+    changes: list[tuple[str, float]] = []
+    for same in (one for kind in kinds for one in islice(kind(atoms, rng), 1)):
+        try:
+            with only_trying(subject):
+                changes.append((f"with {same.what}", abs(offset(same.atoms) - offset(atoms))))
+        except CalculatorError:
+            continue  # reported elsewhere
+    for walk in subject.known["walks"].walks if "walks" in subject.known else ():
+        for one in walk.thresholds:
+            sides = [offset(walk.pair.at(place)) for place in (one.inside, one.outside)]
+            changes.append((f"between {walk.pair.name} at {one.radius:.8g} Å", abs(sides[1] - sides[0])))
+    forward, back = (offset(displaced(atoms, step * line)) for step in (_STEP, -_STEP))
+    slope_of_offset = (forward - back) / (2 * _STEP)
+    worst = max(subject.repeats.offsets.values(), key=lambda one: abs(one.change))
+    if abs(worst.change) <= max(_ALLOWED * noise.energy, _SMALL_OFFSET * subject.kT):
+        return
+    limit = max(_SIGNIFICANT * along.error, _CENTRAL * abs(slope_of_offset))
+    free = along.agrees
+    other = abs(along.difference - along.force + slope_of_offset) <= limit
+    belong = "both" if free and other else "free" if free else "energy" if other else "neither"
+    wrong = [f"{what}, by {size:.3g} eV" for what, size in changes if size > _LARGE_OFFSET * subject.kT]
+    yield finding(
+        "TWO_ENERGIES",
+        "error" if wrong else "warning",
+        belong,
+        "wrong" if wrong else None,
+        formula=worst.formula,
+        offset=worst.first,
+        change=worst.change,
+        kT=abs(worst.change) / subject.kT if subject.kT else None,
+        places="; ".join(wrong),
+    )

@@ -1,0 +1,415 @@
+"""Is the energy smooth wherever atoms can go? Pairs, triples and surroundings through every threshold."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from mdnum.audit.base import Chart, CheckResult, Observed, Progress, TimeUp, finding
+from mdnum.audit.check import AuditCheck
+from mdnum.audit.crowds import Crowd, crowd
+from mdnum.audit.curve import SMOOTH
+from mdnum.audit.environments import EnvironmentWalks, Event, walk_surroundings
+from mdnum.audit.pairs import FARTHEST
+from mdnum.audit.subject import CalculatorSubject
+from mdnum.audit.thresholds import BESIDE, PairThreshold, PairWalk, PairWalks, find_thresholds, walk_pairs
+
+ORDERS = (
+    "energy", "force", "curvature", "third derivative", "fourth derivative", "fifth derivative",
+    "none up to the fifth",
+)  # fmt: skip
+#: Representable distances shown on either side of a jump.
+_ULPS = 12
+_DRAWN = 4
+#: An energy jump above so many kT is an error: a thousand of them in one direction make one kT; one below the
+#: second, or of the force below so many kT per unit of length, is information.
+_LARGE, _SMALL, _SMALL_FORCE = 1e-3, 1e-7, 1e-5
+#: A switch whose curvature is this many times that of the well is what limits the time step.
+_STEEP = 5.0
+
+
+class SmoothnessCheck(AuditCheck):
+    """Is the energy smooth wherever atoms can go, and if not, where, to what order and by how much?"""
+
+    name, title, order = "smoothness", "Smoothness", 20
+    needed_to = ("differentiate",)
+    #: Neighbors that a crowded center gets, and routes through the structure that are scanned.
+    neighbors, routes = 160, 2
+
+    def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
+        """Walk and crowd."""
+        walks = walk_pairs(subject, progress)
+        if not walks.walks and subject.meter.deadline.passed:
+            raise TimeUp
+        find_thresholds(subject)
+        around = walk_surroundings(subject, progress, routes=self.routes)
+        late: list[tuple[str, str]] = []
+        crowds = crowd(subject, progress, late, self.neighbors)
+        skipped = [*walks.skipped, *around.skipped, *late]
+        if not crowds and not late:
+            skipped.append(
+                ("caps on the number of neighbors", "the calculator takes no crowd of single atoms")
+            )
+        kT = subject.kT
+        return CheckResult(
+            says=summary(walks, around, crowds, kT),
+            findings=[
+                *_jumps(walks, around, kT),
+                *_among_many(around, kT, walks.not_walked),
+                *(one for crowded in crowds for one in _caps(crowded, kT)),
+                *(one for walk in walks.walks for one in reach(walk, kT)),
+            ],
+            tables=_tables(walks, around, crowds, kT),
+            charts=_charts(walks, crowds, subject),
+            numbers=_numbers(walks, around, crowds, kT),
+            skipped=skipped,
+            asked=walks.possible - walks.left + around.asked + len(crowds),
+            possible=walks.possible + around.possible + len(crowds) + len(late),
+        )
+
+
+def _all(walks: PairWalks) -> list[PairThreshold]:
+    return [one for walk in walks.walks for one in walk.thresholds]
+
+
+def place(threshold: PairThreshold) -> str:
+    """Its distance, with as many digits as are known."""
+    if threshold.located < 1e-12:
+        return repr(threshold.radius)
+    digits = int(np.clip(np.ceil(-np.log10(threshold.located)), 1, 15))
+    return f"{threshold.radius:.{digits}f}"
+
+
+def _two(threshold: PairThreshold) -> str:
+    one, other = threshold.species
+    return f"two {one} atoms" if one == other else f"{one} and {other}"
+
+
+def summary(
+    walks: PairWalks, around: EnvironmentWalks, crowds: Sequence[Crowd], kT: float
+) -> tuple[list[str], dict[str, Any]]:
+    """Names of sentences, and their values."""
+    thresholds = _all(walks)
+    seen = [(one.order, one.jumps[0], one.jumps[1]) for one in thresholds]
+    seen += [(one.jump.order, one.jump.energy, one.force) for one in around.events]
+    seen = [one for one in seen if one[0] <= 5]
+    order = min((one[0] for one in seen), default=None)
+    energy = max((abs(one[1]) for one in seen if one[0] == 0), default=0.0)
+    knots = max((walk.knots for walk in walks.walks), default=0)
+    capped = [one for one in crowds if one.kept or one.order_from]
+    cutoffs = sorted({f"{walk.cutoff:.6g}" for walk in walks.walks if walk.cutoff})
+    worst = {None: "nothing", 0: "energy", 1: "force"}.get(order, "derivative")
+    says = ["walked" if walks.walks else "not_walked"]
+    values: dict[str, Any] = {
+        "pairs": len(walks.walks), "of": len(walks.walks) + len(walks.not_walked),
+        "thresholds": len(thresholds), "cutoffs": ", ".join(cutoffs), "energy": 1e3 * energy,
+        "kT": energy / kT if kT else None,
+        "force": max((abs(one[2]) for one in seen if one[0] <= 1), default=0.0),
+        "derivative": ORDERS[order] if order is not None else "", "knots": knots,
+        "not_walked": ", ".join(walks.not_walked),
+        "kept": min((one.kept or (one.order_from or 1) - 1 for one in capped), default=0),
+        "neighbors": max((one.neighbors for one in crowds), default=0),
+    }  # fmt: skip
+    says += ["ends"] if cutoffs else []
+    says.append(f"jumps_{worst}" if order is None or order <= SMOOTH else "jumps_at_an_end")
+    says += ["knots"] if knots else []
+    says += ["capped"] if capped else ["crowded"] if crowds else []
+    says += ["missing"] if walks.walks and walks.not_walked else []
+    # how small a step of the force can be that escapes
+    if steps := [walk.steps for walk in walks.walks if walk.steps]:
+        low, half, everywhere = (max(one[k] for one in steps) for k in (0, 2, 3))
+        high = min(one[1] for one in steps)
+        if low < high:
+            says += ["least", "least_but"] if thresholds else ["least"]
+            values |= {
+                "low": low, "high": high, "beside": BESIDE, "half": _rounded_up(half),
+                "everywhere": _rounded_up(everywhere),
+            }  # fmt: skip
+    return [f"smoothness_{one}" for one in says], values
+
+
+def _rounded_up(value: float) -> float:
+    """One digit that does not promise more than is known."""
+    digit = 10.0 ** np.floor(np.log10(value))
+    return float(np.ceil(value / digit) * digit)
+
+
+def _jumps(walks: PairWalks, around: EnvironmentWalks, kT: float) -> Iterator[Observed]:
+    """Findings of pair thresholds, by the lowest derivative that jumps."""
+    for order, code in enumerate(("ENERGY_JUMP", "FORCE_JUMP", "CURVATURE_JUMP")):
+        same = [one for one in _all(walks) if one.order == order]
+        if not same:
+            continue
+        worst = max(same, key=lambda one: abs(one.jumps[order]))
+        rest = [f"{'-'.join(one.species)} {one.radius:.6g} Å" for one in same if one is not worst]
+        more = f" and {len(rest) - 4} more" if len(rest) > 4 else ""
+        size, severity = abs(worst.jumps[order]) / kT, "info"
+        values: dict[str, Any] = {
+            "two": _two(worst), "inside": repr(worst.inside), "outside": repr(worst.outside),
+            "at": place(worst), "energy": 1e3 * worst.jumps[0], "kT": size, "force": worst.jumps[1],
+            "curvature": worst.jumps[2], "others": ", ".join(rest[:4]) + more,
+        }  # fmt: skip
+        among: list[float] = []
+        if order == 0:
+            among = [
+                abs(one.jump.energy) for one in around.events if one.threshold in same and one.jump.order == 0
+            ]
+            values |= {"among": 1e3 * max(among, default=0.0), "among_kT": max(among, default=0.0) / kT}
+            size = max([size, *(one / kT for one in among)])
+            severity = "error" if size > _LARGE else "warning" if size > _SMALL else "info"
+        elif order == 1:
+            severity = "warning" if size > _SMALL_FORCE else "info"
+        yield finding(
+            code,
+            severity,
+            None if worst.dies else "within",
+            "among" if among else None,
+            "others" if rest else None,
+            **values,
+        )
+
+
+def _among_many(around: EnvironmentWalks, kT: float, not_walked: Sequence[str]) -> Iterator[Observed]:
+    if sharp := [one for one in around.unexplained if one.jump.order <= 1]:
+        worst = max(sharp, key=lambda one: (one.force, abs(one.jump.energy)))
+        size = abs(worst.jump.energy) / kT if worst.jump.order == 0 else 0.0
+        center, k = worst.ties[0] if worst.ties else (None, None)
+        yield finding(
+            "JUMP_AMONG_MANY",
+            "error" if size > _LARGE else "warning",
+            "tie" if worst.ties else None,
+            "not_walked" if not_walked else None,
+            route=worst.route,
+            at=f"{worst.at:.12g}",
+            energy=1e3 * worst.jump.energy,
+            force=worst.force,
+            k=k,
+            atom=center,
+            not_walked=", ".join(not_walked),
+            places=len(sharp),
+            routes=len(around.routes),
+        )
+    if bent := [one for one in around.unexplained if one.jump.order == 2]:
+        worst = max(bent, key=lambda one: abs(one.jump.curvature))
+        values = {"route": worst.route, "at": f"{worst.at:.8g}", "curvature": worst.jump.curvature}
+        yield finding("CURVATURE_JUMP_AMONG_MANY", "info", places=len(bent), **values)
+
+
+def _caps(one: Crowd, kT: float) -> Iterator[Observed]:
+    values: dict[str, Any] = {"species": one.species, "radius": one.radius}
+    if one.kept:
+        yield finding(
+            "NEIGHBOR_CAP",
+            "error",
+            "energy" if one.energy else None,
+            **values,
+            kept=one.kept,
+            neighbors=one.neighbors,
+            distance=one.distance,
+            force=one.force,
+            energy=1e3 * one.energy,
+            kT=one.energy / kT,
+        )
+    if one.order_from:
+        yield finding(
+            "NEIGHBOR_CAP_BY_ORDER",
+            "error",
+            **values,
+            neighbors=one.order_from,
+            fewer=one.order_from - 1,
+            energy=1e3 * one.order_energy,
+            kT=one.order_energy / kT,
+            force=one.order_force,
+        )
+
+
+def reach(walk: PairWalk, kT: float) -> Iterator[Observed]:
+    """Findings of one walk: no end, a steep end, more places than were zoomed into."""
+    further = walk.further
+    if walk.cutoff is None and np.abs(walk.energy).max() > 0:
+        # what was searched for an end, and no more
+        how = "not_further"
+        if further is not None:
+            how = "lost" if not further.left else "falls" if np.isfinite(further.left) else "constant"
+        yield finding(
+            "NO_CUTOFF",
+            "info",
+            how,
+            pair=walk.pair.name,
+            scanned=walk.scanned,
+            farthest=FARTHEST,
+            reached=further.reached if further else None,
+            force=abs(further.force) if further else None,
+            left=1e3 * further.left if further else None,
+            kT=further.left / kT if further and kT else None,
+        )
+    steep = _steepness(walk)
+    if steep is not None and steep[0] > _STEEP:
+        yield finding("STEEP_SWITCH", "warning", pair=walk.pair.name, times=steep[0], at=steep[1])
+    if walk.left_out:
+        yield finding("MANY_KINKS", "info", pair=walk.pair.name, places=walk.left_out)
+
+
+def _steepness(walk: PairWalk) -> tuple[float, float] | None:
+    """(largest curvature beyond the well over that at its bottom, where); None without a well."""
+    curvature = -np.gradient(walk.force, walk.distance)
+    bottom = int(np.argmin(walk.energy))
+    if walk.energy[bottom] >= 0 or bottom < 2 or curvature[bottom] <= 0:
+        return None
+    width = 2 * (walk.distance[1] - walk.distance[0])
+    beyond = walk.distance > 1.1 * walk.distance[bottom]
+    for one in walk.thresholds:
+        if one.order <= 1:  # at a place where the force jumps, a difference is no curvature
+            beyond &= np.abs(walk.distance - one.radius) > width
+    if not beyond.any():
+        return None
+    worst = int(np.argmax(np.where(beyond, np.abs(curvature), 0.0)))
+    return float(abs(curvature[worst]) / curvature[bottom]), float(walk.distance[worst])
+
+
+def _first_to_jump(event: Event) -> str:
+    """The lowest derivative that jumps; where none up to the curvature does, that of the pair."""
+    order = event.jump.order
+    return ORDERS[max(order, event.threshold.order) if order == SMOOTH and event.threshold else order]
+
+
+def _tables(
+    walks: PairWalks, around: EnvironmentWalks, crowds: Sequence[Crowd], kT: float
+) -> dict[str, list[dict[str, Any]]]:
+    return {
+        "Thresholds found by walking pairs": [
+            {
+                "pair": "-".join(one.species),
+                "distance (Å)": place(one),
+                "what": "the end" if one.dies else "a change",
+                "first to jump": ORDERS[one.order],
+                "energy (meV)": 1e3 * one.jumps[0] if one.order == 0 else 0.0,
+                "in kT": abs(one.jumps[0]) / kT if one.order == 0 else 0.0,
+                "force (eV/Å)": one.jumps[1] if one.order <= 1 else 0.0,
+                "curvature (eV/Å²)": one.jumps[2] if one.order <= 2 else 0.0,
+                "third derivative (eV/Å³)": one.third or None,
+                "last before": repr(one.inside),
+                "first beyond": repr(one.outside),
+            }
+            for one in _all(walks)
+        ],
+        "The same among the others of the structure, and what only shows there": [
+            {
+                "moved": one.route,
+                "pair distance (Å)": f"{one.distance:.10g}" if one.threshold else "none fits",
+                "first to jump": _first_to_jump(one),
+                "energy (meV)": 1e3 * one.jump.energy if one.jump.order == 0 else 0.0,
+                "in kT": abs(one.jump.energy) / kT if one.jump.order == 0 else 0.0,
+                "largest force (eV/Å)": one.force if one.jump.order <= 1 else 0.0,
+                "curvature (eV/Å²)": one.jump.curvature if one.jump.order == 2 else None,
+            }
+            for one in around.events
+        ],
+        "Smallest step of the force that is found": [
+            {
+                "pair": "-".join(walk.pair.species),
+                "from (Å)": walk.steps[0],
+                "to (Å)": walk.steps[1],
+                "everywhere, above (eV/Å)": walk.steps[3],
+                "over half of the way, above (eV/Å)": walk.steps[2],
+            }
+            for walk in walks.walks
+            if walk.steps
+        ],
+        "Crowded atoms": [
+            {
+                "element": one.species,
+                "neighbors given": one.neighbors,
+                "within (Å)": one.radius,
+                "nearest that are kept": one.kept,
+                "order of atoms matters from": one.order_from,
+                "energy (meV)": 1e3 * max(one.energy, one.order_energy),
+                "force (eV/Å)": max(one.force, one.order_force),
+            }
+            for one in crowds
+        ],
+    }
+
+
+def _numbers(
+    walks: PairWalks, around: EnvironmentWalks, crowds: Sequence[Crowd], kT: float
+) -> dict[str, Any]:
+    thresholds = _all(walks)
+    steps = [abs(one.jumps[0]) for one in thresholds if one.order == 0]
+    steps += [abs(one.jump.energy) for one in around.events if one.jump.order == 0]
+    forces = [abs(one.jumps[1]) for one in thresholds if one.order <= 1]
+    forces += [one.force for one in around.events if one.jump.order <= 1]
+    forces += [max(one.force, one.order_force) for one in crowds]
+    orders = [one.order for one in thresholds] + [one.jump.order for one in around.events]
+    return {
+        "pairs": len(walks.walks),
+        "pairs_not_walked": list(walks.not_walked),
+        "thresholds": len(thresholds),
+        "cutoffs": {"-".join(walk.pair.species): walk.cutoff for walk in walks.walks},
+        "order": min(orders, default=None),
+        "largest_energy_jump": max(steps, default=0.0),
+        "largest_energy_jump_kT": max(steps, default=0.0) / kT if kT else None,
+        "largest_force_jump": max(forces, default=0.0),
+        "force_steps_seen": max((walk.steps[3] for walk in walks.walks if walk.steps), default=None),
+        "crossings_measured": around.measured,
+        "routes": len(around.routes),
+        "unexplained": sum(one.threshold is None for one in around.events),
+        "neighbors_kept": min((one.kept for one in crowds if one.kept), default=None),
+        "order_matters_from": min((one.order_from for one in crowds if one.order_from), default=None),
+        "neighbors_tried": max((one.neighbors for one in crowds), default=0),
+    }
+
+
+def _charts(walks: PairWalks, crowds: Sequence[Crowd], subject: CalculatorSubject) -> list[Chart]:
+    found: list[Chart] = []
+    for walk in walks.walks[:_DRAWN]:
+        found.append(_energies(walk, subject.kT))
+        sharp = [one for one in walk.thresholds if one.order <= 1]
+        found += [_close_up(walk, one, subject) for one in sharp[:1]]
+    for one in crowds:
+        if one.kept:
+            title = f"{one.species} with {one.neighbors} neighbors: what jumps when another passes the k-th"
+            lines = {"force": [force for _, force in one.jumps]}
+            k = [float(k) for k, _ in one.jumps]
+            found.append(
+                Chart(title, "k", "largest jump of a force (eV/Å)", k, lines, {"kept": float(one.kept)})
+            )
+    return found
+
+
+def _energies(walk: PairWalk, kT: float) -> Chart:
+    """The energy of two, where it is small enough to see what happens at the thresholds."""
+    depth = max(-float(walk.energy.min()), 2 * kT)
+    shown = walk.energy < 2 * depth
+    first = len(shown) - int(np.argmin(shown[::-1])) if not shown.all() else 0
+    return Chart(
+        f"Two particles: {walk.pair.name}",
+        "distance (Å)",
+        "energy (eV)",
+        walk.distance[first:].tolist(),
+        {"energy": walk.energy[first:].tolist()},
+        {
+            f"{'the interaction ends' if one.dies else 'the law changes'} at {one.radius:.6g} Å": one.radius
+            for one in walk.thresholds[-4:]
+        },
+    )
+
+
+def _close_up(walk: PairWalk, threshold: PairThreshold, subject: CalculatorSubject) -> Chart:
+    """Energy or force at the last representable distances before a jump and the first ones beyond it."""
+    below, above = [threshold.inside], [threshold.outside]
+    for _ in range(_ULPS - 1):
+        below.append(float(np.nextafter(below[-1], -np.inf)))
+        above.append(float(np.nextafter(above[-1], np.inf)))
+    row = threshold.order
+    values = walk.pair.curve(subject).many([*below[::-1], *above])[row]
+    what = ("energy", "force")[row]
+    return Chart(
+        f"{walk.pair.name} at {threshold.outside!r} Å, distance by representable distance",
+        "representable distances from the jump",
+        f"{what} ({('eV', 'eV/Å')[row]})",
+        [*np.arange(-_ULPS, 0.0), *np.arange(0.0, _ULPS)],
+        {what: (values - (values[-1] if row == 0 else 0.0)).tolist()},
+    )

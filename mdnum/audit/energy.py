@@ -1,0 +1,564 @@
+"""Where the energy of a run went: flips at thresholds, jumps elsewhere, work of the forces, drift.
+
+The energy of every step is accounted for: ΔU plus the work of the forces on the straight way between two
+steps vanishes for a force that has this energy, whatever the integrator does. At a threshold it is the jump
+of a flip; at another single place, that of a cap on neighbors or a choice of the nearest; anywhere else it is
+a force that is not the energy's derivative.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import product
+
+import numpy as np
+from ase import Atoms
+from jaxtyping import Float
+
+from mdnum.audit.nve import NveRun, at
+from mdnum.audit.subject import CalculatorSubject
+from mdnum.audit.thresholds import PairThreshold
+from mdnum.trajectories.frame import Box, Frame
+from mdnum.trajectories.rules import SpeciesCutoffs
+from mdnum.trajectories.tracker import Tracker
+
+#: Å before and after a crossing at which the energy is asked for.
+_BESIDE = 1e-7
+#: Flips whose jumps are measured; the others get the mean of these.
+_MEASURED = 240
+#: Steps with flips that a sample must have.
+_ENOUGH = 30
+#: Halvings of a step's way: what is left of it then is a millionth of an Å.
+_LEVELS = 15
+#: After this many, a force that is no gradient has spread over sixteen parts, a jump is still in one.
+_SPREAD_AT = 4
+#: Of the largest: a part with less than this is not followed. Of a spread each of sixteen has less.
+_FOLLOWED = 0.15
+#: Steps that are searched for jumps, and calls after which no further one is.
+_MOST_STEPS, _CALLS = 40, 800
+#: Of kT: what a step leaves unexplained below this is not searched.
+_SMALL = 1e-6
+_BLOCKS = 8
+
+Steps = Float[np.ndarray, "steps"]
+Along = Callable[[float], tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class RunCrossing:
+    """A pair that crossed a threshold between two steps.
+
+    Attributes:
+        step: after it; the step before is one less.
+        i, j, rank: the pair, as in a flip of `mdnum.trajectories`.
+        entered: whether it is inside afterwards.
+        threshold: its place among the thresholds.
+        distance: at `step`, Å.
+        margin: at `step`, Å.
+        share: of the step's straight way at which the distance is the threshold's.
+        slack: of the way to stay clear of it on either side.
+    """
+
+    step: int
+    i: int
+    j: int
+    rank: int
+    entered: bool
+    threshold: int
+    distance: float
+    margin: float
+    share: float
+    slack: float
+
+    @property
+    def sign(self) -> float:
+        """1 for a pair that enters, -1 for one that leaves."""
+        return 1.0 if self.entered else -1.0
+
+
+def crossings(run: NveRun, like: Atoms, thresholds: Sequence[PairThreshold]) -> list[RunCrossing]:
+    """All flips of a run, in the order of steps and of their places on the way.
+
+    Args:
+        like: species and cell.
+        thresholds: any number for each pair of species.
+    """
+    box = Box(np.asarray(like.cell.array, np.float64), np.asarray(like.pbc, bool))
+    species = like.get_chemical_symbols()
+    found = []
+    for level in _levels(thresholds, set(species)):
+        radii = {thresholds[place].species: thresholds[place].radius for place in level}
+        places = {frozenset(thresholds[place].species): place for place in level}
+        tracker = Tracker(SpeciesCutoffs(radii), species=species)
+        for step, positions in enumerate(run.positions):
+            flips = tracker.step(Frame(step, float(step), positions, box))
+            # the flips of one pair one way, by place on the way: which image a rank means does not matter
+            taken: dict[tuple[int, int, bool], list[tuple[float, float]]] = {}
+            for row in range(len(flips)):
+                i, j, entered = int(flips.i[row]), int(flips.j[row]), bool(flips.entered[row])
+                place = places[frozenset((species[i], species[j]))]
+                if (i, j, entered) not in taken:
+                    before, after = (run.positions[n][j] - run.positions[n][i] for n in (step - 1, step))
+                    taken[i, j, entered] = _ways(before, after, entered, thresholds[place], box)
+                ways = taken[i, j, entered]
+                share, slack = ways.pop(0) if ways else (0.5, 1e-3)
+                found.append(
+                    RunCrossing(
+                        step, i, j, int(flips.rank[row]), entered, place,
+                        float(flips.distance[row]), float(flips.margin[row]), share, slack,
+                    )
+                )  # fmt: skip
+    return sorted(found, key=lambda one: (one.step, one.share))
+
+
+def _levels(thresholds: Sequence[PairThreshold], species: set[str]) -> list[list[int]]:
+    """Thresholds in groups that have one for a pair of species at most: a rule has no room for more."""
+    levels: list[list[int]] = []
+    for place, one in enumerate(thresholds):
+        if not set(one.species) <= species:
+            continue
+        key = frozenset(one.species)
+        for level in levels:
+            if all(frozenset(thresholds[other].species) != key for other in level):
+                level.append(place)
+                break
+        else:
+            levels.append([place])
+    return levels
+
+
+def _ways(
+    before: Float[np.ndarray, "3"],
+    after: Float[np.ndarray, "3"],
+    entered: bool,
+    threshold: PairThreshold,
+    box: Box,
+) -> list[tuple[float, float]]:
+    """Where on the way of a step images of a pair cross a threshold one way, and what to stay clear of there.
+
+    Ranks name images by their distance: which image a flip belongs to is not known, those that cross are.
+    """
+    end, way = _images(after, threshold.radius, box), after - before
+    start = end - way
+    square = threshold.radius**2
+    was, is_now = np.sum(start**2, axis=1) < square, np.sum(end**2, axis=1) < square
+    crossing = (is_now & ~was) if entered else (was & ~is_now)
+    length = float(np.linalg.norm(way))
+    slack = float(np.clip(max(_BESIDE, 3 * threshold.located) / length if length else 1.0, 1e-9, 1e-3))
+    return sorted((_root(one, way, square), slack) for one in start[crossing])
+
+
+def _root(start: Float[np.ndarray, "3"], way: Float[np.ndarray, "3"], square: float) -> float:
+    """The share s in [0, 1] at which |start + s way|² passes a value."""
+    a, b, c = float(way @ way), 2 * float(start @ way), float(start @ start) - square
+    inside = b * b - 4 * a * c
+    if a == 0 or inside < 0:
+        return 0.5
+    # the form without cancellation
+    q = -0.5 * (b + np.copysign(np.sqrt(inside), b))
+    roots = [q / a, c / q if q else 0.0]
+    return float(np.clip(min(roots, key=lambda one: abs(one - 0.5)), 0.0, 1.0))
+
+
+def _images(vector: Float[np.ndarray, "3"], radius: float, box: Box) -> Float[np.ndarray, "images 3"]:
+    """The periodic images of a vector that may be as long as a radius, and some more."""
+    if not box.periodic:
+        return vector[None]
+    rows = box.matrix[box.pbc]
+    shares = np.rint(np.linalg.lstsq(rows.T, vector, rcond=None)[0])
+    base = vector - shares @ rows
+    # distance between the planes of the cell: one over the length of a reciprocal vector
+    widths = 1 / np.linalg.norm(np.linalg.pinv(rows), axis=0)
+    reach = [range(-int(radius / width) - 2, int(radius / width) + 3) for width in widths]
+    return base + np.array(list(product(*reach)), np.float64) @ rows
+
+
+def along_step(subject: CalculatorSubject, run: NveRun, like: Atoms, step: int) -> Along:
+    """Energy, and force along the way, by the share of the straight way of a step."""
+    start, way = run.positions[step - 1], run.positions[step] - run.positions[step - 1]
+    known: dict[float, tuple[float, float]] = {}
+
+    def asked(share: float) -> tuple[float, float]:
+        if share not in known:
+            there = at(like, start + share * way)
+            known[share] = subject.energy(there), float(np.sum(subject.forces(there) * way))
+        return known[share]
+
+    return asked
+
+
+def account(
+    subject: CalculatorSubject,
+    run: NveRun,
+    like: Atoms,
+    step: int,
+    crossed: Sequence[RunCrossing],
+    thresholds: Sequence[PairThreshold],
+    smooth: int = 2,
+) -> tuple[list[float], float]:
+    """Work of the forces along the straight way of a step, in pieces between its crossings.
+
+    Args:
+        subject: another object than the run's; asked three times for each crossing and once more.
+        like: species and cell.
+        step: at its end.
+        crossed: those of this step, by their share.
+        thresholds: as `crossings` was given them.
+        smooth: order from which a threshold is passed without care: 2, for Simpson's rule takes a kink in the
+            force's slope as it takes the fourth power of the step; or 1 where there are too many kinks of the
+            force, which are as often on one side of the middle as on the other.
+
+    Returns:
+        (jump of the energy at each crossing, 0 where it does not jump; change of the energy that neither a
+        jump nor the work of the forces explains), eV.
+
+    Error:
+        Simpson's rule on the way of one step, fifth power of its length; the calculator's noise.
+    """
+    asked, way = along_step(subject, run, like, step), run.positions[step] - run.positions[step - 1]
+    left, end = (
+        (share, (float(run.potential[n]), float(np.sum(run.forces[n] * way))))
+        for share, n in ((0.0, step - 1), (1.0, step))
+    )
+    jumps, rest = [], 0.0
+    for one in crossed:
+        order = thresholds[one.threshold].order
+        if order >= smooth:
+            jumps.append(0.0)
+            continue
+        below, above = max(one.share - one.slack, left[0]), min(one.share + one.slack, 1.0)
+        before = (below, asked(below)) if below > left[0] else left
+        after = (above, asked(above)) if above < 1.0 else end
+        rest += _unexplained(left, before, asked)
+        # what the smooth forces do between the two places is no jump
+        mean = 0.5 * (before[1][1] + after[1][1])
+        change = after[1][0] - before[1][0] + mean * (after[0] - before[0])
+        jumps.append(change if order == 0 else 0.0)
+        rest += 0.0 if order == 0 else change
+        left = after
+    return jumps, rest + _unexplained(left, end, asked)
+
+
+def _unexplained(
+    first: tuple[float, tuple[float, float]], last: tuple[float, tuple[float, float]], asked: Along
+) -> float:
+    """Energy gained plus work done between two places, by Simpson's rule; 0 if forces have this energy."""
+    width = last[0] - first[0]
+    if width <= 0:
+        return 0.0
+    middle = asked(0.5 * (first[0] + last[0]))[1]
+    work = width * (first[1][1] + 4 * middle + last[1][1]) / 6
+    return last[1][0] - first[1][0] + work
+
+
+@dataclass(frozen=True)
+class HiddenJump:
+    """A place on the straight way of a step at which the energy jumps.
+
+    Attributes:
+        step: at its end.
+        share: of the way.
+        energy: after minus before, without the work done between, eV.
+        ties: (atom, k) whose k-th and next neighbors change places there.
+    """
+
+    step: int
+    share: float
+    energy: float
+    ties: tuple[tuple[int, int], ...]
+
+
+@dataclass(frozen=True)
+class HiddenJumps:
+    """Jumps in the steps of a run whose energy does not add up.
+
+    Attributes:
+        jumps: found in the steps that were searched.
+        steps: those, with what they left unexplained, eV.
+        candidates: steps that leave more unexplained than noise does.
+    """
+
+    jumps: tuple[HiddenJump, ...] = ()
+    steps: Mapping[int, float] = field(default_factory=dict)
+    candidates: tuple[int, ...] = ()
+
+    @property
+    def share(self) -> float:
+        """Of what those steps leave unexplained, the part that is jumps."""
+        whole = sum(abs(rest) for rest in self.steps.values())
+        left = sum(abs(rest - self.brought(step)) for step, rest in self.steps.items())
+        return max(1.0 - left / whole, 0.0) if whole else 0.0
+
+    def brought(self, step: int) -> float:
+        """Energy that the jumps found in a step brought, eV."""
+        return sum(jump.energy for jump in self.jumps if jump.step == step)
+
+    def energies(self, rest: Steps) -> Steps:
+        """Energy that such jumps brought, by step; by their share where a step was not searched, eV."""
+        found = np.zeros(len(rest))
+        for step in self.candidates:
+            found[step] = self.brought(step) if step in self.steps else self.share * rest[step]
+        return found
+
+    @property
+    def rank(self) -> tuple[int, int] | None:
+        """(k, at how many jumps the k-th and next neighbors change places), the most frequent k."""
+        counts = Counter(k for jump in self.jumps for k in {k for _, k in jump.ties})
+        return counts.most_common(1)[0] if counts else None
+
+
+def hidden_jumps(
+    probe: CalculatorSubject,
+    run: NveRun,
+    like: Atoms,
+    rest: Steps,
+    sharp: Mapping[int, Sequence[float]],
+    noise: float,
+) -> HiddenJumps:
+    """Search the steps that leave most unexplained: is it all at single places of their way?
+
+    Args:
+        probe: another object than the run's.
+        rest: energy that each step leaves unexplained; nan where that is not known.
+        sharp: by step, shares of its way at which a known threshold jumps, which are not counted again.
+        noise: of the energy, eV.
+    """
+    limit = max(40 * noise, _SMALL * probe.kT)
+    large = np.abs(np.nan_to_num(rest)) > limit
+    candidates = [
+        int(step) for step in np.flatnonzero(large)[np.argsort(-np.abs(rest[large]), kind="stable")]
+    ]
+    began = probe.meter.calls
+    jumps: list[HiddenJump] = []
+    searched: dict[int, float] = {}
+    for step in candidates[:_MOST_STEPS]:
+        if searched and probe.meter.calls - began > _CALLS:
+            break
+        searched[step] = float(rest[step])
+        jumps += _within(probe, run, like, step, np.asarray(sharp.get(step, ()), np.float64), limit)
+    return HiddenJumps(tuple(jumps), searched, tuple(candidates))
+
+
+def _within(
+    probe: CalculatorSubject, run: NveRun, like: Atoms, step: int, sharp: np.ndarray, limit: float
+) -> list[HiddenJump]:
+    """The jumps on the way of one step."""
+    asked = along_step(probe, run, like, step)
+
+    def unexplained(low: float, high: float) -> float:
+        return _unexplained((low, asked(low)), (high, asked(high)), asked)
+
+    parts = [(0.0, 1.0)]
+    first = unexplained(0.0, 1.0)
+    for level in range(_LEVELS):
+        halves = [
+            half for low, high in parts for half in ((low, 0.5 * (low + high)), (0.5 * (low + high), high))
+        ]
+        sizes = [abs(unexplained(*half)) for half in halves]
+        floor = max(limit, _FOLLOWED * max(max(sizes), abs(first) if level >= _SPREAD_AT else 0.0))
+        parts = [half for half, size in zip(halves, sizes, strict=True) if size > floor]
+        if not parts:
+            return []
+    found = []
+    start, way = run.positions[step - 1], run.positions[step] - run.positions[step - 1]
+    for low, high in parts:
+        middle = 0.5 * (low + high)
+        if len(sharp) and np.abs(sharp - middle).min() < 1e-3:
+            continue
+        ties = _exchanged(at(like, start + low * way), at(like, start + high * way))
+        found.append(HiddenJump(step, middle, unexplained(low, high), ties))
+    return found
+
+
+def _exchanged(before: Atoms, after: Atoms) -> tuple[tuple[int, int], ...]:
+    """(atom, k) whose k-th and next neighbors are others after than before, by nearest images."""
+    orders = []
+    for atoms in (before, after):
+        distances = atoms.get_all_distances(mic=bool(atoms.pbc.any()))
+        np.fill_diagonal(distances, -1.0)
+        orders.append(np.argsort(distances, axis=1, kind="stable"))
+    found = []
+    for center, (one, other) in enumerate(zip(*orders, strict=True)):
+        # two that change places differ at two ranks, of which the first is k
+        ranks = np.flatnonzero(one != other)
+        found += [(center, int(k)) for k in ranks if k + 1 < len(one) and one[k] == other[k + 1]]
+    return tuple(found)
+
+
+@dataclass(frozen=True)
+class EnergyBalance:
+    """Where the energy of a run went, step by step.
+
+    Attributes:
+        crossed: flips at thresholds.
+        jumps: energy that the flips of each step brought, measured or by the mean of those measured, eV.
+        measured: crossings whose jump was measured, by place in `crossed`, and their jumps, eV.
+        rest: what neither flips nor the work of the forces explains; nan at steps that were left out, eV.
+        hidden: jumps in it.
+    """
+
+    crossed: Sequence[RunCrossing]
+    jumps: Steps
+    measured: Mapping[int, float]
+    rest: Steps
+    hidden: HiddenJumps = field(default_factory=HiddenJumps)
+
+    @property
+    def elsewhere(self) -> Steps:
+        """Energy that jumps brought where no pair threshold is, by step, eV."""
+        return self.hidden.energies(self.rest)
+
+    @property
+    def filled(self) -> Steps:
+        """The rest without such jumps, with its mean at steps that were left out, eV."""
+        left = self.rest - self.elsewhere
+        return np.where(np.isnan(left), np.nanmean(left), left)
+
+    @property
+    def means(self) -> dict[int, float]:
+        """Jump of a pair that enters, by threshold, eV."""
+        found: dict[int, list[float]] = {}
+        for place, jump in self.measured.items():
+            found.setdefault(self.crossed[place].threshold, []).append(self.crossed[place].sign * jump)
+        return {threshold: float(np.mean(jumps)) for threshold, jumps in found.items()}
+
+    def by_means(self, crossed: Sequence[RunCrossing], steps: int) -> Steps:
+        """Energy that the flips of another run brought, by the mean jumps of this one, eV."""
+        jumps, means = np.zeros(steps), self.means
+        for one in crossed:
+            jumps[one.step] += one.sign * means.get(one.threshold, 0.0)
+        return jumps
+
+
+def balance(
+    probe: CalculatorSubject,
+    run: NveRun,
+    like: Atoms,
+    limits: Sequence[PairThreshold],
+    rng: np.random.Generator,
+    noise: float = 0.0,
+) -> EnergyBalance:
+    """Account for the energy of a run.
+
+    Args:
+        probe: another object than the run's.
+        like: species and cell.
+        limits: where flips happen.
+        rng: picks the steps whose flips are measured where there are too many.
+        noise: of the energy, eV.
+    """
+    crossed = crossings(run, like, limits)
+    by_step: dict[int, list[int]] = {}
+    for place, one in enumerate(crossed):
+        by_step.setdefault(one.step, []).append(place)
+    # a step without a crossing that needs care costs one call; of the others a sample must do
+    orders = np.array([limits[one.threshold].order for one in crossed], np.int64)
+    sharp = int((orders < 2).sum())
+    stepped = len({one.step for one, order in zip(crossed, orders, strict=True) if order < 2})
+    # a sample of steps is as good as all, unless it is a handful because each step has so many
+    smooth = 2 if sharp <= _MEASURED or _MEASURED * stepped >= _ENOUGH * sharp else 1
+    careful = {
+        step: count for step, places in by_step.items() if (count := int((orders[places] < smooth).sum()))
+    }
+    chosen: set[int] = set()
+    afforded = 0
+    for step in rng.permutation(sorted(careful)):
+        if afforded < _MEASURED:
+            chosen.add(int(step))
+            afforded += careful[int(step)]
+    count = len(run.potential)
+    rest = np.full(count, np.nan)
+    rest[0] = 0.0
+    measured: dict[int, float] = {}
+    for step in range(1, count):
+        places = by_step.get(step, [])
+        if step in careful and step not in chosen:
+            continue
+        jumped, rest[step] = account(
+            probe, run, like, step, [crossed[place] for place in places], limits, smooth
+        )
+        measured |= dict(zip(places, jumped, strict=True))
+    means = EnergyBalance(crossed, rest, measured, rest).means
+    jumps = np.zeros(count)
+    known: dict[int, list[float]] = {}
+    for place, one in enumerate(crossed):
+        jumps[one.step] += measured.get(place, one.sign * means.get(one.threshold, 0.0))
+        if orders[place] == 0:
+            known.setdefault(one.step, []).append(one.share)
+    hidden = hidden_jumps(probe, run, like, rest, known, noise)
+    return EnergyBalance(crossed, jumps, measured, rest, hidden)
+
+
+# -- drift: a slope with an error that blocks give -------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Drift:
+    """How a quantity changes with time.
+
+    Attributes:
+        slope: per unit of time.
+        error: standard error of it, from blocks.
+    """
+
+    slope: float
+    error: float
+
+    @property
+    def significant(self) -> bool:
+        """Whether it is told from zero: more than four standard errors away."""
+        return abs(self.slope) > 4 * self.error
+
+    def times(self, factor: float) -> Drift:
+        """In another unit."""
+        return Drift(self.slope * factor, abs(factor) * self.error)
+
+    def minus(self, other: Drift) -> Drift:
+        """The difference of two that scatter independently."""
+        return Drift(self.slope - other.slope, float(np.hypot(self.error, other.error)))
+
+
+def drift(time: Steps, values: Steps) -> Drift:
+    """Slope of a straight line through the means of blocks, with its standard error.
+
+    Blocks are longer than what a step remembers, so their means scatter independently where the run is long
+    enough; neighboring steps do not. There must be 16 values at least.
+    """
+    blocks = np.array_split(np.arange(len(values)), _BLOCKS)
+    x = np.array([time[block].mean() for block in blocks])
+    y = np.array([values[block].mean() for block in blocks])
+    x = x - x.mean()
+    square = float(np.sum(x**2))
+    slope = float(np.sum(x * y)) / square
+    left = y - y.mean() - slope * x
+    return Drift(slope, float(np.sqrt(np.sum(left**2) / (_BLOCKS - 2) / square)))
+
+
+def wandering(time: Steps, increments: Steps) -> Drift:
+    """Slope of a quantity that changes by increments, such as jumps, whose sum wanders without a memory.
+
+    What is left of a straight line through a random walk is itself a walk, so the error is taken from the
+    sums over blocks instead.
+
+    Args:
+        time: after each increment.
+        increments: at least 16.
+    """
+    sums = [float(np.sum(block)) for block in np.array_split(increments, _BLOCKS)]
+    whole = float(time[-1] - time[0])
+    error = float(np.std(sums, ddof=1) * np.sqrt(_BLOCKS)) / whole
+    return Drift(drift(time, np.cumsum(increments)).slope, error)
+
+
+def ratio(time: Steps, total: Steps, kinetic: Steps) -> float:
+    """Energy drifted over the run, over the standard deviation of the kinetic energy.
+
+    Source:
+        the energy conservation score of the mlipaudit suite; meV/atom/ps is what lambench reports.
+    """
+    slope = float(np.polyfit(time - time[0], total - total[0], 1)[0])
+    scatter = float(np.std(kinetic))
+    change = slope * float(time[-1] - time[0])
+    return change / scatter if scatter else (float("inf") if change else 0.0)

@@ -1,0 +1,171 @@
+"""Two particles on a line: the arrangement in which a calculator shows where its pair interaction changes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import combinations_with_replacement
+from typing import Literal
+
+import numpy as np
+from ase import Atoms
+from jaxtyping import Float
+
+from mdnum.audit.curve import Curve
+from mdnum.audit.subject import CalculatorError, CalculatorSubject
+
+#: What a calculator may want around two atoms, the simplest first: (a cell, periodic).
+_SURROUNDINGS = ((False, False), (True, False), (True, True))
+#: A scan does not go further apart than this, in the unit of length.
+FARTHEST = 30.0
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two particles, single atoms or whole molecules, that can be put at any distance.
+
+    Attributes:
+        species: symbols of the two reference atoms; molecules by the heaviest of their atoms.
+        first: the particle that stays, its reference atom at the origin.
+        second: the particle that moves along x, its reference atom at the origin.
+        box: edge of the cubic cell around them, 0 for none.
+        periodic: whether the cell repeats.
+        name: formulas of the two.
+        moves: what such a particle is in the structure, an atom or a molecule.
+    """
+
+    species: tuple[str, str]
+    first: Atoms
+    second: Atoms
+    box: float
+    periodic: bool
+    name: str
+    moves: Literal["atom", "molecule"] = "atom"
+
+    def at(self, distance: float) -> Atoms:
+        """The two at a distance (of the reference atoms), which is exact in the last bit."""
+        moved = self.second.copy()
+        moved.positions[:, 0] += distance
+        both = self.first + moved
+        if self.box:
+            both.set_cell([self.box] * 3)
+        both.pbc = self.periodic
+        return both
+
+    def others(self, distance: float) -> Float[np.ndarray, "pairs"]:
+        """Distances between the two of all atoms but the reference atoms, at a distance of those."""
+        moved = self.second.positions[None] + [distance, 0.0, 0.0]
+        return np.linalg.norm(moved - self.first.positions[:, None], axis=2).ravel()[1:]
+
+    def curve(self, subject: CalculatorSubject) -> Curve:
+        """Energy against distance, and the force that drives the second away from the first."""
+
+        def at(distance: float) -> tuple[float, float]:
+            atoms = self.at(distance)
+            energy = subject.energy(atoms)
+            return energy, float(subject.forces(atoms)[len(self.first) :, 0].sum())
+
+        return Curve(at)
+
+
+def pairs(subject: CalculatorSubject, most: int = 6) -> tuple[list[Pair], list[tuple[str, str]]]:
+    """Two of each species of the structure that the calculator answers for, the most frequent first.
+
+    Single atoms where it takes them as near as they come in the structure; where it does not (a bond order
+    may divide by the number of neighbors), each with two companions behind it; where it takes no such atoms
+    at all (rigid water), molecules of the structure.
+
+    Returns:
+        (pairs, what was left out and why).
+    """
+    symbols = subject.atoms.get_chemical_symbols()
+    species = sorted(set(symbols), key=lambda one: (-symbols.count(one), one))
+    wanted = list(combinations_with_replacement(species, 2))
+    wanted.sort(key=lambda two: -symbols.count(two[0]) * symbols.count(two[1]))
+    nearest = _nearest(subject.atoms)
+    found: list[Pair] = []
+    skipped: list[tuple[str, str]] = []
+    for one, other in wanted[:most]:
+        single, another = (Atoms(symbol, [(0, 0, 0)]) for symbol in (one, other))
+        pair, why = _answered(subject, (one, other), single, another, nearest)
+        if pair is None:
+            skipped.append((f"two atoms {one}-{other} by themselves", why))
+            if nearest:
+                trios = trio(one, nearest, -1.0), trio(other, nearest, 1.0)
+                pair, _ = _answered(subject, (one, other), *trios, nearest)
+        if pair is not None:
+            found.append(pair)
+    skipped += [
+        (f"pair {one}-{other}", f"the {most} most frequent pairs were walked") for one, other in wanted[most:]
+    ]
+    return found or _molecules(subject), skipped
+
+
+def _nearest(atoms: Atoms) -> float:
+    """Smallest distance of two atoms of a structure; 0 where there is one atom."""
+    if len(atoms) < 2:
+        return 0.0
+    distances = atoms[: min(len(atoms), 500)].get_all_distances(mic=bool(atoms.pbc.any()))
+    return float(distances[~np.eye(len(distances), dtype=bool)].min())
+
+
+def trio(symbol: str, side: float, way: float) -> Atoms:
+    """An atom at the origin with two companions behind it."""
+    depth = way * side * np.sqrt(0.75)
+    return Atoms([symbol] * 3, [(0, 0, 0), (depth, side / 2, 0), (depth, -side / 2, 0)])
+
+
+def molecules(atoms: Atoms) -> list[np.ndarray]:
+    """Indices of the atoms of each molecule: those that bonds connect, by covalent radii."""
+    from ase.neighborlist import natural_cutoffs, neighbor_list
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    first, second = neighbor_list("ij", atoms, [1.1 * radius for radius in natural_cutoffs(atoms)])
+    graph = coo_array((np.ones(len(first)), (first, second)), shape=(len(atoms), len(atoms)))
+    count, label = connected_components(graph, directed=False)
+    order = np.argsort(label, kind="stable")
+    return np.split(order, np.searchsorted(label[order], np.arange(1, count)))
+
+
+def whole(atoms: Atoms, indices: np.ndarray) -> Atoms:
+    """One molecule in one piece, its heaviest atom at the origin; no cell."""
+    part = _part(atoms, indices)
+    lead = int(np.argmax(part.get_masses()))
+    offsets = part.get_distances(lead, np.arange(len(part)), mic=bool(atoms.pbc.any()), vector=True)
+    return Atoms(part.get_chemical_symbols(), offsets)
+
+
+def _part(atoms: Atoms, indices: np.ndarray) -> Atoms:
+    part = atoms[indices]
+    assert isinstance(part, Atoms)
+    return part
+
+
+def _molecules(subject: CalculatorSubject) -> list[Pair]:
+    """Two molecules of the structure, where it consists of several; alike if there are two alike."""
+    atoms, groups = subject.atoms, molecules(subject.atoms)
+    if not 2 <= len(groups) <= len(atoms) / 2:
+        return []
+    formulas = [_part(atoms, group).get_chemical_formula() for group in groups]
+    second = next((k for k in range(1, len(groups)) if formulas[k] == formulas[0]), 1)
+    one, other = whole(atoms, groups[0]), whole(atoms, groups[second])
+    leads = [part.get_chemical_symbols()[int(np.argmax(part.get_masses()))] for part in (one, other)]
+    pair, _ = _answered(subject, (leads[0], leads[1]), one, other, 0.0)
+    return [replace(pair, moves="molecule")] if pair else []
+
+
+def _answered(
+    subject: CalculatorSubject, species: tuple[str, str], first: Atoms, second: Atoms, nearest: float
+) -> tuple[Pair | None, str]:
+    """The simplest surroundings in which the calculator gives energy and forces, or why there are none."""
+    why = ""
+    for cell, periodic in _SURROUNDINGS:
+        name = "-".join(part.get_chemical_formula() for part in (first, second))
+        pair = Pair(species, first, second, 2.5 * FARTHEST if cell else 0.0, periodic, name)
+        for distance in filter(None, (nearest, 3.0, 6.0)):
+            if isinstance(answer := subject.try_both(pair.at(distance)), CalculatorError):
+                why = why or answer.message
+                break
+        else:
+            return pair, ""
+    return None, why

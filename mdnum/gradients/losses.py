@@ -1,0 +1,474 @@
+"""Losses of a trajectory, evaluated frame by frame: the trajectory is never stored whole.
+
+A loss looks at some frames, each together with the first, adds up what it sees, and makes a number of the
+sums. That is enough for averages, correlations with the start and histograms, and its derivative needs one
+frame at a time too. A loss that the command line can name is a class here with a name, a label and a unit.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable
+from dataclasses import fields
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from mdnum.errors import InputError
+from mdnum.registry import Registry
+
+if TYPE_CHECKING:
+    from mdnum.systems.build import Simulation
+
+
+class LossFrame(NamedTuple):
+    """One step as a loss sees it, atoms in the user's order.
+
+    Attributes:
+        step: its number.
+        x: positions as if the box had no faces, length. v: velocities, length per internal time.
+        potential: potential energy. virial: sum over pairs of r_ij · F_ij, energy.
+    """
+
+    step: Int[Array, ""]
+    x: Float[Array, "3 atoms"]
+    v: Float[Array, "3 atoms"]
+    potential: Float[Array, ""]
+    virial: Float[Array, ""]
+
+
+class LossContext(NamedTuple):
+    """What does not change along a run.
+
+    Attributes:
+        masses: of the atoms.
+        matrix: lattice vectors as rows, length. volume: of the box, length³; 0 without one.
+        kB: Boltzmann's constant in the units of the run.
+        timestep: internal time. time_factor: internal time of one unit of time of the system file.
+    """
+
+    masses: Float[Array, "atoms"]
+    matrix: Float[Array, "3 3"]
+    volume: Float[Array, ""]
+    kB: Float[Array, ""]
+    timestep: Float[Array, ""]
+    time_factor: Float[Array, ""]
+
+
+class Loss(eqx.Module):
+    """A number made of the frames of a trajectory.
+
+    Attributes:
+        every: looks at every n-th step. first: from this step on.
+        name, label, unit: its name on the command line, a few words, and its unit with the names of
+            `Units` in braces.
+        of_single_frames: whether each frame shows it by itself, so that an ensemble has it too.
+    """
+
+    name: ClassVar[str]
+    label: ClassVar[str] = ""
+    unit: ClassVar[str] = ""
+    every: int = eqx.field(static=True, default=1)
+    first: int = eqx.field(static=True, default=0)
+
+    def __check_init__(self):
+        if self.every < 1 or self.first < 0:
+            raise InputError(
+                f"every = {self.every}, first = {self.first}; expected at least 1 and at least 0",
+                where=f"loss {self.name}",
+            )
+
+    @classmethod
+    def named(cls, options: dict[str, Any], simulation: Simulation, steps: int) -> Loss:
+        """The loss of a system with these options, as the command line gives them."""
+        return cls(**options)
+
+    def looks_at(self, steps: Int[np.ndarray, "rows"], last: int) -> Bool[np.ndarray, "rows"]:
+        """Which steps it looks at, of a run up to the last one."""
+        return (steps >= self.first) & ((steps - self.first) % self.every == 0)
+
+    @abstractmethod
+    def observe(self, frame: LossFrame, origin: LossFrame, around: LossContext) -> Any:
+        """What one frame adds: a pytree of arrays, differentiable in both frames; `origin` is step 0."""
+
+    def value(self, total: Any, frames: Int[Array, ""] | int) -> Float[Array, ""]:
+        """The number, from the sum of what was observed and the number of frames: the mean."""
+        return total / frames
+
+    def reason_unavailable(self, around: LossContext) -> str | None:
+        """Why it has no meaning in these surroundings; None where it has."""
+        return None
+
+    @property
+    def of_single_frames(self) -> bool:
+        return False
+
+
+class _OfLast(Loss):
+    """Of the last step alone."""
+
+    def looks_at(self, steps, last):
+        return steps == last
+
+    def value(self, total, frames):
+        return total
+
+
+class _OfFrames(Loss):
+    """A mean of what each frame shows by itself."""
+
+    @property
+    def of_single_frames(self) -> bool:
+        return True
+
+
+class Custom(Loss):
+    """Any function of the trajectory that is a function of sums over frames.
+
+    Attributes:
+        see: (frame, origin, surroundings) to a pytree of arrays that is summed over frames.
+        conclude: (sum, number of frames) to a scalar.
+        single: `see` does not look at the origin, so that the loss is one of an ensemble, too.
+    """
+
+    name = "custom"
+    see: Callable[[LossFrame, LossFrame, LossContext], Any] = eqx.field(static=True, kw_only=True)
+    conclude: Callable[[Any, Any], Any] = eqx.field(
+        static=True, kw_only=True, default=lambda total, frames: total / frames
+    )
+    single: bool = eqx.field(static=True, kw_only=True, default=False)
+
+    def observe(self, frame, origin, around):
+        return self.see(frame, origin, around)
+
+    def value(self, total, frames):
+        value = self.conclude(total, frames)
+        if jax.tree.structure(value) != jax.tree.structure(0.0) or jnp.shape(value) != ():
+            raise InputError(
+                f"the loss has shape {jnp.shape(value)}; expected a scalar",
+                remedy="Reduce it, with a sum or a mean",
+            )
+        return jnp.asarray(value)
+
+    @property
+    def of_single_frames(self) -> bool:
+        return self.single
+
+
+class FinalProjection(_OfLast):
+    """Projection of the last positions on fixed directions, divided by the number of atoms.
+
+    Attributes:
+        direction: shape (3, atoms), or (3,) for all atoms alike.
+    """
+
+    name, label, unit = "final-projection", "mean of the last positions along x", "{length}"
+    direction: Float[Array, "3 *atoms"] = eqx.field(default_factory=lambda: jnp.array([1.0, 0.0, 0.0]))
+
+    def observe(self, frame, origin, around):
+        way = self.direction if self.direction.ndim == 2 else self.direction[:, None]
+        return jnp.sum(frame.x * way.astype(frame.x.dtype)) / frame.x.shape[1]
+
+
+class MeanSquaredDisplacement(_OfLast):
+    """Mean squared displacement since step 0 at the last step, length²."""
+
+    name, label, unit = "msd", "mean squared displacement at the last step", "{length}²"
+
+    def observe(self, frame, origin, around):
+        return jnp.mean(jnp.sum(jnp.square(frame.x - origin.x), axis=0))
+
+
+class VelocityAutocorrelation(_OfLast):
+    """Mean of v(0) · v(t) over atoms at the last step, (length / internal time)²."""
+
+    # inside, time is length * sqrt(mass / energy)
+    name, label, unit = "vacf", "mean of v(0) · v(t) at the last step", "{energy}/{mass}"
+
+    def observe(self, frame, origin, around):
+        return _correlation(frame, origin)
+
+
+class MeanPotential(_OfFrames):
+    """Potential energy of an atom, averaged over frames."""
+
+    name, label, unit = "potential", "potential energy of an atom, averaged over steps", "{energy}"
+
+    def observe(self, frame, origin, around):
+        return frame.potential / frame.x.shape[1]
+
+
+class MeanTemperature(_OfFrames):
+    """Kinetic temperature 2 K / (3 N kB), averaged over frames, K (or the units' temperature)."""
+
+    name, label, unit = "temperature", "kinetic temperature, averaged over steps", "{temperature}"
+
+    def observe(self, frame, origin, around):
+        return 2 * _kinetic(frame, around) / (3 * frame.x.shape[1] * around.kB)
+
+
+class MeanPressure(_OfFrames):
+    """Pressure (2 K + virial) / (3 V), averaged over frames, energy/length³."""
+
+    name, label, unit = "pressure", "pressure, averaged over steps", "{energy}/{length}³"
+
+    def observe(self, frame, origin, around):
+        return (2 * _kinetic(frame, around) + frame.virial) / (3 * around.volume)
+
+    def reason_unavailable(self, around: LossContext) -> str | None:
+        return None if float(around.volume) > 0 else "the box has no volume: it is not periodic everywhere"
+
+
+class EinsteinDiffusion(Loss):
+    """Diffusion constant from the slope of the mean squared displacement, length² per unit of time.
+
+    A straight line is fitted to the displacements since step 0 of all frames, and D is a sixth of its slope.
+    Displacements are ballistic at first: look from a step on at which they no longer are.
+
+    Source: M. P. Allen, D. J. Tildesley, Computer Simulation of Liquids (2017), section 2.7.
+    """
+
+    name, unit = "diffusion-einstein", "{length}²/{time}"
+    label = "diffusion constant from the slope of displacements"
+
+    def observe(self, frame, origin, around):
+        moved = jnp.sum(jnp.square((frame.x - origin.x).astype(jnp.float64)), axis=0)
+        # steps are exact; the time of a step is in what they are compared with
+        rate = jnp.mean(moved) / (around.timestep / around.time_factor)
+        step = frame.step.astype(jnp.float64)
+        return jnp.stack([step, step * step, rate, step * rate])
+
+    def value(self, total, frames):
+        step, step2, rate, both = total / frames
+        spread = step2 - step * step
+        return (both - step * rate) / spread / 6
+
+    def looks_at(self, steps, last):
+        if last < self.first + self.every:
+            raise InputError(
+                f"a slope needs two frames, and up to step {last} there is one at most",
+                remedy="Run longer, or look earlier or more often",
+                where=f"loss {self.name}",
+            )
+        return super().looks_at(steps, last)
+
+
+class GreenKuboDiffusion(Loss):
+    """Diffusion constant as the integral of the velocity autocorrelation, length² per unit of time.
+
+    A third of the integral of v(0) · v(t), averaged over atoms, from step 0 to `until`, by the trapezoidal
+    rule over every n-th step.
+
+    Attributes:
+        until: the step up to which is integrated, a multiple of `every`; correlations are noise later on.
+
+    Error: of order (every × timestep)² in the correlation's slope at `until`; at 0 it has none.
+    Source: as for `EinsteinDiffusion`.
+    """
+
+    name, unit = "diffusion-green-kubo", "{length}²/{time}"
+    label = "diffusion constant from the velocity autocorrelation"
+    until: int = eqx.field(static=True, kw_only=True)
+
+    def __check_init__(self):
+        if self.first or self.until < self.every or self.until % self.every:
+            raise InputError(
+                f"first = {self.first}, every = {self.every}, until = {self.until}; expected 0, and a "
+                "positive multiple of every",
+                where=f"loss {self.name}",
+            )
+
+    @classmethod
+    def named(cls, options, simulation, steps):
+        every = options.get("every", 1)
+        return cls(**({"until": steps // every * every} | options))
+
+    def looks_at(self, steps, last):
+        if last < self.until:
+            raise InputError(
+                f"the integral goes up to step {self.until}, the run to step {last}",
+                remedy="Run longer, or integrate less far",
+                where=f"loss {self.name}",
+            )
+        return super().looks_at(steps, last) & (steps <= self.until)
+
+    def observe(self, frame, origin, around):
+        end = (frame.step == 0) | (frame.step == self.until)
+        # length²/internal time² times internal time, per unit of time
+        width = self.every * around.timestep * around.time_factor
+        return jnp.where(end, 0.5, 1.0) * width * _correlation(frame, origin) / 3
+
+    def value(self, total, frames):
+        return total
+
+
+class RadialDistribution(_OfFrames):
+    """A number made of g(r), the density of pairs against that of an ideal gas, averaged over frames.
+
+    Every distance is shared between the four nearest bins by cubic B-splines, which add up to one: no
+    pair is lost, and g(r) has two continuous derivatives by every position. All pairs are examined, row by
+    row, so that a frame costs of the order of atoms² operations and of atoms memory.
+
+    Attributes:
+        r_max: right edge of the last bin, length.
+        bins: number of bins of equal width, from 0.
+        target: the loss is the mean squared difference from this, shape (bins,), or from the same in all.
+        weights: the loss is the sum of g(r) with these weights instead, shape (bins,).
+
+    Source: of the loss, J. P. Hansen, I. R. McDonald, Theory of Simple Liquids (2013), section 2.5.
+    """
+
+    name, label = "rdf", "mean squared difference of g(r) from 1"
+    r_max: float = eqx.field(static=True, kw_only=True)
+    bins: int = eqx.field(static=True, kw_only=True, default=60)
+    target: Float[Array, "*bins"] = eqx.field(kw_only=True, default_factory=lambda: jnp.ones((), jnp.float64))
+    weights: Float[Array, "bins"] | None = eqx.field(kw_only=True, default=None)
+
+    def __check_init__(self):
+        if not self.r_max > 0 or self.bins < 4:
+            raise InputError(
+                f"r_max = {self.r_max:g}, bins = {self.bins}; expected above 0, and at least 4",
+                where=f"loss {self.name}",
+            )
+        for name, given in (("target", self.target), ("weights", self.weights)):
+            if given is not None and jnp.shape(given) not in ((), (self.bins,)):
+                raise InputError(
+                    f"{name} has shape {jnp.shape(given)}; expected ({self.bins},)", where=f"loss {self.name}"
+                )
+
+    @classmethod
+    def named(cls, options, simulation, steps):
+        # all pairs are examined, and neighboring steps look alike
+        # bins reach two widths further, and no further than nearest images do
+        half = 0.5 * float(min(simulation.cell.widths))
+        bins = options.get("bins", 60)
+        own: dict[str, Any] = {"every": 10, "bins": bins, "r_max": 0.999 * half / (1 + 2 / bins)}
+        return cls(**(own | options))
+
+    @property
+    def width(self) -> float:
+        """Of a bin, length."""
+        return self.r_max / self.bins
+
+    @property
+    def centers(self) -> Float[Array, "bins"]:
+        """Of the bins, length."""
+        return (jnp.arange(self.bins, dtype=jnp.float64) + 0.5) * self.width
+
+    def reason_unavailable(self, around: LossContext) -> str | None:
+        """Distances are those of nearest images."""
+        if not float(around.volume) > 0:
+            return "the box has no volume: it is not periodic everywhere"
+        half = float(jnp.min(1 / jnp.linalg.norm(jnp.linalg.inv(around.matrix), axis=0))) / 2
+        reach = self.r_max + 2 * self.width
+        if reach > half:
+            return (
+                f"its last bin reaches to {reach:.4g}, beyond half the smallest box width {half:.4g}: make "
+                "r_max smaller"
+            )
+        return None
+
+    def observe(self, frame: LossFrame, origin: LossFrame, around: LossContext):
+        x = frame.x.astype(jnp.float64)
+        atoms = x.shape[1]
+        inverse = jnp.linalg.inv(around.matrix)
+        labels = jnp.arange(atoms)
+
+        @jax.checkpoint
+        def row(counts, i):
+            d = x - x[:, i][:, None]
+            # which image is the nearest has no derivative
+            d = d - around.matrix.T @ lax.stop_gradient(jnp.round(inverse.T @ d))
+            r2 = jnp.sum(d * d, axis=0)
+            near = (labels != i) & (r2 < (self.r_max + 2 * self.width) ** 2)
+            r = jnp.sqrt(jnp.where(near, r2, 1.0))
+            return counts + _shared(r, near, self.width, self.bins), None
+
+        counts, _ = lax.scan(row, jnp.zeros(self.bins, jnp.float64), labels)
+        # the second moment of a B-spline is part of the volume that it covers
+        shells = 4 * jnp.pi * self.width * (jnp.square(self.centers) + self.width**2 / 3)
+        return counts * around.volume / (atoms * (atoms - 1) * shells)
+
+    def curve(self, total, frames) -> Float[Array, "bins"]:
+        """g(r) at the centers of the bins, from the sum over frames."""
+        return total / frames
+
+    def value(self, total, frames):
+        g = self.curve(total, frames)
+        if self.weights is not None:
+            return jnp.sum(self.weights * g)
+        return jnp.mean(jnp.square(g - self.target))
+
+
+def _shared(r: Float[Array, "pairs"], near, width: float, bins: int) -> Float[Array, "bins"]:
+    """Counts of bins with centers at (k + 1/2) width, each distance shared by a cubic B-spline."""
+    u = r / width - 0.5
+    left = lax.stop_gradient(jnp.floor(u))
+    t = u - left
+    rest = 1 - t
+    shares = (
+        rest * rest * rest / 6,
+        (4 - 6 * t * t + 3 * t * t * t) / 6,
+        (4 - 6 * rest * rest + 3 * rest * rest * rest) / 6,
+        t * t * t / 6,
+    )
+    # two more bins on either side take what lies beyond the ends
+    first = jnp.clip(left.astype(jnp.int32), -1, bins + 1)
+    counts = jnp.zeros(bins + 5, jnp.float64)
+    for k, share in enumerate(shares):
+        counts = counts.at[first + jnp.int32(k + 1)].add(jnp.where(near, share, 0), mode="promise_in_bounds")
+    return counts[2 : bins + 2]
+
+
+def _correlation(frame: LossFrame, origin: LossFrame):
+    return jnp.mean(jnp.sum(frame.v.astype(jnp.float64) * origin.v.astype(jnp.float64), axis=0))
+
+
+def _kinetic(frame: LossFrame, around: LossContext) -> Float[Array, ""]:
+    speed2 = jnp.sum(jnp.square(frame.v.astype(jnp.float64)), axis=0)
+    return 0.5 * jnp.sum(around.masses * speed2)
+
+
+#: Losses by the names that the command line gives them.
+LOSSES: Registry[Loss] = Registry("loss", "mdnum.losses", Loss)
+for _loss in (
+    MeanSquaredDisplacement, VelocityAutocorrelation, EinsteinDiffusion, GreenKuboDiffusion,
+    RadialDistribution, MeanPotential, MeanTemperature, MeanPressure, FinalProjection,
+):  # fmt: skip
+    LOSSES.add(_loss.name, _loss, description=_loss.label)
+
+
+def parse(text: str, simulation: Simulation, steps: int) -> Loss:
+    """The loss that a text names.
+
+    Args:
+        text: a name of `LOSSES`, with options behind a colon where others than the defaults are meant:
+            "potential:every=10,first=500".
+        simulation, steps: what it is a loss of.
+
+    Raises:
+        InputError: no such loss, or it has no such option.
+    """
+    name, _, rest = text.partition(":")
+    name = name.strip()
+    kind: type[Loss] = LOSSES[name]
+    known = {one.name: str(one.type) for one in fields(kind) if one.type in ("int", "float", int, float)}
+    options: dict[str, Any] = {}
+    for part in filter(None, (part.strip() for part in rest.split(","))):
+        key, equals, value = (piece.strip() for piece in part.partition("="))
+        if not equals or key not in known:
+            raise InputError(
+                f"{part!r} is no number of the loss {name}",
+                remedy=f"It has {', '.join(known)}; write for example {name}:every=10",
+            )
+        try:
+            options[key] = int(value) if "int" in known[key] else float(value)
+        except ValueError:
+            a = "a whole number" if "int" in known[key] else "a number"
+            raise InputError(f"{key} = {value!r} of the loss {name} is not {a}") from None
+    return kind.named(options, simulation, steps)

@@ -1,0 +1,226 @@
+"""What a derivative of a rollout is asked for and answered with, and what every method is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar, Literal
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from mdnum.errors import InputError
+from mdnum.gradients import parameters
+from mdnum.gradients.losses import Loss, LossFrame
+from mdnum.gradients.tape import RunTape, surroundings
+from mdnum.md.pairforce import PairForce
+from mdnum.registry import Registry
+from mdnum.systems.build import Simulation
+
+#: Called with the steps done, all steps, and the name of the phase.
+Progress = Callable[[int, int, str], None]
+#: What a method differentiates: the steps with decisions held fixed, the flow with the times of its flips,
+#: values between shifted runs, an average over runs or states, another program.
+Kind = Literal["steps", "flow", "values", "average", "other program"]
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A loss of a rollout.
+
+    Attributes:
+        simulation: the system as objects, its start included.
+        loss: what is made of the trajectory.
+        steps: last step.
+    """
+
+    simulation: Simulation
+    loss: Loss
+    steps: int
+
+    def __post_init__(self):
+        if self.steps < 1:
+            raise InputError(f"steps = {self.steps}; expected at least 1")
+        if not self.loss.looks_at(np.arange(self.steps + 1), self.steps).any():
+            raise InputError(
+                f"the loss {self.loss.name} looks at no step up to {self.steps}",
+                remedy="Run longer, or look earlier or more often",
+            )
+        around = surroundings(self.simulation)
+        why = self.loss.reason_unavailable(around)
+        if why is not None:
+            raise InputError(f"the loss {self.loss.name} has no meaning here: {why}")
+        # a loss that is no real number is refused before anything is run
+        dtype = self.simulation.policy.dtype("state")
+        vector = jax.ShapeDtypeStruct((3, self.simulation.atoms), dtype)
+        number = jax.ShapeDtypeStruct((), np.float64)
+        shapes: tuple[Any, ...] = (jax.ShapeDtypeStruct((), np.int64), vector, vector, number, number)
+        made = jax.eval_shape(
+            lambda frame: self.loss.value(self.loss.observe(frame, frame, around), 1), LossFrame(*shapes)
+        )
+        if jax.tree.structure(made) != jax.tree.structure(0.0) or made.shape != ():
+            seen = getattr(made, "shape", None) or jax.tree.structure(made)
+            raise InputError(f"the loss has shape {seen}; expected a scalar", remedy="Reduce it to a number")
+        if not np.issubdtype(made.dtype, np.floating):
+            raise InputError(
+                f"the loss is of dtype {made.dtype}; expected a real number",
+                remedy="A count or a complex number has no gradient: make a float of it that varies smoothly",
+            )
+
+    def at(self, values: Mapping[str, Any]) -> Problem:
+        """The same loss of a rollout with other parameters."""
+        return replace(self, simulation=parameters.with_values(self.simulation, values)) if values else self
+
+    def value(self, values: Mapping[str, Any] | None = None) -> float:
+        """The loss, of the run that the rollout makes."""
+        made = self.at(values or {})
+        return RunTape(made.simulation, made.loss, made.steps, budget=0).value
+
+    @property
+    def jumps(self) -> bool:
+        """Whether the force jumps at the cutoff."""
+        return bool(np.any(self.simulation.jumps()[1] != 0))
+
+
+@dataclass(frozen=True)
+class Gradient:
+    """A derivative of a loss, and which derivative it is.
+
+    Attributes:
+        method: name of the method.
+        description: which derivative this is, one sentence.
+        value: the loss of the program that was differentiated.
+        gradient: derivative by full name of the parameter, of the shape of its value.
+        notes: what a reader must know about single parameters, by name: no dependence, a missing term.
+        details: plain values that belong to the method: counts, errors, tables.
+        kind: what was differentiated.
+        depends: whether the run used each parameter on the way to the loss, where that is known.
+    """
+
+    method: str
+    description: str
+    value: float
+    gradient: dict[str, Float[np.ndarray, "..."]]
+    notes: dict[str, str] = field(default_factory=dict)
+    details: dict[str, Any] = field(default_factory=dict)
+    kind: Kind = "steps"
+    depends: dict[str, bool] = field(default_factory=dict)
+
+
+class Method:
+    """A way to differentiate a rollout: a frozen dataclass of its options, in a file with a row in METHODS.
+
+    Attributes:
+        name: as the command line has it. description: which derivative it gives, one sentence.
+        kind: what it differentiates.
+    """
+
+    name: ClassVar[str]
+    description: ClassVar[str]
+    kind: ClassVar[Kind] = "steps"
+
+    def reason_unavailable(self, problem: Problem, names: Sequence[str]) -> str | None:
+        """Why this derivative does not exist for this problem; None where it does."""
+        return None
+
+    def __call__(self, problem: Problem, names: Sequence[str], progress: Progress | None = None) -> Gradient:
+        """The derivative by the named parameters.
+
+        Raises:
+            InputError: it does not exist for this problem, or there is no such parameter.
+        """
+        return self.differentiate(problem, self.check(problem, names), progress)
+
+    def check(self, problem: Problem, names: Sequence[str]) -> tuple[str, ...]:
+        """Full names of the parameters.
+
+        Raises:
+            InputError: no such parameter, or the method does not apply.
+        """
+        full = parameters.resolve(problem.simulation, names)
+        why = self.reason_unavailable(problem, full)
+        if why is not None:
+            raise InputError(f"the method {self.name} does not apply: {why}")
+        return full
+
+    def differentiate(self, problem: Problem, names: tuple[str, ...], progress: Progress | None) -> Gradient:
+        """The derivative, of names that were checked."""
+        raise NotImplementedError
+
+    def result(self, value: float, gradient: dict[str, Any], notes=None, details=None) -> Gradient:
+        """A gradient of this method."""
+        return Gradient(self.name, self.description, value, gradient, notes or {}, details or {}, self.kind)
+
+
+#: Methods by the names that the command line gives them, in the order of tables.
+METHODS: Registry[Method] = Registry("method", "mdnum.gradient_methods", Method)
+for _name, _class in {
+    "symmetric": "recorded:Symmetric", "forward": "recorded:Forward", "unrolled": "unrolled:Unrolled",
+    "reversible": "recorded:Reversible", "event-aware": "recorded:EventAware",
+    "finite-differences": "differences:FiniteDifferences",
+    "shadow-differences": "differences:ShadowDifferences",
+    "smoothed-differences": "ensemble:SmoothedDifferences", "surrogate": "recorded:Surrogate",
+    "ensemble": "ensemble:Ensemble", "reweighting": "averages:Reweighting",
+    "boundary": "averages:BoundaryTerm",
+}.items():  # fmt: skip
+    METHODS.add(_name, f"mdnum.gradients.{_class}")
+#: Names of what reverse mode keeps of its forward pass, which its method decides by the memory there is.
+_SPELLINGS = {"epochs": "unrolled", "recursive": "unrolled"}
+
+
+def method(name: str) -> Method:
+    """The method of that name, with its defaults.
+
+    Raises:
+        InputError: there is none.
+    """
+    return METHODS.parse(_SPELLINGS.get(name, name))
+
+
+def independent(problem: Problem, gradient: Mapping[str, Any], *, saltation: bool) -> dict[str, str]:
+    """Notes on parameters whose derivative is exactly zero, or misses what the flips add."""
+    notes = {}
+    missing = problem.jumps and not saltation
+    for name, value in gradient.items():
+        if np.any(np.asarray(value)):
+            if missing:
+                notes[name] = "without what the flips add: the force jumps at the cutoff; event-aware adds it"
+        elif name == "cutoff.radius" and missing:
+            notes[name] = (
+                "exactly 0 because it only decides which pairs interact, and decisions are not "
+                "differentiated; event-aware adds what they do"
+            )
+        else:
+            notes[name] = (
+                "exactly 0 in this run: no step on the way to the loss depends on it, or what does cancels"
+            )
+    return notes
+
+
+def pairs_only(simulation: Simulation) -> str | None:
+    """Why the reverse pass of pairs does not apply; None where it does."""
+    if not isinstance(simulation.force, PairForce):
+        return "it is for pair potentials"
+    return rounded(simulation)
+
+
+def rounded(simulation: Simulation) -> str | None:
+    """Why forces have no derivative: one that is rounded after every operation has none."""
+    if simulation.policy.dtype("force").itemsize < 4:
+        precision = simulation.policy.force
+        return f"forces in {precision} are rounded after every operation, which has no derivative"
+    return None
+
+
+def scalars_only(problem: Problem, names: Sequence[str]) -> str | None:
+    """Why differences of values do not apply."""
+    large = [name for name in names if np.ndim(parameters.value(problem.simulation, name))]
+    return f"{', '.join(large)}: a value for each shift of each entry would be needed" if large else None
+
+
+def in_phase(progress: Progress | None, phase: str) -> Callable[[int, int], None] | None:
+    """A callback of steps alone, that names the phase too."""
+    if progress is None:
+        return None
+    return lambda step, steps: progress(step, steps, phase)

@@ -1,0 +1,352 @@
+"""Methods at the recorded run: reverse by symmetric Jacobians, forward by tangents, with flips and without.
+
+The run is made first, by the program that makes every run; then it is linearized at the states and decisions
+that it recorded, or that come by where a fixed-point run is reversed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from mdnum.gradients import parameters
+from mdnum.gradients.adjoint import Trace, reverse
+from mdnum.gradients.crossings import Crossings
+from mdnum.gradients.forces import FORCE, MODEL, SCALE
+from mdnum.gradients.parameters import Cotangents, columns_of, gathered
+from mdnum.gradients.problem import (
+    Gradient,
+    Method,
+    Problem,
+    Progress,
+    in_phase,
+    independent,
+    pairs_only,
+    rounded,
+)
+from mdnum.gradients.tangents import by_column, tangents
+from mdnum.gradients.tape import KEPT, ReversibleTape, RunTape, TapeStretch
+from mdnum.md.latticestep import forgotten_bits
+from mdnum.systems.build import Simulation
+from mdnum.systems.schema import ONSET_FRACTION
+
+#: Default guard of event-aware gradients, as a share of the rms radial speed of a pair.
+GUARD = 1e-3
+#: Tangents that are carried at once; each costs a force evaluation a step, a reverse pass about three.
+MOST = 64
+_SINGLE_FRAMES = (
+    "the loss looks at energy or virial in single frames, and these jump with a flip: that has a slope in an "
+    "average over frames at equal times alone"
+)
+#: Crossings of the largest weight that are named in the details.
+_NAMED = 10
+#: Called with every stretch of the reverse pass, last first, and what was carried at its steps.
+Watch = Callable[[TapeStretch, Trace], None]
+
+
+@dataclass(frozen=True)
+class ReversePass:
+    """A reverse pass that has been made.
+
+    Attributes:
+        tape: the run.
+        parts: derivatives by all that it is made of. gradient: by full name.
+        crossings: of every stretch with their weights, last stretch first; empty without saltation.
+        guard: radial speed below which a crossing was left out, length per internal time.
+    """
+
+    tape: RunTape
+    parts: Cotangents
+    gradient: dict[str, Float[np.ndarray, "..."]]
+    crossings: list[Crossings]
+    guard: float
+
+
+def passed(
+    problem: Problem,
+    names: Sequence[str],
+    *,
+    saltation: bool = True,
+    guard: float = GUARD,
+    budget: int = KEPT,
+    watches: Sequence[Watch] = (),
+    tape: RunTape | None = None,
+    progress: Progress | None = None,
+) -> ReversePass:
+    """Run a problem and its reverse pass, which several instruments may watch.
+
+    Args:
+        problem: the loss of a rollout.
+        names: full names of the parameters.
+        saltation: whether flips count.
+        guard: as a share of the rms radial speed of a pair.
+        budget: bytes of the recorded run that are kept.
+        watches: see `Watch`.
+        tape: the run, where it has been made (with flips, if saltation is asked for).
+
+    Raises:
+        InputError: saltation without a pair potential. NumericalError: the run blew up.
+    """
+
+    def watch(stretch: TapeStretch, trace: Trace) -> None:
+        for one in watches:
+            one(stretch, trace)
+
+    if tape is None:
+        tape = tape_of(problem, saltation, budget, progress)
+    speed = guard * radial_speed(problem.simulation)
+    parts, crossings = reverse(
+        tape,
+        wanted=wanted(names),
+        saltation=saltation,
+        guard=speed,
+        progress=in_phase(progress, "reverse pass"),
+        watch=watch if watches else None,
+    )
+    gradient = {name: parameters.gradient(problem.simulation, parts, name) for name in names}
+    return ReversePass(tape, parts, gradient, crossings, speed)
+
+
+def tape_of(problem: Problem, flips: bool, budget: int = KEPT, progress: Progress | None = None) -> RunTape:
+    """The run of a problem."""
+    return RunTape(
+        problem.simulation, problem.loss, problem.steps, flips=flips, budget=budget,
+        progress=in_phase(progress, "run"),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Symmetric(Method):
+    """The derivative of the steps that ran, by one reverse pass without a tape of operations.
+
+    Attributes:
+        budget: bytes of the recorded run that are kept in memory; what does not fit is run again, stretch by
+            stretch, with the same bits.
+    """
+
+    budget: int = KEPT
+
+    name = "symmetric"
+    description = "the derivative of the steps that ran, their decisions held fixed"
+
+    def reason_unavailable(self, problem: Problem, names: Sequence[str]) -> str | None:
+        return rounded(problem.simulation) if problem.simulation.pairwise else None
+
+    def differentiate(self, problem: Problem, names: tuple[str, ...], progress: Progress | None) -> Gradient:
+        made = passed(problem, names, saltation=False, budget=self.budget, progress=progress)
+        return self.of(problem, made)
+
+    def of(self, problem: Problem, made: ReversePass) -> Gradient:
+        """The gradient, of a pass that was made."""
+        tape = made.tape
+        details = {"stretches": len(tape), "run again": tape.replayed, "bytes kept": tape.held}
+        notes = independent(problem, made.gradient, saltation=False)
+        return self.result(tape.value, made.gradient, notes, details)
+
+
+@dataclass(frozen=True)
+class EventAware(Method):
+    """The derivative of the flow: that of the steps, and what the time of every flip adds.
+
+    Attributes:
+        guard: radial speed below which a crossing grazes and is left out, as a share of the rms radial speed
+            of a pair. Left in, single crossings would dominate: their terms go with one over that speed.
+        budget: as for `Symmetric`.
+    """
+
+    guard: float = GUARD
+    budget: int = KEPT
+
+    name = "event-aware"
+    kind = "flow"
+    description = "the derivative of the steps plus what moving the time of every flip does"
+
+    def reason_unavailable(self, problem: Problem, names: Sequence[str]) -> str | None:
+        return pairs_only(problem.simulation)
+
+    def differentiate(self, problem: Problem, names: tuple[str, ...], progress: Progress | None) -> Gradient:
+        made = passed(problem, names, guard=self.guard, budget=self.budget, progress=progress)
+        return self.of(problem, made)
+
+    def of(self, problem: Problem, made: ReversePass) -> Gradient:
+        """The gradient, of a pass that was made."""
+        notes = independent(problem, made.gradient, saltation=True)
+        unseen = bool(np.any(problem.simulation.jumps())) and made.tape.jumps_unseen
+        if unseen:
+            notes |= dict.fromkeys(made.gradient, _SINGLE_FRAMES)
+        details = {"guard": made.guard, "loss jumps": unseen, **weights(made.crossings)}
+        return self.result(made.tape.value, made.gradient, notes, details)
+
+
+@dataclass(frozen=True)
+class Forward(Method):
+    """The derivative of the steps that ran, by tangents that are carried along with them.
+
+    Attributes:
+        saltation: whether every flip adds what moving its time does, as the method event-aware has it.
+        guard: as for `EventAware`. budget: as for `Symmetric`.
+        most: numbers that it differentiates by, at most.
+    """
+
+    saltation: bool = False
+    guard: float = GUARD
+    budget: int = KEPT
+    most: int = MOST
+
+    name = "forward"
+    description = "the derivative of the steps that ran, their decisions held fixed, by tangents"
+
+    def reason_unavailable(self, problem: Problem, names: Sequence[str]) -> str | None:
+        simulation = problem.simulation
+        if simulation.lattice is not None:
+            return "a fixed-point integer state has no tangent; the method reversible is for it"
+        if self.saltation or simulation.pairwise:
+            why = pairs_only(simulation)
+            if why is not None:
+                return why
+        many = len(columns_of(simulation, names))
+        if many > self.most:
+            return f"{many} numbers would need a tangent each, and at most {self.most} are carried"
+        return None
+
+    def differentiate(self, problem: Problem, names: tuple[str, ...], progress: Progress | None) -> Gradient:
+        simulation = problem.simulation
+        tape = tape_of(problem, self.saltation, self.budget, progress)
+        guard, saltation = self.guard * radial_speed(simulation), self.saltation
+        total, crossed, grazing = None, 0, 0
+        phase = in_phase(progress, "tangents")
+        for part in tangents(tape, names, saltation=saltation, guard=guard, progress=phase):
+            total = part.total
+            if part.crossings is not None:
+                crossed += len(part.crossings)
+                grazing += int(part.crossings.grazing.sum())
+        gradient = gathered(simulation, names, by_column(tape, total))
+        details: dict[str, Any] = {"tangents": len(columns_of(simulation, names))}
+        if saltation:
+            details |= {"guard": guard, "crossings": crossed, "grazing": grazing}
+        notes = independent(problem, gradient, saltation=saltation)
+        found = self.result(tape.value, gradient, notes, details)
+        if saltation:
+            return replace(found, kind="flow", description=f"{EventAware.description}, by tangents")
+        return found
+
+
+@dataclass(frozen=True)
+class Reversible(Method):
+    """The derivative of the steps that ran, of a run with a fixed-point integer state that is reversed.
+
+    The forward pass keeps its last state. Roundings to integers count as the identity.
+
+    Raises:
+        NumericalError: reversed, the run is not the one that was made.
+    """
+
+    name = "reversible"
+    description = (
+        "the derivative of the steps that ran with a fixed-point integer state, reversed bit for bit; their "
+        "decisions held fixed"
+    )
+
+    def reason_unavailable(self, problem: Problem, names: Sequence[str]) -> str | None:
+        if problem.simulation.lattice is None:
+            return 'only steps of a fixed-point integer state can be reversed (precision.state = "lattice")'
+        return pairs_only(problem.simulation)
+
+    def differentiate(self, problem: Problem, names: tuple[str, ...], progress: Progress | None) -> Gradient:
+        simulation = problem.simulation
+        tape = ReversibleTape(simulation, problem.loss, problem.steps, progress=in_phase(progress, "run"))
+        made = passed(problem, names, saltation=False, tape=tape, progress=progress)
+        assert simulation.lattice is not None
+        details = {
+            "stretches": tape.stretches,
+            "lattice": simulation.lattice.to_dict(float(simulation.integrator.timestep)),
+            "returned to the start": True,
+            "bytes that grow with the run": tape.nbytes,
+            "bits forgotten by friction a step": forgotten_bits(simulation.integrator),
+        }
+        notes = independent(problem, made.gradient, saltation=False)
+        return self.result(tape.value, made.gradient, notes, details)
+
+
+@dataclass(frozen=True)
+class Surrogate(Method):
+    """The gradient of a switched twin, another program, whose flips add nothing because no force jumps.
+
+    Attributes:
+        cutoff: of the twin; one with an onset.
+        onset: where its switching begins, as a share of the cutoff.
+        method: how the twin is differentiated.
+    """
+
+    cutoff: str = "quintic"
+    onset: float = ONSET_FRACTION
+    method: Method = field(default_factory=Symmetric)
+
+    name = "surrogate"
+    kind = "other program"
+    description = "the derivative of another program, whose cutoff switches smoothly"
+
+    def reason_unavailable(self, problem: Problem, names: Sequence[str]) -> str | None:
+        why = pairs_only(problem.simulation)
+        if why is not None:
+            return why
+        if problem.simulation.cutoff.switches:
+            return f"the cutoff is {problem.simulation.cutoff.name}, which has no force jump to smooth"
+        return self.method.reason_unavailable(self.twin(problem), names)
+
+    def twin(self, problem: Problem) -> Problem:
+        """The problem that is differentiated."""
+        made = problem.simulation.with_cutoff(self.cutoff)
+        model = eqx.tree_at(lambda m: m.r_onset, made.model, made.model.r_cut * self.onset)
+        return replace(problem, simulation=replace(made, model=model))
+
+    def differentiate(self, problem: Problem, names: tuple[str, ...], progress: Progress | None) -> Gradient:
+        found = self.method(self.twin(problem), names, progress)
+        details = {"cutoff": self.cutoff, "onset": self.onset, **found.details}
+        notes = dict.fromkeys(names, "of the switched twin, not of the system that was asked about")
+        return self.result(found.value, found.gradient, notes | found.notes, details)
+
+
+def weights(crossings: Sequence[Crossings]) -> dict[str, Any]:
+    """Counts of the crossings, and those that weigh most."""
+    total = sum(len(one) for one in crossings)
+    grazing = sum(int(one.grazing.sum()) for one in crossings)
+    left_out = sum(
+        float(np.sum(np.abs(one.weight[one.grazing & np.isfinite(one.weight)]))) for one in crossings
+    )
+    applied = sum(float(np.sum(np.abs(one.weight[~one.grazing]))) for one in crossings)
+    rows = [
+        {
+            "step": int(one.ledger.step[k]),
+            "i": int(one.ledger.subject[k, 0]),
+            "j": int(one.ledger.subject[k, 1]),
+            "entered": bool(one.ledger.entered[k]),
+            "radial_speed": float(one.speed[k]),
+            "weight": float(one.weight[k]),
+            "grazing": bool(one.grazing[k]),
+        }
+        for one in crossings
+        for k in np.argsort(-np.abs(one.weight))[:_NAMED]
+    ]
+    rows.sort(key=lambda row: -abs(row["weight"]))
+    return {
+        "crossings": total, "grazing": grazing, "weight applied": applied, "weight left out": left_out,
+        "heaviest": rows[:_NAMED],
+    }  # fmt: skip
+
+
+def radial_speed(simulation: Simulation) -> float:
+    """Root mean square speed along the line between two atoms, length per internal time."""
+    speed2 = float(np.mean(np.sum(simulation.velocities**2, axis=1)))
+    return float(np.sqrt(2 * speed2 / 3))
+
+
+def wanted(names: Sequence[str]) -> frozenset[str]:
+    """What the reverse pass has to work out for these parameters."""
+    parts = {"potential": {MODEL}, "cutoff": {MODEL}, "dynamics": {FORCE}, "box": {SCALE, FORCE}}
+    return frozenset(part for name in names for part in parts.get(name.partition(".")[0], ()))

@@ -1,0 +1,460 @@
+"""A cell-list neighbor search on the host, compiled by numba: the fast builder of Verlet lists.
+
+Bins are half a list radius wide, or wider; an axis with room for fewer than five has a single one, and every
+atom meets every atom along it. Distances are those of the minimum image, so the caller refuses radii beyond
+half the smallest perpendicular width.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
+
+import numba
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from mdnum.errors import CapacityError, InputError
+from mdnum.md.cell import Cell, displacement, strain_loss
+from mdnum.numerics import set_bits
+from mdnum.registry import Registry
+
+# a pair at the edge of the list must not be lost to rounding: the skin criterion assumes that every
+# unlisted pair was at least r_list apart
+_SAFETY = 1.0 + 1e-12
+
+
+@numba.njit(cache=True, nogil=True)
+def _bin_atoms(fractional, bins, bin_of, start, order):
+    """Counting sort of atoms by bin; atoms keep their order within a bin."""
+    n = fractional.shape[1]
+    for i in range(n):
+        b = 0
+        for k in range(3):
+            place = int(fractional[k, i] * bins[k])
+            # rounding can put a fractional coordinate at 1, or a free coordinate at the far edge
+            place = min(max(place, 0), bins[k] - 1)
+            b = b * bins[k] + place
+        bin_of[i] = b
+        start[b + 1] += 1
+    for b in range(start.shape[0] - 1):
+        start[b + 1] += start[b]
+    cursor = start[:-1].copy()
+    for i in range(n):
+        b = bin_of[i]
+        order[cursor[b]] = i
+        cursor[b] += 1
+
+
+@numba.njit(cache=True, nogil=True)
+def _segments(b0, b1, b2, bins, reach, periodic, start, matrix, first, last, shift):
+    """Runs of bin-sorted atoms around one bin, with the lattice vector that brings each run near."""
+    found = 0
+    for d0 in range(-reach[0], reach[0] + 1):
+        c0 = b0 + d0
+        n0 = 0
+        if c0 < 0 or c0 >= bins[0]:
+            if not periodic[0]:
+                continue
+            n0 = 1 if c0 >= bins[0] else -1
+            c0 -= n0 * bins[0]
+        for d1 in range(-reach[1], reach[1] + 1):
+            c1 = b1 + d1
+            n1 = 0
+            if c1 < 0 or c1 >= bins[1]:
+                if not periodic[1]:
+                    continue
+                n1 = 1 if c1 >= bins[1] else -1
+                c1 -= n1 * bins[1]
+            row = (c0 * bins[1] + c1) * bins[2]
+            for n2 in range(-1, 2):
+                if n2 != 0 and not periodic[2]:
+                    continue
+                low = max(b2 - reach[2], n2 * bins[2])
+                high = min(b2 + reach[2], (n2 + 1) * bins[2] - 1)
+                if low > high:
+                    continue
+                first[found] = start[row + low - n2 * bins[2]]
+                last[found] = start[row + high - n2 * bins[2] + 1]
+                for c in range(3):
+                    shift[found, c] = n0 * matrix[0, c] + n1 * matrix[1, c] + n2 * matrix[2, c]
+                found += 1
+    return found
+
+
+@numba.njit(cache=True, nogil=True)
+def _gather(x, runs, first, last, shift, near):
+    """Copy the atoms of all runs side by side, moved by their lattice vectors; returns how many."""
+    count = 0
+    for q in range(runs):
+        for j in range(first[q], last[q]):
+            for c in range(3):
+                near[c, count] = x[c, j] + shift[q, c]
+            near[3, count] = j
+            count += 1
+    return count
+
+
+@numba.njit(cache=True, nogil=True)
+def _distances(near, count, xi, yi, zi, squares):
+    """Squared distances to all candidates; a loop without branches, which vectorizes."""
+    for k in range(count):
+        dx, dy, dz = near[0, k] - xi, near[1, k] - yi, near[2, k] - zi
+        squares[k] = dx * dx + dy * dy + dz * dz
+
+
+@numba.njit(cache=True, nogil=True)
+def _image_distances(near, count, xi, yi, zi, matrix, inverse, squares):
+    """As `_distances`, where an axis has a single bin and the nearest image is looked for pair by pair."""
+    for k in range(count):
+        dx, dy, dz = near[0, k] - xi, near[1, k] - yi, near[2, k] - zi
+        f = np.rint(dx * inverse[0, 0] + dy * inverse[1, 0] + dz * inverse[2, 0])
+        g = np.rint(dx * inverse[0, 1] + dy * inverse[1, 1] + dz * inverse[2, 1])
+        h = np.rint(dx * inverse[0, 2] + dy * inverse[1, 2] + dz * inverse[2, 2])
+        dx -= f * matrix[0, 0] + g * matrix[1, 0] + h * matrix[2, 0]
+        dy -= f * matrix[0, 1] + g * matrix[1, 1] + h * matrix[2, 1]
+        dz -= f * matrix[0, 2] + g * matrix[1, 2] + h * matrix[2, 2]
+        squares[k] = dx * dx + dy * dy + dz * dz
+
+
+@numba.njit(cache=True, nogil=True)
+def _fill(x, matrix, inverse, periodic, bins, reach, start, r2_list, table):
+    """Neighbors of every (bin-sorted) atom; returns the largest number found, which may exceed the room."""
+    n = x.shape[1]
+    room = table.shape[0]
+    most = 0
+    by_pair = False
+    for k in range(3):
+        by_pair = by_pair or (periodic[k] and reach[k] == 0)
+    near, squares, chosen = np.empty((4, n + 1)), np.empty(n + 1), np.empty(n + 1, np.int32)
+    first, last = np.empty(75, np.int64), np.empty(75, np.int64)
+    shift = np.empty((75, 3))
+    for b0 in range(bins[0]):
+        for b1 in range(bins[1]):
+            for b2 in range(bins[2]):
+                here = (b0 * bins[1] + b1) * bins[2] + b2
+                if start[here] == start[here + 1]:
+                    continue
+                runs = _segments(b0, b1, b2, bins, reach, periodic, start, matrix, first, last, shift)
+                count = _gather(x, runs, first, last, shift, near)
+                for i in range(start[here], start[here + 1]):
+                    if by_pair:
+                        _image_distances(near, count, x[0, i], x[1, i], x[2, i], matrix, inverse, squares)
+                    else:
+                        _distances(near, count, x[0, i], x[1, i], x[2, i], squares)
+                    filled = 0
+                    # no branch to mispredict: every candidate is written, and overwritten unless it is kept
+                    for k in range(count):
+                        j = np.int32(near[3, k])
+                        chosen[filled] = j
+                        filled += int((squares[k] <= r2_list) & (j != i))
+                    most = max(most, filled)
+                    # the slots of consecutive atoms share cache lines, so this is no slower than by rows
+                    for k in range(min(filled, room)):
+                        table[k, i] = chosen[k]
+    return most
+
+
+def _grid(cell: Cell, fractional_extent, r_list: float, atoms: int):
+    """Number of bins and reach of the search along each axis."""
+    bins = np.ones(3, np.int64)
+    reach = np.zeros(3, np.int64)
+    for k in range(3):
+        width = fractional_extent[k]
+        # with the safety: a pair at r_list must never be three bins of r_list/2 apart by rounding
+        fine = int(2 * width / (r_list * _SAFETY))
+        if fine >= 5:
+            bins[k], reach[k] = fine, 2
+        # fewer: one bin along this axis, every atom meets every atom once
+    # empty bins cost a visit each: a dilute system gets no more bins than about two per atom
+    while np.prod(bins.astype(float)) > max(27.0, 2.0 * atoms) and bins.max() > 5:
+        bins[np.argmax(bins)] = max(5, int(bins[np.argmax(bins)] * 0.7))
+    return bins, reach
+
+
+def neighbor_table(
+    positions: Float[np.ndarray, "atoms 3"], cell: Cell, r_list: float, room: int
+) -> tuple[Int[np.ndarray, "room atoms"], Int[np.ndarray, "atoms"], int]:
+    """All neighbors within r_list of every atom, in both directions, atoms sorted by bin.
+
+    Args:
+        positions: wrapped positions, length.
+        cell: the box.
+        r_list: list radius, length, at most half the smallest perpendicular width.
+        room: slots per atom.
+
+    Returns:
+        table of sorted indices padded with the number of atoms; order, such that sorted atom k is atom
+        order[k]; and the largest number of neighbors, which exceeds room when the table is incomplete.
+    """
+    atoms = len(positions)
+    components = np.ascontiguousarray(positions.T, np.float64)
+    inverse = np.asarray(cell.inverse, np.float64)
+    fractional = inverse.T @ components
+    extent = cell.widths.copy()
+    for k in range(3):
+        if cell.pbc[k]:
+            # wrapping a tiny negative coordinate can round it to L itself: bring it to the bin it is put in
+            outside = np.floor(fractional[k])
+            if outside.any():
+                fractional[k] -= outside
+                components = components - np.outer(np.asarray(cell.matrix)[k], outside)
+        else:
+            # along a free axis the bins span the atoms; the direction is that of the axis itself,
+            # orthogonal to the periodic ones where the lattice vectors are (else one bin)
+            extent[k], fractional[k] = _free_axis(cell, components, k)
+    bins, reach = _grid(cell, extent, r_list, atoms)
+    start = np.zeros(int(np.prod(bins)) + 1, np.int64)
+    order = np.empty(atoms, np.int64)
+    _bin_atoms(fractional, bins, np.empty(atoms, np.int64), start, order)
+    table = np.full((room, atoms), atoms, np.int32)
+    most = _fill(
+        np.ascontiguousarray(components[:, order]),
+        np.asarray(cell.matrix, np.float64),
+        inverse,
+        np.array(cell.pbc),
+        bins,
+        reach,
+        start,
+        (r_list * _SAFETY) ** 2,
+        table,
+    )
+    return table, order, int(most)
+
+
+def _free_axis(cell: Cell, components, k: int):
+    """Extent along a free axis, and the atoms' place in it from 0 to 1."""
+    if not cell.orthorhombic and any(cell.pbc):
+        return 0.0, np.zeros(components.shape[1])
+    low, high = float(components[k].min()), float(components[k].max())
+    extent = high - low
+    if extent <= 0:
+        return 0.0, np.zeros(components.shape[1])
+    return extent, (components[k] - low) / extent
+
+
+# --- verlet skin lists: when they are rebuilt, how they are built, and what they hold -----------------
+
+# decisions leave the force loop eight to a byte, so lists have a multiple of eight slots
+SLOTS = 8
+
+
+@dataclass(frozen=True)
+class RebuildRule:
+    """When a list is rebuilt, in the words of LAMMPS's neigh_modify.
+
+    Attributes:
+        skin: r_list - r_cut, length.
+        every: a list may be rebuilt only at multiples of this many steps after its build.
+        delay: and not before this many steps.
+        check: rebuild only where an atom has moved by more than skin/2 (else blindly, whenever allowed).
+    """
+
+    skin: float
+    every: int = 1
+    delay: int = 0
+    check: bool = True
+
+    @property
+    def first_allowed(self) -> int:
+        """Age at which a list can first be rebuilt; a build there is `dangerous` in LAMMPS's sense,
+        because an earlier one may have been due."""
+        return max(self.every, self.delay)
+
+    @property
+    def safe(self) -> bool:
+        """Whether a list is never used once its skin is spent."""
+        return self.check and self.every == 1 and self.delay <= 1
+
+
+@dataclass(frozen=True)
+class PairTable:
+    """The pairs of one list, both directions, as the force loop reads them.
+
+    Attributes:
+        index: neighbor of each slot and atom, in sorted labels, padded with the number of atoms,
+            shape (slots, atoms).
+        order: sorted atom k is atom order[k].
+        r_list: list radius, length.
+        occupancy: largest number of neighbors of an atom.
+        build_seconds: time the search took.
+    """
+
+    index: Int[np.ndarray, "slots atoms"]
+    order: Int[np.ndarray, "atoms"]
+    r_list: float
+    occupancy: int
+    build_seconds: float
+
+    @property
+    def slots(self) -> int:
+        """Room per atom."""
+        return self.index.shape[0]
+
+    @property
+    def pairs(self) -> int:
+        """Number of listed pairs, each counted once."""
+        return int(np.count_nonzero(self.index < self.index.shape[1])) // 2
+
+    def decided(
+        self, bits: UInt8[np.ndarray, "words atoms"]
+    ) -> tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]]:
+        """Labels i < j of the pairs whose packed decision is yes, each once, in the order of the table."""
+        slots, columns = set_bits(bits)
+        i, j = self.order[columns], self.order[self.index[slots, columns]]
+        keep = i < j
+        return i[keep], j[keep]
+
+    def unsorted(self) -> Int[np.ndarray, "atoms slots"]:
+        """Neighbors in the user's labels, one row per atom, padded with the number of atoms."""
+        atoms = self.index.shape[1]
+        labels = np.append(self.order, atoms).astype(np.int32)
+        out = np.empty((atoms, self.slots), np.int32)
+        out[self.order] = labels[self.index].T
+        return out
+
+
+@runtime_checkable
+class ListBuilder(Protocol):
+    """A neighbor search that fills a pair table."""
+
+    @property
+    def name(self) -> str:
+        """The word of system files."""
+        ...
+
+    def build(
+        self, positions: Float[np.ndarray, "atoms 3"], cell: Cell, r_list: float, slots: int
+    ) -> tuple[Int[np.ndarray, "slots atoms"], Int[np.ndarray, "atoms"], int]:
+        """Index table in sorted labels, order, and the largest neighbor count (above slots: incomplete)."""
+        ...
+
+
+@dataclass(frozen=True)
+class HostBuilder:
+    """mdnum's own cell list, compiled by numba, on the host."""
+
+    name: str = "host"
+
+    def build(self, positions, cell, r_list, slots):
+        return neighbor_table(positions, cell, r_list, slots)
+
+
+@dataclass(frozen=True)
+class JaxMdBuilder:
+    """jax-md's partition.neighbor_list, through the adaptor that keeps its traps shut."""
+
+    name: str = "jax-md"
+
+    def build(self, positions, cell, r_list, slots):
+        from mdnum.md import jaxmd
+
+        rows = np.asarray(jaxmd.dense_pairs(positions, cell.matrix, cell.pbc, r_list))
+        atoms = len(positions)
+        occupancy = int((rows < atoms).sum(1).max(initial=0))
+        table = np.full((slots, atoms), atoms, np.int32)
+        # jax-md pads at the end of a row; its order is kept, it is the order of the sum
+        kept = min(slots, rows.shape[1])
+        if occupancy <= slots:
+            table[:kept] = rows[:, :kept].T
+        return table, np.arange(atoms), occupancy
+
+
+#: Every way to search for neighbors, by its name; a package adds one by an entry point of this group.
+BUILDERS: Registry[ListBuilder] = Registry("list builder", "mdnum.builders")
+BUILDERS.add("host", HostBuilder())
+BUILDERS.add("jax-md", JaxMdBuilder())
+
+
+def check_radius(cell: Cell, r_cut: float, skin: float) -> None:
+    """Refuse a list radius that the minimum image cannot serve.
+
+    Raises:
+        InputError: r_cut + skin exceeds half the smallest perpendicular width of the box.
+    """
+    half = float(np.min(cell.widths)) / 2
+    if r_cut + skin > half:
+        wanted = f"r_cut + skin = {r_cut + skin:g} exceeds half the smallest perpendicular box width {half:g}"
+        if r_cut < half:
+            remedy = f"Use a skin of at most {half - r_cut:.4g}, or a larger box"
+        else:
+            remedy = f"Repeat the box (r_cut alone needs a width of {2 * r_cut:g}) or use a smaller cutoff"
+        raise InputError(wanted, remedy=remedy, where="neighbors.skin")
+
+
+@dataclass
+class VerletList:
+    """A list that grows its capacity when it must and remembers where it was built.
+
+    Attributes:
+        builder: the neighbor search.
+        rule: when to rebuild.
+        r_cut: largest interaction radius, length.
+        slack: room kept beyond the largest occupancy seen, so that a denser moment does not recompile.
+        guard: added to the list radius to cover the rounding of displacements in a narrow state, length.
+        slots: room per atom; 0 lets the density decide.
+    """
+
+    builder: ListBuilder
+    rule: RebuildRule
+    r_cut: float
+    slack: float = 1.04
+    guard: float = 0.0
+    slots: int = field(default=0)
+
+    def build(self, positions: Float[np.ndarray, "atoms 3"], cell: Cell) -> PairTable:
+        """The pairs within r_cut + skin of wrapped positions; capacity grows until they fit.
+
+        Raises:
+            CapacityError: an atom would have every other atom as a neighbor and more.
+        """
+        r_list = self.r_cut + self.rule.skin
+        atoms = len(positions)
+        first = not self.slots
+        if first:
+            self.slots = self._guess(atoms, cell, r_list)
+        begin = time.perf_counter()
+        while True:
+            index, order, most = self.builder.build(positions, cell, r_list + self.guard, self.slots)
+            if most <= self.slots and first:
+                # every size of table is compiled for: settle on one with room before the first use
+                first, wanted = False, self._rounded(most * self.slack)
+                if wanted != self.slots:
+                    self.slots = wanted
+                    continue
+            if most <= self.slots:
+                return PairTable(index, order, r_list, most, time.perf_counter() - begin)
+            if most >= atoms and atoms > 1:
+                raise CapacityError(f"an atom has {most} neighbors among {atoms} atoms")
+            self.slots = self._rounded(most * self.slack)
+
+    def _guess(self, atoms: int, cell: Cell, r_list: float) -> int:
+        volume = cell.volume
+        if not np.isfinite(volume):
+            return SLOTS
+        # a guess that is too small costs one more search, one that is too large costs every step
+        mean = atoms / volume * 4.0 / 3.0 * np.pi * r_list**3
+        return self._rounded(min(mean, atoms))
+
+    @staticmethod
+    def _rounded(slots: float) -> int:
+        return max(SLOTS, int(np.ceil(slots / SLOTS)) * SLOTS)
+
+    def consumed(self, positions, cell: Cell, reference, reference_cell: Cell) -> float:
+        """Share of the skin that motion and box strain have used since the build; above 1 is too late.
+
+        Args:
+            positions, cell: now; reference, reference_cell: at the build. Wrapped positions, length.
+        """
+        moved = displacement(cell, _carried(reference, reference_cell, cell), positions)
+        largest = float(np.sqrt(np.max(sum(c * c for c in moved), initial=0.0)))
+        loss = strain_loss(reference_cell, cell, self.r_cut + self.rule.skin)
+        return (2 * largest + loss) / self.rule.skin if self.rule.skin > 0 else np.inf
+
+
+def _carried(positions, old: Cell, new: Cell):
+    """Where positions would be if they had only moved with the box."""
+    if np.array_equal(old.matrix, new.matrix):
+        return positions
+    return np.asarray(positions) @ np.asarray(old.inverse) @ np.asarray(new.matrix)

@@ -1,0 +1,53 @@
+"""Dtypes by role, rounding bounds, sums; and thresholds, decisions, their ledger and verdicts."""
+
+from __future__ import annotations
+
+import jax
+
+from mdnum.numerics.events import (
+    Hysteresis,
+    Ledger,
+    Threshold,
+    broken_alternations,
+    changed_bits,
+    changes_in_time,
+    count_set,
+    set_bits,
+    sort_rows,
+)
+from mdnum.numerics.roles import PrecisionPolicy, RolePrecision
+from mdnum.numerics.rounding import (
+    Reach,
+    distance_bound,
+    gamma,
+    neighbor,
+    ordinal,
+    squared_distance_bound,
+    ulp_distance,
+    unit_roundoff,
+)
+
+# every threshold, margin and ledger entry is a float64; jax would otherwise make them float32 in silence
+jax.config.update("jax_enable_x64", True)
+
+__all__ = [
+    "Hysteresis",
+    "Ledger",
+    "PrecisionPolicy",
+    "Reach",
+    "RolePrecision",
+    "Threshold",
+    "broken_alternations",
+    "changed_bits",
+    "changes_in_time",
+    "count_set",
+    "distance_bound",
+    "gamma",
+    "neighbor",
+    "ordinal",
+    "set_bits",
+    "sort_rows",
+    "squared_distance_bound",
+    "ulp_distance",
+    "unit_roundoff",
+]

@@ -1,0 +1,283 @@
+"""The event model: threshold, margin, decision; decisions as packed bits; the ledger of their flips."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numba
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from mdnum.errors import InputError
+
+INCLUSIVE = {"<": False, "<=": True}
+
+
+@dataclass(frozen=True)
+class Threshold:
+    """A number that a computed quantity is compared with, and how.
+
+    The comparison is part of the physics: codes that agree on a cutoff still disagree on `<` against `<=`
+    and on comparing r or r², and then on pairs that sit at the cutoff.
+
+    Attributes:
+        value: the threshold in the quantity's own space, exactly as the program compares it: a number, or an
+            array that a compiled program is given.
+        comparison: "<" or "<=": the decision is yes when `quantity comparison value`.
+        space: name of the quantity's space, for example "r", "r2" or "height".
+    """
+
+    value: Any
+    comparison: str = "<"
+    space: str = "r"
+
+    def __post_init__(self):
+        if self.comparison not in INCLUSIVE:
+            raise InputError(f"unknown comparison {self.comparison!r}; known are {', '.join(INCLUSIVE)}")
+
+    def margin(self, quantity):
+        """threshold - quantity: positive means yes.
+
+        Error: exact when the quantity is within a factor two of the threshold (Sterbenz' lemma), and of the
+        right sign always, because IEEE subtraction of unequal numbers never gives zero (gradual underflow).
+        """
+        return self.value - quantity
+
+    def decide(self, quantity):
+        """The decision itself, of the shape of the quantity; NaN decides no."""
+        return quantity <= self.value if INCLUSIVE[self.comparison] else quantity < self.value
+
+    def ambiguous(self, quantity, bound):
+        """Whether another legitimate rounding of the quantity could have decided otherwise.
+
+        Args:
+            quantity: computed value(s).
+            bound: bound(s) on |computed - exact| in the quantity's space.
+        """
+        return np.abs(self.margin(quantity)) <= bound
+
+
+@dataclass(frozen=True)
+class Hysteresis:
+    """A decision that turns yes at one threshold and no at another (a Schmitt trigger).
+
+    A quantity that wavers about one threshold flips its decision each time. With a gap between the two it
+    flips once; the gap is to be wider than the noise. A Verlet list does the same with its skin: it is
+    built when the skin is used up, not whenever an atom moves.
+
+    Attributes:
+        enter: where a no turns yes.
+        leave: where a yes stays yes; turning no needs this threshold to be passed. The same space, and at
+            least as high as enter.
+    """
+
+    enter: Threshold
+    leave: Threshold
+
+    def __post_init__(self):
+        if self.enter.space != self.leave.space:
+            raise InputError(
+                f"the two thresholds are in different spaces, {self.enter.space} and {self.leave.space}"
+            )
+        enter, leave = self.enter.value, self.leave.value
+        # traced values are checked where they were made
+        if isinstance(enter, float | int) and isinstance(leave, float | int) and leave < enter:
+            raise InputError(
+                f"a yes would end at {leave:g}, before it begins at {enter:g}",
+                remedy="Put the threshold for leaving at or above the one for entering",
+            )
+
+    def margin(self, quantity, before):
+        """Signed distance to the threshold that holds now: positive means yes.
+
+        Args:
+            quantity: computed value(s).
+            before: the decision(s) of the step before.
+        """
+        return _where(before, self.leave.margin(quantity), self.enter.margin(quantity))
+
+    def decide(self, quantity, before):
+        """The decision, given the one before."""
+        return _where(before, self.leave.decide(quantity), self.enter.decide(quantity))
+
+
+def _where(condition, yes, no):
+    if isinstance(yes, np.ndarray | np.generic | float | bool):
+        return np.where(condition, yes, no)
+    # jax's arrays are selected by jax, without the event core depending on being traced
+    import jax.numpy as jnp
+
+    return jnp.where(condition, yes, no)
+
+
+@dataclass(frozen=True)
+class Ledger:
+    """The flips of one channel in time; row order is step, then subject.
+
+    Step s means that the decision at s differs from the one at s - 1.
+
+    Attributes:
+        channel: name of the stream of decisions, for example "pair".
+        step: step of each flip.
+        subject: labels of what was decided, shape (flips, labels).
+        entered: True where the decision turned yes.
+        margin: signed distance to the threshold at the step of the flip, in the quantity's space.
+        bound: rounding bound on the quantity, in the same space.
+        jump: what the flip does to the conserved quantity (energy), signed.
+        extra: further columns by name, each of shape (flips,).
+    """
+
+    channel: str
+    step: Int[np.ndarray, "flips"]
+    subject: Int[np.ndarray, "flips labels"]
+    entered: Bool[np.ndarray, "flips"]
+    margin: Float[np.ndarray, "flips"]
+    bound: Float[np.ndarray, "flips"]
+    jump: Float[np.ndarray, "flips"]
+    extra: dict[str, np.ndarray] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.step)
+
+    @property
+    def ambiguous(self) -> Bool[np.ndarray, "flips"]:
+        """Flips whose date another legitimate rounding could have moved: |margin| within the bound."""
+        return np.abs(self.margin) <= self.bound
+
+    def counts(self, steps: int) -> tuple[Int[np.ndarray, "steps"], Int[np.ndarray, "steps"]]:
+        """How many decisions turned yes and no at each step 0..steps."""
+        entered = np.bincount(self.step[self.entered], minlength=steps + 1)
+        left = np.bincount(self.step[~self.entered], minlength=steps + 1)
+        return entered, left
+
+    def inside(self, first: int, steps: int) -> Int[np.ndarray, "steps"]:
+        """Number of yes decisions at each step 0..steps by the event algebra: first + entered - left."""
+        entered, left = self.counts(steps)
+        return first + np.cumsum(entered - left)
+
+    def jumps(self, steps: int) -> Float[np.ndarray, "steps"]:
+        """Sum of the jumps of the flips of each step 0..steps."""
+        # bincount of nothing is a row of integers, whatever its weights
+        return np.bincount(self.step, weights=self.jump, minlength=steps + 1).astype(np.float64)
+
+
+def sort_rows(step, subject) -> Int[np.ndarray, "rows"]:
+    """Order of rows by step, then by the labels of the subject, first label first."""
+    sizes = [int(column.max(initial=0)) + 1 for column in subject.T]
+    key = step - step.min(initial=0)
+    if float(key.max(initial=0) + 1) * float(np.prod(np.array(sizes, float))) >= 2**63:
+        return np.lexsort((*subject.T[::-1], step))
+    # one integer sorts several times faster than three keys; rows are distinct, so the order is unique
+    for column, size in zip(subject.T, sizes, strict=True):
+        key = key * size + column
+    return np.argsort(key)
+
+
+def broken_alternations(ledger: Ledger) -> int:
+    """Rows that repeat the direction of the same subject's flip before: 0 for a complete ledger.
+
+    A decision that turned yes can only turn no next, so a missed flip of a subject that flips again
+    leaves two equal directions in a row.
+    """
+    if not len(ledger):
+        return 0
+    keys = tuple(ledger.subject[:, k] for k in range(ledger.subject.shape[1]))
+    order = np.lexsort((ledger.step, *keys))
+    subject, entered = ledger.subject[order], ledger.entered[order]
+    same = np.all(subject[1:] == subject[:-1], axis=1)
+    return int(np.sum(same & (entered[1:] == entered[:-1])))
+
+
+# --- packed bits: eight slots to a byte --------------------------------------------------------------
+#
+# A step of a list with W*8 slots for each of C columns leaves a (W, C) array of bytes; slot k of column c is
+# bit k % 8 of byte [k // 8, c].
+
+_POPULATION = np.array([int(byte).bit_count() for byte in range(256)], np.int64)
+
+
+@numba.njit(cache=True, nogil=True)
+def _scan(rows, columns, row, slot, column, values):
+    """Note the bits that change from row to row; returns their number, of which those that fit are noted."""
+    at, room = 0, row.shape[0]
+    for r in range(1, rows.shape[0]):
+        for w in range(rows.shape[1]):
+            changed = rows[r, w] ^ rows[r - 1, w]
+            if changed:
+                now = rows[r, w]
+                for byte in range(8):
+                    bits = (changed >> np.uint64(8 * byte)) & np.uint64(255)
+                    if bits and at + 8 > room:
+                        at += _POPULATION[bits]
+                    elif bits:
+                        place = 8 * w + byte
+                        for k in range(8):
+                            if (bits >> np.uint64(k)) & np.uint64(1):
+                                row[at] = r - 1
+                                slot[at] = 8 * (place // columns) + k
+                                column[at] = place % columns
+                                values[at] = (now >> np.uint64(8 * byte + k)) & np.uint64(1)
+                                at += 1
+    return at
+
+
+def changes_in_time(
+    before: UInt8[np.ndarray, "words columns"], rows: UInt8[np.ndarray, "rows words columns"]
+) -> tuple[
+    Int[np.ndarray, "flips"], Int[np.ndarray, "flips"], Int[np.ndarray, "flips"], UInt8[np.ndarray, "flips"]
+]:
+    """The decisions that differ from the row before, for consecutive rows of one list.
+
+    Args:
+        before: decisions ahead of the first row.
+        rows: decisions of each row.
+
+    Returns:
+        row, slot, column and the decision now (1 yes, 0 no) of every change, by row, slot word, column, bit.
+    """
+    count, words, columns = rows.shape
+    size = words * columns
+    padded = np.zeros((count + 1, -(-size // 8) * 8), np.uint8)
+    padded[0, :size] = before.reshape(-1)
+    padded[1:, :size] = rows.reshape(count, size)
+    # on a big-endian machine the bytes of a word would be met in the other order
+    wide = padded.view("<u8").astype(np.uint64, copy=False)
+    # rarely too little; where it is, the count says how much is needed
+    room = wide.size // 4 + 64
+    while True:
+        row, slot, column = (np.empty(room, np.int64) for _ in range(3))
+        values = np.empty(room, np.uint8)
+        total = _scan(wide, max(columns, 1), row, slot, column, values)
+        if total + 8 <= room:
+            return row[:total], slot[:total], column[:total], values[:total]
+        room = total + 8
+
+
+def changed_bits(
+    before: UInt8[np.ndarray, "words columns"], now: UInt8[np.ndarray, "words columns"]
+) -> tuple[Int[np.ndarray, "flips"], Int[np.ndarray, "flips"], UInt8[np.ndarray, "flips"]]:
+    """The slots whose decision differs between two steps of one list.
+
+    Returns:
+        slot, column and the decision now (1 yes, 0 no) of every changed bit, by slot word, column, bit.
+    """
+    _, slot, column, values = changes_in_time(before, now[None])
+    return slot, column, values
+
+
+def set_bits(
+    packed: UInt8[np.ndarray, "words columns"],
+) -> tuple[Int[np.ndarray, "set"], Int[np.ndarray, "set"]]:
+    """Slot and column of every yes decision."""
+    slots, columns, _ = changed_bits(np.zeros_like(packed), packed)
+    return slots, columns
+
+
+def count_set(packed: UInt8[np.ndarray, "..."]) -> int:
+    """How many decisions of packed bytes (any number of columns) are yes."""
+    flat = np.ascontiguousarray(packed).reshape(-1)
+    whole = len(flat) // 8 * 8
+    return int(np.bitwise_count(flat[:whole].view(np.uint64)).sum(dtype=np.int64)) + int(
+        np.bitwise_count(flat[whole:]).sum(dtype=np.int64)
+    )

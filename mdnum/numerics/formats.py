@@ -1,0 +1,216 @@
+"""Formats of numbers, emulated: rounding to any of them, products of matrices in them, stochastic rounding.
+
+Which numbers a format has is what decides here; its speed is not emulated. TF32 is what some devices do to
+float32 matrix products unless told otherwise: the inputs keep 10 of 23 fraction bits, the sums are float32.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from mdnum.errors import InputError
+from mdnum.numerics.roles import ALL
+
+
+@dataclass(frozen=True)
+class FloatFormat:
+    """A binary floating-point format with subnormals and infinities, as IEEE 754 arranges them.
+
+    Attributes:
+        name: such as "tf32".
+        bits: width in memory (TF32 lives in 32).
+        significand: binary digits of the significand, the implicit one included.
+        exponent: bits of the exponent.
+    """
+
+    name: str
+    bits: int
+    significand: int
+    exponent: int
+
+    @property
+    def emin(self) -> int:
+        """Exponent of the smallest normal number."""
+        return 2 - 2 ** (self.exponent - 1)
+
+    @property
+    def emax(self) -> int:
+        """Exponent of the largest number."""
+        return 1 - self.emin
+
+    @property
+    def largest(self) -> float:
+        """The largest finite number."""
+        return 2.0**self.emax * (2.0 - 2.0 ** (1 - self.significand))
+
+    @property
+    def smallest_normal(self) -> float:
+        """The smallest number with all its digits."""
+        return 2.0**self.emin
+
+    @property
+    def smallest_subnormal(self) -> float:
+        """The smallest positive number, and the spacing below the smallest normal one."""
+        return 2.0 ** (self.emin + 1 - self.significand)
+
+    @property
+    def unit_roundoff(self) -> float:
+        """The largest relative error of one rounding to nearest."""
+        return 2.0**-self.significand
+
+
+FORMATS: Mapping[str, FloatFormat] = {
+    form.name: form
+    for form in (
+        FloatFormat("float64", 64, 53, 11),
+        FloatFormat("float32", 32, 24, 8),
+        FloatFormat("tf32", 32, 11, 8),
+        FloatFormat("float16", 16, 11, 5),
+        FloatFormat("bfloat16", 16, 8, 8),
+    )
+}
+
+COLUMNS = (
+    "format",
+    "bits",
+    "significand",
+    "unit roundoff",
+    "largest",
+    "smallest normal",
+    "smallest subnormal",
+)
+
+
+def format_of(name: str) -> FloatFormat:
+    """The format of a name.
+
+    Raises:
+        InputError: no format is called that.
+    """
+    if name not in FORMATS:
+        raise InputError(f"unknown format {name!r}; known are {', '.join(FORMATS)}")
+    return FORMATS[name]
+
+
+def _spacing(x: Float[Array, "..."], form: FloatFormat) -> Float[Array, "..."]:
+    """Distance of the numbers of a format around x, a power of two; x is float64."""
+    # jnp.frexp has no derivative rule for its exponent; the bits say the same
+    field = (lax.bitcast_convert_type(x, jnp.int64) >> 52) & 0x7FF
+    exponent = jnp.maximum(field - 1023, form.emin) + 1 - form.significand
+    # a power of two from its bits: exact, where exp2 need not be
+    normal = lax.bitcast_convert_type((jnp.maximum(exponent, -1022) + 1023) << 52, jnp.float64)
+    return normal
+
+
+@jax.custom_jvp
+def _identity_slope(x, rounded):
+    return rounded
+
+
+@_identity_slope.defjvp
+def _identity_slope_jvp(primals, tangents):
+    return _identity_slope(*primals), tangents[0]
+
+
+def round_to(x: Float[Array, "..."], name: str) -> Float[Array, "..."]:
+    """x rounded to the nearest number of a format, ties to even, in the dtype of x.
+
+    Subnormals of the format are kept and what is too large becomes infinite (`lax.reduce_precision` flushes
+    the former). One rounding from up to float64, where a cast may round twice. Its derivative is 1.
+
+    Args:
+        x: float64 or narrower.
+        name: of the format; one with more digits or range than the dtype of x leaves x as it is.
+    """
+    form = format_of(name)
+    if form.significand >= 53:
+        return x
+    wide = lax.stop_gradient(x).astype(jnp.float64)
+    spacing = _spacing(wide, form)
+    rounded = jnp.rint(wide / spacing) * spacing
+    rounded = jnp.where(jnp.abs(rounded) > form.largest, jnp.sign(wide) * jnp.inf, rounded)
+    return _identity_slope(x, jnp.where(jnp.isfinite(wide), rounded, wide).astype(x.dtype))
+
+
+def matmul(
+    a: Float[Array, "... m k"], b: Float[Array, "... k n"], name: str = "float32"
+) -> Float[Array, "... m n"]:
+    """A matrix product as a device makes it: inputs in a format, products and sums in a wider one.
+
+    "float64": all in float64. "float32": all in float32. "tf32", "bfloat16" and "float16": inputs rounded to
+    the format, exact products, sums in float32. The result has the dtype of a.
+
+    Error: at most (2u + gamma_k) |a| |b| with the format's u and float32's gamma. The order of the sums is
+    that of the CPU's own product, not of a device.
+    """
+    format_of(name)
+    if name == "float64":
+        return jnp.matmul(a.astype(jnp.float64), b.astype(jnp.float64)).astype(a.dtype)
+    a32, b32 = (round_to(q, name).astype(jnp.float32) for q in (a, b))
+    return jnp.matmul(a32, b32, precision=lax.Precision.HIGHEST).astype(a.dtype)
+
+
+def stochastic_round(x: Float[Array, "..."], name: str, key: Array) -> Float[Array, "..."]:
+    """x rounded up or down to a neighbor in a format with probabilities that keep its mean.
+
+    In the dtype of x; a number of the format stays as it is. Unbiased: the expectation is x (for |x| up to
+    the largest number), with a standard deviation of at most half the spacing; so a long sum of small terms
+    does not stand still. The uniform numbers have 53 bits. Its derivative is 1. Source: Croci et al., R. Soc.
+    Open Sci. 9, 211631 (2022).
+    """
+    form = format_of(name)
+    if form.significand >= 53:
+        return x
+    wide = lax.stop_gradient(x).astype(jnp.float64)
+    spacing = _spacing(wide, form)
+    below = jnp.floor(wide / spacing)
+    up = jax.random.uniform(key, x.shape, jnp.float64) < wide / spacing - below
+    rounded = (below + up.astype(jnp.float64)) * spacing
+    rounded = jnp.where(jnp.abs(rounded) > form.largest, jnp.sign(wide) * jnp.inf, rounded)
+    return _identity_slope(x, jnp.where(jnp.isfinite(wide), rounded, wide).astype(x.dtype))
+
+
+def cast(
+    x: Float[Array, "..."],
+    dtype: str,
+    rounding: Literal["nearest", "stochastic"] = "nearest",
+    key: Array | None = None,
+) -> Float[Array, "..."]:
+    """x as an array of a dtype, rounded once, to nearest or stochastically (`RolePrecision.rounding`).
+
+    Raises:
+        InputError: stochastic without a key.
+    """
+    if rounding == "nearest":
+        return round_to(x, dtype).astype(ALL[dtype])
+    if key is None:
+        raise InputError("stochastic rounding needs a key")
+    return stochastic_round(x, dtype, key).astype(ALL[dtype])
+
+
+@jax.custom_jvp
+def quantize(
+    x: Float[Array, "..."],
+    scale: Float[Array, ""],
+    lowest: Float[Array, ""],
+    highest: Float[Array, ""],
+) -> Float[Array, "..."]:
+    """The multiple of scale nearest to x, from lowest * scale to highest * scale; all may be traced.
+
+    Derivative 1 inside, 0 where clamped. Error: at most scale/2 inside, plus one rounding.
+    """
+    return jnp.clip(jnp.rint(x / jnp.broadcast_to(scale, x.shape)), lowest, highest) * scale
+
+
+@quantize.defjvp
+def _quantize_jvp(primals, tangents):
+    x, scale, lowest, highest = primals
+    inside = (x >= lowest * scale) & (x <= highest * scale)
+    return quantize(*primals), jnp.where(inside, tangents[0], jnp.zeros_like(x))

@@ -1,0 +1,301 @@
+"""Sums of integers, which are the same in every order; segments; and every reduction by its name.
+
+A finite float is an integer multiple of its format's smallest subnormal. The exact sum adds those integers
+in a number wide enough for all of them (Kulisch & Miranker 1986), held as limbs of 32 bits in int64, and
+rounds once. The fixed-point sum rounds every term to a coarser unit first and then needs one int64.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import ml_dtypes
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int, UInt64
+
+from mdnum.errors import InputError
+from mdnum.numerics.exact import integer_of
+from mdnum.numerics.rounding import gamma, unit_roundoff
+from mdnum.numerics.sums import (
+    Add,
+    Blocked,
+    Kahan,
+    Neumaier,
+    Pairwise,
+    Permuted,
+    Reduction,
+    Sequential,
+    Sorted,
+    Whole,
+)
+from mdnum.registry import Registry
+
+_LIMB = 32
+_MASK = 2**_LIMB - 1
+
+
+class _Format(NamedTuple):
+    """Significand bits with the implicit one, and the exponent field of infinity."""
+
+    digits: int
+    top: int
+
+    @classmethod
+    def of(cls, dtype) -> _Format:
+        info = ml_dtypes.finfo(np.dtype(dtype))
+        return cls(info.nmant + 1, 2**info.nexp - 1)
+
+    @property
+    def limbs(self) -> int:
+        # two more than the largest term needs: one for its parts, one for 2^31 terms and the sign
+        return (self.top + self.digits) // _LIMB + 3
+
+
+def _parts(terms: Float[Array, "n columns"], form: _Format) -> tuple[jax.Array, list[jax.Array]]:
+    """Every term as signed pieces of 32 bits: the limb of the lowest piece, and the pieces."""
+    bits = lax.bitcast_convert_type(terms, integer_of(terms.dtype)).astype(jnp.int64)
+    magnitude = bits & ((1 << (8 * terms.dtype.itemsize - 1)) - 1)
+    exponent, fraction = magnitude >> (form.digits - 1), magnitude & ((1 << (form.digits - 1)) - 1)
+    digits = jnp.where(exponent > 0, fraction | (1 << (form.digits - 1)), fraction)
+    # as a multiple of the smallest subnormal the term is digits * 2^shift
+    shift = jnp.maximum(exponent, 1) - 1
+    limb, shift = shift // _LIMB, shift % _LIMB
+    low = (digits & _MASK) << shift
+    pieces = [low & _MASK, low >> _LIMB]
+    if form.digits > _LIMB:
+        high = (digits >> _LIMB) << shift
+        pieces = [pieces[0], pieces[1] + (high & _MASK), high >> _LIMB]
+    sign = jnp.where(bits < 0, -1, 1)
+    return limb, [sign * piece for piece in pieces]
+
+
+def _carried(limbs: Int[Array, "limbs columns"]) -> tuple[Int[Array, "columns"], Int[Array, "limbs columns"]]:
+    """What is carried out at the top, -1 where the number is negative, and limbs from 0 to 2^32 - 1."""
+
+    def step(carry, limb):
+        value = limb + carry
+        return value >> _LIMB, value & _MASK
+
+    return lax.scan(step, jnp.zeros_like(limbs[0]), limbs)
+
+
+def _rounded(limbs: Int[Array, "limbs columns"], form: _Format) -> UInt64[Array, "columns"]:
+    """Bits of the float nearest to a non-negative number, ties to even."""
+    count = limbs.shape[0]
+    filled = limbs != 0
+    place = count - 1 - jnp.argmax(filled[::-1], axis=0)
+
+    def at(k):
+        found = jnp.take_along_axis(limbs, jnp.maximum(place - k, 0)[None], axis=0)[0]
+        return jnp.where(place >= k, found, 0).astype(jnp.uint64)
+
+    top, middle, low = at(0), at(1), at(2)
+    below = jnp.any(filled & (jnp.arange(count)[:, None] < place - 2), axis=0)
+    # the leading bit to the left end of 64; what does not fit only says whether there is more
+    leading = lax.clz(top.astype(jnp.uint32)).astype(jnp.int64)
+    shift = leading.astype(jnp.uint64)
+    window = (((top << _LIMB) | middle) << shift) | (low >> (jnp.uint64(_LIMB) - shift))
+    more = below | (((low << shift) & jnp.uint64(_MASK)) != 0)
+    length = _LIMB * (place + 1) - leading
+    # a number no longer than the significand is exact, subnormal or not, and its bits are the number itself
+    digits = jnp.clip(length, 1, form.digits)
+    excess = jnp.maximum(length - form.digits, 0).astype(jnp.uint64)
+    cut = (64 - digits).astype(jnp.uint64)
+    kept, rest = window >> cut, window & ((jnp.uint64(1) << cut) - jnp.uint64(1))
+    half = jnp.uint64(1) << (cut - jnp.uint64(1))
+    up = (rest > half) | ((rest == half) & (more | (kept & jnp.uint64(1) == 1)))
+    up = up & (excess > 0)
+    bits = (excess << (form.digits - 1)) + kept + up.astype(jnp.uint64)
+    infinity = jnp.uint64(form.top << (form.digits - 1))
+    return jnp.where(jnp.any(filled, axis=0), jnp.minimum(bits, infinity), jnp.uint64(0))
+
+
+def nearest(value: Fraction, dtype) -> Any:
+    """The float nearest to a rational number, ties to even, on the host; infinity where none is near."""
+    info = ml_dtypes.finfo(np.dtype(dtype))
+    kind = np.dtype(dtype).type
+    if value == 0:
+        return kind(0)
+    size = abs(value)
+    exponent = size.numerator.bit_length() - size.denominator.bit_length()
+    if size < Fraction(2) ** exponent:
+        exponent -= 1
+    place = max(exponent, int(info.minexp)) - info.nmant
+    digits = round(size / Fraction(2) ** place)
+    rounded = Fraction(digits) * Fraction(2) ** place
+    if rounded > Fraction(float(info.max)):
+        return kind(np.inf if value > 0 else -np.inf)
+    # exact: the rounded number is a float of this dtype, so it is one of float64
+    return kind(math.copysign(float(rounded), value))
+
+
+@dataclass(frozen=True)
+class Exact(Whole):
+    """The exact sum, rounded once to nearest: the same bits in every order.
+
+    Error: half an ulp of the result; no overflow on the way; up to 2^31 terms. An infinity or a NaN among
+    the terms gives what IEEE addition gives.
+    """
+
+    def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
+        """Integer additions only."""
+        dtype, shape = terms.dtype, terms.shape[1:]
+        form = _Format.of(dtype)
+        flat = terms.reshape(terms.shape[0], -1)
+        place, pieces = _parts(flat, form)
+        columns = jnp.broadcast_to(jnp.arange(flat.shape[1]), flat.shape)
+        limbs = jnp.zeros((form.limbs, flat.shape[1]), jnp.int64)
+        for k, piece in enumerate(pieces):
+            limbs = limbs.at[place + k, columns].add(piece, mode="drop")
+        out, _ = _carried(limbs)
+        sign = jnp.where(out < 0, -1, 1)
+        _, limbs = _carried(limbs * sign)
+        negative = jnp.uint64(1 << (8 * dtype.itemsize - 1))
+        bits = _rounded(limbs, form) | jnp.where(out < 0, negative, jnp.uint64(0))
+        integer = jnp.dtype(f"uint{8 * dtype.itemsize}")
+        total = lax.bitcast_convert_type(bits.astype(integer), dtype)
+        special = jnp.any(~jnp.isfinite(flat), axis=0)
+        return jnp.where(special, jnp.sum(flat, axis=0), total).reshape(shape)
+
+    def bound(self, terms: Float[np.ndarray, "n ..."]) -> Float[np.ndarray, "..."]:
+        """u |sum|, where |sum| is itself bounded, since the host adds in float64."""
+        wide = terms.astype(np.float64)
+        total = np.abs(wide.sum(axis=0)) + gamma(len(terms)) * np.abs(wide).sum(axis=0)
+        return np.asarray(unit_roundoff(terms.dtype) * total)
+
+
+@dataclass(frozen=True)
+class FixedPoint(Whole):
+    """A sum of integers: every term is rounded to a multiple of 2^-bits first.
+
+    The same bits in every order, at the cost of one rounding per term. Error: at most n * 2^(-bits - 1)
+    plus the rounding of the result. A term beyond 2^(62 - bits) / n could overflow the sum: the answer is
+    then NaN, never a wrapped number.
+
+    Attributes:
+        bits: binary digits after the point, from -1000 to 1000.
+    """
+
+    bits: int = 40
+
+    def __post_init__(self):
+        if abs(self.bits) > 1000:
+            raise InputError(f"{self.bits} digits after the binary point", remedy="Give -1000 to 1000.")
+
+    def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
+        """One int64 per sum."""
+        scaled = terms.astype(jnp.float64) * 2.0**self.bits
+        fits = jnp.all(jnp.abs(scaled) <= 2.0**62 / terms.shape[0], axis=0)
+        total = jnp.sum(jnp.rint(jnp.where(fits, scaled, 0.0)).astype(jnp.int64), axis=0)
+        value = total.astype(jnp.float64) * 2.0**-self.bits
+        return jnp.where(fits, value, jnp.nan).astype(terms.dtype)
+
+    def bound(self, terms: Float[np.ndarray, "n ..."]) -> Float[np.ndarray, "..."]:
+        """Half a unit for each term, and one rounding of the result."""
+        size = np.abs(terms.astype(np.float64)).sum(axis=0)
+        return np.asarray(len(terms) * 2.0 ** (-self.bits - 1) + 2 * unit_roundoff(terms.dtype) * size)
+
+
+# --- by name ------------------------------------------------------------------------------------------
+
+
+def _numbered(reduction: Callable[[int], Reduction], default: int) -> Callable[..., Reduction]:
+    """A reduction from the text of its number."""
+
+    def make(number: str | None = None) -> Reduction:
+        try:
+            return reduction(default if number is None else int(number))
+        except ValueError:
+            raise InputError(f"{number!r} is not a whole number") from None
+
+    return make
+
+
+#: Every order in which a sum can be made, by name: "exact", "permuted:3" (seed), "blocked:8" (width).
+REDUCTIONS: Registry[Reduction] = Registry("reduction", "mdnum.reductions", kind=Whole, separator=":")
+REDUCTIONS.add("sequential", lambda: Sequential(), description="left to right, as a loop does")
+REDUCTIONS.add("reversed", lambda: Sequential("reversed"), description="right to left")
+REDUCTIONS.add("permuted", _numbered(Permuted, 0), description="a random order; a number is its seed")
+REDUCTIONS.add("pairwise", lambda: Pairwise(), description="a balanced tree")
+REDUCTIONS.add("blocked", _numbered(Blocked, 32), description="a tree; a number is the width of its nodes")
+REDUCTIONS.add("kahan", lambda: Kahan(), description="a loop that carries what each addition lost")
+REDUCTIONS.add("neumaier", lambda: Neumaier(), description="Kahan's for terms of any size")
+REDUCTIONS.add("sorted", lambda: Sorted(), description="by magnitude, smallest first")
+REDUCTIONS.add("exact", lambda: Exact(), description="exact, rounded once")
+REDUCTIONS.add(
+    "fixed-point", _numbered(FixedPoint, 40), description="of integers; a number is the bits after the point"
+)
+
+
+parse = REDUCTIONS.parse
+#: The shipped ones, with their defaults.
+BY_NAME = {name: parse(name) for name in REDUCTIONS.shipped}
+
+
+# --- segments: sums that frameworks make behind one's back ----------------------------------------------
+
+
+def grouped(
+    index: Int[np.ndarray, "entries"], values: Float[Array, "entries ..."], segments: int
+) -> Float[Array, "most segments ..."]:
+    """Entries of the same index side by side, in storage order, for a reduction over the leading axis.
+
+    Shorter groups are filled with minus zero, which changes no sum and no sign.
+
+    Args:
+        index: segment of each entry, known (not traced).
+        values: the entries.
+        segments: how many segments there are.
+
+    Raises:
+        InputError: an index outside 0 ... segments - 1.
+    """
+    index = np.asarray(index)
+    if len(index) and not (index.min() >= 0 and index.max() < segments):
+        raise InputError(f"an index outside 0 ... {segments - 1}")
+    order = np.argsort(index, kind="stable")
+    counts = np.bincount(index, minlength=segments)
+    starts = np.concatenate([[0], np.cumsum(counts)])[:-1]
+    place = np.arange(len(index)) - np.repeat(starts, counts)
+    shape = (int(counts.max(initial=0)), segments, *values.shape[1:])
+    return jnp.full(shape, -0.0, values.dtype).at[place, index[order]].set(values[order])
+
+
+def segment_sum(
+    values: Float[Array, "entries ..."],
+    index: Int[np.ndarray, "entries"],
+    segments: int,
+    reduction: Reduction = Sequential(),
+    zero: Int[Array, ""] | None = None,
+) -> Float[Array, "segments ..."]:
+    """The sum of each segment in the order of a reduction, rounded after every addition.
+
+    Args:
+        values: the entries.
+        index: segment of each entry, known (not traced), not necessarily sorted.
+        segments: how many segments there are.
+        reduction: applied to each segment's entries in storage order.
+        zero: see `Reduction`.
+    """
+    return reduction(grouped(index, values, segments), zero)
+
+
+def scatter_add(
+    values: Float[Array, "entries ..."], index: Int[Array, "entries"], segments: int
+) -> Float[Array, "segments ..."]:
+    """The sum of each segment as XLA's scatter makes it: in storage order on a CPU, in any on a device."""
+    return jnp.zeros((segments, *values.shape[1:]), values.dtype).at[index].add(values)
+
+
+def orders(entries: int, count: int, seed: int = 0) -> list[Int[np.ndarray, "entries"]]:
+    """Storage orders to try: as given, reversed, and random ones up to `count`."""
+    rng = np.random.default_rng(seed)
+    given = np.arange(entries)
+    return [given, given[::-1], *(rng.permutation(entries) for _ in range(count - 2))][:count]

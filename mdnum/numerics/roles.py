@@ -1,0 +1,140 @@
+"""Precision by role: which dtype the state, the arithmetic, the decision and the sums are kept in."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import ml_dtypes
+import numpy as np
+
+from mdnum.errors import InputError
+
+WIDE: Mapping[str, np.dtype] = {"float64": np.dtype(np.float64), "float32": np.dtype(np.float32)}
+ALL: Mapping[str, np.dtype] = {
+    **WIDE,
+    "float16": np.dtype(np.float16),
+    "bfloat16": np.dtype(ml_dtypes.bfloat16),
+}
+#: The state in whole numbers: doubles that are multiples of fixed units.
+LATTICE = "lattice"
+_ROUNDINGS = ("nearest", "stochastic")
+
+
+#: Roles of molecular dynamics that sixteen bits cannot play, and why.
+_TOO_SHORT: Mapping[str, str] = {
+    "state": "a step moves an atom by less than the spacing of such coordinates, so nothing would move",
+    "decision": "such coordinates are some hundredths of a distance apart, and their grid would decide",
+    "accumulate": "it keeps two or three digits of a sum of some hundred terms, and the small ones are lost",
+}
+
+
+def carrier(name: str) -> np.dtype:
+    """The dtype of the arrays that hold numbers of a policy's word: whole numbers are held by doubles."""
+    return ALL["float64" if name == LATTICE else name]
+
+
+def _check(policy: object, roles: tuple[str, ...], known: Mapping[str, np.dtype]) -> None:
+    for role in roles:
+        value = getattr(policy, role)
+        if value not in known:
+            raise InputError(
+                f"unknown dtype {value!r}; known are {', '.join(known)}", where=f"precision.{role}"
+            )
+
+
+def check_role(role: str, dtype: str) -> None:
+    """Refuse a dtype that a role of molecular dynamics cannot have.
+
+    Raises:
+        InputError: no dtype is called that, or it has sixteen bits and the role needs more.
+    """
+    known = ALL if role == "force" else WIDE
+    if role == "state" and dtype == LATTICE:
+        return
+    if dtype in ALL and dtype not in known:
+        raise InputError(
+            f"{dtype} cannot be the {role} of molecular dynamics: {_TOO_SHORT[role]}",
+            where=f"precision.{role}",
+            remedy=f"Use {' or '.join(WIDE)}; pair forces may be {dtype} (precision.force)",
+        )
+    if dtype not in known:
+        raise InputError(f"unknown dtype {dtype!r}; known are {', '.join(known)}", where=f"precision.{role}")
+
+
+@dataclass(frozen=True)
+class PrecisionPolicy:
+    """The dtype of each role of a number in a rollout of molecular dynamics.
+
+    Attributes:
+        state: positions and velocities as they are carried from step to step; "lattice" for whole numbers.
+        force: distances and pair terms that enter forces and energies. In bfloat16 or float16 displacements
+            are those of the decision, rounded, and all that follows has sixteen bits up to the sum.
+        decision: the quantity and the threshold that a decision compares.
+        accumulate: the sums over neighbors.
+    """
+
+    state: str = "float64"
+    force: str = "float64"
+    decision: str = "float64"
+    accumulate: str = "float64"
+
+    def __post_init__(self):
+        for role in ("state", "force", "decision", "accumulate"):
+            check_role(role, getattr(self, role))
+
+    def dtype(self, role: str) -> np.dtype:
+        """The numpy dtype of a role ("state", "force", "decision" or "accumulate")."""
+        return carrier(getattr(self, role))
+
+    @property
+    def geometry(self) -> np.dtype:
+        """The dtype of the displacements that forces are made from.
+
+        That of the force; of a force in sixteen bits that of the decision, because a difference of two such
+        coordinates has no digits left.
+        """
+        return self.dtype("force") if self.force in WIDE else self.dtype("decision")
+
+
+@dataclass(frozen=True)
+class RolePrecision:
+    """The dtype of each role of a number in a small world, where sixteen bits are allowed too.
+
+    Attributes:
+        state: what is carried from step to step.
+        arithmetic: the operations between one state and the next.
+        decision: the quantity and the threshold that a decision compares.
+        accumulate: sums; wider than `arithmetic` it is "store low, accumulate high".
+        loss: the scalar that is differentiated.
+        rounding: how a result becomes a state: "nearest" (ties to even) or "stochastic" (up or down with
+            probabilities that make the mean exact).
+        seed: of stochastic rounding.
+    """
+
+    state: str = "float64"
+    arithmetic: str = "float64"
+    decision: str = "float64"
+    accumulate: str = "float64"
+    loss: str = "float64"
+    rounding: str = "nearest"
+    seed: int = 0
+
+    def __post_init__(self):
+        _check(self, ("state", "arithmetic", "decision", "accumulate", "loss"), ALL)
+        if self.rounding not in _ROUNDINGS:
+            raise InputError(
+                f"unknown rounding {self.rounding!r}; known are {', '.join(_ROUNDINGS)}",
+                where="precision.rounding",
+            )
+        if self.seed < 0:
+            raise InputError(f"{self.seed} is negative", remedy="Give 0 or more.", where="precision.seed")
+
+    def dtype(self, role: str) -> np.dtype:
+        """The numpy dtype of a role ("state", "arithmetic", "decision", "accumulate" or "loss")."""
+        return ALL[getattr(self, role)]
+
+    @classmethod
+    def all(cls, name: str) -> RolePrecision:
+        """Every role in one dtype."""
+        return cls(name, name, name, name, name)

@@ -1,0 +1,181 @@
+"""Floats as integers, and how far a computed distance can be from the exact distance of the positions.
+
+A displacement is x_j - x_i, less a lattice vector or none along each periodic axis, with a rounding after
+every subtraction; squares are added in a row. What each rounding can lose goes by the size of the result
+that is rounded: `Reach` says how large those can be in a box, whatever the positions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import ml_dtypes
+import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import DTypeLike
+
+_SIGNED = {
+    np.dtype(np.float64): np.int64,
+    np.dtype(np.float32): np.int32,
+    np.dtype(np.float16): np.int16,
+    np.dtype(ml_dtypes.bfloat16): np.int16,
+}
+
+
+def unit_roundoff(dtype: DTypeLike) -> float:
+    """Half the spacing of the floats at 1: the largest relative error of one rounding (Higham 2002, 2.1)."""
+    # ml_dtypes' finfo knows bfloat16 too
+    return float(ml_dtypes.finfo(np.dtype(dtype)).eps) / 2
+
+
+def ordinal(x: Float[np.ndarray, "..."]) -> Int[np.ndarray, "..."]:
+    """Position of x among all floats of its dtype, as a signed integer; -0 and +0 share 0.
+
+    Adjacent finite floats have adjacent ordinals, so differences count ulps. NaN has no meaningful ordinal.
+    """
+    x = np.asarray(x)
+    integer = _SIGNED[x.dtype]
+    bits = x.view(integer).astype(np.int64)
+    lowest = np.int64(np.iinfo(integer).min)
+    return np.where(bits < 0, lowest - bits, bits)
+
+
+def ulp_distance(a, b, dtype: DTypeLike = np.float64) -> Int[np.ndarray, "..."]:
+    """How many floats of dtype lie from a to b, with sign (b above a is positive).
+
+    Error: exact up to 2^62; further apart (floats of opposite sign) the answer is ±2^62.
+    """
+    start, end = ordinal(np.asarray(a, dtype)), ordinal(np.asarray(b, dtype))
+    limit = np.int64(2**62)
+    # halves cannot overflow, and tell where the difference would
+    far = np.abs(end // 2 - start // 2) >= limit // 2
+    with np.errstate(over="ignore"):
+        return np.where(far, np.where(end > start, limit, -limit), end - start)
+
+
+def neighbor(x, ulps: int, dtype: DTypeLike = np.float64):
+    """The float that lies the given number of ulps above x (below, where negative)."""
+    x = np.asarray(x, dtype)
+    integer = _SIGNED[x.dtype]
+    place = ordinal(x) + ulps
+    lowest = np.int64(np.iinfo(integer).min)
+    # the branch not taken must not overflow
+    bits = np.where(place < 0, lowest - np.minimum(place, 0), place)
+    return bits.astype(integer).view(x.dtype)[()]
+
+
+#: Covers the terms of second order, u times as small: u is at most 2^-24 where distances are compared.
+_SECOND_ORDER = 1.001
+
+
+def gamma(n: int, dtype: DTypeLike = np.float64) -> float:
+    """n*u / (1 - n*u): bounds the relative error of n roundings in a row (Higham 2002, lemma 3.1)."""
+    nu = n * unit_roundoff(dtype)
+    return nu / (1.0 - nu)
+
+
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Reach:
+    """What a displacement between any two positions in a box is made of, as far as its rounding goes.
+
+    Attributes:
+        lattice: vectors of the periodic axes in the order in which they are taken off, length.
+        coordinate: largest |coordinate| of a position, per axis, length.
+    """
+
+    lattice: tuple[Vector, ...] = ()
+    coordinate: Vector = (0.0, 0.0, 0.0)
+
+    @classmethod
+    def of(cls, lattice: Float[np.ndarray, "vectors 3"], coordinate: Float[np.ndarray, "3"]) -> Reach:
+        """The reach of a box, from arrays."""
+        return cls(tuple(_three(row) for row in lattice), _three(coordinate))
+
+    def rounded(self) -> tuple[Float[np.ndarray, "3"], int]:
+        """Sizes of the results that are rounded, added up, beyond that of the displacement; and how many.
+
+        A component is d + n_1 a_1 + n_2 a_2 + n_3 a_3 after the first subtraction, with each n in {-1, 0, 1},
+        and loses one term with each that follows. What is left is d, which is one part of all of them.
+        """
+        sizes, most = np.zeros(3), 1
+        for axis in range(3):
+            # taking off a zero rounds nothing
+            parts = [abs(vector[axis]) for vector in self.lattice if vector[axis] != 0]
+            sizes[axis] = sum(sum(parts[k:]) for k in range(len(parts)))
+            most = max(most, 1 + len(parts))
+        return sizes, most
+
+    def narrowed(self, dtype: DTypeLike) -> Float[np.ndarray, "3"]:
+        """By how much lattice vectors in dtype are off those of the system, per axis, added up, length."""
+        lattice = np.array(self.lattice, np.float64).reshape(-1, 3)
+        return np.abs(lattice.astype(dtype).astype(np.float64) - lattice).sum(axis=0)
+
+
+def _three(values) -> Vector:
+    x, y, z = (float(value) for value in values)
+    return x, y, z
+
+
+def displacement_bound(
+    r, reach: Reach, dtype: DTypeLike = np.float64, state: DTypeLike = np.float64, seen=None
+):
+    """Bound on the length of the error of a computed displacement.
+
+    Half an ulp, at most u times its size, for each result that is rounded. Where the state has more digits
+    than dtype both positions are rounded first, and where a double has, the box is: the exact displacement
+    is that of the positions of the state in the box of the system file. The image that is nearest in dtype
+    is taken to be the nearest one: r_cut is below half the width of the box by more than rounding.
+
+    Args:
+        r: length(s) of the displacement.
+        reach: of the box.
+        dtype: of the arithmetic.
+        state: of the positions.
+        seen: largest |coordinate| along each axis where it may be beyond that of the reach, length,
+            shape (..., 3).
+
+    Returns:
+        The bound, length, of the shape of r, or that of `seen` without its last axis.
+    """
+    u = unit_roundoff(dtype)
+    sizes, roundings = reach.rounded()
+    if unit_roundoff(state) < u:
+        coordinate = np.array(reach.coordinate)
+        sizes = sizes + 2 * (coordinate if seen is None else np.fmax(coordinate, seen))
+    error = u * sizes + reach.narrowed(dtype)
+    length = float(np.linalg.norm(error)) if error.ndim == 1 else np.linalg.norm(error, axis=-1)
+    return _SECOND_ORDER * (length + u * roundings * np.asarray(r, np.float64))
+
+
+def squared_distance_bound(
+    r, reach: Reach, dtype: DTypeLike = np.float64, state: DTypeLike = np.float64, seen=None
+):
+    """Bound on |computed r² - exact r²|: the displacement's error, and gamma_3 for squares and sums.
+
+    Args: as `displacement_bound`.
+
+    Returns:
+        The bound, length squared, shaped likewise.
+    """
+    r = np.asarray(r, np.float64)
+    error = displacement_bound(r, reach, dtype, state, seen)
+    return 2.0 * r * error + error**2 + gamma(3, dtype) * (r + error) ** 2
+
+
+def distance_bound(r, reach: Reach, dtype: DTypeLike = np.float64, state: DTypeLike = np.float64, seen=None):
+    """Bound on |computed r - exact r|, r = sqrt(r²) with a correctly rounded square root.
+
+    A length is off by no more than its vector; the square root halves the relative error of r² and adds one
+    rounding.
+
+    Args: as `displacement_bound`.
+
+    Returns:
+        The bound, length, shaped likewise.
+    """
+    r = np.asarray(r, np.float64)
+    error = displacement_bound(r, reach, dtype, state, seen)
+    return error + (gamma(3, dtype) / 2 + _SECOND_ORDER * unit_roundoff(dtype)) * (r + error)

@@ -1,0 +1,146 @@
+"""Saltation: what an event does to a perturbation that is carried through it.
+
+A perturbed trajectory meets a threshold at another time, and between the two times one of them already
+flows by the new law. To first order this moves the tangent by a rank-one term that differentiating the
+steps of a program never sees, because the steps do not move with the event.
+
+Works on numpy and on jax arrays alike, with any number of leading batch axes, and inside jit.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from mdnum.errors import NumericalError
+
+#: |n · F-| / (|n| |F-|) at and below which an event counts as grazing.
+GRAZING = 1e-8
+
+
+def grazing(
+    flow: Float[Any, "*batch state"], normal: Float[Any, "*batch state"], limit: float = GRAZING
+) -> Bool[Any, "*batch"]:
+    """Whether the trajectory only touches the threshold: n · F- vanishes, and the saltation term with it
+    ceases to exist.
+
+    Also where the flow or the normal is zero or not finite. Safe inside jit.
+    """
+    xp = normal.__array_namespace__()
+    speed = xp.abs((normal * flow).sum(-1))
+    scale = xp.sqrt((normal * normal).sum(-1) * (flow * flow).sum(-1))
+    return ~(speed > limit * scale)
+
+
+def time_shift(
+    tangent: Float[Any, "*batch state"],
+    flow_before: Float[Any, "*batch state"],
+    normal: Float[Any, "*batch state"],
+    threshold_rate: Any = 0.0,
+) -> Float[Any, "*batch"]:
+    """How the time of the event moves with the tangent: -(n · dx + dc) / (n · F-).
+
+    Args:
+        tangent: dx, the perturbation just before the event.
+        flow_before: F-, the time derivative of the state just before it.
+        normal: n, gradient of the event function c(x) that changes sign there.
+        threshold_rate: dc, derivative of the event function at fixed x (a threshold that is itself the
+            parameter: -1 for c = r - r_cut and the parameter r_cut).
+
+    Returns:
+        The shift; 0 where the event grazes.
+    """
+    xp = normal.__array_namespace__()
+    touch = grazing(flow_before, normal)
+    speed = xp.where(touch, xp.ones_like(normal[..., 0]), (normal * flow_before).sum(-1))
+    return xp.where(touch, xp.zeros_like(speed), -((normal * tangent).sum(-1) + threshold_rate) / speed)
+
+
+def carry(
+    tangent: Float[Any, "*batch state"],
+    reset: Float[Any, "*batch state state"] | None,
+    flow_before: Float[Any, "*batch state"],
+    flow_after: Float[Any, "*batch state"],
+    normal: Float[Any, "*batch state"],
+    *,
+    reset_rate: Any = 0.0,
+    threshold_rate: Any = 0.0,
+) -> Float[Any, "*batch state"]:
+    """A tangent through an event: DR dx + dR - (F+ - DR F-) dt, with dt from `time_shift`.
+
+    The matrix is never formed, so this also serves systems of many atoms.
+
+    Args:
+        reset: DR, Jacobian of the state after in the state before; None for the identity (a force jump).
+        reset_rate: dR, derivative of the reset at fixed state (the restitution as a parameter).
+
+    Returns:
+        The tangent just after the event, without the saltation term where the event grazes.
+    """
+
+    def through(x):
+        return x if reset is None else (reset * x[..., None, :]).sum(-1)
+
+    shift = time_shift(tangent, flow_before, normal, threshold_rate)
+    return through(tangent) + reset_rate - (flow_after - through(flow_before)) * shift[..., None]
+
+
+def saltation_flagged(
+    reset: Float[Any, "*batch state state"],
+    flow_before: Float[Any, "*batch state"],
+    flow_after: Float[Any, "*batch state"],
+    normal: Float[Any, "*batch state"],
+) -> tuple[Float[Any, "*batch state state"], Bool[Any, "*batch"]]:
+    """The saltation matrix and whether the event grazes; for use inside jit.
+
+    Returns:
+        Xi = DR + (F+ - DR F-) n^T / (n^T F-), and the flag; where it is set, Xi is DR alone.
+    """
+    xp = normal.__array_namespace__()
+    touch = grazing(flow_before, normal)
+    speed = xp.where(touch, xp.ones_like(normal[..., 0]), (normal * flow_before).sum(-1))
+    jump = flow_after - (reset * flow_before[..., None, :]).sum(-1)
+    term = jump[..., :, None] * normal[..., None, :] / speed[..., None, None]
+    return reset + xp.where(touch[..., None, None], xp.zeros_like(term), term), touch
+
+
+def saltation(
+    reset: Float[Any, "*batch state state"],
+    flow_before: Float[Any, "*batch state"],
+    flow_after: Float[Any, "*batch state"],
+    normal: Float[Any, "*batch state"],
+) -> Float[Any, "*batch state state"]:
+    """The saltation matrix of an event, Xi = DR + (F+ - DR F-) n^T / (n^T F-).
+
+    A perturbation dx just before the event is Xi dx just after it. For a ball of restitution e that meets
+    the floor with velocity v it is [[-e, 0], [-(1 + e) g / v, -e]]; for a force that jumps from a to b at a
+    distance crossed with speed v it is [[1, 0], [(b - a) / v, 1]].
+
+    Args:
+        reset: DR, Jacobian of the state after the event in the state before it.
+        flow_before, flow_after: time derivatives of the state just before and just after.
+        normal: gradient of the event function at the event.
+
+    Raises:
+        NumericalError: the event grazes, so the time of the event has no derivative.
+
+    Error: a few ulps of the largest term, times |n| |F-| / |n · F-|.
+
+    Source: Kong, Payne, Zhu & Johnson, Saltation Matrices: The Essential Tool for Linearizing Hybrid
+    Dynamical Systems, Proc. IEEE 112 (2024) 585, arXiv:2306.06862.
+    """
+    matrix, touch = saltation_flagged(reset, flow_before, flow_after, normal)
+    if np.any(np.asarray(touch)):
+        where = int(np.flatnonzero(np.asarray(touch).reshape(-1))[0])
+        size = normal.shape[-1]
+        n, f = (np.asarray(x, np.float64).reshape(-1, size)[where] for x in (normal, flow_before))
+        raise NumericalError(
+            f"the trajectory grazes its threshold: |n · F-| is {abs(float(n @ f)):.3g}, expected above "
+            f"{GRAZING:g} |n| |F-| = {GRAZING * float(np.linalg.norm(n) * np.linalg.norm(f)):.3g}",
+            remedy="Move the start or the threshold so that it is crossed, or use saltation_flagged and "
+            "leave the flagged events out",
+            where=f"event {where}",
+        )
+    return matrix

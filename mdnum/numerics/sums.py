@@ -1,0 +1,368 @@
+"""The order in which a sum is made, as an object.
+
+A reduction serves two callers. The force loop of molecular dynamics hands it blocks of terms (leading
+axis: the slots of the block) and keeps a carry, so that the terms of a whole neighbor list never exist at
+once; a reduction that needs all terms stacks them and sums at the end. Everything else hands it a whole
+array and gets the sum over the leading axis, rounded after every addition in the dtype of the terms: what
+a numpy loop in that dtype gives, bit for bit. `jnp.sum` is none of these: it adds sixteen-bit terms in
+float32 and in an order of its own, which hides what a narrow accumulator does.
+
+The derivative of every reduction is that of the sum: rounding and order have none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Literal, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from mdnum.errors import InputError
+from mdnum.numerics.exact import fence, integer_of
+from mdnum.numerics.rounding import gamma, unit_roundoff
+
+Add = Callable[[jax.Array, jax.Array], jax.Array]
+
+
+class Reduction(Protocol):
+    """Order of a sum, over slots that arrive in blocks or over the leading axis of an array."""
+
+    def within(self, total: jax.Array, terms: Sequence[jax.Array]) -> tuple[jax.Array, jax.Array | None]:
+        """Take one block; returns the carried total and, if it is to be summed later, the block's own sum."""
+        ...
+
+    def finish(self, total: jax.Array, blocks: jax.Array | None) -> jax.Array:
+        """The sum, from the carried total and the stacked block sums (leading axis: blocks)."""
+        ...
+
+    def __call__(
+        self, terms: Float[Array, "n ..."], zero: Int[Array, ""] | None = None
+    ) -> Float[Array, "..."]:
+        """The sum over the leading axis, rounded after every addition in the dtype of the terms.
+
+        Args:
+            terms: what is summed.
+            zero: an integer zero that XLA must not know (`exact.zero_bits`), for the fences. Without one,
+                sixteen-bit sums take one from the data; then products that were not fenced by the caller
+                may still be contracted into the sum.
+        """
+        ...
+
+    def bound(self, terms: Float[np.ndarray, "n ..."]) -> Float[np.ndarray, "..."]:
+        """How far the computed sum can be from the exact one, on the host, in float64.
+
+        Holds as long as no sum overflows or is subnormal (XLA on a CPU flushes subnormals of every dtype but
+        float16 to zero).
+        """
+        ...
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _summed(reduction: Whole, terms, zero):
+    if zero is None and terms.dtype.itemsize == 2:
+        zero = _data_zero(terms)
+    return reduction.sum_of(terms if zero is None else fence(terms, zero), _adder(zero))
+
+
+@_summed.defjvp
+def _summed_jvp(reduction, primals, tangents):
+    terms, zero = primals
+    return _summed(reduction, terms, zero), jnp.sum(tangents[0], axis=0)
+
+
+# called outside of jit, a sum is one program all the same: operation by operation it would take seconds
+_compiled = partial(jax.jit, static_argnums=0)(_summed)
+
+
+def _data_zero(terms: jax.Array) -> jax.Array:
+    """A zero that XLA does not see through: the sign bit of an absolute value."""
+    integer = integer_of(terms.dtype)
+    bits = lax.bitcast_convert_type(jnp.abs(terms.reshape(-1)[0]), integer)
+    return lax.shift_right_logical(bits, jnp.asarray(8 * terms.dtype.itemsize - 1, integer))
+
+
+class Whole:
+    """Base of a reduction of a whole array, with its derivative; blocks are stacked and summed at the end."""
+
+    def within(self, total, terms):
+        """Keep the block; it is summed by `finish`."""
+        return total, jnp.stack(list(terms))
+
+    def finish(self, total, blocks):
+        """The sum of all blocks, in the order of their slots."""
+        return self(blocks.reshape(-1, *blocks.shape[2:]))
+
+    def __call__(
+        self, terms: Float[Array, "n ..."], zero: Int[Array, ""] | None = None
+    ) -> Float[Array, "..."]:
+        """The sum over the leading axis (see `Reduction`)."""
+        if terms.size == 0:
+            return jnp.zeros(terms.shape[1:], terms.dtype)
+        return _compiled(self, terms, zero)
+
+    def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
+        """The sum of at least one term; `add` adds two and rounds."""
+        raise NotImplementedError(type(self).__name__)
+
+    def bound(self, terms: Float[np.ndarray, "n ..."]) -> Float[np.ndarray, "..."]:
+        """How far the computed sum can be from the exact one (see `Reduction`)."""
+        depth = self.depth(len(terms))
+        return np.asarray(_chain(depth, terms.dtype) * np.abs(terms.astype(np.float64)).sum(axis=0))
+
+    def depth(self, n: int) -> int:
+        """The most additions that one of n terms goes through."""
+        return max(n - 1, 0)
+
+
+def _chain(depth: int, dtype) -> float:
+    factor = gamma(depth, dtype)
+    return factor if factor >= 0 else np.inf
+
+
+def _adder(zero: jax.Array | None) -> Add:
+    return jnp.add if zero is None else lambda a, b: fence(a + b, zero)
+
+
+def in_order(terms, add, start=None):
+    """((0 + t0) + t1) + ..., or from another start: a scan, which XLA does not reorder. Unrolled, since a
+    step of a loop costs more than an addition."""
+    total, _ = lax.scan(
+        lambda total, term: (add(total, term), None),
+        jnp.zeros(terms.shape[1:], terms.dtype) if start is None else start,
+        terms,
+        unroll=min(16, terms.shape[0]),
+    )
+    return total
+
+
+@dataclass(frozen=True)
+class Sequential(Whole):
+    """Term after term. Error: at most gamma_{n-1} * sum |terms| (Higham 2002, 4.4).
+
+    Attributes:
+        order: "forward" (left to right, as a loop does) or "reversed".
+    """
+
+    order: Literal["forward", "reversed"] = "forward"
+
+    def within(self, total, terms):
+        """Forward: add the slots to the carry; reversed: keep them."""
+        if self.order == "reversed":
+            return super().within(total, terms)
+        for term in terms:
+            total = total + term
+        return total, None
+
+    def finish(self, total, blocks):
+        """Forward: the carry."""
+        return total if self.order == "forward" else super().finish(total, blocks)
+
+    def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
+        """From zero, one after the other."""
+        return in_order(terms[::-1] if self.order == "reversed" else terms, add)
+
+
+def _tree(terms: list[jax.Array]) -> jax.Array:
+    while len(terms) > 1:
+        pairs = [terms[k] + terms[k + 1] for k in range(0, len(terms) - 1, 2)]
+        terms = pairs + terms[len(terms) - len(terms) % 2 :]
+    return terms[0]
+
+
+def _levels(terms, add, width: int):
+    """A tree whose nodes add `width` neighbors left to right, until one node is left."""
+    while terms.shape[0] > 1:
+        count = terms.shape[0]
+        groups = -(-count // width)
+        # minus zero is the one addend that changes nothing, not even the sign of a zero
+        padding = jnp.full((groups * width - count, *terms.shape[1:]), -0.0, terms.dtype)
+        nodes = jnp.concatenate([terms, padding]).reshape(groups, width, *terms.shape[1:])
+        total = nodes[:, 0]
+        if width <= 16:
+            for k in range(1, width):
+                total = add(total, nodes[:, k])
+        else:
+            rest = jnp.moveaxis(nodes[:, 1:], 1, 0)
+            total, _ = lax.scan(lambda t, x: (add(t, x), None), total, rest, unroll=16)
+        terms = total
+    return terms[0]
+
+
+@dataclass(frozen=True)
+class Blocked(Whole):
+    """A tree of a given width: each node adds that many neighbors left to right, as a device's blocks do.
+
+    Error: at most gamma_{(width - 1) * levels} * sum |terms|. Width 2 is the balanced tree, a width of at
+    least the number of terms the loop.
+
+    Attributes:
+        width: children of a node, at least 2.
+    """
+
+    width: int = 32
+
+    def __post_init__(self):
+        if self.width < 2:
+            raise InputError(f"a tree of width {self.width} adds nothing", remedy="Give 2 or more.")
+
+    def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
+        """Level by level."""
+        return _levels(terms, add, self.width)
+
+    def depth(self, n: int) -> int:
+        """Width - 1 additions on every level."""
+        levels = 0
+        while n > 1:
+            n, levels = -(-n // self.width), levels + 1
+        return (self.width - 1) * levels
+
+
+@dataclass(frozen=True)
+class Pairwise(Blocked):
+    """A balanced tree. Error: at most gamma_{log2 n} * sum |terms| (Higham 2002, 4.6)."""
+
+    width: int = field(default=2, init=False)
+
+    def within(self, total, terms):
+        """The tree of the block."""
+        return total, _tree(list(terms))
+
+    def finish(self, total, blocks):
+        """The tree of the blocks' trees."""
+        return _tree(list(jnp.asarray(blocks)))
+
+
+@dataclass(frozen=True)
+class Permuted(Whole):
+    """A loop over the terms in a random order: what atomic additions on a device do, made repeatable.
+
+    Attributes:
+        seed: of the order; the same for every sum of as many terms.
+    """
+
+    seed: int = 0
+
+    def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
+        """In the order drawn for this many terms."""
+        order = np.random.default_rng(self.seed).permutation(terms.shape[0])
+        return in_order(terms[order], add)
+
+
+@dataclass(frozen=True)
+class Halves(Whole):
+    """Two loops side by side, over the first half of the terms and over the second, added at the end.
+
+    What two scatters do, one for each end of a pair, where each pair is held once. Error: at most
+    gamma_{n/2} * sum |terms|.
+    """
+
+    def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
+        """An odd term is in the second half."""
+        half = terms.shape[0] // 2
+        if half == 0:
+            return in_order(terms, add)
+        return add(in_order(terms[:half], add), in_order(terms[half:], add))
+
+    def depth(self, n: int) -> int:
+        """The longer loop, and the last addition."""
+        return n - n // 2 if n > 1 else 0
+
+
+@dataclass(frozen=True)
+class Twice(Whole):
+    """Every term twice, halved: a loop, and the same loop once more onto its result.
+
+    What a scatter onto the sums of a dense list does, where each pair is held from both ends. Error: at most
+    gamma_{2n} * sum |terms|, where no half of a term is subnormal.
+    """
+
+    def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
+        """Halving is exact."""
+        halves = terms * jnp.asarray(0.5, terms.dtype)
+        return in_order(halves, add, in_order(halves, add))
+
+    def depth(self, n: int) -> int:
+        """Both loops."""
+        return max(2 * n - 1, 0)
+
+
+@dataclass(frozen=True)
+class Sorted(Whole):
+    """A loop over the terms by magnitude; equal magnitudes by sign, so no order of arrival matters.
+
+    Smallest first loses least where all terms have one sign (Higham 2002, 4.2), largest first where they
+    cancel.
+
+    Attributes:
+        order: of magnitudes, "ascending" or "descending".
+    """
+
+    order: Literal["ascending", "descending"] = "ascending"
+
+    def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
+        """Sorted along the leading axis, each column by itself."""
+        _, terms = lax.sort((jnp.abs(terms), terms), dimension=0, num_keys=2)
+        return in_order(terms if self.order == "ascending" else terms[::-1], add)
+
+
+# --- compensated: the rounding error of every addition is computed exactly and carried along ------------
+
+
+def _start(terms: jax.Array) -> tuple[jax.Array, jax.Array]:
+    zeros = jnp.zeros(terms.shape[1:], terms.dtype)
+    return zeros, zeros
+
+
+class _Compensated(Whole):
+    def bound(self, terms: Float[np.ndarray, "n ..."]) -> Float[np.ndarray, "..."]:
+        """(2u + 8(n u)²) * sum |terms|: independent of n until n is near 1/u (Higham 2002, 4.3)."""
+        u, n = unit_roundoff(terms.dtype), len(terms)
+        factor = 2 * u + 8 * (n * u) ** 2 if n * u < 0.1 else np.inf
+        return np.asarray(factor * np.abs(terms.astype(np.float64)).sum(axis=0))
+
+
+@dataclass(frozen=True)
+class Kahan(_Compensated):
+    """A loop that subtracts from the next term what the last addition lost (Kahan, CACM 8, 40 (1965)).
+
+    Error: at most (2u + O(n u²)) * sum |terms|; a term much larger than the sum so far defeats it.
+    """
+
+    def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
+        """Four additions per term."""
+
+        def step(carry, term):
+            total, lost = carry
+            addend = add(term, -lost)
+            new = add(total, addend)
+            return (new, add(add(new, -total), -addend)), None
+
+        (total, _), _ = lax.scan(step, _start(terms), terms, unroll=min(4, terms.shape[0]))
+        return total
+
+
+@dataclass(frozen=True)
+class Neumaier(_Compensated):
+    """Kahan's sum for terms of any size: the losses are summed apart and added at the end.
+
+    Error: at most u |sum| + O(n² u²) * sum |terms|. Source: Neumaier, ZAMM 54, 39 (1974).
+    """
+
+    def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
+        """Four additions per term and one at the end."""
+
+        def step(carry, term):
+            total, lost = carry
+            new = add(total, term)
+            larger = jnp.abs(total) >= jnp.abs(term)
+            big, small = jnp.where(larger, total, term), jnp.where(larger, term, total)
+            return (new, add(lost, add(add(big, -new), small))), None
+
+        (total, lost), _ = lax.scan(step, _start(terms), terms, unroll=min(4, terms.shape[0]))
+        return add(total, lost)

@@ -1,0 +1,577 @@
+"""Two runs that differ in one choice: their dates, how fast they diverge, and what a flip had to do with it.
+
+The verdict compares two separations from the first run: of the second run, and of the second run's
+arithmetic under the first run's decisions. Only the latter can tell whether the flips did it. Where it splits
+as well, repeats of the pair tell whether the flips accelerated it or only came along, by a sequential sign
+test: where half of such pairs or fewer are delayed by more than a given delay, k or more of n are with the
+probability of k heads or more in n tosses at most, however the delays are distributed.
+docs/verdict-calibration.md has how often it is wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from math import comb
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, Shaped
+
+#: Repeats of a pair at most, where nothing was said.
+REPEATS = 15
+#: Pairs that are added before the next look.
+LOOK = 5
+#: How often a word may be wrong: the chance of it where half of the pairs are delayed.
+ERROR = 0.05
+
+
+@dataclass(frozen=True)
+class Delay:
+    """When one pair splits, free and under the first run's decisions.
+
+    Attributes:
+        free, handed: steps of the two splits; None for one that was not seen.
+        free_until, handed_until: last steps at which the separations are known.
+    """
+
+    free: int | None
+    handed: int | None
+    free_until: int
+    handed_until: int
+
+    @classmethod
+    def of(cls, free: Float[np.ndarray, "steps"], handed: Float[np.ndarray, "steps"], tolerance: float):
+        """From separations at each step, length; NaN after a run was ended."""
+        found = []
+        for separation in (free, handed):
+            beyond = separation > tolerance
+            seen = np.flatnonzero(np.isfinite(separation))
+            found.append((int(beyond.argmax()) if beyond.any() else None, int(seen[-1]) if len(seen) else -1))
+        (split, until), (other, other_until) = found
+        return cls(split, other, until, other_until)
+
+    def beyond(self, steps: float) -> bool | None:
+        """Whether the split comes more than so many steps later without the flips; None if not seen."""
+        if self.free is not None and self.handed is not None:
+            return self.handed - self.free > steps
+        if self.free is not None:
+            return True if self.handed_until + 1 - self.free > steps else None
+        if self.handed is not None:
+            return False if self.handed - self.free_until - 1 <= steps else None
+        return None
+
+
+@cache
+def looks(pairs: int, error: float = ERROR) -> tuple[tuple[int, int], ...]:
+    """After how many pairs to look, and how many of them must agree: (pairs, agreeing) of each look.
+
+    The error is spent in proportion to the pairs (Lan and DeMets, Biometrika 70, 659, 1983): up to each look
+    the exact probability that fair coins have stopped on one given side is at most that share of it.
+
+    Args:
+        pairs: at most.
+        error: chance of either word where each pair is as likely delayed as not.
+    """
+    ends = [*range(1 + LOOK, pairs, LOOK), pairs]
+    going, before, spent, found = {0: 1.0}, 0, 0.0, []
+    for end in ends:
+        more = end - before
+        reached: dict[int, float] = {}
+        for heads, chance in going.items():
+            for new in range(more + 1):
+                at = heads + new
+                reached[at] = reached.get(at, 0.0) + chance * comb(more, new) / 2.0**more
+        need, above = end + 1, 0.0
+        while 2 * (need - 1) > end and spent + above + reached.get(need - 1, 0.0) <= error * end / pairs:
+            need -= 1
+            above += reached.get(need, 0.0)
+        spent += above
+        if need <= end:
+            found.append((end, need))
+        # both sides stop
+        going = {heads: chance for heads, chance in reached.items() if end - need < heads < need}
+        before = end
+    return tuple(found)
+
+
+#: Fewer repeats than this can never be clear.
+FEWEST = next(pairs for pairs in range(1, 2 + REPEATS) if looks(pairs)) - 1
+
+
+@dataclass(frozen=True)
+class Count:
+    """How many pairs were delayed.
+
+    Attributes:
+        pairs: that were run, the pair itself among them.
+        later: that were delayed by more than asked for.
+        not_later: that were not; of the others it was not seen.
+        most: pairs at most.
+    """
+
+    pairs: int
+    later: int
+    not_later: int
+    most: int
+
+    @property
+    def needed(self) -> tuple[int, int] | None:
+        """The look these pairs are at, or the next: pairs, and how many must agree; None for none."""
+        return next((look for look in looks(self.most) if look[0] >= self.pairs), None)
+
+    @property
+    def delayed(self) -> bool | None:
+        """Whether most pairs are delayed, at a look; None where these do not tell."""
+        need = dict(looks(self.most)).get(self.pairs)
+        if need is None:
+            return None
+        return True if self.later >= need else False if self.not_later >= need else None
+
+    @property
+    def wanted(self) -> int:
+        """Pairs to be run before the next look; 0 where there is no further one or the word is clear."""
+        if self.delayed is not None:
+            return 0
+        return next((end - self.pairs for end, _ in looks(self.most) if end > self.pairs), 0)
+
+
+def count(delays: tuple[Delay, ...], steps: float, most: int) -> Count:
+    """Counts the pairs that split more than so many steps later without the flips.
+
+    Args:
+        delays: of the pair itself and its repeats.
+        steps: that count as a delay.
+        most: pairs at most.
+    """
+    found = [delay.beyond(steps) for delay in delays]
+    return Count(len(found), found.count(True), found.count(False), most)
+
+
+# --- dates, growth and verdict of a pair ----------------------------------------------------------------
+
+Word = Literal["same", "no fork", "open", "cause", "accelerated", "bystander", "undecided"]
+
+#: A slope is fitted to separations between these, as shares of the split tolerance: above rounding's plateau
+#: at the start, below saturation at the end.
+_FIT = (1e-12, 0.1)
+#: Fewer rows than this give no growth rate.
+_FIT_ROWS = 16
+#: A split must have been followed for so many times its steps before "did not split" means anything.
+PATIENCE = 1.2
+#: A counterfactual that grows and would split within so many times the free run's steps is late, not saved.
+_SAVED = 5.0
+#: A delay of less than one e-folding is no delay: the separation was never as much as e times smaller.
+NATS = 1.0
+#: r² of a fit that counts as growth.
+FITS = 0.5
+#: E-foldings that the later half of a fit must grow by before it predicts anything. What the first steps do
+#: is a power law: its later half grows by 0.7 e-foldings for every e-folding of the time.
+_HALF = 3.0
+
+
+@dataclass(frozen=True)
+class Dates:
+    """When two runs part; None where they do not within the horizon.
+
+    Attributes:
+        seed: first step whose state bits differ.
+        fork: first step whose decisions differ.
+        split: first step at which the separation passes the tolerance.
+    """
+
+    seed: int | None
+    fork: int | None
+    split: int | None
+
+
+@dataclass(frozen=True)
+class Growth:
+    """Exponential growth of a separation, fitted to its logarithm.
+
+    Attributes:
+        rate: per step; NaN where too few rows could be fitted.
+        r_squared: of the fit.
+        first, last: steps between which it was fitted.
+    """
+
+    rate: float
+    r_squared: float
+    first: int
+    last: int
+
+    @property
+    def plain(self) -> bool:
+        """Whether something grows at all, rather than a line through noise."""
+        return bool(np.isfinite(self.rate) and self.rate > 0 and self.r_squared > FITS)
+
+    def steps_to(self, start: float, end: float) -> float | None:
+        """Steps in which a separation grows from one size to another; None where it does not grow."""
+        if not (np.isfinite(self.rate) and self.rate > 0 and start > 0):
+            return None
+        return max(0.0, float(np.log(end / start) / self.rate))
+
+
+def split_of(separation: Float[np.ndarray, "steps"], tolerance: float) -> int | None:
+    """The first step at which a separation passes the tolerance; None where it does not."""
+    beyond = separation > tolerance
+    return int(beyond.argmax()) if beyond.any() else None
+
+
+def growth(separation: Float[np.ndarray, "steps"], tolerance: float) -> Growth:
+    """The rate at which a separation grows before it saturates.
+
+    The fit takes the rows up to the split whose separation lies between 1e-12 and a tenth of the tolerance,
+    from the last time on that it was below the lower end. A slope through noise has a low r_squared.
+
+    Args:
+        separation: of each step, length; NaN where a run had ended.
+        tolerance: of the split, length.
+    """
+    end = split_of(separation, tolerance)
+    rows = separation[: len(separation) if end is None else end]
+    with np.errstate(invalid="ignore"):
+        fit = (rows > _FIT[0] * tolerance) & (rows < _FIT[1] * tolerance)
+        low = np.flatnonzero(rows <= _FIT[0] * tolerance)
+    fit[: low[-1] + 1 if len(low) else 0] = False
+    at = np.flatnonzero(fit)
+    if len(at) < _FIT_ROWS:
+        return Growth(float("nan"), float("nan"), -1, -1)
+    rate, r_squared = _line(at, np.log(rows[at]))
+    return Growth(rate, r_squared, int(at[0]), int(at[-1]))
+
+
+def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
+    """Slope of a straight line and its r²."""
+    slope, base = np.polyfit(x, y, 1)
+    spread = float(np.sum((y - y.mean()) ** 2))
+    return float(slope), 1.0 - float(np.sum((y - slope * x - base) ** 2)) / spread if spread > 0 else 0.0
+
+
+def expected(
+    separation: Float[np.ndarray, "steps"], tolerance: float, exponent: float | None = None
+) -> float | None:
+    """Steps after the last one at which runs that have not split are expected to; None where nothing tells.
+
+    Their own growth predicts only where it outlasts the first steps: its later half must be several
+    e-foldings, at a rate within a factor of 2 of the whole.
+
+    Args:
+        separation: of each step, length; NaN where a run had ended.
+        tolerance: of the split, length.
+        exponent: the Lyapunov exponent per step, where it is known: it needs no fit.
+    """
+    seen = np.flatnonzero(np.isfinite(separation))
+    if not len(seen) or not separation[seen[-1]] > 0:
+        return None
+    rate = exponent
+    if rate is None:
+        fit = growth(separation, tolerance)
+        if not fit.plain:
+            return None
+        at = np.arange((fit.first + fit.last) // 2, fit.last + 1)
+        at = at[np.isfinite(separation[at]) & (separation[at] > 0)]
+        late, _ = _line(at, np.log(separation[at]))
+        if late * (at[-1] - at[0]) < _HALF or not 0.5 < late / fit.rate < 2.0:
+            return None
+        rate = fit.rate
+    if not rate > 0:
+        return None
+    return max(0.0, float(np.log(tolerance / separation[seen[-1]])) / rate)
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether the flips caused a split, accelerated it, or only came along.
+
+    Attributes:
+        word: "same" (no bit differs), "no fork" (no decision differs), "open" (no split within the horizon,
+            or no counterfactual that was followed far enough), "cause" (without the flips no split),
+            "accelerated" (most pairs such as this split later without them, by more than one e-folding of the
+            separation), "bystander" (the split came before any flip, or most pairs do not split later by
+            that much), "undecided" (the repeats that were allowed do not tell the two apart).
+        free: split of the free run, step.
+        handed: split of the run under the other's decisions, step; None where there is none.
+        nats: growth rate times the steps gained: how many e-foldings the flips of this pair were worth;
+            infinite for a cause.
+        threshold: delay that counts as later, steps: one e-folding, 0 where the separation grows otherwise;
+            None where no pairs were counted.
+        count: of the pair and its repeats, those that split later; None where none were counted.
+        reasons: the criteria, in words with their numbers.
+    """
+
+    word: Word
+    free: int | None
+    handed: int | None
+    nats: float | None
+    reasons: tuple[str, ...]
+    threshold: float | None = None
+    count: Count | None = None
+
+    @property
+    def wanted(self) -> int:
+        """Further repeats that would have to be run before the next look; 0 for none."""
+        return self.count.wanted if self.word == "undecided" and self.count is not None else 0
+
+
+def judge(
+    dates: Dates,
+    free: Float[np.ndarray, "steps"],
+    handed: Float[np.ndarray, "steps"] | None,
+    tolerance: float,
+    repeats: Sequence[Delay] = (),
+    most: int = REPEATS,
+    *,
+    ended: str | None = None,
+) -> Verdict:
+    """The verdict on a pair of runs.
+
+    Args:
+        dates: of the pair.
+        free: separation of the two free runs at each step, length.
+        handed: separation of the counterfactual from the first run, length; NaN after it was ended. None
+            where there is no counterfactual.
+        tolerance: of the split, length.
+        repeats: of the pair, the start perturbed by as much as the choice does.
+        most: repeats that may be run in all.
+        ended: where the fork is that one run ended and the other did not: which and how, in words.
+    """
+    last = len(free) - 1
+    if ended is not None:
+        before = f"no decision differs in the {last} steps before"
+        return Verdict("open", dates.split, None, None, (f"{ended}: that is the fork; {before}",))
+    if dates.seed is None:
+        return Verdict("same", None, None, None, (f"no bit differs in {last} steps",))
+    if dates.fork is None:
+        text = f"no decision differs in {last} steps; the separation reaches {np.nanmax(free):.2g}"
+        reasons = (text,) if dates.split is not None else (text, *_outlook(free, tolerance))
+        return Verdict("no fork", dates.split, None, None, reasons)
+    if dates.split is None:
+        reasons = _outlook(free, tolerance)
+        other = None if handed is None else split_of(handed, tolerance)
+        if other is not None:
+            reasons += (
+                f"under the first run's decisions the runs do split, at step {other}: the decisions that "
+                "differ keep them together",
+            )
+        return Verdict("open", None, other, None, reasons)
+    if dates.split < dates.fork:
+        text = (
+            f"the runs had split at step {dates.split}, before any decision differed (step {dates.fork}): no "
+            "flip had a part in it"
+        )
+        return Verdict("bystander", dates.split, None, None, (text,))
+    if handed is None:
+        text = f"split at step {dates.split}; without a counterfactual nothing is said about the cause"
+        return Verdict("open", dates.split, None, None, (text,))
+    delay = Delay.of(free, handed, tolerance)
+    fit = growth(free, tolerance)
+    rate = fit.rate if fit.plain else None
+    if delay.handed is None:
+        return _kept(dates.split, handed, tolerance, (delay, *repeats), most, rate)
+    gained = delay.handed - dates.split
+    text = (
+        f"free, the runs split at step {dates.split}; under the first run's decisions at step "
+        f"{delay.handed}, {abs(gained)} steps {'later' if gained >= 0 else 'earlier'}"
+    )
+    return _counted((delay, *repeats), most, rate, gained, (text,))
+
+
+def _counted(
+    delays: tuple[Delay, ...], most: int, rate: float | None, gained: float, reasons: tuple[str, ...]
+) -> Verdict:
+    """The verdict where the runs split either way: how many of the pair and its repeats split later."""
+    pair = delays[0]
+    threshold = 0.0 if rate is None else NATS / rate
+    nats = None if rate is None else rate * gained
+    if nats is not None:
+        reasons += (f"the flips were worth {nats:.2g} e-foldings of the separation",)
+    found = count(delays, threshold, 1 + most)
+    later = "later" if rate is None else f"later by more than one e-folding ({threshold:.0f} steps)"
+    unseen = found.pairs - found.later - found.not_later
+    reasons += (
+        f"of the pair and {found.pairs - 1} repeats (all positions of B's start displaced at random by as "
+        "much as the choice separates the runs in their first 100 steps, an ulp at least) "
+        f"{found.later} split {later} without the flips and {found.not_later} do not"
+        + (f"; of {unseen} it was not seen" if unseen else ""),
+    )
+    made = found.delayed
+    word: Word = "undecided" if made is None else "accelerated" if made else "bystander"
+    if made is None:
+        need = found.needed
+        reasons += (
+            f"so few repeats cannot tell: at least {FEWEST} are needed"
+            if need is None
+            else f"that is not clear: {need[1]} of {need[0]} would be",
+        )
+    return Verdict(word, pair.free, pair.handed, nats, reasons, threshold, found)
+
+
+def _kept(
+    free: int,
+    handed: Float[np.ndarray, "steps"],
+    tolerance: float,
+    delays: tuple[Delay, ...],
+    most: int,
+    rate: float | None,
+) -> Verdict:
+    """The verdict where the runs do not split under the first run's decisions."""
+    some = np.isfinite(handed)
+    seen = int(np.flatnonzero(some)[-1]) if some.any() else 0
+    reach = float(np.nanmax(handed)) if some.any() else 0.0
+    below = float(np.log(tolerance / reach)) if reach > 0 else float("inf")
+    how = f"{below:.2g} e-foldings below the tolerance" if reach > 0 else "the same bits"
+    text = (
+        f"free, the runs split at step {free}; under the first run's decisions they do not up to step "
+        f"{seen}: the separation is {reach:.2g} at most, {how}"
+    )
+    if seen < PATIENCE * free:
+        more = (
+            f"only {seen - free} steps follow the split; run longer to tell a cause from a delay"
+            if seen > free
+            else "where it was ended"
+        )
+        return Verdict("open", free, None, None, (text, more))
+    late = _expected(handed, tolerance, seen)
+    if late is not None and late < _SAVED * free:
+        more = f"it grows and is expected to split about step {late:.0f}: later, but not saved"
+        return _counted(delays, most, rate, late - free, (text, more))
+    if below < NATS:
+        more = "which is within one e-folding of it: no cause without a longer run"
+        return Verdict("open", free, None, None, (text, more))
+    basis = (
+        f"the word cause rests on that: no split within {seen / free:.2g} times the steps to the free one, "
+        "and none on its way"
+    )
+    return Verdict("cause", free, None, float("inf"), (text, basis))
+
+
+def _outlook(free: Float[np.ndarray, "steps"], tolerance: float) -> tuple[str, ...]:
+    """How the separation stands at the end of a horizon without a split, and what is to be expected."""
+    seen = free[np.isfinite(free)]
+    text = f"after {len(free) - 1} steps the separation is {seen[-1]:.2g}, the tolerance {tolerance:.2g}"
+    more = expected(free, tolerance)
+    if more is None:
+        return text, "it does not grow plainly enough in so few steps to predict a split"
+    rate = growth(free, tolerance).rate
+    return text, f"growing at {rate:.2g} a step it would split about {more:.0f} steps later"
+
+
+def _expected(separation: Float[np.ndarray, "steps"], tolerance: float, seen: int) -> float | None:
+    """The step at which a counterfactual may split, if it grows at all; None where it does not."""
+    fit = growth(separation[: seen + 1], tolerance)
+    now = float(separation[seen])
+    if not (fit.plain and now > 0):
+        return None
+    return seen + float(np.log(tolerance / now)) / fit.rate
+
+
+# --- what a split owes to the decisions and what to the arithmetic --------------------------------------
+#
+# Beside the free runs there are two mixed ones: B's arithmetic under A's decisions and A's under B's. Each
+# shares one thing with either free run, so its split from that run says what the other thing is worth.
+
+Name = Literal["A", "B"]
+What = Literal["decisions", "arithmetic"]
+
+_RUNS: tuple[tuple[Name, Name], ...] = (("A", "A"), ("B", "B"), ("B", "A"), ("A", "B"))
+#: Series of separations by arithmetic, decisions and the run that they are taken from.
+SERIES: Mapping[tuple[Name, Name, Name], str] = {
+    ("B", "A", "A"): "B|A",
+    ("B", "A", "B"): "B|A from B",
+    ("A", "B", "A"): "A|B from A",
+    ("A", "B", "B"): "A|B",
+}
+
+
+@dataclass(frozen=True)
+class Cell:
+    """When one run splits from another.
+
+    Attributes:
+        arithmetic, decisions: whose they are in the run.
+        reference: the free run that it is compared with.
+        split: step; None where it does not split.
+        until: the last step at which it was compared.
+    """
+
+    arithmetic: Name
+    decisions: Name
+    reference: Name
+    split: int | None
+    until: int
+
+    @property
+    def same(self) -> bool:
+        """Whether this is the reference itself."""
+        return self.arithmetic == self.decisions == self.reference
+
+
+@dataclass(frozen=True)
+class Share:
+    """How much of a split one difference is worth: by how much it comes later without it.
+
+    Attributes:
+        what: the difference that is taken away; the other one stays.
+        reference: the run that is compared with.
+        steps: by which the split comes later; below 0 where it comes earlier.
+        at_least: whether the split had not come when it was followed no longer.
+        nats: growth rate times steps: powers of e of the separation; None without a rate.
+    """
+
+    what: What
+    reference: Name
+    steps: int
+    at_least: bool
+    nats: float | None
+
+
+def table(series: Mapping[str, Shaped[np.ndarray, "steps"]], tolerance: float) -> tuple[Cell, ...]:
+    """Splits of all runs from A, then from B: (A, A), (B, B), (B, A) and (A, B), those that were run.
+
+    Args:
+        series: separations at each step, length: "B", and those of SERIES; NaN after a run was ended.
+        tolerance: of the split, length.
+    """
+    names: tuple[Name, ...] = ("A", "B")
+    cells = []
+    for reference in names:
+        for arithmetic, decisions in _RUNS:
+            last = len(series["B"]) - 1
+            if arithmetic == decisions == reference:
+                cells.append(Cell(arithmetic, decisions, reference, None, last))
+                continue
+            name = "B" if arithmetic == decisions else SERIES[arithmetic, decisions, reference]
+            if name not in series:
+                continue
+            seen = np.flatnonzero(np.isfinite(series[name]))
+            if len(seen):
+                split = split_of(series[name], tolerance)
+                cells.append(Cell(arithmetic, decisions, reference, split, int(seen[-1])))
+    return tuple(cells)
+
+
+def shares(cells: tuple[Cell, ...], rate: float) -> tuple[Share, ...]:
+    """What the decisions and the arithmetic contribute, each as seen from A and from B.
+
+    Args:
+        cells: of `table`.
+        rate: at which the free runs part, per step; NaN where it is not known.
+    """
+    free = next((cell.split for cell in cells if cell.arithmetic == cell.decisions != cell.reference), None)
+    if free is None:
+        return ()
+    found = []
+    for cell in cells:
+        if cell.arithmetic == cell.decisions:
+            continue
+        # with the reference's decisions it lacks the difference in decisions
+        what: What = "decisions" if cell.decisions == cell.reference else "arithmetic"
+        if cell.split is None and cell.until <= free:
+            # ended before it could have come later
+            continue
+        steps = (cell.until if cell.split is None else cell.split) - free
+        nats = rate * steps if np.isfinite(rate) else None
+        found.append(Share(what, cell.reference, steps, cell.split is None, nats))
+    return tuple(sorted(found, key=lambda share: (share.what == "arithmetic", share.reference)))

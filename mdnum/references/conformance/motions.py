@@ -1,0 +1,378 @@
+"""Sequences of motion for lists that are kept: those that have caught stale lists, and the smallest ones.
+
+A pair that was beyond r_cut + padding when the list was built is inside the cutoff once its two atoms have
+come closer by the padding, and no motion that takes it there is smaller than the straight one. A rule that
+asks whether two atoms could have used up the padding rebuilds before that, whichever way they went, however
+they shared it and whatever the others did. So each of `motions` closes a pair by the padding and a hair:
+along axes, diagonals and no axis; by both atoms or one; alone, among atoms at rest, among others that do the
+same or in a common drift; at once, creeping, and back and forth.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+
+import numpy as np
+from numpy import ndarray
+
+from mdnum.references.conformance.case import Case, sequence
+from mdnum.references.conformance.catalog import gas
+
+_R, _SKIN, _L = 1.0, 0.3, 6.0
+#: What a pair starts beyond the padding and ends inside the cutoff by, in paddings.
+HAIR = 2e-3
+#: Of a ladder, in paddings: which of them a list has that shows no pairs of its skin is not known.
+_RUNGS = np.geomspace(0.25, 3.0, 20)
+_BEYOND = int((_RUNGS >= 1).sum())  # of a list that has the padding it is taken to have
+#: What the atom of a pair that is named first does of the motion.
+_SHARES = (0.5, 1.0, 0.0, 0.3, 0.7)
+
+
+def movers() -> Iterator[Case]:
+    """Scripts for a list that is kept, the short ones first."""
+    for area in (_pairs, _many, _wrapping, _strain, _reuse):
+        yield from area()
+
+
+def sequences() -> Iterator[Case]:
+    """Scripts for a list that starts from nothing each time: what it keeps to itself must not matter."""
+    for case in _reuse():
+        yield replace(case, skin=0.0)
+
+
+def _pairs() -> Iterator[Case]:
+    middle = np.array([3.0, 3.0, 3.0])
+    apart = _R + 1.01 * _SKIN
+    for share, steps in ((0.9, 1), (0.6, 1), (0.51, 1), (0.9, 9), (0.6, 20)):
+        path = [_two(middle, apart - 2 * share * _SKIN * k / steps) for k in range(steps + 1)]
+        how = "in one step" if steps == 1 else f"in {steps} steps"
+        yield sequence(f"two atoms head-on, each by {share} skins {how}", "motion", path, _L)
+    path = [_two(middle, apart - 0.02 * _SKIN * k) for k in range(120)]
+    yield sequence("two atoms creep together, 120 steps", "motion", path, _L)
+    path = [np.array([middle, middle + np.array([apart - 1.1 * _SKIN * k / 10, 0, 0])]) for k in range(11)]
+    yield sequence("one atom comes to another at rest", "motion", path, _L)
+    others = gas(12, _L, 80)
+    others = others[np.linalg.norm(others - middle, axis=1) > 2.0]
+    path = [np.vstack([_two(middle, apart - 0.09 * _SKIN * k), others]) for k in range(14)]
+    yield sequence("two atoms head-on among others at rest", "motion", path, _L)
+    path = [np.array([middle, middle + np.array([0.9 + 0.01 * k, 0, 0])]) for k in range(40)]
+    yield sequence("two atoms part slowly", "motion", path, _L)
+    at = middle + np.array([apart, 0, 0])
+    out, within = np.array([middle, at]), np.array([middle, middle + np.array([0.5, 0, 0])])
+    yield sequence("an atom jumps in and out", "motion", [out] * 3 + [within] + [out] * 3, _L)
+
+
+def _two(middle: ndarray, apart: float) -> ndarray:
+    half = np.array([apart / 2, 0.0, 0.0])
+    return np.array([middle - half, middle + half])
+
+
+def _many() -> Iterator[Case]:
+    start = gas(40, _L, 81)
+    yield sequence("nothing moves", "motion", [start] * 5, _L)
+    drift = np.array([0.011, 0.007, -0.005])
+    yield sequence("all atoms drift slowly", "motion", [start + k * drift for k in range(120)], _L)
+    speeds = np.random.default_rng(82).normal(size=start.shape)
+    speeds /= np.linalg.norm(speeds, axis=1)[:, None]
+    for step, steps in ((0.01, 110), (0.03, 60), (0.1, 20), (0.4, 8), (2.5, 5)):
+        path = [start + k * step * speeds for k in range(steps)]
+        yield sequence(f"a gas, {step} r_cut at a step", "motion", path, _L)
+    fast = [np.vstack([start[0] + 0.8 * k * np.array([1.0, 0.6, 0.3]), start[1:]]) for k in range(12)]
+    yield sequence("one fast atom among atoms at rest", "motion", fast, _L)
+    path = [gas(30, 4.0, 83) * (1 + 0.1 * abs(5 - k)) for k in range(11)]
+    name = "a free cluster flies apart and comes back"
+    yield sequence(name, "motion", path, np.zeros((3, 3)), pbc=False)
+    order = np.random.default_rng(84).permutation(len(start))
+    yield sequence("atoms change places", "motion", [start, start[order], start], _L)
+    dense, sparse = 3.0 + 0.25 * gas(40, _L, 85, -1.0, 1.0), gas(40, _L, 86)
+    yield sequence("dense, sparse, dense, sparse", "motion", [sparse, dense, sparse, dense, sparse], _L)
+    jitter = np.random.default_rng(87).normal(scale=0.12, size=(60, *start.shape))
+    yield sequence("a jitter of a third of the skin", "motion", [start + noise for noise in jitter], _L)
+
+
+def _wrapping() -> Iterator[Case]:
+    start = gas(30, _L, 90)
+    speeds = np.random.default_rng(91).normal(scale=0.05, size=start.shape)
+    whole = [start + k * speeds for k in range(50)]
+    yield sequence("atoms leave the box", "wrapping", whole, _L)
+    yield sequence("atoms are wrapped as they leave", "wrapping", [np.mod(x, _L) for x in whole], _L)
+    twice = [np.mod(x, _L) if k % 2 else x for k, x in enumerate(whole)]
+    yield sequence("atoms are wrapped at every other step", "wrapping", twice, _L)
+    rng = np.random.default_rng(92)
+    tossed = [start + _L * rng.integers(-2, 3, start.shape) for _ in range(6)]
+    yield sequence("other images of the same atoms", "wrapping", tossed, _L)
+    pair = [np.array([[0.05, 3, 3], [5.2, 3, 3]]) + np.array([k * 0.01 - 0.1, 0, 0]) for k in range(20)]
+    yield sequence("a pair goes through a face, wrapped", "wrapping", [np.mod(x, _L) for x in pair], _L)
+    meet = [
+        np.array([[0.02 + 0.01 * k, 3, 3], [_L - 1.4 + 0.01 * k * (1 + k / 10), 3, 3]]) for k in range(30)
+    ]
+    yield sequence("an atom follows another through a face", "wrapping", [np.mod(x, _L) for x in meet], _L)
+    skewed = np.array([[5.0, 0, 0], [2.0, 5.0, 0], [-1.5, 1.0, 5.0]])
+    slanted = gas(30, skewed, 93)
+    moved = [slanted + k * speeds[:30] for k in range(40)]
+    home = [x - np.floor(np.linalg.solve(skewed.T, x.T).T) @ skewed for x in moved]
+    yield sequence("a skewed box, atoms are wrapped", "wrapping", home, skewed)
+
+
+def _strain() -> Iterator[Case]:
+    apart = _R + _SKIN + 0.01
+    edge = 4.0
+    across = np.array([[apart / 2, 2, 2], [edge - apart / 2, 2, 2]])
+    for total, steps in ((0.35, 1), (0.6, 1), (1.0, 1), (0.35, 10), (0.35, 100)):
+        path = [(across, np.diag([edge - total * k / steps, edge, edge])) for k in range(steps + 1)]
+        how = "at once" if steps == 1 else f"in {steps} steps"
+        yield sequence(f"the box shrinks by {total} {how}, the atoms rest", "strain", path, edge)
+    close = np.array([[0.5, 2, 2], [edge - 0.5 - 1e-9, 2, 2]])
+    path = [(close, np.diag([edge, edge, edge])), (close, np.diag([edge - 2e-9, edge, edge]))]
+    yield sequence("the box shrinks by 2e-9, no skin", "strain", path, edge, _R, 0.0)
+    start = gas(40, _L, 100)
+    for scale, word in ((0.97, "shrinks"), (1.03, "grows")):
+        factors = scale ** np.arange(9)
+        path = [(start * f, np.eye(3) * _L * f) for f in factors]
+        yield sequence(f"the box {word} and takes the atoms along", "strain", path, _L)
+    factors = 0.995 ** np.arange(40)
+    path = [(start * f, np.eye(3) * _L * f) for f in factors]
+    yield sequence("the box shrinks slowly and takes the atoms along", "strain", path, _L)
+    for size in (0.02, 0.2):
+        shears = [np.array([[1.0, 0, 0], [size * k, 1, 0], [0, 0, 1]]) for k in range(9)]
+        path = [(start @ shear, _L * shear) for shear in shears]
+        yield sequence(f"the box is sheared by {size} at a step", "strain", path, _L)
+    over = np.array([[1.0, 0.3, 2], [2.4, edge - 0.3, 2], [3.0, 2, 2]])
+    for steps in (1, 12):
+        tilts = [np.array([[edge, 0, 0], [1.4 * k / steps, edge, 0], [0, 0, edge]]) for k in range(steps + 1)]
+        how = "at once" if steps == 1 else f"in {steps} steps"
+        name = f"the box is sheared {how}, the atoms rest, the volume stays"
+        yield sequence(name, "strain", [(over, tilt) for tilt in tilts], edge)
+    swapped = [(across, np.diag([edge - w, edge * edge / (edge - w), edge])) for w in np.linspace(0, 0.5, 6)]
+    yield sequence("one edge shrinks, one grows, the atoms rest", "strain", swapped, edge)
+    angles = np.linspace(0.0, 1.2, 7)
+    turns = [np.array([[np.cos(a), np.sin(a), 0], [-np.sin(a), np.cos(a), 0], [0, 0, 1.0]]) for a in angles]
+    yield sequence("box and atoms turn", "strain", [(start @ turn, _L * turn) for turn in turns], _L)
+    mixed = [(start * (1 - 0.004 * k) + 0.01 * k, np.eye(3) * _L * (1 - 0.004 * k)) for k in range(12)]
+    yield sequence("the box shrinks while the atoms drift", "strain", mixed, _L)
+    few = gas(5, 2.3, 101)
+    path = [(few * f, np.eye(3) * 2.3 * f) for f in (1.0, 0.9, 0.75, 0.6, 0.5, 0.8)]
+    yield sequence("the box shrinks below two cutoffs", "strain", path, 2.3)
+
+
+def _reuse() -> Iterator[Case]:
+    start, other = gas(40, _L, 110), gas(40, _L, 111)
+    dense = 3.0 + 0.2 * gas(40, _L, 112, -1.0, 1.0)
+    yield sequence("fewer atoms each time", "reuse", [start[:n] for n in (40, 23, 9, 2, 1, 0)], _L)
+    yield sequence("more atoms each time", "reuse", [start[:n] for n in (1, 2, 9, 23, 40)], _L)
+    yield sequence("an atom is removed and added", "reuse", [start, start[1:], start, start[:-1]], _L)
+    yield _anew(sequence("as many other atoms", "reuse", [start, other, start], _L))
+    yield _anew(sequence("many neighbors, then few, then many", "reuse", [dense, start, dense, start], _L))
+    boxes = [(start, np.eye(3) * _L), (start, np.eye(3) * 9.0), (start * 0.6, np.eye(3) * 3.6)]
+    yield _anew(sequence("other boxes", "reuse", boxes, _L))
+    yield _other_skins()
+    yield _anew(sequence("the same atoms three times", "reuse", [start] * 3, _L))
+
+
+def _other_skins() -> Case:
+    """A list that starts anew with a thinner skin, and with a thicker one; each time two atoms come in."""
+    middle, path, skins = np.array([3.0, 3.0, 3.0]), [], []
+    for skin in (0.6, 0.1, 0.6):
+        apart = _R + 1.01 * skin
+        path += [_two(middle, apart), _two(middle, apart - 0.6 * skin), _two(middle, apart - 1.8 * skin)]
+        skins += [skin, None, None]
+    case = sequence("started anew with another skin", "reuse", path, _L, _R, max(filter(None, skins)))
+    starts = zip(case.stills, skins, strict=True)
+    stills = tuple(replace(still, fresh=skin is not None, skin=skin) for still, skin in starts)
+    return replace(case, stills=stills)
+
+
+def _anew(case: Case) -> Case:
+    """A script in which every still is another question to the same list."""
+    return replace(case, stills=tuple(replace(still, fresh=True) for still in case.stills))
+
+
+def motions(padding: float | None = None) -> Iterator[Case]:
+    """Scripts of motions, the short ones first; `Case.motions` counts them.
+
+    Args:
+        padding: that the list was seen to have, or says that it has, in units of the skin that it is given;
+            None where neither: what it is given is tried first, and a ladder of others.
+    """
+    room = _SKIN * (padding or 1.0)
+    edge = max(6.0, 2.6 * (_R + room))
+    ways = _ways()
+    for share in _SHARES:
+        words = f"the smallest motions of a pair, {share:.0%} by its first atom"
+        yield _chain(words, (_meeting(room, way, share, edge, n) for n, way in enumerate(ways)), edge)
+    some = [ways[n] for n in (0, 2, 5, 9, 13)]
+    for share in (0.5, 1.0):
+        paths = [_walk(room, way, share, edge, n, np.linspace(0, 1, 8)) for n, way in enumerate(some)]
+        yield _sequence(f"pairs that creep together, {share:.0%} by the first atom", paths, edge)
+    back = (0.0, 0.45, -0.45, 0.9, -0.9, 1.0)
+    paths = [_walk(room, way, 0.5, edge, n, back) for n, way in enumerate(some)]
+    yield _sequence("pairs that go back and forth, then together", paths, edge)
+    for share in (0.5, 1.0):
+        words = f"a pair among 40 atoms at rest, {share:.0%} by its first atom"
+        yield _chain(words, (_among(room, way, share, edge, n) for n, way in enumerate(ways)), edge)
+    yield _chain(
+        "a pair comes together while all atoms drift",
+        (_adrift(room, way, edge, n) for n, way in enumerate(ways)),
+        edge,
+    )
+    for share in (0.5, 0.3):
+        words = f"twelve pairs at once, {share:.0%} by their first atoms"
+        yield _chain(words, (_dozen(room, way, share, n) for n, way in enumerate(ways[::2])), 12.0)
+    yield _in_turn(room, ways)
+    leaning = edge * np.array([[1.0, 0, 0], [0.45, 1.0, 0], [-0.35, 0.4, 1.0]])
+    for cell, word in ((leaning, "a skewed box"), (np.diag([4 * edge, edge, edge]), "a long box")):
+        along = [*ways, *(row / np.linalg.norm(row) for row in cell)]
+        pairs = (_meeting(room, way, 0.5, edge, n) for n, way in enumerate(along))
+        yield _chain(f"the smallest motions of a pair, {word}", pairs, cell)
+    if padding is None or abs(padding - 1.0) < 0.02:
+        for skin in (0.08, 1.0):
+            pairs = (_meeting(skin, way, 0.5, edge, n) for n, way in enumerate(ways))
+            yield _chain(f"the smallest motions of a pair, a skin of {skin}", pairs, edge, skin)
+    for n in (0, 4, 9, 13) if padding is None else (9,):
+        yield _ladder(room, ways[n], n)
+        for share in (1.0, 0.5):
+            yield _one_by_one(room, ways[n], share, n)
+
+
+def _ways() -> list[ndarray]:
+    """Unit vectors: axes, diagonals of faces and of the cube, and three of no kind."""
+    ways = [np.array(way, float) for way in itertools.product((-1, 0, 1), repeat=3) if way > (0, 0, 0)]
+    ways.sort(key=lambda way: (np.count_nonzero(way), tuple(-way)))
+    ways += list(np.random.default_rng(140).normal(size=(3, 3)))
+    return [way / np.linalg.norm(way) for way in ways]
+
+
+def _apart(room: float) -> float:
+    """Where a pair starts: beyond the list, by a hair."""
+    return _R + (1 + HAIR) * room
+
+
+def _closing(room: float) -> float:
+    """What takes it inside the cutoff, by a hair."""
+    return (1 + 2 * HAIR) * room
+
+
+def _meeting(room: float, way: ndarray, share: float, edge: float, n: int) -> tuple[ndarray, ndarray]:
+    """Two atoms somewhere, before and after they came together."""
+    path = _walk(room, way, share, edge, n, (0.0, 1.0))
+    return path[0], path[1]
+
+
+def _walk(
+    room: float, way: ndarray, share: float, edge: float, n: int, closed: Iterable[float]
+) -> list[ndarray]:
+    """Two atoms somewhere, closed by so many of the smallest motion."""
+    middle = edge * np.random.default_rng(150 + n).uniform(0.2, 0.8, 3)
+    start = np.array([middle - _apart(room) / 2 * way, middle + _apart(room) / 2 * way])
+    moves = _closing(room) * np.array([share * way, (share - 1.0) * way])
+    return [start + part * moves for part in closed]
+
+
+def _among(room: float, way: ndarray, share: float, edge: float, n: int) -> tuple[ndarray, ndarray]:
+    """Two atoms that come together, wherever they are in the file, and 40 at rest."""
+    first, second = (n * 11) % 42, (n * 17 + 23) % 42
+    second = (second + 1) % 42 if second == first else second
+    start = gas(42, edge, 160 + n)
+    pair = _walk(room, way, share, edge, n, (0.0, 1.0))
+    start[[first, second]] = pair[0]
+    end = start.copy()
+    end[[first, second]] = pair[1]
+    return start, end
+
+
+def _adrift(room: float, way: ndarray, edge: float, n: int) -> tuple[ndarray, ndarray]:
+    """The same among ten atoms, all of which drift: across the motion, along it, by much and by little."""
+    start = gas(12, edge, 180 + n)
+    pair = _walk(room, way, 0.5, edge, n, (0.0, 1.0))
+    start[4:6] = pair[0]
+    end = start.copy()
+    end[4:6] = pair[1]
+    across = np.cross(way, np.roll(way, 1) + np.array([0.3, -0.2, 0.1]))
+    across /= np.linalg.norm(across)
+    drift = (4 * across, 0.5 * way, 4 * way, 0.5 * across)[n % 4]
+    return start, end + room * drift
+
+
+def _dozen(room: float, way: ndarray, share: float, n: int) -> tuple[ndarray, ndarray]:
+    """Twelve pairs in places of their own, all of which do the same."""
+    places = _places(12, 12.0, n)
+    start = np.vstack([places - _apart(room) / 2 * way, places + _apart(room) / 2 * way])
+    moves = _closing(room) * np.vstack([np.tile(share * way, (12, 1)), np.tile((share - 1.0) * way, (12, 1))])
+    return start, start + moves
+
+
+def _in_turn(room: float, ways: list[ndarray]) -> Case:
+    """25 pairs, whose 50 atoms go one after the other: who is not looked at is found."""
+    count = 25
+    places = _places(count, 15.0, 0)
+    way = np.array([ways[n % len(ways)] for n in range(count)])
+    start = np.vstack([places - _apart(room) / 2 * way, places + _apart(room) / 2 * way])
+    # a pair that has come together is far from its next turn: the second atom comes from beyond again
+    path = [start]
+    for atom in range(2 * count):
+        moved = path[-1].copy()
+        pair, sign = atom % count, 1.0 if atom < count else -1.0
+        if atom == count:
+            # all anew, so that every rule rebuilds
+            moved = start + np.array([2.0, 1.0, -1.5])
+            path.append(moved)
+            moved = moved.copy()
+        moved[atom] += sign * _closing(room) * way[pair]
+        path.append(moved)
+    case = sequence("50 atoms, each of them comes to another in its turn", "rule", path, 15.0)
+    return replace(case, motions=2 * count)
+
+
+def _ladder(room: float, way: ndarray, n: int) -> Case:
+    """Pairs from near and far creep together: each comes inside when its own start is just used up."""
+    places = _places(len(_RUNGS), 12.0, n)
+    rungs = room * _RUNGS[:, None]
+    path = []
+    for closed in (0.0, *_RUNGS):
+        half = (_R + (1 + HAIR) * rungs - (1 + 2 * HAIR) * room * closed) / 2 * way
+        path.append(np.vstack([places - half, places + half]))
+    case = sequence(f"pairs from near and far creep together, {_direction(way)}", "rule", path, 12.0)
+    return replace(case, motions=_BEYOND)
+
+
+def _one_by_one(room: float, way: ndarray, share: float, n: int) -> Case:
+    """The same pair by pair, each back to its place before the next: by one atom of it, or by both."""
+    places, count = _places(len(_RUNGS), 12.0, n + 1), len(_RUNGS)
+    half = (_R + (1 + HAIR) * room * _RUNGS[:, None]) / 2 * way
+    start = np.vstack([places - half, places + half])
+    path = [start]
+    for rung, far in enumerate(_RUNGS):
+        moved = start.copy()
+        turned = (rung + n) % 2
+        first, second = (rung, rung + count) if turned else (rung + count, rung)
+        toward = (1.0 if turned else -1.0) * (1 + 2 * HAIR) * room * far * way
+        moved[first] += share * toward
+        moved[second] -= (1 - share) * toward
+        path.append(moved)
+    name = f"pairs from near and far, one by one, {share:.0%} by an atom, {_direction(way)}"
+    return replace(sequence(name, "rule", path, 12.0), motions=_BEYOND)
+
+
+def _direction(way: ndarray) -> str:
+    return f"along ({', '.join(f'{part:.2g}' for part in way)})"
+
+
+def _places(count: int, edge: float, n: int) -> ndarray:
+    """Places of their own for pairs, in an order that is not that of space."""
+    side = int(np.ceil(count ** (1 / 3)))
+    grid = (np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), -1).reshape(-1, 3) + 0.5) / side
+    return edge * np.random.default_rng(200 + n).permutation(grid)[:count]
+
+
+def _chain(
+    name: str, pairs: Iterable[tuple[ndarray, ndarray]], cell: float | ndarray, skin: float = _SKIN
+) -> Case:
+    """Motions one after the other: between them all atoms go elsewhere, which no rule overlooks."""
+    return _sequence(name, [[start, end] for start, end in pairs], cell, skin)
+
+
+def _sequence(name: str, paths: list[list[ndarray]], cell: float | ndarray, skin: float = _SKIN) -> Case:
+    case = sequence(name, "rule", [still for path in paths for still in path], cell, _R, skin)
+    return replace(case, motions=len(paths))

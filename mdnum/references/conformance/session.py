@@ -1,0 +1,429 @@
+"""Calls of a list, in this process or one of its own: what came back, or what became of the call instead."""
+
+from __future__ import annotations
+
+import ast
+import builtins
+import dis
+import linecache
+import os
+import pickle
+import signal
+import struct
+import subprocess
+import sys
+import tempfile
+import textwrap
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import islice
+from pathlib import Path
+from types import TracebackType
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy import ndarray
+
+from mdnum.errors import MdnumError
+from mdnum.references.conformance.answer import Answer, Malformed, parts, read
+from mdnum.references.conformance.case import Case
+from mdnum.references.conformance.lists import PairList
+from mdnum.safe_path import environment, python
+
+#: Seconds that an answer may take, for so many atoms at most and for more; and those to import a library.
+#: They are its own processor time: by the clock nothing comes in time on a machine that has other work to do.
+FEW, CALL, LONG, START = 1000, 45.0, 120.0, 120.0
+#: A process that used less than this share of the time waits for something that does not come; and one that
+#: has had this many times its seconds by the clock is not waited for, whatever else the machine does.
+_IDLE, _MOST = 0.05, 10.0
+_SIZE = struct.Struct("<Q")
+#: Modules, beside Python's own, whose exceptions are about a call that the list made, not about its input.
+_BORROWED = frozenset({"numpy", "scipy", "numba", "pandas", "torch", "jax", "jaxlib", "cupy", "ctypes"})
+
+
+@dataclass(frozen=True)
+class CallOutcome:
+    """What became of one call.
+
+    Attributes:
+        answer: the pairs, or None.
+        raised: the exception in words, or None.
+        refused: the exception states on purpose that this cannot be done (`meant`).
+        malformed: why the answer is none, or None.
+        changed: the input that the call wrote to, or None.
+        crashed: how the process ended that made the call, or None.
+        late: that it did not answer in time, or None.
+        aliased: the rows of the answer before this one were other ones after this call.
+        skin: the padding that a list that is kept states, length; None where it states none.
+    """
+
+    answer: Answer | None = None
+    raised: str | None = None
+    refused: bool = False
+    malformed: str | None = None
+    changed: str | None = None
+    crashed: str | None = None
+    late: str | None = None
+    aliased: bool = False
+    skin: float | None = None
+
+
+class Session:
+    """Calls of one list, a kept one through its life.
+
+    Args:
+        tested: the list.
+        reuse: ask the same object in all cases, as a program that runs for long does.
+    """
+
+    def __init__(self, tested: PairList, reuse: bool = False):
+        self.tested, self.reuse = tested, reuse
+        self._made: Any = None
+        self._returned: list[ndarray] = []
+
+    def ask(self, case: Case) -> list[CallOutcome]:
+        """The outcome at every still, as far as the list goes: it ends at the first that is no answer."""
+        return list(self.outcomes(case))
+
+    def outcomes(self, case: Case) -> Iterator[CallOutcome]:
+        """The same, one after the other."""
+        if self._made is None or (self.tested.kept and not self.reuse):
+            try:
+                self._made = self.tested.make()
+            except (Exception, SystemExit) as error:
+                yield _failed(error, case, None)
+                return
+        positions, cell = np.zeros((0, 3)), np.zeros((3, 3))
+        for step, still in enumerate(case.stills):
+            pbc, count, before = np.array(case.pbc), len(still.positions), len(positions)
+            fresh = not step or still.fresh or (self.tested.limits.fixed_atoms and count != before)
+            if self.tested.kept and not fresh and count == before:
+                # a program moves its atoms where they are: a list that kept the array and not its numbers
+                # sees no motion
+                positions[...], cell[...] = still.positions, still.cell
+            else:
+                positions, cell = np.array(still.positions), np.array(still.cell)
+            skin = case.skin if still.skin is None else still.skin
+            outcome = self._call(case, positions, cell, pbc, skin if fresh else None)
+            yield outcome
+            if outcome.answer is None:
+                return
+
+    def close(self) -> None:
+        """Lets go of the list."""
+        self._made, self._returned = None, []
+
+    def _call(
+        self, case: Case, positions: ndarray, cell: ndarray, pbc: ndarray, skin: float | None
+    ) -> CallOutcome:
+        """One call; with a skin, a list that is kept is allocated."""
+        inputs = {"positions": positions, "cell": cell, "pbc": pbc}
+        before = {name: array.copy() for name, array in inputs.items()}
+        returned, self._returned = self._returned, []
+        held = [part.copy() for part in returned]
+        try:
+            if not self.tested.kept:
+                given = self._made(positions, cell, pbc, case.r_cut)
+            elif skin is not None:
+                given = self._made.allocate(positions, cell, pbc, case.r_cut, skin)
+            else:
+                given = self._made.update(positions, cell)
+        except (Exception, SystemExit) as error:
+            return _failed(error, case, self.tested.package)
+        try:
+            answer = read(given)
+            # np.asarray of a tensor on the same device is a view of it, and of a list of numbers none
+            self._returned = [
+                np.asarray(part) for part in parts(given).values() if hasattr(part, "__array__")
+            ]
+        except Malformed as error:
+            return CallOutcome(malformed=str(error))
+        same = (
+            a.shape == b.shape and a.tobytes() == b.tobytes() for a, b in zip(returned, held, strict=True)
+        )
+        changed = [name for name, array in inputs.items() if not np.array_equal(before[name], array)]
+        return CallOutcome(
+            answer, changed=changed[0] if changed else None, aliased=not all(same), skin=self._stated_skin()
+        )
+
+    def _stated_skin(self) -> float | None:
+        try:
+            skin = float(self._made.skin) if self.tested.kept else -1.0
+        except (AttributeError, TypeError, ValueError):
+            return None
+        return skin if np.isfinite(skin) and skin >= 0 else None
+
+
+def _failed(error: Exception | SystemExit, case: Case, package: str | None) -> CallOutcome:
+    if isinstance(error, SystemExit):  # it would have ended the process of whoever called it
+        return CallOutcome(crashed=f"it ends the process: SystemExit: {error}")
+    # what follows the first lines is where it was raised, in some libraries with the frames of compiled code
+    text = str(error).partition("Exception raised from ")[0].strip()
+    first, frames, rest = text.partition("Traceback of ")
+    # TorchScript says what happened in the last line of a traceback
+    text = " ".join((f"{first} {rest.splitlines()[-1]}" if frames else text).split())
+    # without atoms there is nothing that could not be done
+    refused = case.atoms > 0 and meant(error, package)
+    return CallOutcome(raised=f"{type(error).__name__}: {text[:300]}", refused=refused)
+
+
+def meant(error: Exception, package: str | None = None) -> bool:
+    """Whether an exception states on purpose that something cannot be done, or came about by accident.
+
+    A refusal keeps a program from computing with wrong pairs and can be relied on. A `min()` of no distances
+    is a ValueError as well, and only shows that nobody thought of such input.
+
+    Args:
+        error: with its traceback.
+        package: distribution of the list; what it raises itself in compiled code counts as meant.
+
+    Returns:
+        True where the innermost frame is the list's own and stands at a `raise`, or at a call of a library's
+        compiled code that raised, of a ValueError, a RuntimeError or a class of the library's own, with
+        words; False where it is not, and where that cannot be decided.
+    """
+    own = (package or "").replace("-", "_").lower()
+    usual = isinstance(error, ValueError | RuntimeError) or _is_own(type(error).__module__, own)
+    if not usual or isinstance(error, np.linalg.LinAlgError | RecursionError | UnicodeError):
+        return False
+    last = error.__traceback__
+    while last is not None and last.tb_next is not None:
+        last = last.tb_next
+    if last is None or not str(error).strip():
+        return False
+    module = str(last.tb_frame.f_globals.get("__name__", ""))
+    if not _is_own(module, own) and module != "__main__":
+        return False
+    if last.tb_frame.f_code.co_filename.endswith((".pyx", ".pxd", ".pxi")):
+        return bool(own) and module.partition(".")[0].lower() == own
+    return _at_raise(last) or _is_own(_called_module(last), own)
+
+
+def _is_own(module: str, own: str) -> bool:
+    """Whether a module is a list's, rather than Python's or one that everybody computes with."""
+    top = module.partition(".")[0]
+    return bool(top) and (top.lower() == own or (top not in _BORROWED and top not in sys.stdlib_module_names))
+
+
+def _at_raise(place: TracebackType) -> bool:
+    """Whether a frame stands at a `raise` statement."""
+    code, at = place.tb_frame.f_code.co_code, place.tb_lasti
+    if 0 <= at < len(code) and dis.opname[code[at]] == "RAISE_VARARGS":
+        return True
+    # compiled code shows frames that name its lines and have no instructions
+    line = linecache.getline(place.tb_frame.f_code.co_filename, place.tb_lineno)
+    return len(code) < 16 and line.strip().startswith("raise ")
+
+
+def _called_module(place: TracebackType) -> str:
+    """The module of the compiled function that a frame stands in a call of; empty where it is none."""
+    code = place.tb_frame.f_code
+    where = next(islice(code.co_positions(), max(0, place.tb_lasti // 2), None), (None,) * 4)
+    first, last, left, right = where
+    if first is None or last is None or left is None or right is None:
+        return ""
+    lines = [linecache.getline(code.co_filename, number).encode() for number in range(first, last + 1)]
+    # columns count bytes
+    lines[-1] = lines[-1][:right]
+    lines[0] = lines[0][left:]
+    try:
+        call = ast.parse(textwrap.dedent(b"".join(lines).decode()).strip(), mode="eval").body
+    except (SyntaxError, ValueError):
+        return ""
+    if not isinstance(call, ast.Call):
+        return ""
+    function = _value(call.func, place)
+    owner = getattr(function, "__self__", None)
+    for module in (
+        getattr(function, "__module__", None),
+        getattr(owner, "__name__", None) if type(owner).__name__ == "module" else None,
+        getattr(type(owner), "__module__", None) if owner is not None else None,
+        getattr(type(function), "__module__", None),
+    ):
+        if isinstance(module, str) and module:
+            return module
+    return ""
+
+
+def _value(name: ast.expr, place: TracebackType) -> Any:
+    """What a name, or an attribute of one, means where an exception passed; None where unclear."""
+    if isinstance(name, ast.Attribute):
+        return getattr(_value(name.value, place), name.attr, None)
+    if not isinstance(name, ast.Name):
+        return None
+    frame = place.tb_frame
+    scopes = (frame.f_locals, frame.f_globals, vars(builtins))
+    return next((scope[name.id] for scope in scopes if name.id in scope), None)
+
+
+class RemoteSession:
+    """As `Session`, in another process; a new one after each that ended: a crash is a finding and not an end.
+
+    Args:
+        tested: a list that `load` finds by its word.
+        reuse: ask one object in all cases.
+    """
+
+    def __init__(self, tested: PairList, reuse: bool = False):
+        self.tested, self.reuse = tested, reuse
+        self._process: subprocess.Popen[bytes] | None = None
+        # what a library prints is no part of the report; its last words before a crash are
+        self._printed: Any = tempfile.TemporaryFile()  # noqa: SIM115 (closed with the session)
+        self._from = 0
+
+    def ask(self, case: Case) -> list[CallOutcome]:
+        """The outcome at every still, as far as the list goes."""
+        outcomes: list[CallOutcome] = []
+        try:
+            process = self._process or self._start()
+            try:
+                _send(process.stdin, (case, self.reuse, self.tested.limits))
+            except OSError as error:
+                raise _Ended(self._how_it_ended(process)) from error
+            # each step has its own time, which ends with its outcome
+            while (outcome := self._receive(process, CALL if case.atoms <= FEW else LONG)) is not None:
+                outcomes.append(outcome)
+            return outcomes
+        except _Ended as ended:
+            self.close()
+            late = isinstance(ended, _Late)
+            return [*outcomes, CallOutcome(late=str(ended)) if late else CallOutcome(crashed=str(ended))]
+
+    def close(self) -> None:
+        """Ends the process."""
+        process, self._process = self._process, None
+        if process is not None:
+            process.kill()
+            process.wait()
+            for stream in (process.stdin, process.stdout):
+                if stream is not None:
+                    stream.close()
+
+    def _start(self) -> subprocess.Popen[bytes]:
+        self._from = self._printed.seek(0, os.SEEK_END)
+        self._process = subprocess.Popen(
+            python("-m", "mdnum.references.conformance.loading", self.tested.word),
+            env=environment(),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._printed,
+        )
+        ready = self._receive(self._process, START)
+        if isinstance(ready, Exception):
+            raise ready
+        return self._process
+
+    def _receive(self, process: subprocess.Popen[bytes], seconds: float) -> Any:
+        done, late = threading.Event(), list[str]()
+        watch = threading.Thread(target=_watch, args=(process, seconds, done, late), daemon=True)
+        watch.start()
+        try:
+            return _received(process.stdout)
+        except EOFError as error:
+            if late:
+                raise _Late(f"no answer within {seconds:.3g} s{late[0]}") from error
+            raise _Ended(self._how_it_ended(process)) from error
+        finally:
+            done.set()
+            watch.join()
+
+    def _how_it_ended(self, process: subprocess.Popen[bytes]) -> str:
+        code = process.wait()
+        if code >= 0:
+            how = f"the process ended with exit code {code}"
+        else:
+            name = signal.Signals(-code).name if -code in {*signal.Signals} else f"signal {-code}"
+            how = f"the process was ended by {name}"
+        self._printed.seek(self._from)
+        lines = self._printed.read().decode(errors="replace").strip().splitlines()
+        return f"{how}: {lines[-1].strip()[:200]}" if lines else how
+
+
+class _Ended(Exception):
+    """The other process is gone; the message says how."""
+
+
+class _Late(_Ended):
+    """It was ended, because it did not answer."""
+
+
+def _watch(process: Any, seconds: float, done: threading.Event, late: list[str]) -> None:
+    """Ends a process that had its time and did not answer; `late` then has the words for it."""
+    began, used = time.monotonic(), _processor_seconds(process.pid)
+    left = seconds
+    while not done.wait(left):
+        elapsed = time.monotonic() - began
+        now = _processor_seconds(process.pid)
+        spent = elapsed if used is None or now is None else now - used
+        waits = spent < _IDLE * elapsed
+        if spent >= seconds or waits or elapsed >= _MOST * seconds:
+            late.append(", in which it computed nothing" if waits else " of processor time")
+            process.kill()
+            return
+        left = max(0.1, seconds - spent)
+
+
+def _processor_seconds(process: int) -> float | None:
+    """What a process has used of the processor so far, all threads together; None where that is not known."""
+    try:
+        # the second word is the name of the program in brackets, which may hold blanks
+        words = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+        return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
+    except (OSError, ValueError, IndexError):
+        return None  # another system, or the process is gone
+
+
+def _send(stream: BinaryIO | Any, message: Any) -> None:
+    data = pickle.dumps(message, protocol=pickle.HIGHEST_PROTOCOL)
+    stream.write(_SIZE.pack(len(data)) + data)
+    stream.flush()
+
+
+def _received(stream: BinaryIO | Any) -> Any:
+    head = stream.read(_SIZE.size)
+    size = _SIZE.unpack(head)[0] if len(head) == _SIZE.size else -1
+    data = stream.read(max(size, 0))
+    if len(data) != size:
+        raise EOFError
+    return pickle.loads(data)
+
+
+def serve(load: Any, word: str) -> None:
+    """CaseAnswers questions on stdin until there are no more: the other process of a `RemoteSession`.
+
+    Args:
+        load: finds a list by a word.
+        word: of the list.
+    """
+    # a list may print: what it writes to stdout must not be taken for an answer
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    try:
+        tested = load(word)
+    except MdnumError as error:
+        _send(answers, error)
+        return
+    _send(answers, "ready")
+    try:
+        import resource
+
+        # a grid of cells over a huge box is a MemoryError, not a machine that swaps
+        have = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+        resource.setrlimit(resource.RLIMIT_DATA, (have // 2, resource.getrlimit(resource.RLIMIT_DATA)[1]))
+    except (ImportError, OSError, ValueError):
+        pass  # not on this system
+    sessions: dict[bool, Session] = {}
+    while True:
+        try:
+            case, reuse, limits = _received(sys.stdin.buffer)
+        except EOFError:
+            return
+        session = sessions.setdefault(reuse, Session(replace(tested, limits=limits), reuse))
+        try:
+            for outcome in session.outcomes(case):
+                _send(answers, outcome)
+        except MemoryError as error:
+            _send(answers, CallOutcome(raised=f"MemoryError: {error}"))
+        _send(answers, None)

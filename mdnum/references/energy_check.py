@@ -1,0 +1,499 @@
+"""`mdnum check energy` and `mdnum check dynamics`: mdnum against ASE, frame by frame and step by step."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from ase import Atoms
+from ase.md.verlet import VelocityVerlet
+from numpy import ndarray
+
+from mdnum.numerics.roles import WIDE, carrier
+from mdnum.numerics.rounding import unit_roundoff
+from mdnum.references.ase_models import Reference, evaluate, independent, reference
+from mdnum.references.independent import Edges, PairModel, edges_of, pair_forms
+from mdnum.references.oracle import rounding_bound
+from mdnum.systems import System, build, schema
+
+ENERGY_PAIR, FORCE, ENERGY_MANY_BODY = 1e-12, 1e-10, 1e-10
+"""What float64 must meet: relative energy of pair and of many-body potentials; forces over their scale."""
+
+SOME_STEPS = 200
+"""Steps to the later of the two frames compared by default."""
+
+ROUNDINGS = 5.0
+"""What narrower precision must meet: this many times the rounding expected of one typical number."""
+
+
+@dataclass(frozen=True)
+class FrameComparison:
+    """One frame, evaluated twice.
+
+    Attributes:
+        frame: which.
+        energy, energy_reference: total energies (eV or ε).
+        energy_rel: their difference over the energy (or sum |pair energies| / 1000).
+        force_max: largest difference of a force component.
+        force_scale: largest force on an atom or along a pair, which a perfect crystal has too.
+        force_rel: force_max / force_scale.
+        stress_max: largest difference of a stress component (energy / length³); None without a volume.
+        stress_rel: over the largest stress that a single kind of term could have.
+        energy_expected, force_expected: differences that rounding in the system's precision lets expect.
+        energy_third, force_third: relative energy and largest force component of mdnum against a third
+            evaluation, in plain numpy; None where there is none.
+        ambiguous: pairs within rounding of a cutoff, about which the two may rightly differ.
+        ok: within tolerance.
+    """
+
+    frame: str
+    energy: float
+    energy_reference: float
+    energy_rel: float
+    force_max: float
+    force_scale: float
+    force_rel: float
+    stress_max: float | None
+    stress_rel: float | None
+    energy_expected: float
+    force_expected: float
+    energy_third: float | None
+    force_third: float | None
+    ambiguous: int
+    ok: bool
+
+    @property
+    def energy_roundings(self) -> float:
+        """Energy difference in units of the expected rounding."""
+        return _over(abs(self.energy - self.energy_reference), self.energy_expected)
+
+    @property
+    def force_roundings(self) -> float:
+        """Largest force difference in units of the expected rounding."""
+        return _over(self.force_max, self.force_expected)
+
+
+@dataclass(frozen=True)
+class EnergyReport:
+    """Energies, forces and stresses against a reference.
+
+    Attributes:
+        system: name.
+        reference: what it was compared with; says so when it is not ASE.
+        is_ase: whether the reference is a class of ASE.
+        conversion: what was done to make the conventions equal.
+        precision: "float64", or the narrowest type in use.
+        frames: one comparison per frame.
+        ok: every frame within tolerance.
+    """
+
+    system: str
+    reference: str
+    is_ase: bool
+    conversion: str
+    precision: str
+    frames: tuple[FrameComparison, ...]
+    ok: bool
+
+    @property
+    def worst(self) -> dict[str, Any]:
+        """The worst of all frames, in the names of summary.json's `ase`."""
+        stress = [frame.stress_max for frame in self.frames if frame.stress_max is not None]
+        return {
+            "reference": self.reference,
+            "energy_rel": max(frame.energy_rel for frame in self.frames),
+            "force_max": max(frame.force_max for frame in self.frames),
+            "stress_max": max(stress) if stress else None,
+            "force_scale": max(frame.force_scale for frame in self.frames),
+            "ok": self.ok,
+        }
+
+    def rows(self) -> list[dict[str, Any]]:
+        """A row per frame."""
+        narrow = self.precision != "float64"
+        return [
+            {
+                "frame": frame.frame,
+                "reference": self.reference,
+                "energy": frame.energy,
+                "energy, relative": frame.energy_rel,
+                "force, largest": frame.force_max,
+                "force, relative": frame.force_rel,
+                "stress, largest": frame.stress_max,
+                **(
+                    {"energy, roundings": frame.energy_roundings, "force, roundings": frame.force_roundings}
+                    if narrow
+                    else {}
+                ),
+                "against numpy": frame.energy_third,
+                "ambiguous pairs": frame.ambiguous,
+                "agrees": frame.ok,
+            }
+            for frame in self.frames
+        ]
+
+
+def check_energy(
+    subject: Any,
+    frames: Mapping[str, Atoms] | Sequence[Atoms] | None = None,
+    *,
+    judge: Reference | None = None,
+) -> EnergyReport:
+    """Compare energies, forces and stresses with ASE (or, where ASE has no class, with plain numpy).
+
+    Args:
+        subject: a `System`, or a `Simulation` built from one.
+        frames: positions and cells to compare at, by name or in order; default the initial frame and the
+            one after some steps, which a crystal needs to have forces at all.
+        judge: instead of the reference chosen by `ase_models.reference`.
+    Raises:
+        InputError: the system cannot be built.
+    """
+    simulation = build(subject) if isinstance(subject, System) else subject
+    system: System = simulation.system
+    judge = reference(system) if judge is None else judge
+    third = independent(system) if judge.is_ase and system.spec.potential.kind != "eam" else None
+    named = _named(frames, simulation)
+    calculator, other = judge.make(), third.make() if third else None
+    compared = tuple(
+        _compare(name, atoms, simulation, system, calculator, other) for name, atoms in named.items()
+    )
+    precision = narrowest(system)
+    return EnergyReport(
+        system.name,
+        judge.label,
+        judge.is_ase,
+        judge.conversion,
+        precision,
+        compared,
+        all(frame.ok for frame in compared),
+    )
+
+
+def narrowest(system: System) -> str:
+    """The narrowest float type among the roles that energies and forces depend on."""
+    precision = system.spec.precision
+    roles = (precision.state, precision.force, precision.accumulate)
+    return max(map(str, map(carrier, roles)), key=unit_roundoff)
+
+
+def _places(system: System) -> str:
+    """The narrowest float type of places: a force in sixteen bits has the displacements of the decision."""
+    precision = system.spec.precision
+    if precision.force in WIDE:
+        return narrowest(system)
+    return max(map(str, map(carrier, (precision.state, precision.decision))), key=unit_roundoff)
+
+
+def _named(frames: Mapping[str, Atoms] | Sequence[Atoms] | None, simulation: Any) -> dict[str, Atoms]:
+    if isinstance(frames, Mapping):
+        return dict(frames)
+    if frames is not None:
+        return {f"frame {number}": atoms for number, atoms in enumerate(frames)}
+    system: System = simulation.system
+    steps = min(SOME_STEPS, system.spec.dynamics.steps)
+    positions = simulation.positions
+    for positions, _, _ in _rollout(simulation, steps):  # noqa: B007 the last one counts
+        pass
+    later = system.atoms.copy()
+    later.set_positions(positions)
+    return {"initial": system.atoms, f"step {steps}": later}
+
+
+def _compare(
+    name: str, atoms: Atoms, simulation: Any, system: System, calculator: Any, other: Any
+) -> FrameComparison:
+    positions = atoms.get_positions()
+    if system.spec.precision.state == "float32":
+        positions = positions.astype(np.float32).astype(np.float64)  # both are to see what the state can hold
+    mine = simulation.evaluate(positions, np.asarray(atoms.cell))
+    stored = Atoms(numbers=atoms.numbers, positions=positions, cell=atoms.cell, pbc=system.atoms.pbc)
+    theirs = evaluate(calculator, stored)
+    third = evaluate(other, stored) if other is not None else None
+
+    scale = _Scales.of(system, simulation, stored, mine, theirs)
+    energy, energy_reference = float(mine.energy), theirs["energy"]
+    energy_rel = _over(abs(energy - energy_reference), max(abs(energy_reference), 1e-3 * scale.energy))
+    force_max = float(np.abs(np.asarray(mine.forces) - theirs["forces"]).max(initial=0.0))
+    stress_max = stress_rel = None
+    if theirs["stress"] is not None:
+        stress_max = float(np.abs(np.asarray(mine.stress) - theirs["stress"]).max())
+        stress_rel = _over(stress_max, scale.stress)
+    force_rel = _over(force_max, scale.force)
+    if narrowest(system) == "float64":
+        tolerance = ENERGY_PAIR if system.spec.cutoff is not None else ENERGY_MANY_BODY
+        ok = energy_rel <= tolerance and force_rel <= FORCE and (stress_rel is None or stress_rel <= FORCE)
+    else:
+        ok = (
+            abs(energy - energy_reference) <= ROUNDINGS * scale.energy_expected
+            and force_max <= ROUNDINGS * scale.force_expected
+        )
+    return FrameComparison(
+        name,
+        energy,
+        energy_reference,
+        energy_rel,
+        force_max,
+        scale.force,
+        force_rel,
+        stress_max,
+        stress_rel,
+        scale.energy_expected,
+        scale.force_expected,
+        _over(abs(energy - third["energy"]), max(abs(third["energy"]), 1e-3 * scale.energy))
+        if third
+        else None,
+        float(np.abs(np.asarray(mine.forces) - third["forces"]).max(initial=0.0)) if third else None,
+        scale.ambiguous,
+        ok,
+    )
+
+
+def _over(difference: float, scale: float) -> float:
+    """difference / scale, where equal is 0 whatever the scale."""
+    return 0.0 if difference == 0.0 else float(difference / scale) if scale > 0.0 else float("inf")
+
+
+@dataclass(frozen=True)
+class _Scales:
+    """What differences are measured against.
+
+    energy: sum of |energies|; force: largest force on an atom or along a pair; stress: virial without
+    cancellation over the volume; *_expected: what rounding lets expect.
+    """
+
+    energy: float
+    force: float
+    stress: float
+    energy_expected: float
+    force_expected: float
+    ambiguous: int
+
+    @classmethod
+    def of(
+        cls, system: System, simulation: Any, atoms: Atoms, mine: Any, theirs: Mapping[str, Any]
+    ) -> _Scales:
+        """Scales of a frame; pair by pair where there are pairs, else from the totals."""
+        unit, places = unit_roundoff(narrowest(system)), unit_roundoff(_places(system))
+        largest_force = float(np.abs(theirs["forces"]).max(initial=0.0))
+        volume = atoms.get_volume() if atoms.cell.rank == 3 else float("inf")
+        positions, cell = atoms.get_positions(), np.asarray(atoms.cell)
+        # a displacement is a difference of coordinates of this size, each rounded once or twice
+        shift = rounding_bound(positions, cell, 0.0, unit_roundoff=places) / 8.0
+        i, j, r = (np.asarray(array) for array in (mine.i, mine.j, mine.distance))
+        if system.spec.cutoff is None:
+            # many-body potentials need not split their energy by atom
+            split = theirs["energies"]
+            energies = float(np.abs(theirs["energy"] if split is None else split).sum())
+            force = max(largest_force, _over(energies / max(len(atoms), 1), float(r.min(initial=np.inf))))
+            stress = force * float(r.sum()) / volume
+            # many-body terms are steep: a bond's stiffness is about force scale per tenth of its length
+            stiff = 10.0 * force / max(float(r.mean()) if len(r) else 1.0, 1e-300)
+            return cls(
+                energies,
+                force,
+                stress,
+                4.0 * unit * energies + shift * largest_force * np.sqrt(len(atoms)),
+                8.0 * unit * force + 4.0 * shift * stiff,
+                0,
+            )
+        if places < unit:
+            # the distance itself is rounded, too
+            shift = shift + unit * r
+        model = PairModel(pair_forms(system.spec, system.species))
+        edges = Edges(np.array(atoms.get_chemical_symbols()), i, j, np.zeros((len(i), 3)), r)
+        energies, forces, stiffness = np.zeros(len(i)), np.zeros(len(i)), np.zeros(len(i))
+        for form, rows in model.groups(edges):
+            u, du = form(r[rows])
+            step = 1e-4 * form.r_cut
+            energies[rows], forces[rows] = np.abs(u), np.abs(du)
+            stiffness[rows] = np.abs(form(r[rows] + step)[1] - form(r[rows] - step)[1]) / (2 * step)
+        per_atom = np.zeros(len(atoms))
+        np.add.at(per_atom, i, (stiffness * shift) ** 2 + (12.0 * unit * forces) ** 2)
+        np.add.at(per_atom, j, (stiffness * shift) ** 2 + (12.0 * unit * forces) ** 2)
+        summed = np.zeros(len(atoms))
+        np.add.at(summed, i, energies)
+        # rounding of the terms adds at random, rounding of the running sums with their size
+        energy_expected = np.sqrt(
+            ((forces * shift) ** 2).sum() + ((12.0 * unit * energies) ** 2).sum() + (unit * summed.sum()) ** 2
+        )
+        force = max(largest_force, float(forces.max(initial=0.0)))
+        return cls(
+            float(energies.sum()),
+            force,
+            float((forces * r).sum()) / volume,
+            float(energy_expected),
+            float(np.sqrt(per_atom.max(initial=0.0))) + 4.0 * unit * force,
+            _ambiguous(model, atoms, places),
+        )
+
+
+def _ambiguous(model: PairModel, atoms: Atoms, unit: float) -> int:
+    """Pairs within rounding of their cutoff, counted as inside or not."""
+    bound = rounding_bound(atoms.get_positions(), np.asarray(atoms.cell), model.reach, unit_roundoff=unit)
+    edges = edges_of(atoms, model.reach + bound)
+    once = edges.i < edges.j
+    radius = np.zeros(len(edges.i))
+    for a, b in model.forms:
+        chosen = (edges.symbols[edges.i] == a) & (edges.symbols[edges.j] == b)
+        radius[chosen] = model.forms[a, b].r_cut
+    return int((once & (np.abs(edges.r - radius) <= bound)).sum())
+
+
+def _rollout(simulation: Any, steps: int) -> Iterator[tuple[ndarray, ndarray, float]]:
+    """Unwrapped positions, velocities (atoms, 3) and potential energy of every step from 0 on."""
+    from mdnum.rollout.engine import Engine, unwrapped
+
+    for segment in Engine(simulation, steps).segments():
+        potential = segment.rows_of("potential")
+        for row in range(segment.rows):
+            x = np.asarray(segment.unsorted("x", row), np.float64)
+            x = unwrapped(simulation.cell.matrix, x, segment.unsorted("images", row))
+            yield x, np.asarray(segment.unsorted("v", row), np.float64), float(potential[row])
+
+
+AGREEMENT = {"float64": 1e-9, "float32": 1e-2, "float16": 1e-1, "bfloat16": 1e-1}
+"""Largest deviation of a position after 100 steps, in units of r_cut.
+
+Rounding starts near 1e-16 (6e-8) and chaos multiplies it, by e³ per LJ time in a liquid; five orders of
+magnitude are left for that. A wrong force or time step shows at 1e-6 or more within ten steps.
+"""
+
+_SUDDEN = 100.0  # growth of the deviation within one step that chaos cannot do
+
+
+@dataclass(frozen=True)
+class DynamicsReport:
+    """Two trajectories from one start.
+
+    Attributes:
+        system: name.
+        reference: whose forces ASE's VelocityVerlet used.
+        is_ase: whether those were a class of ASE.
+        precision: narrowest float type of mdnum's run.
+        steps: steps taken.
+        position: largest deviation of a coordinate at each step (length), from step 0.
+        velocity: largest deviation of a velocity component at each step (length per internal time).
+        energy: deviation of the potential energy at each step.
+        growth: factor by which the position deviation grew per step over the second half.
+        sudden: first step at which it grew a hundredfold at once, which a decision at a cutoff can do and
+            chaos cannot; None where it did not.
+        r_cut: unit of the tolerance.
+        tolerance: of the position at the last step, length.
+        ok: within tolerance at the last step.
+    """
+
+    system: str
+    reference: str
+    is_ase: bool
+    precision: str
+    steps: int
+    position: tuple[float, ...]
+    velocity: tuple[float, ...]
+    energy: tuple[float, ...]
+    growth: float
+    sudden: int | None
+    r_cut: float
+    tolerance: float
+    ok: bool
+
+    def rows(self) -> list[dict[str, Any]]:
+        """A row for about ten of the steps."""
+        shown = np.unique(np.linspace(0, self.steps, 11).round().astype(int))
+        return [
+            {
+                "step": int(step),
+                "position, largest": self.position[step],
+                "velocity, largest": self.velocity[step],
+                "energy": self.energy[step],
+            }
+            for step in shown
+        ]
+
+
+def check_dynamics(system: System, steps: int = 100, *, judge: Reference | None = None) -> DynamicsReport:
+    """Compare a rollout with ASE's velocity Verlet, from the same positions and velocities.
+
+    A Langevin system is run without its bath. A hard cutoff has the forces of ASE's shifted one, so the
+    trajectories must agree although the energies have different zeros.
+
+    Args:
+        system: what to run.
+        steps: how many steps.
+        judge: whose forces; default ASE's class, or plain numpy where ASE has none or needs minutes.
+    """
+    system = _without_bath(system)
+    judge = _forces(system) if judge is None else judge
+    simulation = build(system)
+    narrow = system.spec.precision.state == "float32"
+    start = simulation.positions.astype(np.float32).astype(np.float64) if narrow else simulation.positions
+    atoms = Atoms(
+        numbers=system.atoms.numbers,
+        positions=start,
+        cell=system.atoms.cell,
+        pbc=system.atoms.pbc,
+        masses=simulation.masses,
+    )
+    atoms.set_velocities(simulation.velocities)
+    atoms.calc = judge.make()
+    integrator = VelocityVerlet(atoms, timestep=system.spec.dynamics.timestep * system.units.time_factor)
+
+    position, velocity, energy = [], [], []
+    for step, (x, v, potential) in enumerate(_rollout(simulation, steps)):
+        if step:
+            integrator.run(1)
+        position.append(float(np.abs(x - atoms.positions).max()))
+        velocity.append(float(np.abs(v - atoms.get_velocities()).max()))
+        energy.append(abs(potential - float(atoms.get_potential_energy())))
+    precision = narrowest(system)
+    tolerance = AGREEMENT[precision] * simulation.r_cut
+    ok = len(position) == steps + 1 and position[-1] <= tolerance
+    sudden = _sudden(position, floor=1e-13 * simulation.r_cut if not narrow else 1e-5 * simulation.r_cut)
+    return DynamicsReport(
+        system.name,
+        judge.label,
+        judge.is_ase,
+        precision,
+        steps,
+        tuple(position),
+        tuple(velocity),
+        tuple(energy),
+        _growth(position),
+        sudden,
+        simulation.r_cut,
+        tolerance,
+        ok,
+    )
+
+
+def _without_bath(system: System) -> System:
+    dynamics = system.spec.dynamics
+    if isinstance(dynamics, schema.NVETable):
+        return system
+    shared = dynamics.model_dump(exclude={"kind", "friction"})
+    nve = schema.NVETable(kind="nve", **shared)
+    return replace(system, spec=system.spec.model_copy(update={"dynamics": nve}))
+
+
+def _forces(system: System) -> Reference:
+    """ASE's class where a step takes it a tenth of a second; Tersoff and sums over species take more."""
+    judge = reference(system)
+    slow = system.spec.potential.kind == "tersoff" or len(system.species) > 1
+    return independent(system) if slow and system.spec.potential.kind != "eam" else judge
+
+
+def _sudden(position: list[float], floor: float) -> int | None:
+    for step in range(2, len(position)):
+        if position[step] > _SUDDEN * max(position[step - 1], floor):
+            return step
+    return None
+
+
+def _growth(position: list[float]) -> float:
+    """Factor per step, from a line through log(deviation) over the second half."""
+    tail = np.array(position[len(position) // 2 :])
+    if len(tail) < 3 or not (tail > 0).all():
+        return 1.0
+    return float(np.exp(np.polyfit(np.arange(len(tail)), np.log(tail), 1)[0]))

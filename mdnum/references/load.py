@@ -1,0 +1,204 @@
+"""A Python object by words: `package.module:thing(argument=value)`, or `file.py:thing(argument=value)`.
+
+A module is imported, a file is run, a name is looked up, and it is called where arguments are given. These
+are literals; nothing else is evaluated.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import importlib.util
+import itertools
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from mdnum.errors import InputError
+from mdnum.registry import nearest
+from mdnum.safe_path import search_last
+
+_counter = itertools.count()
+
+
+@dataclass(frozen=True)
+class NamedObject:
+    """Where an object is, by the words of a person.
+
+    Attributes:
+        text: the words.
+        home: a module, or the path of a Python file.
+        call: what stands after the colon: a dotted name, with literal arguments or without; may be empty
+            for a file.
+    """
+
+    text: str
+    home: str
+    call: str
+
+    @property
+    def is_file(self) -> bool:
+        """Whether the home is a file, which is run, rather than a module, which is imported."""
+        return self.home.endswith(".py")
+
+    @property
+    def name(self) -> str:
+        """The last part of the dotted name, without arguments; the stem of the file where there is none."""
+        return self.call.partition("(")[0].rpartition(".")[2].strip() or Path(self.home).stem
+
+    def find(self, defaults: Sequence[str] = (), anew: bool = False) -> Any:
+        """The object.
+
+        Args:
+            defaults: names to look for in a file after which none stands.
+            anew: run a file again, so that two objects of it share nothing.
+
+        Raises:
+            InputError: there is no such module, file or name, an argument is no literal, or importing or
+                calling it failed; with what to write instead.
+        """
+        module = self._run(anew) if self.is_file else self._import()
+        if not self.call:
+            return self._default(module, defaults)
+        try:
+            node = ast.parse(self.call, mode="eval").body
+        except SyntaxError:
+            raise self._wrong(
+                f"{self.call!r} is not a name with arguments", "Write thing(argument=value)"
+            ) from None
+        if not isinstance(node, ast.Call):
+            return self._attribute(node, module)
+        target = self._attribute(node.func, module)
+        arguments = [self._literal(argument) for argument in node.args]
+        if any(keyword.arg is None for keyword in node.keywords):
+            raise self._wrong("** cannot be used here", "Write the arguments out")
+        keywords: Any = {keyword.arg: self._literal(keyword.value) for keyword in node.keywords}
+        if not callable(target):
+            raise self._wrong(f"{self.name} cannot be called", "Leave the parentheses out")
+        try:
+            return target(*arguments, **keywords)
+        except Exception as error:
+            raise self._wrong(f"making it failed: {described(error)}", "Correct the arguments") from error
+
+    def source(self) -> tuple[str, str]:
+        """(lines that import the name, an expression that is the object), for a script without mdnum."""
+        first = self.call.partition("(")[0].partition(".")[0].strip()
+        if not self.is_file:
+            return f"from {self.home} import {first}\n", self.call
+        path = Path(self.home).expanduser().resolve()
+        lines = f"import sys\nsys.path.insert(0, {str(path.parent)!r})\nfrom {path.stem} import {first}\n"
+        return lines, self.call
+
+    def _wrong(self, message: str, remedy: str) -> InputError:
+        return InputError(message, where=self.text, remedy=remedy)
+
+    def _import(self) -> ModuleType:
+        try:
+            search_last(".", self.home)  # a module beside the person is found, too
+            return importlib.import_module(self.home)
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:  # whatever a module raises while it is imported, SystemExit too
+            raise self._not_imported(error) from error
+
+    def _run(self, anew: bool) -> ModuleType:
+        path = Path(self.home).expanduser()
+        if not path.is_file():
+            raise InputError("no such file", where=self.home, remedy="Give the path of a Python file")
+        name = f"_mdnum_{path.stem}_{next(_counter)}" if anew else path.stem
+        spec = importlib.util.spec_from_file_location(name, path)
+        assert spec is not None and spec.loader is not None  # of every file that ends in .py
+        module = importlib.util.module_from_spec(spec)
+        sys.modules.setdefault(name, module)  # dataclasses and pickles look a module up by its name
+        try:
+            # it can import its neighbors; unlike with `python file.py`, none of them hides a package
+            search_last(path.parent)
+            spec.loader.exec_module(module)
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:
+            if sys.modules.get(name) is module:
+                del sys.modules[name]
+            raise self._not_imported(error) from error
+        return module
+
+    def _not_imported(self, error: BaseException) -> InputError:
+        remedy = "Correct what it does when it is imported"
+        if isinstance(error, ImportError):
+            missing = getattr(error, "name", None)
+            remedy = f"Install {missing}, or correct the name" if missing else "Install what it needs"
+        elif isinstance(error, SyntaxError):
+            remedy = "Correct that line"
+        return InputError(f"cannot be imported: {described(error)}", where=self.home, remedy=remedy)
+
+    def _default(self, module: ModuleType, defaults: Sequence[str]) -> Any:
+        for name in defaults:
+            if hasattr(module, name):
+                return getattr(module, name)
+        names = public(module)
+        lacks = f", which has no {' or '.join(defaults)}" if defaults else ", and not a thing in it"
+        remedy = (
+            f"Give {self.home}:{names[0]}. It has {', '.join(names[:8])}" if names else "It has no function"
+        )
+        raise InputError(f"{self.home} is a file{lacks}", remedy=remedy)
+
+    def _attribute(self, node: ast.expr, module: ModuleType) -> Any:
+        """The object that a dotted name means."""
+        parts: list[str] = []
+        while isinstance(node, ast.Attribute):
+            parts.append(node.attr)
+            node = node.value
+        if not isinstance(node, ast.Name):
+            raise self._wrong(
+                "only a name, with literal arguments, can stand after the colon",
+                "Write a Python file, and name it",
+            )
+        value, where = module, self.home
+        for part in reversed([*parts, node.id]):
+            if not hasattr(value, part):
+                names = public(value)
+                close = nearest(part, names)
+                has = (
+                    f"It has {', '.join(names[:8])}" if names else "It has no function: give the name of one"
+                )
+                raise InputError(
+                    f"{where} has no {part!r}", remedy=f"Did you mean {close}?" if close else has
+                )
+            value, where = getattr(value, part), f"{where}.{part}"
+        return value
+
+    def _literal(self, node: ast.expr) -> Any:
+        try:
+            return ast.literal_eval(node)
+        except (ValueError, TypeError, SyntaxError):
+            raise self._wrong(
+                f"the argument {ast.unparse(node)} is not a literal (a number, text, True, a list, ...)",
+                "For anything more, write a Python file that makes it, and name the file",
+            ) from None
+
+
+def place(text: str) -> NamedObject | None:
+    """Where words say that an object is; None where they name neither a file nor, by a colon, a module."""
+    text = text.strip()
+    head, separator, call = text.partition(".py:")
+    if separator:
+        return NamedObject(text, f"{head}.py", call.strip())
+    if text.endswith(".py"):
+        return NamedObject(text, text, "")
+    home, colon, call = text.partition(":")
+    return NamedObject(text, home.strip(), call.strip()) if colon and home and call else None
+
+
+def public(scope: Any) -> list[str]:
+    """Names of what can be called in a module or a class."""
+    scope = scope if isinstance(scope, ModuleType | type) else type(scope)
+    return [name for name in vars(scope) if name[0] != "_" and callable(getattr(scope, name, None))]
+
+
+def described(error: BaseException) -> str:
+    """An exception in one line."""
+    words = " ".join(str(error).split())[:300]
+    return f"{type(error).__name__}: {words}" if words else type(error).__name__

@@ -1,0 +1,459 @@
+"""`mdnum check pairs`: the pairs of neighbor searches against brute force, and where each stops counting."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from ase import Atoms
+from ase.cell import Cell as AseCell
+from numpy import ndarray
+
+from mdnum import systems
+from mdnum.references.conformance.answer import read
+from mdnum.references.conformance.case import once
+from mdnum.references.conformance.lists import ListLimits, PairList
+from mdnum.references.conformance.loading import known
+from mdnum.references.oracle import PairSet, all_pairs, completed, exactly_inside, rounding_bound
+from mdnum.systems import System
+
+AGREES, AT_THE_CUTOFF, DIFFERS, FAILED, NOT_ASKED = (
+    "agrees",
+    "differs at the cutoff",
+    "differs",
+    "failed",
+    "not asked",
+)
+_SINGLE = 2.0**-24
+_NEARBY = 3  # ulps either side of r_cut in which oriented pairs are placed
+
+
+@dataclass(frozen=True)
+class Search:
+    """A neighbor list, asked for pairs as a careful user would: in a box and with atoms as it wants them.
+
+    Attributes:
+        listed: the list, made anew at every question.
+    """
+
+    listed: PairList
+
+    @property
+    def name(self) -> str:
+        """Of the list."""
+        return self.listed.name
+
+    @property
+    def ours(self) -> bool:
+        """Whether a run stands on it: it is mdnum's."""
+        return self.listed.package == "mdnum"
+
+    @property
+    def unit(self) -> float:
+        """Roundoff of its arithmetic."""
+        return self.listed.unit or 2.0**-53
+
+    @cached_property
+    def _call(self) -> Callable[..., Any]:
+        return self.listed.make()
+
+    @cached_property
+    def _full(self) -> bool:
+        """Whether it lists every pair from both of its atoms."""
+        if self.listed.full is not None:
+            return self.listed.full
+        pair, cell, pbc = np.array([[0.0, 0, 0], [0.5, 0, 0]]), 4.0 * np.eye(3), np.ones(3, bool)
+        if self.listed.limits.free:
+            cell, pbc = np.zeros((3, 3)), np.zeros(3, bool)
+        return len(read(self._call(pair, cell, pbc, 1.0))) > 1
+
+    def refusal(self, positions: ndarray, cell: ndarray, pbc: ndarray, r_cut: float) -> str | None:
+        """Why it cannot be asked about these atoms, or None when it can."""
+        if self.listed.version is None:
+            return "not installed"
+        positions, cell = self._placed(positions, cell, pbc)
+        return self.listed.limits.refusal(once("", "few", positions, cell, pbc.tolist(), r_cut))
+
+    def pairs(self, positions: ndarray, cell: ndarray, pbc: ndarray, r_cut: float) -> tuple[ndarray, ndarray]:
+        """(i, j) of the pairs within r_cut, one row for each image, i <= j."""
+        positions, cell = self._placed(np.asarray(positions, float), np.asarray(cell, float), pbc)
+        answer = read(self._call(positions, cell, np.array(pbc), float(r_cut)))
+        i, j = np.minimum(answer.i, answer.j), np.maximum(answer.i, answer.j)
+        if self._full:
+            # half of the rows of each pair
+            order = np.lexsort((j, i))[::2]
+            i, j = i[order], j[order]
+        return i, j
+
+    def _placed(self, positions: ndarray, cell: ndarray, pbc: ndarray) -> tuple[ndarray, ndarray]:
+        """Positions and cell in the form that the list wants, with the same distances."""
+        limits = self.listed.limits
+        positions, cell = np.array(positions), np.where(np.asarray(pbc)[:, None], cell, 0.0)
+        if limits.whole_cell and pbc.any():
+            cell = completed(cell, pbc)
+        if pbc.all() and (
+            (limits.lower_triangular and np.count_nonzero(np.triu(cell, 1)))
+            or (limits.right_handed and np.linalg.det(cell) < 0)
+        ):
+            standard = np.asarray(AseCell(cell).standard_form()[0])
+            positions, cell = positions @ np.linalg.solve(cell, standard), standard
+        # jax-md loses pairs of atoms outside of the box, which `mdnum conform` reports
+        wraps = limits.wrapped or limits.along_axes or self.listed.package == "jax-md"
+        if wraps and pbc.any():
+            full = completed(cell, pbc)
+            fraction = positions @ np.linalg.inv(full)
+            positions = positions - np.where(pbc, np.floor(fraction), 0.0) @ full
+            # an atom a hair below a face is wrapped onto the one across, by rounding
+            over = pbc & (positions @ np.linalg.inv(full) >= 1.0)
+            positions = np.where(over, 0.0, positions) if limits.along_axes else positions
+        return positions, cell
+
+
+def all_searches(system: System) -> tuple[Search, ...]:
+    """mdnum's own searches with the convention of a system, and those of libraries."""
+    own = own_searches(system)
+    return (*own, *(Search(one) for one in known() if not one.kept and one.package != "mdnum"))
+
+
+def own_searches(system: System) -> tuple[Search, ...]:
+    """What mdnum uses for this system.
+
+    "mdnum force loop" is the set of decisions that multiply the forces, out of jit. The other two are its
+    list builders with the same decision made on the host.
+    """
+    compare = system.spec.cutoff.compare if system.spec.cutoff is not None else "r <"
+    dtype = system.spec.precision.decision
+    unit = _SINGLE if "float32" in (dtype, system.spec.precision.state) else 2.0**-53
+
+    def own(name: str, search: Callable[..., Any], affords: float = 1.0) -> Search:
+        limits = ListLimits(minimum_image=True)
+        return Search(
+            PairList(
+                name, lambda: search, package="mdnum", full=False, unit=unit, limits=limits, affords=affords
+            )
+        )
+
+    return (
+        own("mdnum force loop", _force_loop(system)),
+        own("mdnum, host list", _listed("host", compare, dtype)),
+        own("mdnum, jax-md list", _listed("jax-md", compare, dtype), affords=0),
+    )
+
+
+def _force_loop(system: System) -> Callable[..., Any]:
+    built: dict[Any, Any] = {}
+
+    def search(positions: ndarray, cell: ndarray, pbc: ndarray, r_cut: float) -> Any:
+        key = (len(positions), pbc.tobytes(), r_cut)
+        if key not in built:
+            built[key] = systems.build(_variant(system, positions, cell, pbc, r_cut))
+        evaluation = built[key].evaluate(positions, cell)
+        return np.asarray(evaluation.i), np.asarray(evaluation.j)
+
+    return search
+
+
+def _variant(system: System, positions: ndarray, cell: ndarray, pbc: ndarray, r_cut: float) -> System:
+    """The system itself, or two atoms of it with r_cut for all pairs, without a skin to ask for room."""
+    spec = system.spec
+    spec = spec.model_copy(update={"neighbors": spec.neighbors.model_copy(update={"skin": 0.0})})
+    if len(positions) == len(system.atoms):
+        atoms = Atoms(numbers=system.atoms.numbers, positions=positions, cell=cell, pbc=pbc)
+        return replace(system, spec=spec, atoms=atoms)
+    # the pair of species whose radius r_cut is; a pair at the cutoff is far from any core
+    a = b = 0
+    if spec.cutoff is not None:
+        radius, _ = systems.pairs.cutoff_radii(spec, system.species)
+        a, b = np.argwhere(radius == r_cut)[0]
+    atoms = Atoms([system.species[a], system.species[b]], positions=positions, cell=cell, pbc=pbc)
+    return replace(system, spec=spec, atoms=atoms)
+
+
+def _listed(builder: str, compare: str, dtype: str) -> Callable[..., Any]:
+    def search(positions: ndarray, cell: ndarray, pbc: ndarray, r_cut: float) -> Any:
+        from mdnum.md.cell import Cell, displacement, wrap_positions
+        from mdnum.md.decide import PairDecider
+        from mdnum.md.neighbors import BUILDERS, RebuildRule, VerletList
+
+        box = Cell.create(cell, pbc)  # type: ignore[arg-type]  (one flag or one per axis)
+        wrapped, _ = wrap_positions(box, positions)
+        rows = VerletList(BUILDERS[builder], RebuildRule(0.0), r_cut).build(wrapped, box).unsorted()
+        i, slot = np.nonzero(rows < len(positions))
+        j = rows[i, slot]
+        i, j = i[i < j], j[i < j]
+        decider = PairDecider((r_cut,), compare, dtype)
+        quantity = decider.host_quantity(*displacement(box, wrapped[i], wrapped[j], getattr(np, dtype)))
+        threshold = decider.thresholds[0].value
+        keep = quantity <= threshold if compare.endswith("<=") else quantity < threshold
+        return i[keep], j[keep]
+
+    return search
+
+
+@dataclass(frozen=True)
+class SearchResult:
+    """What one search found.
+
+    Attributes:
+        name, version: which search.
+        verdict: "agrees"; "differs at the cutoff": only within its own rounding; "differs"; "failed";
+            "not asked": see note.
+        pairs: pairs found inside the cutoff.
+        missing: pairs of the oracle that it does not have, beyond its rounding.
+        extra: pairs that the oracle does not have, beyond its rounding.
+        borderline: pairs decided otherwise than by real arithmetic, within its rounding.
+        effective: the cutoff it acts on.
+        seconds: time of the first search, compiling included.
+        ours: whether it is mdnum's own, on which a run depends.
+        note: why it was not asked, or how it failed.
+    """
+
+    name: str
+    version: str | None
+    verdict: str
+    pairs: int = 0
+    missing: int = 0
+    extra: int = 0
+    borderline: int = 0
+    effective: EffectiveCutoff | None = None
+    seconds: float = 0.0
+    ours: bool = False
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class PairsReport:
+    """The pair sets of all searches against the oracle.
+
+    Attributes:
+        system: name.
+        compare: what inside means in this system.
+        r_cut: longest cutoff radius.
+        pairs: pairs inside, by real arithmetic.
+        decided_exactly: pairs so close to a cutoff that float64 could not decide.
+        results: one per search.
+    """
+
+    system: str
+    compare: str
+    r_cut: float
+    pairs: int
+    decided_exactly: int
+    results: tuple[SearchResult, ...]
+
+    @property
+    def ok(self) -> bool:
+        """Whether mdnum's own searches agree, except within rounding."""
+        return all(one.verdict in (AGREES, AT_THE_CUTOFF, NOT_ASKED) for one in self.results if one.ours)
+
+    def rows(self) -> list[dict[str, Any]]:
+        """A row per search."""
+        return [
+            {
+                "search": one.name,
+                "version": one.version,
+                "pairs": None if one.note else one.pairs,
+                "missing": None if one.note else one.missing,
+                "extra": None if one.note else one.extra,
+                "borderline": None if one.note else one.borderline,
+                "stops counting": one.effective.stops if one.effective else None,
+                "compares": one.effective.comparison if one.effective else None,
+                "ms, first call": None if one.note else round(1e3 * one.seconds, 2),
+                "verdict": one.note or one.verdict,
+            }
+            for one in self.results
+        ]
+
+
+def check_pairs(
+    system: System,
+    *,
+    searches: Sequence[Search] | None = None,
+    positions: ndarray | None = None,
+    effective: bool = True,
+) -> PairsReport:
+    """Compare the pairs that every search finds inside the cutoff with brute force.
+
+    A system with a radius for each pair of species asks a search once per radius and keeps the pairs it
+    applies to. The oracle follows the comparison of the system file (`<` or `<=`), decided in rational
+    arithmetic near the threshold; a search that decides such a pair otherwise is "at the cutoff", which is
+    rounding or convention and not an error.
+
+    Args:
+        system: what to check.
+        searches: default: mdnum's own and those of every library that is installed.
+        positions: instead of the system's own.
+        effective: also bisect each search's effective cutoff.
+    """
+    x: ndarray = system.atoms.get_positions() if positions is None else np.asarray(positions, dtype=float)
+    cell, pbc, species = np.asarray(system.atoms.cell), np.asarray(system.atoms.pbc), system.species_index
+    compare = system.spec.cutoff.compare if system.spec.cutoff is not None else "r <"
+    # each cutoff radius with the pairs of species it is for, as a square table of booleans
+    radius = np.full((len(system.species),) * 2, system.r_cut)
+    if system.spec.cutoff is not None:
+        radius, _ = systems.pairs.cutoff_radii(system.spec, system.species)
+    groups = [(float(value), radius == value) for value in np.unique(radius)[::-1]]
+    truth = []
+    for value, chosen in groups:
+        found = all_pairs(x, cell, pbc, value, closed=compare.endswith("="), reach=value * (1 + 1e-4))
+        truth.append(found.select(chosen[species[found.i], species[found.j]]))
+
+    def ask(search: Search) -> SearchResult:
+        result = SearchResult(search.name, search.listed.version, NOT_ASKED, ours=search.ours)
+        if note := search.refusal(x, cell, pbc, groups[0][0]):
+            return replace(result, note=note)
+        counts, pairs, seconds = np.zeros(3, int), 0, 0.0
+        try:
+            for (value, chosen), right in zip(groups, truth, strict=True):
+                begin = time.perf_counter()
+                i, j = search.pairs(x, cell, pbc, value)
+                seconds += time.perf_counter() - begin
+                keep = chosen[species[i], species[j]]
+                bound = rounding_bound(x, cell, value, unit_roundoff=search.unit)
+                counts += compare_pairs(i[keep], j[keep], right, value, bound)
+                pairs += int(keep.sum())
+            stops = effective_cutoff(search, groups[0][0], periodic=bool(pbc.all())) if effective else None
+        except Exception as error:  # another library's search may fail in any way; that is a result
+            if search.ours:  # a defect to see whole
+                raise
+            note = f"failed: {type(error).__name__}: {error}"
+            return replace(result, verdict=FAILED, note=note)
+        missing, extra, borderline = counts.tolist()
+        verdict = DIFFERS if missing or extra else AT_THE_CUTOFF if borderline else AGREES
+        return SearchResult(
+            search.name, search.listed.version, verdict, pairs, missing, extra, borderline, stops, seconds,
+            search.ours,
+        )  # fmt: skip
+
+    return PairsReport(
+        system.name,
+        compare,
+        groups[0][0],
+        sum(int(pairs.inside.sum()) for pairs in truth),
+        sum(int(pairs.exact.sum()) for pairs in truth),
+        tuple(map(ask, all_searches(system) if searches is None else searches)),
+    )
+
+
+def compare_pairs(i: ndarray, j: ndarray, right: PairSet, r_cut: float, bound: float) -> tuple[int, int, int]:
+    """(missing, extra, borderline) of a search's pairs against the oracle's.
+
+    Args:
+        i, j: the search's pairs, i <= j, one row per image.
+        right: the oracle's, listed somewhat beyond the cutoff.
+        r_cut: cutoff.
+        bound: how far the search's distances may be off; differing decisions on pairs this close to r_cut
+            are borderline.
+    """
+
+    def counted(i: ndarray, j: ndarray) -> Counter[tuple[int, int]]:
+        return Counter(zip(i.tolist(), j.tolist(), strict=True))
+
+    found = counted(i, j)
+    expected = counted(right.i[right.inside], right.j[right.inside])
+    close = np.abs(right.distance - r_cut) <= bound
+    tolerated = counted(right.i[close], right.j[close])
+    lost, phantom = expected - found, found - expected
+    missing, extra = (lost - tolerated).total(), (phantom - tolerated).total()
+    return missing, extra, lost.total() + phantom.total() - missing - extra
+
+
+@dataclass(frozen=True)
+class EffectiveCutoff:
+    """The cutoff a search acts on, when asked for r_cut.
+
+    Attributes:
+        r_cut: the cutoff asked for.
+        last_counted: largest distance along x at which the pair is still counted.
+        ulps: last_counted - r_cut in units of r_cut's last place; -1 for an exact "<", 0 for an exact "<=".
+        comparison: "<" or "<=", with "in float32" where the numbers are cast to it; else "rounded".
+        oriented: pairs placed within 3 ulps of r_cut in random directions.
+        disagree: those of them decided otherwise than real arithmetic does with r < r_cut.
+    """
+
+    r_cut: float
+    last_counted: float
+    ulps: int
+    comparison: str
+    oriented: int
+    disagree: int
+
+    @property
+    def stops(self) -> str:
+        """Where the search stops counting, in words."""
+        if abs(self.ulps) < 1000:
+            return f"{self.ulps:+d} ulp"
+        return f"{self.last_counted / self.r_cut - 1:+.1e} relative"
+
+
+def effective_cutoff(
+    search: Search, r_cut: float, *, periodic: bool = True, oriented: int | None = None, seed: int = 0
+) -> EffectiveCutoff:
+    """Bisect two-atom configurations to the last double that a search counts as inside r_cut.
+
+    The two atoms differ along x only and the first has x = 0, so their distance is the coordinate itself
+    and nothing is lost before the search sees it: what is measured is the search alone. In a periodic box
+    (5 r_cut wide) its own wrapping counts too.
+
+    Args:
+        search: what to ask.
+        r_cut: the cutoff to ask for.
+        periodic: in a periodic box, as in a simulation; else free atoms.
+        oriented: how many randomly oriented pairs to place within 3 ulps of r_cut; default what the
+            search can afford.
+        seed: of the orientations.
+    Error: none, doubles are walked over one by one in the end; it assumes that a search which counts a
+        distance counts the smaller ones (checked at relative distances of 1e-5).
+    """
+    oriented = round(min(100, 1200 * search.listed.affords)) if oriented is None else oriented
+    cell, pbc = np.eye(3) * (5.0 * r_cut if periodic else 0.0), np.full(3, periodic)
+
+    def counts(pair: ndarray) -> bool:
+        return len(search.pairs(pair, cell, pbc, r_cut)[0]) > 0
+
+    def counts_at(ordinal: int) -> bool:
+        return counts(np.array([[0.0, 0.0, 0.0], [_double(ordinal), 0.0, 0.0]]))
+
+    start = _ordinal(r_cut)
+    if not counts_at(_ordinal(r_cut * (1 - 1e-5))) or counts_at(_ordinal(r_cut * (1 + 1e-5))):
+        return EffectiveCutoff(r_cut, float("nan"), 0, "not a cutoff", 0, 0)
+    # most searches stop within an ulp of what they were asked for, so doubling steps end after two or three
+    sign, step = (1, 1) if counts_at(start) else (-1, 1)
+    while counts_at(start + sign * step) == (sign > 0):
+        step *= 2
+    first, last = sorted((start + sign * (step // 2), start + sign * step))
+    while last - first > 1:
+        middle = (first + last) // 2
+        first, last = (middle, last) if counts_at(middle) else (first, middle)
+    disagree = sum(
+        counts(pair) != exactly_inside(pair, np.zeros((3, 3)), 0, 1, (0, 0, 0), r_cut)
+        for pair in borderline_pairs(r_cut, oriented, seed)
+    )
+    comparison = {-1: "<", 0: "<="}.get(first - start, "rounded")
+    if comparison == "rounded" and search.unit > 2.0**-30:
+        single = int(np.float32(_double(first)).view(np.int32)) - int(np.float32(r_cut).view(np.int32))
+        comparison = {-1: "< in float32", 0: "<= in float32"}.get(single, comparison)
+    return EffectiveCutoff(r_cut, _double(first), first - start, comparison, oriented, disagree)
+
+
+def borderline_pairs(r_cut: float, count: int, seed: int) -> ndarray:
+    """Randomly oriented pairs within 3 ulps of r_cut: (count, 2, 3); the first atom is the origin."""
+    rng = np.random.default_rng(seed)
+    direction = rng.normal(size=(count, 3))
+    direction /= np.linalg.norm(direction, axis=1)[:, None]
+    length = r_cut + rng.uniform(-_NEARBY, _NEARBY, size=(count, 1)) * np.spacing(r_cut)
+    return np.stack([np.zeros((count, 3)), length * direction], axis=1)
+
+
+def _ordinal(x: float) -> int:
+    """Place of a positive double among the doubles."""
+    return int(np.float64(x).view(np.int64))
+
+
+def _double(ordinal: int) -> float:
+    return float(np.int64(ordinal).view(np.float64))

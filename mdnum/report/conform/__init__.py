@@ -1,1 +1,0 @@
-"""The page of a neighbor list that went through the conformance suite."""

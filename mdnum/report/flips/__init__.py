@@ -1,1 +1,0 @@
-"""Pages on anybody's trajectory: the flips of one, and where two part."""

@@ -1,1 +1,0 @@
-"""The report of a fork folder: two runs that differ in one choice, or every choice screened."""

@@ -1,1 +1,0 @@
-"""What a gradient folder says, to people."""

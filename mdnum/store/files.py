@@ -1,0 +1,366 @@
+"""How a file of a folder is opened: whole or not there, never through a link, a full disk in one line."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+import os
+import re
+import secrets
+import stat
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import BinaryIO, Literal
+
+from mdnum import __version__
+from mdnum.errors import FolderError
+
+#: Folders inside a folder; the folder itself may be a link, for that is the choice of whoever names it.
+SUBFOLDERS = ("parts", "figures", "structures")
+
+_REMEDIES = {
+    errno.ENOSPC: ("the disk is full", "Free some space, then {again}"),
+    errno.EDQUOT: ("the disk quota is used up", "Free some space, then {again}"),
+    errno.EFBIG: ("the file would pass the size limit", "Raise the limit, then {again}"),
+    errno.EACCES: ("permission denied", "Choose a folder that can be written to"),
+    errno.EPERM: ("permission denied", "Choose a folder that can be written to"),
+    errno.EROFS: ("the file system is read-only", "Choose a folder that can be written to"),
+    errno.ENOTDIR: ("a part of the path is a file, not a folder", "Choose another folder"),
+    errno.ENOENT: ("the folder is gone", "Do not move or remove a run folder while it is written"),
+}
+_MODES = {"rb": os.O_RDONLY, "r+b": os.O_RDWR, "ab": os.O_WRONLY | os.O_APPEND | os.O_CREAT}
+# a pipe that stands where a file should be must not be waited for
+_NO_LINK = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_NONBLOCK", 0)
+
+
+@contextmanager
+def disk_errors(path: Path) -> Iterator[None]:
+    """Turns what the operating system says about path into a FolderError with a remedy."""
+    from mdnum.store.files import resumable
+
+    try:
+        yield
+    except OSError as error:
+        seen, remedy = _REMEDIES.get(error.errno or 0, (error.strerror or str(error), None))
+        if remedy is not None:
+            again = any(map(resumable, (path, path.parent, path.parent.parent)))
+            remedy = remedy.format(again="continue with --resume" if again else "give the command again")
+        raise FolderError(f"cannot write: {seen}", remedy=remedy, where=str(path)) from error
+
+
+def opened(path: Path, mode: Literal["rb", "r+b", "ab"] = "rb") -> BinaryIO:
+    """Opens a file of a folder, which has to be a file and no link to one.
+
+    Args:
+        mode: "r+b" and "ab" write where the file is, so that a second name of it elsewhere is refused too.
+
+    Raises:
+        FolderError: it is a link, or no plain file. OSError: as `open`.
+    """
+    refuse_link(path, in_place=mode != "rb")
+    try:
+        handle = os.open(path, _MODES[mode] | _NO_LINK, 0o666)
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise _linked(path) from None
+        raise
+    _refuse(os.fstat(handle), path, mode != "rb", handle)
+    return os.fdopen(handle, mode)
+
+
+def refuse_link(path: Path, in_place: bool = False) -> None:
+    """Refuses a file of a folder that leads out of it; one that is not there is none.
+
+    Args:
+        in_place: whether it is to be written where it is.
+
+    Raises:
+        FolderError: it, or the folder inside the folder that it is in, is a link; or it is no plain file.
+    """
+    if path.parent.name in SUBFOLDERS and path.parent.is_symlink():
+        raise _linked(path.parent)
+    with suppress(FileNotFoundError, NotADirectoryError):
+        _refuse(os.lstat(path), path, in_place)
+
+
+def subfolder(root: Path, name: str) -> Path:
+    """A folder inside a folder, made where it is missing.
+
+    Raises:
+        FolderError: it is a link, or cannot be made.
+    """
+    path = root / name
+    if path.is_symlink():
+        raise _linked(path)
+    with disk_errors(path):
+        path.mkdir(exist_ok=True)
+    return path
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[BinaryIO]:
+    """A new file under a name that nobody foresees, moved to path at the end: a kill leaves old or new.
+
+    A link at path is replaced; what it led to stays as it is.
+    """
+    if path.parent.name in SUBFOLDERS and path.parent.is_symlink():
+        raise _linked(path.parent)
+    temporary = path.with_name(f".{secrets.token_hex(8)}.part")
+    with disk_errors(path):
+        try:
+            handle = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL | _NO_LINK, 0o666)
+            with os.fdopen(handle, "w+b") as file:
+                yield file
+                file.flush()
+                # without it a power cut may leave the new name on an empty file
+                os.fsync(file.fileno())
+            os.replace(temporary, path)
+        except BaseException:
+            with suppress(OSError):
+                temporary.unlink(missing_ok=True)
+            raise
+
+
+def write_bytes(path: Path, data: bytes | memoryview) -> None:
+    """Replaces a file of a folder by data; where the folder's manifest lists it, the manifest follows.
+
+    Raises:
+        FolderError: the disk is full, or the folder cannot be written; nothing is left behind.
+    """
+    from mdnum.store import files as manifest
+
+    # first both digests, then the file: it agrees with the manifest wherever a kill falls
+    manifest.foretell(path, manifest.digest_of(data))
+    with replacing(path) as file:
+        file.write(data)
+
+
+def write_text(path: Path, text: str) -> None:
+    """As write_bytes, UTF-8."""
+    write_bytes(path, text.encode())
+
+
+def read_text(path: Path) -> str:
+    """The text of a file of a folder; empty where it is not there.
+
+    Raises:
+        FolderError: it is a link, or not UTF-8.
+    """
+    try:
+        with opened(path) as file:
+            return file.read().decode("utf-8")
+    except (FileNotFoundError, NotADirectoryError):
+        return ""
+    except UnicodeDecodeError as error:
+        raise FolderError(
+            f"is damaged: not UTF-8 text ({error.reason} at byte {error.start})", where=str(path)
+        ) from error
+    except OSError as error:
+        raise FolderError(f"cannot be read: {error.strerror}", where=str(path)) from error
+
+
+def _refuse(seen: os.stat_result, path: Path, in_place: bool, handle: int | None = None) -> None:
+    refused = None
+    if stat.S_ISLNK(seen.st_mode):
+        refused = _linked(path)
+    elif not stat.S_ISREG(seen.st_mode):
+        refused = FolderError("is no plain file", remedy="Remove it, or use another folder", where=str(path))
+    elif in_place and seen.st_nlink > 1:
+        refused = FolderError(
+            "has a second name (a hard link), under which it would be changed too",
+            remedy="Put a copy in its place",
+            where=str(path),
+        )
+    if refused is not None:
+        if handle is not None:
+            os.close(handle)
+        raise refused
+
+
+def _linked(path: Path) -> FolderError:
+    return FolderError(
+        "is a link, and a folder's files are not looked for elsewhere",
+        remedy="Put a copy in its place if it is yours",
+        where=str(path),
+    )
+
+
+# --- manifest.json: what a folder is of, and a digest of every file in it that something is read from -
+
+NAME = "manifest.json"
+#: May be missing.
+ABSENT = ""
+_CHUNK = 1 << 20
+# listed from their first write on; scripts and structures among them, which a page or a person goes by
+_FROM_THE_FIRST = re.compile(r"answers\.json|summary\.json|reproduce[\w.-]*\.py|structures/[^/]+\.extxyz")
+# what a command goes on from, by the world of the folder
+_STATE = {"md": "checkpoint.npz", "audit": "answers.json", "conform": "answers.json"}
+_INSIDE = re.compile(rf"(({'|'.join(SUBFOLDERS)})/)?(?!\.{{1,2}}$)[^/\0]+")
+
+
+@dataclass
+class Manifest:
+    """A folder's manifest.
+
+    Attributes:
+        world: which tables the folder has, a key of `TABLES`.
+        finished: whether its writing came to an end.
+        files: digests that a file may have, by its name in the folder.
+        version: of the mdnum that began it.
+    """
+
+    world: str
+    finished: bool = False
+    files: dict[str, list[str]] = field(default_factory=dict)
+    version: str = __version__
+
+
+def digest_of(data: bytes | memoryview) -> str:
+    """Digest of the bytes of a file."""
+    return hashlib.blake2b(data, digest_size=16).hexdigest()
+
+
+def digest(path: Path) -> str:
+    """Digest of a file as it is; ABSENT where there is none."""
+    try:
+        with opened(path) as file:
+            return digest_of_file(file)
+    except FileNotFoundError:
+        return ABSENT
+
+
+def digest_of_file(file: BinaryIO) -> str:
+    """Digest of all bytes of an open file."""
+    file.seek(0)
+    found = hashlib.blake2b(digest_size=16)
+    while chunk := file.read(_CHUNK):
+        found.update(chunk)
+    return found.hexdigest()
+
+
+def load(root: Path) -> Manifest | None:
+    """The manifest of a folder; None where it has none (an older mdnum wrote none).
+
+    Raises:
+        FolderError: it is damaged.
+    """
+    path = root / NAME
+    text = read_text(path)
+    if not text and not path.exists():
+        return None
+    try:
+        held = json.loads(text)
+        stated = held.pop("digest")
+        if stated != digest_of(_canonical(held)):
+            raise ValueError("its digest is that of another text")
+        files = {str(name): [str(one) for one in allowed] for name, allowed in held["files"].items()}
+        # names of files in the folder, or in one of the folders in it
+        if not all(map(_INSIDE.fullmatch, files)):
+            raise ValueError("it lists files of elsewhere")
+        return Manifest(str(held["world"]), bool(held["finished"]), files, str(held["version"]))
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise FolderError(
+            "is damaged, so that the other files cannot be checked against it",
+            remedy="Restore the folder from a copy, or remove this file to read the others unchecked",
+            where=str(path),
+        ) from error
+
+
+def save(root: Path, made: Manifest) -> None:
+    """Replaces the manifest of a folder."""
+    held = {**asdict(made), "files": dict(sorted(made.files.items()))}
+    text = json.dumps({**held, "digest": digest_of(_canonical(held))}, indent=1)
+    with replacing(root / NAME) as file:
+        file.write(text.encode() + b"\n")
+
+
+def update(
+    root: Path, add: Mapping[str, list[str]], drop: Iterable[str] = (), finished: bool | None = None
+) -> None:
+    """Lists and forgets files; nothing where the folder has no manifest."""
+    made = load(root)
+    if made is None:
+        return
+    before = (dict(made.files), made.finished)
+    made.files |= add
+    for name in drop:
+        made.files.pop(name, None)
+    made.finished = made.finished if finished is None else finished
+    if (made.files, made.finished) != before:
+        save(root, made)
+
+
+def place(path: Path) -> tuple[Path, str]:
+    """(folder, name in it) of a file."""
+    if path.parent.name in SUBFOLDERS and not (path.parent / NAME).exists():
+        return path.parent.parent, f"{path.parent.name}/{path.name}"
+    return path.parent, path.name
+
+
+def foretell(path: Path, new: str) -> None:
+    """Lets a file that the manifest lists have a new digest, beside the one it has."""
+    root, name = place(path)
+    if name == NAME or not (root / NAME).exists():
+        return
+    made = load(root)
+    if made is None or (name not in made.files and not _FROM_THE_FIRST.fullmatch(name)):
+        return
+    known = made.files.get(name, [ABSENT])
+    now = digest(path)
+    allowed = [one for one in known if len(known) == 1 or one == now]
+    if new not in allowed:
+        made.files[name] = [*allowed, new]
+        save(root, made)
+
+
+def remove(path: Path) -> None:
+    """Removes a file of a folder, and from its manifest."""
+    root, name = place(path)
+    update(root, {}, [name])
+    path.unlink(missing_ok=True)
+
+
+def resumable(root: Path) -> bool:
+    """Whether the verb that made a folder would find something there to go on from."""
+    with suppress(FolderError, OSError):
+        made = load(root)
+        if made is None:
+            return any((root / name).exists() for name in _STATE.values())
+        return made.world in _STATE and (root / _STATE[made.world]).exists()
+    return False
+
+
+def listed_files(root: Path, names: Iterable[str]) -> dict[str, list[str]]:
+    """Digests of files as they are, those that are missing left out."""
+    return {name: [digest(root / name)] for name in names if os.path.lexists(root / name)}
+
+
+def _canonical(held: Mapping[str, object]) -> bytes:
+    return json.dumps(held, sort_keys=True, separators=(",", ":")).encode()
+
+
+# --- where a run goes when nobody says ----------------------------------------------------------------
+
+_RUNS = Path("runs")
+
+
+def default_folder(system: str, runs: Path = _RUNS) -> Path:
+    """runs/NAME-N with the system's name in dashes and the first N past those that exist.
+
+    Args:
+        system: a system's name, or the path of its file.
+        runs: the folder of run folders.
+    """
+    path = Path(system)
+    word = path.stem if path.suffix == ".toml" else system
+    slug = re.sub(r"[^A-Za-z0-9._]+", "-", word).strip("-.") or "run"
+    taken = re.compile(re.escape(slug) + r"-(\d+)")
+    numbers = [
+        int(match[1])
+        for entry in (runs.iterdir() if runs.is_dir() else ())
+        if (match := taken.fullmatch(entry.name))
+    ]
+    return runs / f"{slug}-{max(numbers, default=0) + 1}"

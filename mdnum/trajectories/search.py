@@ -1,0 +1,494 @@
+"""All pairs of a frame within a distance, images and all; the nearest few; and what two searches differ in.
+
+Distances in a search carry the rounding of wrapped coordinates. A pair closer to its threshold than a guard
+is decided again from the coordinates as stored (`lattice.square_of`), so every search decides alike.
+"""
+
+from __future__ import annotations
+
+import os
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from jaxtyping import Float, Int
+
+from mdnum.errors import InputError
+from mdnum.trajectories.bins import (
+    DIRECTED,
+    INSIDE,
+    Candidates,
+    SearchLimits,
+    Sides,
+    binned,
+    lattice_vector,
+    meet,
+)
+from mdnum.trajectories.lattice import ReducedLattice, image_square, near_squares, own_images, square_of
+from mdnum.trajectories.rules import Capped, Nearest
+
+#: more pairs than this would take longer than anybody waits
+MOST_PAIRS = 2_000_000_000
+# bytes that a pair takes while members are sorted, as measured
+_BYTES = 95
+# Pairs beyond this many images are an error in the unit, not a wish, where there are so many pairs: every
+# flip among them is looked for among all images of its pair.
+_MOST_IMAGES_EACH, _MOST_REPEATED = 100, 2_000_000
+
+
+class Found(NamedTuple):
+    """What a search recorded, a row per pair, in no order.
+
+    Attributes:
+        i, j: atoms; i the center of a directed one, else either. A pair appears once for each of its images.
+    """
+
+    kind: int  # `INSIDE` or `DIRECTED`
+    i: Int[np.ndarray, "pairs"]
+    j: Int[np.ndarray, "pairs"]
+    value: Float[np.ndarray, "valued"]  # `DIRECTED`: squared distance
+    open: int  # candidates that were decided from the coordinates as stored
+    close: int  # pairs within the bound of their threshold
+    smallest: float  # smallest |margin| among the pairs that were decided so; inf without one
+
+
+class NeighborRows(NamedTuple):
+    """Neighbors of each atom, one after the other."""
+
+    first: Int[np.ndarray, "atoms"]  # where the row of each atom begins in `other`, and its length
+    count: Int[np.ndarray, "atoms"]
+    other: Int[np.ndarray, "pairs"]  # neighbors, in no order; an atom appears once for each of its images
+    square: Float[np.ndarray, "stored"]  # squared distances, where the rule is directed; else empty
+
+    def pairs(self) -> tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]]:
+        """(i, j) of all rows, one row after the other."""
+        i = np.repeat(np.arange(len(self.first)), self.count)
+        inside = np.arange(len(i)) - np.repeat(np.cumsum(self.count) - self.count, self.count)
+        return i, self.other[self.first[i] + inside].astype(np.int64)
+
+
+def search(
+    positions: Float[np.ndarray, "atoms 3"],
+    lattice: ReducedLattice,
+    sides: Sides,
+    radii: Float[np.ndarray, "species species"],
+    kind: int,
+    *,
+    band: float,
+    bound: float,
+    guard: float,
+    room: int = 0,
+    open_room: int = 0,
+) -> Found:
+    """Look for pairs; images of an atom itself are left out, they are those of `lattice.own_images`.
+
+    Args:
+        positions: as stored, anywhere, length.
+        radii: length by species; negative for pairs that are never inside.
+        kind: what to record. `INSIDE`: pairs inside. `DIRECTED`: for each center everything within radius +
+            band.
+        band: pairs this close to their radius are decided from the coordinates as stored, length.
+        bound: pairs this close are counted as close, length; at most the band.
+        guard: how far the wrapped distance of a pair can be off, length; at most the band.
+        room, open_room: pairs inside and pairs in the band to make room for, where it is known.
+    Raises:
+        InputError: more pairs than fit into memory.
+    """
+    radius = float(radii.max(initial=0.0))
+    atoms = binned(positions, lattice, sides, radius + band, guard)
+    expected = _expected(lattice, len(atoms.center_order), len(atoms.order), radius)
+    sure = max(room or int(1.1 * expected), 1024) if kind == INSIDE else 0
+    # half of the pairs that are met are met twice
+    share = 2.0 * (1.0 + band / radius) ** 3 if kind == DIRECTED else 6.0 * band / radius
+    doubtful = max(open_room or int(1.1 * expected * share), 1024)
+    while True:
+        found = Candidates.room(sure, doubtful)
+        count, left = meet(atoms, SearchLimits.of(radii, kind, band), 0, len(atoms.start) - 1, found)
+        # what is open may come to be inside
+        if left <= doubtful and (kind != INSIDE or count + left <= sure):
+            break
+        _check_count(count + left, radius)
+        sure, doubtful = (int(1.05 * (count + left)) if kind == INSIDE else 0), int(1.05 * left) + 1
+    square = np.where(radii >= 0, radii * radii, -1.0)
+    smallest = float(_settle(positions, atoms, kind, square, radii, bound, found))
+    inside, close = int(found.counts[0]), int(found.counts[2])
+    if kind == INSIDE:
+        return Found(kind, found.i[:inside], found.j[:inside], found.value[:0], left, close, smallest)
+    return Found(kind, found.i_open[:left], found.j_open[:left], found.value[:left], left, close, smallest)
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def exact_square(x, home, i, j, n0, n1, n2, vectors):
+    """The number that decides on a pair found with n added to the wrapped coordinates of j.
+
+    The same number whichever of the two comes first: every rounding is that of the opposite number.
+    """
+    s0, s1, s2 = n0 + home[i, 0] - home[j, 0], n1 + home[i, 1] - home[j, 1], n2 + home[i, 2] - home[j, 2]
+    return square_of(x, i, j, s0, s1, s2, vectors)
+
+
+@numba.njit(cache=True, nogil=True)
+def _settle(x, atoms, kind, square, radius, bound, found):
+    """Decide on the candidates that wrapped coordinates left open; returns the smallest |margin|.
+
+    The values are the squares of wrapped coordinates, and then, of a directed search, those that decide.
+    """
+    smallest, home, vectors, species = np.inf, atoms.home, atoms.lattice.vectors, atoms.species
+    for k in range(found.counts[1]):
+        i, j = found.i_open[k], found.j_open[k]
+        n0, n1, n2 = lattice_vector(found.code[k])
+        real = exact_square(x, home, i, j, n0, n1, n2, vectors)
+        if kind == DIRECTED:
+            found.value[k] = real
+            continue
+        si, sj = species[i], species[j]
+        margin = abs(radius[si, sj] - np.sqrt(real))
+        smallest = min(smallest, margin)
+        found.counts[2] += int(margin <= bound)
+        if real < square[si, sj]:
+            found.i[found.counts[0]], found.j[found.counts[0]] = i, j
+            found.counts[0] += 1
+    return smallest
+
+
+def _expected(lattice: ReducedLattice, centers: int, others: int, radius: float) -> float:
+    """About how many pairs there are, if atoms fill the box evenly; 0 where it has no end.
+
+    Raises:
+        InputError: a radius so large, in a box so small, that the pairs would not fit into memory or time.
+    """
+    if not lattice.periodic.all():
+        return 0.0
+    images = (4.0 / 3.0 * np.pi * radius**3) / lattice.volume
+    pairs = 0.5 * centers * others * images
+    if images > _MOST_IMAGES_EACH and pairs > _MOST_REPEATED:
+        raise InputError(
+            f"about {pairs:,.0f} pairs within {radius:.6g}: any two atoms through about {images:,.0f} images "
+            f"in a box of widths {np.round(lattice.widths, 3).tolist()}",
+            remedy="Check the unit of the cutoff, and the box; or select fewer atoms",
+            where="cutoff",
+        )
+    _check_count(pairs, radius)
+    return pairs
+
+
+def _check_count(pairs: float, radius: float) -> None:
+    """Refuse more pairs than there is memory for."""
+    memory = _memory()
+    if pairs > min(MOST_PAIRS, memory / _BYTES):
+        raise InputError(
+            f"about {pairs:,.0f} pairs within {radius:.6g}, which would take {pairs * _BYTES / 1e9:,.0f} GB "
+            f"of this machine's {memory / 1e9:,.0f}",
+            remedy="Check the unit of the cutoff, and the box; or select fewer atoms",
+            where="cutoff",
+        )
+
+
+def _memory() -> float:
+    """Bytes of memory that the machine has; 32 GB where it does not say."""
+    try:
+        return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    except (AttributeError, ValueError, OSError):
+        return 32e9
+
+
+def rows_of(found: Found, atoms: int) -> NeighborRows:
+    """Pairs by their first atom, the lower one unless they are directed."""
+    rows = NeighborRows(
+        np.zeros(atoms, np.int64), np.zeros(atoms, np.int64), np.empty(len(found.i), np.int32),
+        np.empty(len(found.value)),
+    )  # fmt: skip
+    _into_rows(found, rows)
+    return rows
+
+
+@numba.njit(cache=True, nogil=True)
+def _into_rows(found, rows):
+    """A counting sort."""
+    i, j, directed, count = found.i, found.j, found.kind == DIRECTED, rows.count
+    for k in range(i.shape[0]):
+        count[i[k] if directed else min(i[k], j[k])] += 1
+    total = 0
+    for a in range(count.shape[0]):
+        rows.first[a] = total
+        total += count[a]
+        count[a] = 0
+    for k in range(i.shape[0]):
+        a = i[k] if directed else min(i[k], j[k])
+        at = rows.first[a] + count[a]
+        rows.other[at] = j[k] if directed else max(i[k], j[k])
+        if directed:
+            rows.square[at] = found.value[k]
+        count[a] += 1
+
+
+# ---- the nearest few
+
+
+class Chosen(NamedTuple):
+    """The neighbors of each center, nearest first.
+
+    Attributes:
+        last_in: distance under which a neighbor stays one: that of the first outside, or the radius.
+        first_out: distance under which another would be one: that of the last inside, or the radius.
+    """
+
+    rows: NeighborRows  # the squares are those of the neighbors
+    close: int  # as of `Found`
+    smallest: float
+    last_in: Float[np.ndarray, "atoms"]
+    first_out: Float[np.ndarray, "atoms"]
+
+
+def nearest(
+    positions: Float[np.ndarray, "atoms 3"],
+    lattice: ReducedLattice,
+    sides: Sides,
+    rule: Nearest | Capped,
+    *,
+    band: float,
+    bound: float,
+    guard: float,
+) -> Chosen:
+    """The nearest few of each center; arguments as of `search`."""
+    atoms, reach, centers = len(positions), rule.reach, sides.centers
+    both = sides.centers & sides.others
+    # a distance that no pair exceeds: a lattice has no end
+    everything = np.inf
+    if not lattice.periodic.any():
+        everything = float(np.linalg.norm(np.ptp(positions, axis=0))) * (1 + 1e-9) + 1e-300 if atoms else 0.0
+    radius = reach if np.isfinite(reach) else _guess(positions, lattice, sides, rule.most, everything)
+    made = NeighborRows(
+        np.zeros(atoms, np.int64), np.zeros(atoms, np.int64), np.zeros(0, np.int32), np.zeros(0)
+    )
+    last_in, first_out = np.full(atoms, reach), np.full(atoms, reach)
+    close, smallest, one = 0, np.inf, np.zeros(atoms, np.int64)
+    while True:
+        found = search(
+            positions, lattice, Sides(centers, sides.others, one), np.array([[radius]]), DIRECTED,
+            band=band, bound=bound, guard=guard,
+        )  # fmt: skip
+        rows, own = rows_of(found, atoms), own_images(lattice, radius + band)
+        room = min(int(centers.sum()) * rule.most, len(rows.other) + 2 * len(own) * int(centers.sum()))
+        part = made._replace(other=np.empty(room, np.int32), square=np.empty(room))
+        lacking = np.zeros(atoms, bool)
+        # a free direction ends somewhere; along a lattice there is always one more
+        complete = np.isfinite(reach) or radius >= everything
+        written, near, least, short = _choose(
+            rows,
+            part,
+            own,
+            centers,
+            both,
+            rule.most,
+            reach,
+            bound,
+            complete,
+            radius,
+            last_in,
+            first_out,
+            lacking,
+        )
+        made.first[centers & ~lacking] += len(made.other)
+        made = made._replace(
+            other=np.concatenate([made.other, part.other[:written]]),
+            square=np.concatenate([made.square, part.square[:written]]),
+        )
+        close, smallest = close + near, min(smallest, least)
+        if not short:
+            return Chosen(made, int(close), float(smallest), last_in, first_out)
+        centers, radius = lacking, min(radius * 1.4, everything)
+
+
+@numba.njit(cache=True, nogil=True)
+def _choose(
+    rows, made, own, centers, both, most, reach, bound, complete, searched, last_in, first_out, lacking
+):  # fmt: skip
+    """Sort each row by (square, index) and keep the first; returns (written, close, smallest, lacking)."""
+    written, close, smallest, short = 0, 0, np.inf, 0
+    for i in range(rows.first.shape[0]):
+        if not centers[i]:
+            continue
+        first, count = rows.first[i], rows.count[i]
+        length = count + (2 * own.shape[0] if both[i] else 0)
+        squares, js = np.empty(length), np.empty(length, np.int32)
+        for k in range(length):
+            if k < count:
+                squares[k], js[k] = rows.square[first + k], rows.other[first + k]
+            else:
+                squares[k], js[k] = own[(k - count) // 2], i
+        # by index first, so that the stable sort by square breaks ties by index
+        order = np.argsort(js, kind="mergesort")
+        squares, js = squares[order], js[order]
+        order = np.argsort(squares, kind="mergesort")
+        inside = 0
+        for k in range(length):
+            inside += int(squares[k] < reach * reach)
+        kept = min(inside, most)
+        # the first outside must have been seen, and all that come as close as it matters
+        if not complete and (length <= kept or np.sqrt(squares[order[kept]]) > searched):
+            lacking[i] = True
+            short += 1
+            continue
+        limit_in, limit_out = reach, reach
+        if kept == most:
+            limit_out = np.sqrt(squares[order[kept - 1]])
+            if kept < length:
+                limit_in = min(reach, np.sqrt(squares[order[kept]]))
+        last_in[i], first_out[i] = limit_in, limit_out
+        made.first[i], made.count[i] = written, kept
+        for k in range(length):
+            margin = abs((limit_in if k < kept else limit_out) - np.sqrt(squares[order[k]]))
+            close += int(margin <= bound)
+            smallest = min(smallest, margin)
+            if k < kept:
+                if written < made.other.shape[0]:
+                    made.other[written], made.square[written] = js[order[k]], squares[order[k]]
+                written += 1
+    return written, close, smallest, short
+
+
+def _guess(positions, lattice: ReducedLattice, sides: Sides, most: int, everything: float) -> float:
+    """A radius in which most atoms have enough neighbors."""
+    candidates = int(sides.others.sum())
+    if not candidates:
+        return 1.0 if not np.isfinite(everything) else max(everything, 1e-300)
+    extent = np.ptp(positions @ lattice.inverse, axis=0)
+    extent = np.where(lattice.periodic, 1.0, np.maximum(extent, 1e-3 * max(extent.max(), 1e-12)))
+    volume = float(np.prod(extent)) * lattice.volume
+    radius = (3.0 * (1.6 * most + 8) * volume / (4.0 * np.pi * candidates)) ** (1 / 3)
+    return float(min(radius, everything))
+
+
+# ---- two searches
+
+
+class Changed(NamedTuple):
+    """Decisions that differ between two frames, in no order, by indices of the atoms that take part."""
+
+    i: Int[np.ndarray, "flips"]
+    j: Int[np.ndarray, "flips"]
+    rank: Int[np.ndarray, "flips"]
+    entered: np.ndarray
+
+
+def compared(before: NeighborRows, now: NeighborRows, room: int) -> Changed:
+    """Every decision that differs, pair by pair and image by image.
+
+    Args:
+        room: decisions to make room for.
+    """
+    while True:
+        made = Changed._make(np.empty(room, kind) for kind in (np.int64, np.int64, np.int64, np.bool_))
+        total = _compared(before, now, made)
+        if total <= room:
+            return Changed._make(column[:total] for column in made)
+        room = total
+
+
+@numba.njit(cache=True, nogil=True)
+def _compared(old, new, made):
+    """Write what differs; rows that do not fit are counted only. seen[j] = (images before, images now)."""
+    atoms = old.first.shape[0]
+    seen = np.zeros((atoms, 2), np.int32)
+    total, room = 0, made.i.shape[0]
+    for i in range(atoms):
+        for k in range(old.first[i], old.first[i] + old.count[i]):
+            seen[old.other[k], 0] += 1
+        for k in range(new.first[i], new.first[i] + new.count[i]):
+            seen[new.other[k], 1] += 1
+        for side in range(2):
+            first, count = (old.first[i], old.count[i]) if side == 0 else (new.first[i], new.count[i])
+            for k in range(first, first + count):
+                j = old.other[k] if side == 0 else new.other[k]
+                before, now = seen[j, 0], seen[j, 1]
+                seen[j, 0], seen[j, 1] = 0, 0
+                for rank in range(min(before, now), max(before, now)):
+                    if total < room:
+                        made.i[total], made.j[total] = i, j
+                        made.rank[total], made.entered[total] = rank, now > before
+                    total += 1
+    return total
+
+
+def exchanged(
+    before: Found,
+    now: Found,
+    old: tuple[Float[np.ndarray, "atoms 3"], ReducedLattice],
+    new: tuple[Float[np.ndarray, "atoms 3"], ReducedLattice],
+    species: Int[np.ndarray, "atoms"],
+    radii: Float[np.ndarray, "species species"],
+) -> Changed:
+    """The same where no pair has more than one image within reach: nothing is sorted or looked up.
+
+    Every pair of one frame is measured at the other.
+
+    Args:
+        before, now: pairs inside.
+        old, new: positions and lattice at the frame before and now.
+        species, radii: as of `search`.
+    """
+    square, parts = np.where(radii >= 0, radii * radii, -1.0), []
+    for found, (positions, lattice) in ((before, new), (now, old)):
+        chosen = np.empty(len(found.i) + 1, np.int32)
+        chosen = chosen[: _outside(positions, lattice, species, square, found.i, found.j, chosen)]
+        ids = (found.i[chosen].astype(np.int64), found.j[chosen].astype(np.int64))
+        parts.append((*ids, np.zeros(len(chosen), np.int64), np.full(len(chosen), found is now)))
+    return Changed._make(np.concatenate(columns) for columns in zip(*parts, strict=True))
+
+
+@numba.njit(cache=True, nogil=True)
+def _outside(x, lattice, species, square, i, j, chosen):
+    """Number the pairs whose rounded image is not inside; the one that is inside is always a rounded one."""
+    several = square.shape[0] > 1
+    count, block = 0, 1024
+    y, flags, squares = np.empty((3, block)), np.empty(block, np.uint8), np.empty(block)
+    limits = np.full(block, square[0, 0])
+    for begin in range(0, i.shape[0], block):
+        i_here, j_here = i[begin : begin + block], j[begin : begin + block]
+        near_squares(x, i_here, j_here, lattice, y, squares)
+        if several:
+            for k in range(i_here.shape[0]):
+                limits[k] = square[species[i_here[k]], species[j_here[k]]]
+        for k in range(i_here.shape[0]):
+            flags[k] = not squares[k] < limits[k]
+        for k in range(i_here.shape[0]):
+            chosen[count] = begin + k
+            count += flags[k]
+    return count
+
+
+def image_distances(
+    positions: Float[np.ndarray, "atoms 3"],
+    lattice: ReducedLattice,
+    i: Int[np.ndarray, "pairs"],
+    j: Int[np.ndarray, "pairs"],
+    rank: Int[np.ndarray, "pairs"],
+) -> Float[np.ndarray, "pairs"]:
+    """Distances to the images that have `rank` nearer ones, length; inf where there are not so many."""
+    out = np.empty(len(i))
+    _image_distances(positions, lattice, i, j, rank, out)
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _image_distances(x, lattice, i, j, rank, out):
+    narrowest = min(lattice.widths[0], lattice.widths[1], lattice.widths[2])
+    near, block = 0.2499 * narrowest * narrowest, 1024
+    y = np.empty((3, block))
+    for begin in range(0, i.shape[0], block):
+        end = begin + block
+        near_squares(x, i[begin:end], j[begin:end], lattice, y, out[begin:end])
+    for k in range(i.shape[0]):
+        # any other image is a lattice vector away, and none is shorter than the narrowest width
+        if not (out[k] < near and rank[k] == 0 and i[k] != j[k]):
+            out[k] = image_square(x, min(i[k], j[k]), max(i[k], j[k]), rank[k], lattice)
+        out[k] = np.sqrt(out[k])
+
+
+def ranks(i: Int[np.ndarray, "pairs"], j: Int[np.ndarray, "pairs"]) -> Int[np.ndarray, "pairs"]:
+    """0, 1, 2, ... within each run of equal (i, j)."""
+    new = np.ones(len(i), bool)
+    new[1:] = (i[1:] != i[:-1]) | (j[1:] != j[:-1])
+    at = np.flatnonzero(new)
+    return np.arange(len(i)) - np.repeat(at, np.diff(np.append(at, len(i))))

@@ -1,0 +1,492 @@
+"""How long contacts last, where the beginning or the end of many was not seen, and who flips.
+
+Three different answers to the first, each honest about what it is:
+
+- the **lifetime** of a contact that was seen to begin: the product-limit estimate (Kaplan and Meier, J. Am.
+  Stat. Assoc. 53, 457, 1958), which uses stays that go on after the last frame for as long as they were seen;
+- the **mean by rate**: time spent inside over the number of leaves, which uses every frame of every stay,
+  whether its ends were seen or not, and is the mean lifetime where pairs leave at a constant rate;
+- the **residence**: of pairs found inside at some frame, the share still inside (without a break) so much
+  later (Impey, Madden and McDonald, J. Phys. Chem. 87, 5071, 1983). Long stays are met more often: it is not
+  the lifetime.
+
+All in frames; times come from the frames' own. Counts of parts of the pairs add up to those of all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from mdnum.trajectories.history import Contacts, History, Sums, contacts, mended
+from mdnum.trajectories.stride import Strides, doublings
+from mdnum.trajectories.topology import AtomTable
+
+#: Stays from which the share that is inside again is taken: all of them in most files.
+_AGAIN_STAYS = 200_000
+_BUSIEST = 500
+_POINTS = 160
+_CLASSES = 60
+
+
+@dataclass(frozen=True)
+class Durations(Sums):
+    """Stays counted by the number of frames they were inside for; memory does not grow with stays.
+
+    Attributes:
+        seen: by length, stays seen to begin and to end; entry n is for n frames.
+        goes_on: those seen to begin, but not to end (censored on the right).
+        older: those seen to end, but not to begin (censored on the left).
+        throughout: those inside from the first frame to the last.
+    """
+
+    seen: Int[np.ndarray, "lengths"]
+    goes_on: Int[np.ndarray, "lengths"]
+    older: Int[np.ndarray, "lengths"]
+    throughout: Int[np.ndarray, "lengths"]
+
+    @classmethod
+    def of(cls, stays: Contacts, frames: int) -> Durations:
+        """Those of contacts over so many frames."""
+        kinds = [(b, e) for b in (stays.began, ~stays.began) for e in (stays.ended, ~stays.ended)]
+        return cls(*(np.bincount(stays.length[b & e], minlength=frames + 1) for b, e in kinds))
+
+    @property
+    def all(self) -> Int[np.ndarray, "lengths"]:
+        """Stays of any kind by length."""
+        return self.seen + self.goes_on + self.older + self.throughout
+
+    @property
+    def followed(self) -> Int[np.ndarray, "lengths"]:
+        """Stays seen to begin, by the frames after which they were seen to end, or last seen to survive."""
+        # one that goes on after n frames was seen to survive n - 1 times
+        return self.seen + np.append(self.goes_on[1:], 0)
+
+    @property
+    def exposure(self) -> int:
+        """Times that a pair inside at one frame was examined again at the next one."""
+        length = np.arange(len(self.seen))
+        # a stay of n frames that goes on after the last one has been examined again n - 1 times
+        whole, cut = self.seen + self.older, self.goes_on + self.throughout
+        return int(whole @ length + cut @ np.maximum(length - 1, 0))
+
+    @property
+    def leaves(self) -> int:
+        """Stays seen to end."""
+        return int(self.seen.sum() + self.older.sum())
+
+
+@dataclass(frozen=True)
+class Survival:
+    """Share of contacts that last longer than so many frames, from those seen to begin."""
+
+    frames: Int[np.ndarray, "points"]  # lengths at which some ended, from 1, rising
+    share: Float[np.ndarray, "points"]  # still inside after that many frames
+    error: Float[np.ndarray, "points"]  # its standard error (Greenwood)
+    at_risk: Int[np.ndarray, "points"]  # contacts followed for at least that long
+    longest: int  # frames for which any was followed: nothing is known beyond
+
+    def at(self, share: float) -> int | None:
+        """Frames after which at most this share is left: the median at 0.5; None if it stays above."""
+        below = np.flatnonzero(self.share <= share)
+        return int(self.frames[below[0]]) if len(below) else None
+
+    @property
+    def mean(self) -> float:
+        """Area below the curve up to `longest`, frames: the mean, or less where some outlast that."""
+        edges = np.concatenate([[0], self.frames, [self.longest]])
+        return float(np.sum(np.diff(edges) * np.concatenate([[1.0], self.share])))
+
+
+def survival(found: Durations) -> Survival:
+    """The product-limit estimate from the stays that were seen to begin.
+
+    Stays that were there at the first frame are left out: how old they were then is not known, and long ones
+    are met more often.
+    """
+    followed, points = found.followed, np.flatnonzero(found.seen)
+    at_risk = np.cumsum(followed[::-1])[::-1][points]
+    risk, gone = at_risk.astype(np.float64), found.seen[points].astype(np.float64)
+    share = np.cumprod(1.0 - gone / risk)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        terms = np.where(risk > gone, gone / (risk * (risk - gone)), 0.0)
+    lasted = np.flatnonzero(followed)
+    longest = int(lasted[-1]) if len(lasted) else 0
+    return Survival(points, share, share * np.sqrt(np.cumsum(terms)), at_risk, longest)
+
+
+def mean_by_rate(found: Durations) -> tuple[float, float]:
+    """(frames inside per leave, standard error), every stay counted; inf where none was seen to leave.
+
+    The error is that of independent leaves (Poisson): chatter makes it larger.
+    """
+    if not found.leaves:
+        return float("inf"), float("nan")
+    mean = found.exposure / found.leaves
+    return mean, mean / float(np.sqrt(found.leaves))
+
+
+def residence(found: Durations, pairs: Int[np.ndarray, "frames"]) -> Float[np.ndarray, "frames"]:
+    """Of the pairs inside at a frame, the share inside without a break until so many frames later.
+
+    Args:
+        pairs: inside at each frame.
+
+    Returns:
+        by lag from 0, averaged over all frames that leave room for it; nan where no pair was inside.
+    """
+    count, lags = found.all, np.arange(len(pairs))
+    stays = np.cumsum(count[::-1])[::-1]
+    frames = np.cumsum((count * np.arange(len(count)))[::-1])[::-1]
+    # a stay of n frames holds n - t pairs of frames that are t apart
+    kept = np.array([frames[t + 1] - t * stays[t + 1] if t + 1 < len(count) else 0 for t in lags], float)
+    asked = np.cumsum(pairs).astype(float)[::-1]
+    return np.divide(kept, asked, out=np.full(len(pairs), np.nan), where=asked > 0)
+
+
+def again(stays: Contacts, lags: Int[np.ndarray, "lags"], frames: int) -> tuple[np.ndarray, np.ndarray]:
+    """Of the pairs inside at a frame, those inside so many frames later, whatever happened between.
+
+    The intermittent counterpart of `residence`; divide the first by the second (sums over parts of the pairs
+    add up).
+
+    Args:
+        lags: frames, each from 0 to frames - 1.
+
+    Returns:
+        by lag, pairs of frames at which a pair was inside both times, and at which it was the first time.
+    """
+    both, once = np.zeros(len(lags), np.int64), np.zeros(len(lags), np.int64)
+    if not len(stays):
+        return both, once
+    pair = np.cumsum(_new_pairs(stays)) - 1
+    # one line of time for all pairs, each with room after it for the largest lag
+    room = 2 * (frames + 1)
+    begin, end = pair * room + stays.begin, pair * room + stays.end
+    before = np.concatenate([[0], np.cumsum(stays.length)])
+
+    def inside_until(time: np.ndarray) -> np.ndarray:
+        """Frames inside before a time, over all pairs."""
+        at = np.searchsorted(begin, time, side="right")
+        last = np.maximum(at - 1, 0)
+        over = np.maximum(0, np.minimum(time, end[last]) - begin[last])
+        return before[last] + np.where(at > 0, over, 0)
+
+    for place, lag in enumerate(lags.tolist()):
+        both[place] = int((inside_until(end + lag) - inside_until(begin + lag)).sum())
+        once[place] = int(np.maximum(0, np.minimum(stays.end, frames - lag) - stays.begin).sum())
+    return both, once
+
+
+def _new_pairs(stays: Contacts) -> np.ndarray:
+    """Whether each stay is the first of its pair."""
+    changed = [np.diff(column) != 0 for column in (stays.i, stays.j, stays.rank)]
+    return np.concatenate([[True], np.any(changed, axis=0)])[: len(stays)]
+
+
+# ---- who flips
+
+
+@dataclass(frozen=True)
+class Classes:
+    """Classes of atoms: an index for each atom, and names."""
+
+    of: Int[np.ndarray, "atoms"]
+    names: Sequence[str]
+
+    @classmethod
+    def by(cls, words: np.ndarray) -> Classes:
+        """Atoms of one word belong to one class."""
+        names, index = np.unique(words.astype(str), return_inverse=True)
+        return cls(index.reshape(-1), [str(one) for one in names])
+
+
+@dataclass(frozen=True)
+class Labels:
+    """Species, and residues by name and one by one; None where the file has none."""
+
+    species: Classes
+    residue_names: Classes | None
+    residues: Classes | None
+
+    @classmethod
+    def of(cls, table: AtomTable) -> Labels:
+        """Those of a topology."""
+        if not any(table.residue_names):
+            return cls(Classes.by(table.species), None, None)
+        first = np.unique(table.residues, return_index=True)[1]
+        # residues are numbered from 0 without gaps in a topology
+        words = [f"{table.residue_names[at]} {table.residue_ids[at]}" for at in first]
+        return cls(Classes.by(table.species), Classes.by(table.residue_names), Classes(table.residues, words))
+
+
+@dataclass(frozen=True)
+class ClassTally(Sums):
+    """Flips and time inside by pair of classes.
+
+    Attributes:
+        exposure: times that a pair inside at one frame was examined again at the next one.
+    """
+
+    _common = ("names",)
+
+    names: tuple[str, ...]  # of the classes
+    entered: Int[np.ndarray, "classes classes"]  # flips by class of the first and of the second atom
+    left: Int[np.ndarray, "classes classes"]
+    inside: Int[np.ndarray, "classes classes"]  # pairs inside, summed over frames
+    exposure: Int[np.ndarray, "classes classes"]
+
+    @classmethod
+    def of(cls, stays: Contacts, classes: Classes, frames: int, directed: bool = False) -> ClassTally:
+        """Counts by the classes of the two atoms.
+
+        Args:
+            frames: frames examined.
+            directed: whether i -> j and j -> i are two things (nearest neighbors); else both count as one,
+                under the class that comes first.
+        """
+        first, second = classes.of[stays.i], classes.of[stays.j]
+        if not directed:
+            first, second = np.minimum(first, second), np.maximum(first, second)
+        size = len(classes.names)
+        code = first.astype(np.int64) * size + second
+        exposed = np.where(stays.end < frames, stays.length, stays.length - 1)
+        # sums of integers below 2**53 are exact in float64
+        summed = (
+            np.bincount(code, weights, minlength=size**2).astype(np.int64).reshape(size, size)
+            for weights in (stays.began, stays.ended, stays.length, exposed)
+        )
+        return cls(tuple(classes.names), *summed)
+
+    @property
+    def mean_stay(self) -> Float[np.ndarray, "classes classes"]:
+        """Frames inside per leave; nan where none left."""
+        none = np.full(self.left.shape, np.nan)
+        return np.divide(self.exposure, self.left, out=none, where=self.left > 0)
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Rows by pair of classes that were ever inside, those with most flips first."""
+        stay = self.mean_stay
+        rows = [
+            {
+                "first": self.names[a], "second": self.names[b], "entered": int(self.entered[a, b]),
+                "left": int(self.left[a, b]), "inside": int(self.inside[a, b]), "stay": float(stay[a, b]),
+            }
+            for a, b in zip(*np.nonzero(self.inside), strict=True)
+        ]  # fmt: skip
+        return sorted(rows, key=lambda row: (-row["entered"] - row["left"], -row["inside"]))[:_CLASSES]
+
+
+@dataclass(frozen=True)
+class Chatter(Sums):
+    """Flips by how soon the same pair flips back.
+
+    Attributes:
+        inside: visits inside by their length in frames, 0 to the window: a pair that left so soon again.
+    """
+
+    inside: Int[np.ndarray, "lengths"]
+    outside: Int[np.ndarray, "lengths"]  # excursions outside by their length
+    flips: int  # all flips
+
+    @classmethod
+    def of(cls, history: History, window: int) -> Chatter:
+        """Those that are reversed within a window of frames."""
+        pair = history.pair
+        same = pair[1:] == pair[:-1]
+        apart, from_inside = np.diff(history.frame)[same], history.entered[:-1][same]
+        short = apart <= window
+        inside, outside = (
+            np.bincount(apart[one & short], minlength=window + 1) for one in (from_inside, ~from_inside)
+        )
+        return cls(inside, outside, len(history.frame))
+
+    @property
+    def window(self) -> int:
+        """Frames within which a flip was looked for that reverses another."""
+        return len(self.inside) - 1
+
+    @property
+    def undone(self) -> int:
+        """Flips that the same pair reverses within the window."""
+        return int(self.inside.sum() + self.outside.sum())
+
+
+@dataclass(frozen=True)
+class Busiest:
+    """Pairs by the number of their flips, most first."""
+
+    i: Int[np.ndarray, "pairs"]  # the pairs
+    j: Int[np.ndarray, "pairs"]
+    rank: Int[np.ndarray, "pairs"]
+    flips: Int[np.ndarray, "pairs"]  # of each
+    inside: Int[np.ndarray, "pairs"]  # frames inside
+
+    @classmethod
+    def of(cls, history: History, stays: Contacts, most: int = _BUSIEST) -> Busiest:
+        """The pairs of a history that flipped most often."""
+        # stays are in the order of the history's pairs, of which some were never inside
+        inside = np.zeros(len(history), np.int64)
+        ever = history.inside | (history.flips > 0)
+        inside[ever] = np.bincount(np.cumsum(_new_pairs(stays)) - 1, stays.length) if len(stays) else 0
+        return cls(history.i, history.j, history.rank, history.flips, inside).first(most)
+
+    def first(self, most: int = _BUSIEST) -> Busiest:
+        """So many of them, without pairs that never flipped."""
+        order = np.lexsort((self.rank, self.j, self.i, -self.flips))[:most]
+        order = order[self.flips[order] > 0]
+        return Busiest(*(column[order] for column in vars(self).values()))
+
+    def __add__(self, other: Busiest) -> Busiest:
+        """The busiest of two parts that have no pair in common."""
+        columns = zip(vars(self).values(), vars(other).values(), strict=True)
+        return Busiest(*(np.concatenate(both) for both in columns)).first()
+
+
+@dataclass(frozen=True)
+class Residues(Sums):
+    """Flips of each group of atoms (a residue, say): with others, and within itself."""
+
+    between: Int[np.ndarray, "groups"]
+    within: Int[np.ndarray, "groups"]
+
+    @classmethod
+    def of(cls, history: History, classes: Classes) -> Residues:
+        """Flips by the groups of the two atoms."""
+        first, second, flips = classes.of[history.i], classes.of[history.j], history.flips
+        own, count = first == second, len(classes.names)
+        between = (np.bincount(one[~own], flips[~own], count) for one in (first, second))
+        within = np.bincount(first[own], flips[own], count)
+        return cls(sum(between, np.zeros(count)).astype(np.int64), within.astype(np.int64))
+
+
+# ---- all of it
+
+
+@dataclass(frozen=True)
+class AgainSums(Sums):
+    """Sums of `again` over some of the stays."""
+
+    both: Int[np.ndarray, "lags"]
+    once: Int[np.ndarray, "lags"]
+    stays: int
+
+    def __add__(self, other: Any) -> Any:
+        # one part of the pairs is a sample of all of them, and enough
+        return self if self.stays >= _AGAIN_STAYS // 2 else super().__add__(other)
+
+
+@dataclass(frozen=True)
+class Statistics(Sums):
+    """Everything that is counted of the pairs of a rule."""
+
+    durations: Durations  # of contacts, and of contacts whose short gaps are overlooked
+    intermittent: Durations
+    by_species: ClassTally  # None for residues where the file has none
+    by_residue_name: ClassTally | None
+    residues: Residues | None
+    chatter: Chatter
+    strides: Strides
+    busiest: Busiest
+    pairs: int  # that flipped
+    images: int  # pairs through further images of an atom
+    again: AgainSums
+
+    @classmethod
+    def of(cls, history: History, labels: Labels, directed: bool, window: int) -> tuple[Statistics, Contacts]:
+        """Those of some of the pairs, and their contacts.
+
+        Args:
+            window: frames within which a flip that is reversed is chatter, and up to which a stay outside is
+                overlooked in an intermittent contact.
+        """
+        frames, stays = history.frames, contacts(history)
+        named, residues = labels.residue_names, labels.residues
+        some, among = stays, -(-len(stays) // _AGAIN_STAYS)
+        if among > 1:
+            # all stays of some of the pairs: enough for an average, however many there are
+            mine = (stays.i.astype(np.int64) * 7 + stays.j * 13) % among == 0
+            some = Contacts(*(column[mine] for column in vars(stays).values()))
+        counted = cls(
+            durations=Durations.of(stays, frames),
+            intermittent=Durations.of(mended(stays, window), frames),
+            by_species=ClassTally.of(stays, labels.species, frames, directed),
+            by_residue_name=None if named is None else ClassTally.of(stays, named, frames, directed),
+            residues=None if residues is None else Residues.of(history, residues),
+            chatter=Chatter.of(history, window),
+            strides=Strides.of_history(history, doublings(frames)),
+            busiest=Busiest.of(history, stays),
+            pairs=int(np.count_nonzero(history.flips)),
+            images=int(np.count_nonzero((history.rank > 0) | (history.i == history.j))),
+            again=AgainSums(*again(some, lags_of(frames), frames), len(some)),
+        )
+        return counted, stays
+
+    def curves(self, pairs: Int[np.ndarray, "frames"], interval: float) -> dict[str, np.ndarray]:
+        """Columns of a table of lifetimes by lag.
+
+        Args:
+            pairs: inside at each frame.
+            interval: time between frames; nan where it is not known.
+        """
+        lags = lags_of(len(pairs))
+        left, loose = survival(self.durations), survival(self.intermittent)
+
+        def at(curve: Survival, values: np.ndarray, start: float) -> np.ndarray:
+            place = np.searchsorted(curve.frames, lags, side="right") - 1
+            known = np.where(place >= 0, np.concatenate([values, [start]])[place], start)
+            return np.where(lags <= curve.longest, known, np.nan)
+
+        risk, none = np.cumsum(self.durations.followed[::-1])[::-1], np.full(len(lags), np.nan)
+        return {
+            "frames": lags,
+            "time": lags * interval,
+            "at_risk": risk[np.minimum(lags, len(risk) - 1)],
+            "survival": at(left, left.share, 1.0),
+            "error": at(left, left.error, 0.0),
+            "intermittent": at(loose, loose.share, 1.0),
+            "residence": residence(self.durations, pairs)[lags],
+            "again": np.divide(self.again.both, self.again.once, out=none, where=self.again.once > 0),
+        }
+
+
+@dataclass(frozen=True)
+class Lifetime:
+    """Lifetimes in numbers, frames; None where the file does not tell.
+
+    Attributes:
+        mean: the area below the curve, which is the mean where `mean_is_whole`, and less where some are left
+            at its end.
+    """
+
+    followed: int  # contacts seen to begin
+    median: int | None  # frames after which so many are over
+    quarter_gone: int | None
+    three_quarters_gone: int | None
+    mean: float | None
+    mean_is_whole: bool
+    longest: int  # frames for which any was followed
+    mean_by_rate: float  # see `mean_by_rate`
+    mean_by_rate_error: float
+    leaves: int
+
+    @classmethod
+    def of(cls, durations: Durations) -> Lifetime:
+        """Those of stays counted by their length."""
+        left, any_left = survival(durations), bool(durations.seen.any())
+        return cls(
+            int(durations.seen.sum() + durations.goes_on.sum()), left.at(0.5), left.at(0.75), left.at(0.25),
+            left.mean if any_left else None, any_left and bool(left.share[-1] == 0.0), left.longest,
+            *mean_by_rate(durations), durations.leaves,
+        )  # fmt: skip
+
+
+def lags_of(frames: int) -> Int[np.ndarray, "lags"]:
+    """Lags of curves, in frames: all of them as far as there are few, then further apart."""
+    if frames < 2:
+        return np.zeros(1, np.int64)
+    return np.unique(np.concatenate([[0], np.round(np.geomspace(1, frames - 1, _POINTS))]).astype(np.int64))

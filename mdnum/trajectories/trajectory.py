@@ -1,0 +1,248 @@
+"""What every reader gives: the frames asked for, one after the other, and what is known of the atoms.
+
+Positions are those of the file: nothing is wrapped, made whole or centered. Readers differ in what they keep:
+ASE's and mdnum's own (gro, LAMMPS's text dumps) keep every digit, MDAnalysis's narrow every coordinate to
+float32 (`Trajectory.bits`).
+"""
+
+from __future__ import annotations
+
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mdnum.errors import InputError
+from mdnum.trajectories.frame import Frame, FrameError, UnreadableFrame
+from mdnum.trajectories.topology import AtomTable, first_line, table_of_topology
+
+#: Frames from which the resolution of a file is read.
+SAMPLE = 8
+_SLICE = re.compile(r"(-?\d+)?(:(-?\d+)?(:(-?\d+)?)?)?")
+
+
+class Trajectory(ABC):
+    """Frames of one file, read lazily and in order, as often as wanted.
+
+    A reader says how many atoms there are (`_atoms`), finds frames (`_raw`) and decodes them (`_frame`).
+
+    Args:
+        path: the file.
+        topology: the file that says what the atoms are, where it is another one.
+        slice: the frames asked for.
+
+    Attributes:
+        format: the file's format in the reader's word ("XTC", "extxyz").
+        reader: who reads it ("MDAnalysis", "ASE", "mdnum").
+        bits: width of a coordinate as it comes from the reader, 32 or 64; frames are float64 either way.
+        length: unit of length in words; "" where the file does not say.
+        time: unit of time in words; "frame" where the file has no times, whose numbers then stand for them
+            (velocities are per ps there, if the file has any).
+        table: what is known of the atoms.
+        notes: what a reader of the results should know about the reading, each a sentence.
+    """
+
+    format: str
+    reader: str = "mdnum"
+    bits: int = 64
+    length: str = "Å"
+    time: str = "frame"
+    table: AtomTable
+    notes: tuple[str, ...] = ()
+    # what a frame that is none raises while it is decoded
+    _fails: tuple[type[BaseException], ...] = (
+        ValueError,
+        IndexError,
+        KeyError,
+        OSError,
+        EOFError,
+        RuntimeError,
+    )
+    # frames in the file, where they are known
+    _count: int | None = None
+
+    def __init__(self, path: Path, topology: str | Path | None, slice: slice):
+        self.path, self.slice = path, slice
+        self.topology = None if topology is None else Path(topology)
+
+    def _has(self, atoms: int, table: AtomTable | None = None) -> None:
+        """Sets the table of atoms: the topology's, where there is one."""
+        if self.topology is not None:
+            table = table_of_topology(self.topology)
+            if len(table) != atoms:
+                raise InputError(
+                    f"the topology {self.topology.name} has {len(table):,} atoms "
+                    f"and the trajectory {atoms:,}",
+                    remedy="Give the topology that the trajectory was written with, or a selection of it",
+                    where=str(self.path),
+                )
+        self.table = AtomTable.plain(["X"] * atoms, named=False) if table is None else table
+
+    @property
+    def atoms(self) -> int:
+        """Atoms in every frame."""
+        return len(self.table)
+
+    @property
+    def species(self) -> np.ndarray:
+        """Species of every atom, words, shape (atoms,)."""
+        return self.table.species
+
+    @property
+    def name(self) -> str:
+        """The file's name."""
+        return self.path.name
+
+    @property
+    def in_file(self) -> int | None:
+        """Frames in the file; None where they are not known without reading it."""
+        if self._count is None and any(
+            end is not None and end < 0 for end in (self.slice.start, self.slice.stop)
+        ):
+            self._count = sum(1 for _ in self._raw(chosen(slice(None), None)))
+        return self._count
+
+    @property
+    def count(self) -> int | None:
+        """Frames that `frames` gives; None where they are not known without reading the file."""
+        return None if self.in_file is None else len(range(*self.slice.indices(self.in_file)))
+
+    @property
+    def universe(self) -> Any:
+        """The MDAnalysis Universe behind it, or None: another reader has none."""
+        return None
+
+    def frames(self) -> Iterator[Frame]:
+        """The frames asked for, in order, one in memory at a time. Each call starts at the first again.
+
+        Raises:
+            UnreadableFrame: one cannot be read. Those before it have been given.
+            InputError: a frame has another number of atoms.
+        """
+        for number, raw in self._raw(chosen(self.slice, self.in_file)):
+            try:
+                frame = self._frame(number, raw)
+            except self._fails as error:
+                raise self._unreadable(number, error) from error
+            if len(frame.positions) != self.atoms:
+                raise FrameError(
+                    f"frame {number} has {len(frame.positions):,} atoms and the first {self.atoms:,}",
+                    remedy="Leave out the frames with another number of atoms: a flip needs the pair before",
+                    where=str(self.path),
+                    frame=number,
+                )
+            yield frame
+
+    def sample(self) -> list[Frame]:
+        """The first of the frames asked for, `SAMPLE` of them; fewer where one of them cannot be read.
+
+        Raises:
+            InputError: there is none, or not even the first can be read.
+        """
+        sample = []
+        try:
+            for frame in islice(self.frames(), SAMPLE):
+                sample.append(frame)
+        except InputError:
+            if not sample:
+                raise
+        if not sample:
+            words, of = self.slice_words, "" if self.in_file is None else f" of {self.in_file:,}"
+            raise InputError(
+                f"@{words} leaves no frame{of}" if words else "the file holds no frame",
+                remedy="Ask for others" if words else "Check how it was written",
+                where=str(self.path),
+            )
+        return sample
+
+    @property
+    def slice_words(self) -> str:
+        """The frames asked for, as behind an @; empty for all."""
+        if self.slice == slice(None):
+            return ""
+        ends = [
+            self.slice.start,
+            self.slice.stop,
+            *([] if self.slice.step in (None, 1) else [self.slice.step]),
+        ]
+        return ":".join("" if end is None else str(end) for end in ends)
+
+    @abstractmethod
+    def _raw(self, numbers: Iterator[int]) -> Iterator[tuple[int, Any]]:
+        """Frames by their numbers, which go up, as `_frame` takes them; ends with the file."""
+
+    @abstractmethod
+    def _frame(self, number: int, raw: Any) -> Frame:
+        """A frame from what `_raw` gave."""
+
+    def _first(self) -> tuple[int, Any]:
+        """The first of the file.
+
+        Raises:
+            InputError: there is none.
+        """
+        first = next(self._raw(iter([0])), None)
+        if first is None:
+            raise InputError(
+                "the file holds no frame", remedy="Check how it was written", where=str(self.path)
+            )
+        return first
+
+    def _unreadable(self, number: int, error: BaseException | str) -> UnreadableFrame:
+        said = error if isinstance(error, str) else first_line(error)
+        return UnreadableFrame(f"frame {number} cannot be read ({said})", frame=number, where=str(self.path))
+
+
+# ---- which frames: run.xtc@100:, run.xtc@::10, run.xtc@5, as ASE writes it
+
+
+def split_path(text: str) -> tuple[Path, str]:
+    """(path, words of the slice behind its last @); a file whose own name has an @ is found as it is."""
+    whole = Path(text).expanduser()
+    name, at, words = text.rpartition("@")
+    if not at or whole.exists():
+        return whole, ""
+    path = Path(name).expanduser()
+    # words that name no frames are told where the file is there without them
+    return (path, words) if _SLICE.fullmatch(words) or path.is_file() else (whole, "")
+
+
+def parse_slice(words: str, where: str = "") -> slice:
+    """The slice that words name: "100:", "::10", "-50:", "5" (that frame alone), "" (all).
+
+    Raises:
+        InputError: the words are no slice, or go backward: flips follow time.
+    """
+    match = _SLICE.fullmatch(words.strip())
+    if match is None:
+        raise InputError(
+            f"{words!r} names no frames",
+            remedy="Write START:STOP:STEP, for example 100: or ::10 or -50:, or the number of one frame",
+            where=where or None,
+        )
+    colon = match[2]
+    start, stop, step = (None if match[k] is None else int(match[k]) for k in (1, 3, 5))
+    if colon is None:
+        return slice(None) if start is None else slice(start, start + 1 or None)
+    if step is not None and step < 1:
+        raise InputError(
+            f"the frames {words!r} go backward or nowhere",
+            remedy="Write a stride of 1 or more: flips follow time",
+            where=where or None,
+        )
+    return slice(start, stop, step or 1)
+
+
+def chosen(frames: slice, count: int | None) -> Iterator[int]:
+    """The numbers of the frames, upward; without an end where neither the slice nor a count has one."""
+    if count is not None:
+        yield from range(*frames.indices(count))
+        return
+    number, stop, step = frames.start or 0, frames.stop, frames.step or 1
+    while stop is None or number < stop:
+        yield number
+        number += step

@@ -1,0 +1,400 @@
+"""What the page of a run of the ball shows: heights, solver, margins, derivatives, and every decision."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mdnum.report.browse import Browse, Column, plain_rows
+from mdnum.report.finding import Texts, Verdict
+from mdnum.report.section import Figure, Key, Mark, Page, Plot, Role, Section, Series, Table, pairs
+from mdnum.report.svg import FIRST, MUTED, SECOND
+from mdnum.report.words import count, many, number
+from mdnum.workflow.frame import View
+
+TEXTS = Texts(Path(__file__).with_name("ball.toml"))
+#: Rows of a table that the page carries.
+TABLE_ROWS = 5_000
+_REASONS = ("", "none", "tolerance", "cap", "fixed", "not finite", "rest")
+
+
+def applied(view: View) -> list[Mapping[str, Any]]:
+    """Derivatives by method, without those that do not apply."""
+    return [made for made in view.summary["gradient"] if not made["refused"]]
+
+
+def parameters(view: View) -> list[str]:
+    return list(dict.fromkeys(name for made in applied(view) for name in made["gradient"]))
+
+
+def ended(view: View) -> dict[str, int]:
+    return {word: n for word, n in view.summary["ended"].items() if n and word != "none"}
+
+
+def located(view: View) -> bool:
+    """Whether impacts are located inside a step: what is counted are impacts, not iterations."""
+    return view.summary["integrator"] == "event-located"
+
+
+def first_step(view: View, reason: str) -> int:
+    series = view.table("steps")
+    return int(series["step"][np.argmax(series["reason"].astype(str) == reason)])
+
+
+def time_of(view: View, step: np.ndarray) -> np.ndarray:
+    return np.interp(step, view.table("steps")["step"], view.table("steps")["time"])
+
+
+def margin_ratio(view: View) -> np.ndarray:
+    """|margin| of each contact flip in units of its rounding bound."""
+    contacts = view.table("contacts")
+    margin, bound = np.abs(contacts["margin"]), contacts["bound"]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(bound > 0, margin / bound, np.where(margin > 0, np.inf, 0.0))
+
+
+def decision(variant: Mapping[str, Any]) -> str:
+    return variant["channel"] + ("" if variant["ball"] is None else f", ball {variant['ball']}")
+
+
+def page(view: View, verdict: Verdict) -> Page:
+    """Heights, solver, margins, derivatives, closed form, variants, and every decision."""
+    summary = view.summary
+    about = TEXTS(
+        "about", balls=summary["balls"], steps=summary["steps"], contact=summary["contact_kind"],
+        integrator=summary["integrator"].replace("-", " "),
+    )  # fmt: skip
+    described = [str(view.system["about"])] if view.system.get("about") else []
+    sections = [
+        Section("Heights and contacts", [*described, *_plots(view, _heights, _nearest)]),
+        Section("Impacts per step" if located(view) else "Iterations per step", _plots(view, _solver_plot)),
+        Section("Margins of decisions", _plots(view, _stops, _flips)),
+        Section("Gradient", list(_gradient(view)), terminal=True),
+        Section("Against the closed form", list(_exact(view)), terminal=True),
+        Section("Variants", list(_variants(view)), terminal=True),
+        Section("Contacts", list(_contacts(view))),
+        Section("Stop decisions", list(_stop_decisions(view))),
+    ]
+    return Page(
+        view.name, about, list(_keys(view)), [section for section in sections if section.parts],
+        view.system_toml, view.folder.provenance,
+    )  # fmt: skip
+
+
+def _keys(view: View) -> Iterator[Key]:
+    summary, first = view.summary, view.summary["first_contact"]
+    when = "none begins" if first is None else f"first at step {count(first)}"
+    when = when if summary["flips_entered"] or first is None else "in contact at the start"
+    yield Key("Contacts", count(summary["flips_entered"]), when)
+    total = count(summary["iterations_total"])
+    if located(view):
+        yield Key("Impacts", total, "located inside steps")
+    else:
+        most = f"{count(summary['iterations_max'])} at most in a step"
+        yield Key("Iterations", total, most if ended(view) else "nothing is solved")
+    yield Key("Ambiguous", count(summary["ambiguous"]), "decisions within rounding")
+    yield Key("Loss", number(summary["loss"], 6), summary["loss_kind"])
+    error = (summary["exact"] or {}).get("height_error_largest")
+    yield Key("Off closed form", number(error, 2), "there is none" if error is None else "m, at most")
+    if summary["steps_per_second"] is not None:
+        yield Key("Speed", number(summary["steps_per_second"]), "steps per second")
+
+
+def _plots(view: View, *declared: Callable[[View], Plot | None]) -> list[Any]:
+    return [plot for plot in (each(view) for each in declared) if plot is not None]
+
+
+def _groups(
+    x: np.ndarray, y: np.ndarray, *groups: tuple[np.ndarray, str, Role], mark: Mark = "points"
+) -> tuple[Series, ...]:
+    """A set of points for each group that has any finite ones."""
+    return tuple(
+        Series(label, x[mine], y[mine], mark, role)
+        for mine, label, role in groups
+        if np.any(mine & np.isfinite(y))
+    )
+
+
+def _heights(view: View) -> Plot | None:
+    rows, series, contacts = view.table("heights"), view.table("steps"), view.table("contacts")
+    balls = np.unique(rows["ball"]).astype(int).tolist()
+    roles: tuple[Role, ...] = ("first", "second", "third")
+    few = len(balls) <= len(roles)
+    lines = []
+    if few:
+        for n, ball in enumerate(balls):
+            mine = rows["ball"] == ball
+            at = time_of(view, rows["step"][mine])
+            lines.append(Series(f"ball {ball}", at, rows["y"][mine], "line", roles[n]))
+    else:
+        # one line with a gap after each ball
+        order = np.argsort(rows["ball"], kind="stable")
+        ends = np.cumsum(np.bincount(rows["ball"].astype(int)))
+        x, y = (np.insert(values[order], ends, np.nan) for values in (time_of(view, rows["step"]), rows["y"]))
+        lines.append(Series("balls", x, y))
+    if not balls:
+        if not np.isfinite(series["mean_height"]).any():
+            return None
+        lines.append(Series("mean over the balls", series["time"], series["mean_height"]))
+    entered = contacts["entered"].astype(bool) & (np.isin(contacts["ball"], balls) | (not balls))
+    at = time_of(view, contacts["step"][entered])
+    # on the floor, where they are decided
+    marks = [Series("contact begins", at, np.zeros(len(at)), "points", "bad")] if len(at) else []
+    return Plot(
+        "heights", "Heights against time", "time (s)", "height (m)", (*lines, *marks),
+        caption=f"Heights of {many(len(balls), 'ball')}; a mark on the floor for each contact that begins.",
+        horizontals=((0.0, "floor"),),
+    )  # fmt: skip
+
+
+def _nearest(view: View) -> Plot | None:
+    series = view.table("steps")
+    margin = series["min_margin"]
+    if not np.isfinite(margin).any():
+        return None
+    doubtful = (series["ambiguous"] > 0, "a decision within rounding", "bad")
+    return Plot(
+        "nearest", "Margin of the nearest contact decision", "time (s)", "|height| decided on (m)",
+        (Series("nearest height", series["time"], margin), *_groups(series["time"], margin, doubtful)),
+        y_scale="log",
+        caption="The height nearest to the floor that a step decided on: the nearer, the less it takes to "
+        "decide otherwise.",
+    )  # fmt: skip
+
+
+def _solver_plot(view: View) -> Plot | None:
+    series = view.table("steps")
+    reason, iterations = series["reason"].astype(str), series["iterations"].astype(float)
+    shown = _groups(
+        series["time"], iterations, (reason == "tolerance", "ended by tolerance", "first"),
+        (reason == "fixed", "a fixed count", "muted"), (reason == "cap", "gave up at the cap", "bad"),
+        (reason == "not finite", "not finite", "bad"), (reason == "rest", "held at rest", "third"),
+        ((reason == "none") & (iterations > 0), "impacts", "second"),
+    )  # fmt: skip
+    what = "impacts" if located(view) else "iterations"
+    title = f"{what.capitalize()} per step, by what ended them"
+    return Plot("iterations", title, "time (s)", f"{what} per step", shown) if shown else None
+
+
+def _stops(view: View) -> Plot | None:
+    rows = view.table("solver")
+    stopped, capped = rows["stopped"].astype(bool), rows["reason"].astype(str) == "cap"
+    shown = _groups(
+        time_of(view, rows["step"]), rows["margin"].astype(float), (stopped, "stopped", "first"),
+        (~stopped & ~capped, "continued", "second"), (~stopped & capped, "gave up", "bad"),
+    )  # fmt: skip
+    if not shown:
+        return None
+    return Plot(
+        "stops", "Margins of stop decisions", "time (s)", "tolerance − residual", shown, y_scale="symlog",
+        caption="Above zero the residual was below its tolerance and the solver stopped, below zero it "
+        "continued. The scale is logarithmic to both sides of zero.",
+        horizontals=((0.0, "tolerance"),),
+    )  # fmt: skip
+
+
+def _flips(view: View) -> Plot | None:
+    ratio, contacts = margin_ratio(view), view.table("contacts")
+    entered = contacts["entered"].astype(bool)
+    shown = _groups(
+        time_of(view, contacts["step"]), ratio, (entered, "contact begins", "first"),
+        (~entered, "contact ends", "second"),
+    )  # fmt: skip
+    if not shown:
+        return None
+    return Plot(
+        "margins", "Margins of contact flips in units of rounding", "time (s)", "|margin| / rounding bound",
+        shown, y_scale="log", horizontals=((1.0, "below: decided by rounding"),),
+        caption="How far from the floor the height was when a contact began or ended, over the bound on its "
+        "rounding error.",
+    )  # fmt: skip
+
+
+def _gradient(view: View) -> Iterator[Any]:
+    names, exact = parameters(view), view.summary["exact"] or {}
+    if not names:
+        yield TEXTS("no_gradient")
+        return
+    known = exact.get("gradient") or {}
+    yield Figure(
+        "gradient", "A panel for each parameter; the line is the closed form's derivative where it is known. "
+        "An open circle: the loss does not depend on the parameter.",
+        "; ".join(f"dloss/d{name} by {one['method']}: {number(one['gradient'].get(name))}"
+                  for name in names for one in applied(view)),
+        lambda figure: _dots(view, figure), 0.5 + (0.55 + 0.25 * len(applied(view))) * len(names),
+    )  # fmt: skip
+
+    def cell(made: Mapping[str, Any], name: str) -> Any:
+        if not (made.get("depends") or {}).get(name, True):
+            return "0 (does not depend)"
+        error = made.get("details", {}).get("standard_error", {}).get(name)
+        text = number(made["gradient"].get(name), 6)
+        return text if error is None else f"{text} ± {number(error, 2)}"
+
+    rows = [(one["method"], number(one["value"], 6), *(cell(one, name) for name in names), one["says"])
+            for one in applied(view)]  # fmt: skip
+    if known:
+        slopes = [number(known.get(name), 6) for name in names]
+        rows.append(("closed form", "–", *slopes, "The derivative of the exact motion."))
+    rows += [(one["method"], "–", *["does not apply"] * len(names), one["says"])
+             for one in view.summary["gradient"] if one["refused"]]  # fmt: skip
+    yield Table(("method", "loss", *(f"dloss/d{name}" for name in names), "which derivative it is"), rows)
+
+
+def _dots(view: View, figure: Any) -> None:
+    from mdnum.report import drawing
+
+    made, names = applied(view), parameters(view)
+    exact = (view.summary["exact"] or {}).get("gradient") or {}
+    place = np.arange(len(made))[::-1]
+    for axes, name in zip(figure.subplots(len(names), 1, squeeze=False)[:, 0], names, strict=True):
+        values = np.array([np.nan if (x := one["gradient"].get(name)) is None else x for one in made], float)
+        known = float(exact.get(name, np.nan))
+        size = np.abs([x for x in (*values, known) if np.isfinite(x) and x])
+        if len(size) > 1 and size.max() > 300 * size.min():
+            axes.set_xscale("symlog", linthresh=size.min())
+        axes.axvline(0, color=MUTED, lw=0.6)
+        if np.isfinite(known):
+            axes.axvline(known, color=SECOND, lw=1.2, label="closed form")
+        for at, value, one in zip(place, values, made, strict=True):
+            used = (one.get("depends") or {}).get(name, True)
+            axes.plot(value, at, "o", color=FIRST if used else MUTED, mfc=None if used else "none", ms=6)
+        axes.set_yticks(place, [one["method"] for one in made])
+        axes.set_ylim(-0.6, len(made) - 0.4)
+        axes.set_xlabel(f"dloss/d{name}")
+        if name == names[0]:
+            drawing.legend(axes)
+
+
+def _exact(view: View) -> Iterator[Any]:
+    exact = view.summary["exact"]
+    if not exact:
+        return
+    labels = {
+        "balls": "balls compared", "height_error": "height off at the end (m)",
+        "height_error_largest": "height off at most (m)",
+        "height_error_before_contact": "height off before the first contact (m)",
+        "first_contact_time": "first contact (s)", "first_contact_step": "first contact of the run, step",
+        "rest_time": "comes to rest (s)",
+    }  # fmt: skip
+    motion = ("motion", TEXTS(f"motion_{exact['model']}"))
+    rows = [(label, number(exact[key], 6) if isinstance(exact[key], float) else exact[key])
+            for key, label in labels.items() if key in exact]  # fmt: skip
+    off = [
+        (f"dloss/d{name} off by {method}", number(error, 2, signed=True))
+        for method, errors in (exact.get("gradient_error") or {}).items()
+        for name, error in errors.items()
+    ]
+    yield pairs([motion, *rows, *off])
+
+
+def _variants(view: View) -> Iterator[Any]:
+    variants, rows = view.summary["variants"], view.table("separations")
+    if not variants:
+        return
+    roles: tuple[Role, ...] = ("first", "second", "third", "bad", "muted")
+    if np.any(rows["separation"] > 0):
+        names = list(dict.fromkeys(rows["variant"].astype(str).tolist()))
+        lines = []
+        for n, name in enumerate(names):
+            mine = rows["variant"].astype(str) == name
+            x, y = time_of(view, rows["step"][mine]), rows["separation"][mine]
+            lines.append(Series(name, x, y, "line", roles[n % len(roles)], n >= len(roles)))
+        forks = [(float(time_of(view, np.array(one["fork"]))), f"{one['name']} forks")
+                 for one in variants if one["fork"] is not None]  # fmt: skip
+        yield Plot(
+            "separation", "Separation of the variants", "time (s)", "largest |difference| of heights (m)",
+            tuple(lines), y_scale="log", verticals=tuple(forks),
+            caption="Largest difference of heights between the run and each variant.",
+        )  # fmt: skip
+    slopes = list(variants[0]["gradient"])
+    cells = [
+        (
+            one["name"], one["seed"], one["fork"], "none differs" if one["fork"] is None else decision(one),
+            one["margin"], one["margin_there"], one["separation_end"], one["iterations_differ"],
+            number(one["loss"], 6),
+            *("0 (does not depend)" if not one["depends"].get(name, True)
+              else number(one["gradient"].get(name), 6) for name in slopes),
+        )
+        for one in variants
+    ]  # fmt: skip
+    heads = (
+        "variant", "seed", "fork", "decision", "margin here", "margin there", "separation at the end (m)",
+        "steps with other iterations", "loss", *(f"dloss/d{name}" for name in slopes),
+    )  # fmt: skip
+    yield Table(heads, cells)
+    yield TEXTS("variants")
+
+
+def _contacts(view: View) -> Iterator[Any]:
+    """The contact flips nearest to the threshold, in the order of steps."""
+    rows, ratio = view.table("contacts"), margin_ratio(view)
+    if not len(ratio):
+        yield TEXTS("no_contacts")
+        return
+    chosen = np.sort(np.argsort(ratio, kind="stable")[:TABLE_ROWS])
+    columns: list[tuple[np.ndarray, int | None]] = [
+        (rows[name][chosen].astype(int), None) for name in ("step", "ball", "entered")
+    ]
+    columns += [(rows[name][chosen].astype(float), 4) for name in ("height", "margin", "velocity")]
+    columns.append((ratio[chosen].astype(float), 3))
+    yield TEXTS("contacts", shown=len(chosen), rows=len(ratio))
+    yield Browse(
+        name="contacts",
+        row_id="contact-rows",
+        label="Search contacts",
+        placeholder="ball 3, step:100..200, entered",
+        columns=(
+            Column(0, "step", kind="count"),
+            Column(1, "ball", kind="count"),
+            Column(2, "decision", kind="word", words=("left", "entered"), colors=("out", "in")),
+            Column(3, "height", "m"),
+            Column(4, "margin", "m"),
+            Column(5, "velocity", "m/s"),
+            Column(6, "margin", "÷ bound", digits=2, missing="∞"),
+        ),
+        rows=plain_rows(columns),
+        words={"entered": (2, 1), "in": (2, 1), "left": (2, 0), "out": (2, 0)},
+        ranges={"step": 0, "ball": 1},
+        subjects=(1,),
+        nouns=("ball",),
+        ambiguous=6,
+    )
+
+
+def _stop_decisions(view: View) -> Iterator[Any]:
+    """The stop decisions nearest to their tolerance, in the order of steps."""
+    rows = view.table("solver")
+    if not len(rows["step"]):
+        return
+    near = np.abs(rows["margin"].astype(float))
+    chosen = np.sort(np.argsort(near, kind="stable")[:TABLE_ROWS])
+    codes = np.array([_REASONS.index(word) for word in rows["reason"].astype(str)[chosen].tolist()], int)
+    columns: list[tuple[np.ndarray, int | None]] = [
+        (rows[name][chosen].astype(int), None) for name in ("step", "ball", "iteration")
+    ]
+    columns += [(rows[name][chosen].astype(float), 5) for name in ("residual", "margin")]
+    columns += [(rows["stopped"][chosen].astype(int), None), (codes, None)]
+    each = bool(np.any(rows["ball"] >= 0))
+    shown = [
+        Column(0, "step", kind="count"), Column(1, "ball", kind="count"),
+        Column(2, "iteration", kind="count"),
+        Column(3, "residual", digits=4), Column(4, "margin", "tolerance − residual", digits=3),
+        Column(5, "decision", kind="word", words=("continued", "stopped"), colors=("out", "in")),
+        Column(6, "ended by", kind="word", words=("", *_REASONS[1:])),
+    ]  # fmt: skip
+    yield TEXTS("stops", shown=len(chosen), rows=len(near))
+    yield Browse(
+        name="stops",
+        row_id="stop-rows",
+        label="Search stop decisions",
+        placeholder="step:100..200, iteration:5.., stopped, cap",
+        columns=tuple(column for column in shown if each or column.at != 1),
+        rows=plain_rows(columns),
+        words={"stopped": (5, 1), "continued": (5, 0), "tolerance": (6, 2), "cap": (6, 3), "fixed": (6, 4),
+               "rest": (6, 6)},
+        ranges={"step": 0, "ball": 1, "iteration": 2},
+    )  # fmt: skip

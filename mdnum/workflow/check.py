@@ -1,0 +1,105 @@
+"""`mdnum check`: a system against ASE and against other neighbor searches, answered on the spot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from mdnum.plain import plain
+from mdnum.report.finding import Finding, Texts, Verdict, conclude
+from mdnum.report.words import listed
+
+if TYPE_CHECKING:
+    from mdnum.references.energy_check import DynamicsReport, EnergyReport
+    from mdnum.references.pair_check import PairsReport
+    from mdnum.systems import System
+
+TEXTS = Texts(__file__)
+
+
+@dataclass(frozen=True)
+class Checked:
+    """The answer of a check.
+
+    Attributes:
+        report: what was compared, with `ok` and rows for people.
+        verdict: its findings.
+    """
+
+    report: Any
+    verdict: Verdict
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """For JSON."""
+        worst = {"worst": self.report.worst} if hasattr(self.report, "worst") else {}
+        return plain({"ok": self.report.ok, **vars(self.report), **worst, "findings": self.verdict.findings})
+
+
+def check(question: str, system: System) -> Checked:
+    """Check a system.
+
+    Args:
+        question: "energy", "pairs" or "dynamics".
+        system: what to check.
+    """
+    from mdnum.references.energy_check import check_dynamics, check_energy
+    from mdnum.references.pair_check import check_pairs
+
+    checks: Mapping[str, tuple[Callable[[Any], Any], Callable[[Any], Iterator[Finding]]]] = {
+        "energy": (check_energy, energy_findings),
+        "pairs": (check_pairs, pair_findings),
+        "dynamics": (check_dynamics, dynamics_findings),
+    }
+    compare, findings = checks[question]
+    report: Any = compare(system)
+    headline = TEXTS("agrees" if report.ok else "differs", system=system.name)
+    return Checked(report, conclude(findings(report), headline=headline, best="good", judged=True))
+
+
+def energy_findings(report: EnergyReport) -> Iterator[Finding]:
+    """What to know of energies, forces and stresses beside a reference."""
+    wrong = [frame for frame in report.frames if not frame.ok]
+    if wrong:
+        worst = max(wrong, key=lambda frame: frame.force_rel)
+        variants = ["third"] * (worst.energy_third is not None) + ["ambiguous"] * bool(worst.ambiguous)
+        yield TEXTS.finding("ase-disagrees", *variants, reference=report.reference, **vars(worst))
+    if not report.is_ase:
+        yield TEXTS.finding("not-ase")
+    if report.precision != "float64":
+        yield TEXTS.finding(
+            "narrow-precision",
+            precision=report.precision,
+            energy=max(frame.energy_roundings for frame in report.frames),
+            force=max(frame.force_roundings for frame in report.frames),
+        )
+
+
+def dynamics_findings(report: DynamicsReport) -> Iterator[Finding]:
+    """What to know of a trajectory beside ASE's."""
+    if not report.ok:
+        yield TEXTS.finding(
+            "dynamics-differ",
+            *["sudden"] * (report.sudden is not None),
+            steps=len(report.position) - 1,
+            off=report.position[-1],
+            tolerance=report.tolerance,
+            sudden=report.sudden,
+        )
+    if not report.is_ase:
+        yield TEXTS.finding("not-ase", "dynamics")
+
+
+def pair_findings(report: PairsReport) -> Iterator[Finding]:
+    """What to know of the pair sets of searches."""
+    for one in report.results:
+        if one.verdict in ("differs", "failed"):
+            code = "pairs-differ" if one.verdict == "differs" else "search-failed"
+            variants = ["ours"] * one.ours
+            yield TEXTS.finding(code, *variants, **{**vars(one), "effective": None})
+    borderline = [f"{one.name} {one.borderline}" for one in report.results if one.borderline]
+    if borderline:
+        yield TEXTS.finding("pairs-at-the-cutoff", searches=listed(borderline))
+    if report.decided_exactly:
+        yield TEXTS.finding("pairs-ambiguous", pairs=report.decided_exactly)

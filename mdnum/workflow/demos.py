@@ -1,0 +1,308 @@
+"""`mdnum ball --demo` as a function: each classic effect in seconds, with the number that shows it.
+
+A demonstration is a script in the folder `demos` beside the systems, `NN_its_name.py`: its first line says
+what it is about, and its `run()` returns a `Demo`. To add one, add a file.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mdnum.errors import InputError
+from mdnum.plain import plain
+from mdnum.report.finding import Texts, Verdict, conclude
+from mdnum.report.section import Page, Plot, Region, Section, Series, Table, pairs
+from mdnum.report.words import typeset
+from mdnum.systems.find import shipped_folder
+from mdnum.systems.messages import nearest
+from mdnum.workflow import frame
+from mdnum.workflow.frame import Outcome, Progress, Verb, View
+
+__all__ = ["Claim", "Demo", "Plot", "Region", "Series", "Table", "demonstrate", "names", "table"]
+
+TEXTS = Texts(__file__)
+#: Members of a list that are written out; of longer ones, the first and the last.
+_LISTED = 16
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A statement of a demonstration that was tested while it ran.
+
+    Attributes:
+        what: the statement, in words.
+        seen: the number or word that was found.
+        expected: what it was held against, in words ("0.0009765625", "below 1e-12").
+        ok: whether it held.
+    """
+
+    what: str
+    seen: Any
+    expected: str
+    ok: bool
+
+
+@dataclass(frozen=True)
+class Demo:
+    """The outcome of one demonstration.
+
+    Attributes:
+        title: a short heading.
+        question: what it asks, one sentence.
+        answer: what it shows, one to three sentences, with its numbers in words.
+        numbers: the numbers it must show, plain values by name; the first is the headline.
+        checks: statements tested while it ran.
+        tables, plots: what it shows.
+        in_md: the counterpart in molecular dynamics, one sentence.
+        data: more plain values for `--json` (histories and the like).
+    """
+
+    title: str
+    question: str
+    answer: str
+    numbers: Mapping[str, Any]
+    checks: Sequence[Claim]
+    tables: Sequence[Table] = ()
+    plots: Sequence[Plot] = ()
+    in_md: str = ""
+    data: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def ok(self) -> bool:
+        """Whether every check held."""
+        return all(claim.ok for claim in self.checks)
+
+
+def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> Table:
+    """A table of a demonstration, its title first."""
+    return Table(tuple(columns), rows, title)
+
+
+def demonstrate(
+    name: str,
+    *,
+    out: str | Path | None = None,
+    report: bool = True,
+    progress: Progress | None = None,
+) -> Outcome:
+    """Run a demonstration, or all of them.
+
+    Args:
+        name: of one, or "all".
+        out: the new folder; default runs/demo-<name>-<n>.
+        report: whether to write report.html.
+        progress: called between demonstrations.
+
+    Returns:
+        its numbers, checks and curves; `result` is the list of `Demo`.
+
+    Raises:
+        InputError: there is no demonstration of that name.
+    """
+    # an unknown name is refused before anything runs
+    asked = names() if name == "all" else [_known(name)]
+    done: dict[str, Demo] = {}
+    for number, one in enumerate(asked):
+        frame.say(progress, f"demonstration {one}", number, len(asked))
+        done[one] = load(one)()
+    documents = [_document(one, demo) for one, demo in done.items()]
+    summary = documents[0] if name != "all" else {"demos": documents}
+    with frame.new_folder("demos", f"demo-{name}", out) as folder:
+        ok = all(demo.ok for demo in done.values())
+        frame.store(folder, {**summary, "ok": ok}, {"curves": _curves(done)})
+    return frame.finish(folder, report=report, result=list(done.values()), progress=progress)
+
+
+# --- the scripts --------------------------------------------------------------------------------------
+
+
+def names() -> list[str]:
+    """The demonstrations, in the order in which they are best read."""
+    return list(_files())
+
+
+def about(name: str) -> str:
+    """The first line of a demonstration's file, read without importing it (and jax)."""
+    text = ast.get_docstring(ast.parse(_files()[_known(name)].read_text(encoding="utf-8")))
+    return (text or "").partition("\n")[0].rstrip(".")
+
+
+def load(name: str) -> Callable[[], Demo]:
+    """What runs a demonstration.
+
+    Raises:
+        InputError: there is none of that name.
+    """
+    path = _files()[_known(name)]
+    spec = importlib.util.spec_from_file_location(f"mdnum_demo_{path.stem}", path)
+    assert spec is not None and spec.loader is not None
+    # a script's own classes look their module up by name
+    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.run
+
+
+def _files() -> dict[str, Path]:
+    found = sorted(shipped_folder("demos").glob("[0-9][0-9]_*.py"))
+    return {path.stem[3:].replace("_", "-"): path for path in found}
+
+
+def _known(name: str) -> str:
+    known = names()
+    if name not in known:
+        near = nearest(name, known)
+        hint = f"Did you mean {near}? " if near else ""
+        raise InputError(
+            f"no demonstration called {name!r}",
+            remedy=f"{hint}There are {', '.join(known)}; or all",
+            where="--demo",
+        )
+    return name
+
+
+# --- on disk ------------------------------------------------------------------------------------------
+
+
+def _document(name: str, demo: Demo) -> dict[str, Any]:
+    """A demonstration as plain values; the points of its plots are in a table of their own."""
+    document = {"name": name, "ok": demo.ok, **plain(demo)}
+    for table in document["tables"]:
+        del table["shown"], table["bad"]
+    for plot in document["plots"]:
+        plot["series"] = [
+            {key: one[key] for key in ("label", "mark", "role", "dashed")} for one in plot["series"]
+        ]
+    return document
+
+
+def _curves(demos: Mapping[str, Demo]) -> dict[str, np.ndarray]:
+    """A row per point of every line of every plot."""
+    parts: list[tuple[str, str, str, Series]] = [
+        (name, plot.name, series.label, series)
+        for name, demo in demos.items()
+        for plot in demo.plots
+        for series in plot.series
+    ]
+    sizes = [len(series.x) for *_, series in parts]
+    columns = {
+        key: np.repeat(np.array([part[at] for part in parts], dtype=str), sizes)
+        for at, key in enumerate(("part", "curve", "line"))
+    }
+    for key in ("x", "y"):
+        columns[key] = np.concatenate([np.asarray(getattr(part[3], key), float) for part in parts] or [[]])
+    return columns
+
+
+def _plots(document: Mapping[str, Any], curves: Mapping[str, np.ndarray]) -> Iterator[Plot]:
+    """The plots of a demonstration as it declared them, their names those of files."""
+    mine = curves["part"].astype(str) == document["name"]
+    for stored in document["plots"]:
+        here = mine & (curves["curve"].astype(str) == stored["name"])
+        lines = curves["line"].astype(str)
+        series = []
+        for one in stored["series"]:
+            at = here & (lines == one["label"])
+            series.append(Series(x=curves["x"][at], y=curves["y"][at], **one))
+        region = stored["region"]
+        if region is not None:
+            arrays = {key: np.array(region[key]) for key in ("x", "y", "value")}
+            region = Region(words=tuple(region["words"]), **arrays)
+        marks = {key: tuple(map(tuple, stored[key])) for key in ("verticals", "horizontals")}
+        name = f"{document['name']}-{stored['name']}"
+        yield Plot(**{**stored, **marks, "name": name, "series": tuple(series), "region": region})
+
+
+# --- judged and shown ---------------------------------------------------------------------------------
+
+
+def judge(view: View) -> Verdict:
+    """A finding for every demonstration that did not come out."""
+    demos = _demos(view)
+    found = []
+    for demo in demos:
+        failed = [claim["what"] for claim in demo["checks"] if not claim["ok"]]
+        if failed:
+            values = {"name": demo["name"], "failed": len(failed), "checks": len(demo["checks"])}
+            section = demo["title"]
+            found.append(TEXTS.finding("DEMO_FAILED", section=section, which="; ".join(failed), **values))
+    checks = [claim["ok"] for demo in demos for claim in demo["checks"]]
+    headline = "some" if found else "one" if len(demos) == 1 else "all"
+    return conclude(
+        found,
+        [TEXTS("held", held=sum(checks), checks=len(checks))],
+        headline=TEXTS(headline, demos=len(demos), right=len(demos) - len(found)),
+        best="good",
+    )
+
+
+def page(view: View, verdict: Verdict) -> Page:
+    """Question, answer, numbers, checks, tables and figures of each demonstration."""
+    demos, curves = _demos(view), view.table("curves")
+    sections: list[Section] = []
+    for demo in demos:
+        rows = [("ok" if one["ok"] else "failed", one["what"], shown(one["seen"]), one["expected"])
+                for one in demo["checks"]]  # fmt: skip
+        bad = frozenset(row for row, one in enumerate(demo["checks"]) if not one["ok"])
+        digits = _digits(demo["numbers"].values(), 10)
+        numbers = pairs(
+            [(key.replace("_", " "), shown(value, digits)) for key, value in demo["numbers"].items()]
+        )
+        checks = Table(("", "check", "seen", "expected"), rows, shown=1000, bad=bad)
+        told = [demo["question"], typeset(demo["answer"]), numbers, checks]
+        sections.append(Section(demo["title"], told, terminal=True))
+        more: list[Any] = [_table(one) for one in demo["tables"]]
+        more += [*_plots(demo, curves), *([TEXTS("in_md", text=demo["in_md"])] if demo["in_md"] else [])]
+        # of all of them the command prints no tables: they would hide the answers
+        sections.append(Section(TEXTS("more", name=demo["name"]), more, terminal=len(demos) == 1, level=3))
+    title = demos[0]["title"] if len(demos) == 1 else TEXTS("title")
+    return Page(title, sections=sections, provenance=view.folder.provenance)
+
+
+def _demos(view: View) -> Sequence[Mapping[str, Any]]:
+    return view.summary.get("demos", [view.summary])
+
+
+def _table(stored: Mapping[str, Any]) -> Table:
+    """A table whose numbers have the fewest digits, five at least, that tell those of a column apart."""
+    columns = []
+    for values in zip(*stored["rows"], strict=True):
+        digits = _digits(values, 5)
+        columns.append(
+            [shown(value, digits) if isinstance(value, float | list) else value for value in values]
+        )
+    return Table(tuple(stored["columns"]), list(zip(*columns, strict=True)), stored["title"])
+
+
+def _digits(values: Iterable[Any], least: int) -> int:
+    """The fewest significant digits that tell numbers apart."""
+    floats = {value for value in values if isinstance(value, float)}
+    apart = (n for n in range(least, 17) if len({f"{x:.{n}g}" for x in floats}) == len(floats))
+    return next(apart, 17)
+
+
+def shown(value: Any, digits: int = 10) -> str:
+    """A plain value as people read it: numbers to a number of significant digits, lists in brackets."""
+    if isinstance(value, Mapping):
+        return ", ".join(f"{str(key).replace('_', ' ')} {shown(item, digits)}" for key, item in value.items())
+    if isinstance(value, list):
+        digits = _digits(value, min(digits, 5) if len(value) > 3 else digits)
+        texts = [shown(item, digits) for item in value]
+        if len(texts) > _LISTED:
+            return f"[{', '.join(texts[:6])}, …, {texts[-1]}] ({len(texts)} values)"
+        return f"[{', '.join(texts)}]"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return typeset(f"{value:.{digits}g}")
+    return "–" if value is None else typeset(str(value))
+
+
+VERBS = {"demos": Verb(judge, page)}

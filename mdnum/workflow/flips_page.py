@@ -1,0 +1,494 @@
+"""What a ledger of flips shows and does not: findings, sections and figures, from its folder alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from mdnum.report.browse import Browse, Column, plain_rows
+from mdnum.report.finding import Finding, Verdict, conclude
+from mdnum.report.section import Key, Page, Plot, Section, Series, Table, pairs
+from mdnum.report.words import count, many, number, percent, plain
+from mdnum.workflow.flips_shared import TEXTS, Written, repeating, resolution
+from mdnum.workflow.frame import View
+
+#: Share of flips that the file leaves undecided, or hides or makes up, above which it is worth a warning.
+UNDECIDED = 0.02
+#: The same for flips between frames, and for those that are reversed at once.
+HIDDEN, CHATTER = 0.10, 0.15
+#: Share of contacts without a beginning or an end in the file above which that is said.
+CENSORED = 0.5
+#: Fewer flips than this say nothing in shares.
+FEW = 20
+# shares of flips hidden and made up that are not worth a number
+_HARDLY = 1e-3
+# rules with evidence, and with figures of their own; rows of a table; frames from which on flips are averaged
+_TOLD, _DRAWN, _ROWS, _DENSE = 3, 4, 15, 400
+_ORDER = ("error", "warning", "info")
+
+Rule = Mapping[str, Any]
+Limit = tuple[str, tuple[str, ...], dict[str, Any]]
+
+
+# ---- findings
+
+
+def judge(view: View) -> Verdict:
+    """Headline, evidence and findings of a trajectory."""
+    said = Written(view.summary)
+    found = [*_ended(view), *_of_rules(view, said), *_others(view, said)]
+    quiet = all(one.severity == "info" for one in found)
+    return conclude(
+        found, _evidence(view, said), headline=_headline(view, said), best="good" if quiet else "info"
+    )
+
+
+def _headline(view: View, said: Written) -> str:
+    summary, every = view.summary, view.summary["rules"]
+    if summary["frames"] < 2:
+        return TEXTS("one_frame", pairs=every[0]["pairs_first"], rule=said.rule(every[0]))
+    one = next((one for one in every if one["flips"]), None)
+    if one is None:
+        return TEXTS("no_flips", frames=summary["frames"])
+    frames, rule = summary["frames"], said.rule(one)
+    parts = [TEXTS("flips", flips=one["flips"], pairs=one["pairs_flipped"], frames=frames, rule=rule)]
+    if one["flips"] >= FEW:
+        flux, between = by_velocities(one), one["stride"]["between"]
+        lost = flux or (between or {}).get("lost")
+        if lost and HIDDEN < lost < 1:
+            parts.append(TEXTS("hidden_velocities" if flux else "hidden_between", times=1 / (1 - lost)))
+        if one["ambiguous"] > UNDECIDED * one["flips"]:
+            parts.append(TEXTS("undecided", share=one["ambiguous"] / one["flips"]))
+    return " ".join(parts)
+
+
+def _evidence(view: View, said: Written) -> Iterator[str]:
+    yield resolution(view.summary["resolution"], said.unit)
+    for place, one in enumerate(view.summary["rules"][:_TOLD]):
+        if view.summary["frames"] > 1 and not len(_disagreeing(view, place)):
+            numbers = {name: one[name] for name in ("flips", "entered", "left")}
+            yield TEXTS("algebra", rule=said.rule(one), **numbers)
+        life = one["lifetime"]
+        if life["followed"] and life["leaves"]:
+            mean = said.duration(life["mean_by_rate"])
+            yield TEXTS("life", rule=said.rule(one), median=said.life(life), mean=mean)
+
+
+def _ended(view: View) -> Iterator[Finding]:
+    summary = view.summary
+    values = {"last": int(view.table("frames")["number"][-1]), "frames": summary["frames"]}
+    if summary["stopped"]:
+        cut = ["cut"] * summary["cut_short"]
+        yield TEXTS.finding("STOPPED", *cut, error=summary["stopped"], **values)
+    if summary["interrupted"]:
+        yield TEXTS.finding("INTERRUPTED", **values)
+
+
+def _disagreeing(view: View, place: int) -> np.ndarray:
+    """Frames whose pairs are not those before + entered - left."""
+    table = view.table("frames")
+    rows = table["rule"] == place
+    net = (table["entered"][rows] - table["left"][rows])[1:]
+    return np.flatnonzero(np.diff(table["pairs"][rows]) != net)
+
+
+def _of_rules(view: View, said: Written) -> Iterator[Finding]:
+    """One finding for each code: those of several rules are told one after the other, the reason once."""
+    by_code: dict[str, list[Finding]] = {}
+    for place, one in enumerate(view.summary["rules"]):
+        for code, variants, values in _limits(view, said, place, one):
+            section = _title(_SECTIONS[code], view, said, one)
+            made = TEXTS.finding(code, *variants, section=section, rule=said.rule(one), **values)
+            by_code.setdefault(code, []).append(made)
+    for code, several in by_code.items():
+        worst = min(several, key=lambda one: _ORDER.index(one.severity))
+        title = worst.title if len(several) == 1 else f"{worst.title} ({worst.values['rule']})"
+        texts = [*(one.text for one in several), TEXTS.entries[code].get("why", "")]
+        yield replace(worst, title=title, text=" ".join(filter(None, texts)))
+
+
+def _limits(view: View, said: Written, place: int, one: Rule) -> Iterator[Limit]:
+    """(code, variants, values) of what one rule's flips do not show."""
+    if len(wrong := _disagreeing(view, place)):
+        yield "EVENT_ALGEBRA", (), {"first": int(wrong[0]) + 1, "frames": len(wrong)}
+    flips, frames, life = one["flips"], view.summary["frames"], one["lifetime"]
+    if flips:
+        yield from _undecided(one)
+        yield from _between(said, one)
+        flux, lost = one["flux"], by_velocities(one)
+        if lost and lost > HIDDEN:
+            values = {name: flux[name] for name in ("frames", "rate", "error", "seen")}
+            yield "FLUX", (), {**values, "lost": lost, "time": view.summary["time"]}
+        chatter = one["chatter"]
+        if flips >= FEW and chatter["share"] >= CHATTER and not _far_apart(one):
+            values = {name: chatter[name] for name in ("share", "window", "undone")}
+            loose = said.life(one["intermittent"])
+            yield "CHATTER", (), {**values, "flips": flips, "life": said.life(life), "loose": loose}
+    total = sum(one["contacts"].values())
+    cut = total - one["contacts"]["seen"]
+    if total and cut > CENSORED * total and frames > 1:
+        yield "CENSORED", (), {**one["contacts"], "share": cut / total}
+    if one["images"]:
+        yield "IMAGES", (), {"images": one["images"]}
+
+
+def _undecided(one: Rule) -> Iterator[Limit]:
+    missed, invented = (one["grid"][name] if one["grid"] else 0.0 for name in ("missed", "invented"))
+    share = one["ambiguous"] / one["flips"]
+    if not one["ambiguous"] and max(missed, invented) <= UNDECIDED:
+        return
+    grave = one["flips"] >= FEW and max(share, missed, invented) > UNDECIDED
+    variants = ["grave"] * grave
+    if one["grid"]:
+        variants.append("few" if max(missed, invented) < _HARDLY else "some")
+    values = {"missed": missed, "invented": invented, "share": share, "near": one["near_mean"]}
+    yield "UNDECIDABLE", tuple(variants), {**values, "ambiguous": one["ambiguous"], "flips": one["flips"]}
+
+
+def _far_apart(one: Rule) -> bool:
+    """Whether half of the contacts that begin are over by the next frame."""
+    return one["flips"] >= FEW and one["lifetime"]["median"] == 1
+
+
+def _between(said: Written, one: Rule) -> Iterator[Limit]:
+    between = one["stride"]["between"]
+    if _far_apart(one):
+        yield "FRAMES_FAR_APART", (), {"interval": said.duration(1), "stays": one["stays_over"]}
+    elif one["flips"] < FEW or between is None:
+        return
+    elif between["lost"] is None:
+        reason = TEXTS(f"stride_{between['reason']}", **between)
+        minor = () if between["doubled"] > HIDDEN else ("minor",)
+        values = {"lost": None, "low": None, "high": None, "reason": reason}
+        yield "BETWEEN_FRAMES", ("unknown", *minor), {**values, "seen": TEXTS("stride_seen", **between)}
+    elif between["lost"] > HIDDEN:
+        yield "BETWEEN_FRAMES", (), {**between, "seen": TEXTS("stride_seen", **between)}
+
+
+def by_velocities(one: Rule) -> float | None:
+    """Share of the crossings that velocities show to be missing in the file.
+
+    Returns:
+        0 where what is missing may be so by chance; None where there are too few crossings to tell.
+    """
+    flux = one["flux"]
+    if flux is None or flux["lost"] is None or flux["crossed"] < FEW:
+        return None
+    # a rate from a handful of frames scatters: what it may be by chance is no finding
+    return flux["lost"] if flux["rate"] - flux["seen"] > 2.0 * flux["error"] else 0.0
+
+
+def _others(view: View, said: Written) -> Iterator[Finding]:
+    summary, leaps = view.summary, view.summary["leaps"]
+    if leaps:
+        others = leaps["frames"] - 1
+        values = {"frame": leaps["frame"], "atom": leaps["atom"], "distance": said.length(leaps["distance"])}
+        yield TEXTS.finding("LEAP", *(["others"] * bool(others)), others=others, **values)
+    if summary["frames"] > 1:
+        if not summary["has_times"]:
+            yield TEXTS.finding("NO_TIMES")
+        elif summary["backward"]:
+            yield TEXTS.finding("TIME_GOES_BACK", frames=summary["backward"])
+        elif not summary["even"]:
+            yield TEXTS.finding("UNEVEN_FRAMES", interval=said.duration(1))
+    axes = repeating(summary["box"])
+    more = (
+        ["partial"] * (0 < len(axes) < 3) + ["free"] * (not axes) + ["velocities"] * summary["velocities_odd"]
+    )
+    if summary["notes"] or more:
+        yield TEXTS.finding("READING", *more, notes=" ".join(summary["notes"]), axes=", ".join(axes))
+    if any(one["min_margin"] == 0 for one in summary["rules"]):
+        yield TEXTS.finding("TIE", margin=said.length(0.0))
+
+
+# ---- sections
+
+_SECTIONS = {
+    "EVENT_ALGEBRA": "Pairs and flips", "UNDECIDABLE": "Pairs and flips", "IMAGES": "Pairs and flips",
+    "FRAMES_FAR_APART": "Between the frames", "BETWEEN_FRAMES": "Between the frames",
+    "FLUX": "Between the frames", "CHATTER": "Between the frames", "CENSORED": "How long contacts last",
+}  # fmt: skip
+
+
+def _title(title: str, view: View, said: Written, one: Rule) -> str:
+    """Of a section about a rule, which is named where there are several."""
+    return f"{title}, {said.rule(one)}" if len(view.summary["rules"]) > 1 else title
+
+
+def page(view: View, verdict: Verdict) -> Page:
+    """The page of a trajectory."""
+    summary, said = view.summary, Written(view.summary)
+    size = f"{many(summary['atoms'], 'atom')}, {many(summary['frames'], 'frame')}"
+    if said.timed:
+        size += f" {said.time(plain(summary['interval']))} apart"
+    sections = [Section("Rules", [_rules(view, said)], terminal=True)]
+    for place, one in enumerate(summary["rules"]):
+        sections += _rule_sections(view, said, place, one)
+    if (browsed := _busiest(view)) is not None:
+        sections.append(Section("The busiest pairs", [browsed]))
+    sections.append(Section("What was read", [pairs(list(_input(view, said, size))), TEXTS("files")]))
+    return Page(
+        f"{view.name}: neighbor-set flips", f"{size}; {summary['format']}, read by {summary['reader']}",
+        list(_keys(said, summary["rules"][0])), sections, provenance=view.folder.provenance,
+    )  # fmt: skip
+
+
+def _keys(said: Written, one: Rule) -> Iterator[Key]:
+    yield Key("Pairs inside", number(one["pairs_mean"], 4), f"on average, {said.rule(one)}")
+    yield Key("Flips", count(one["flips"]), said.rate(one["flips_per_frame"]))
+    share = percent(one["ambiguous"] / one["flips"]) if one["flips"] else ""
+    yield Key("Undecidable", count(one["ambiguous"]), share)
+    yield Key("Median contact", said.life(one["lifetime"]), "of those seen to begin")
+    yield Key("Mean by rate", said.duration(one["lifetime"]["mean_by_rate"]), "all of them")
+
+
+def _input(view: View, said: Written, size: str) -> Iterator[tuple[str, str]]:
+    summary = view.summary
+    frames = f", frames {summary['slice']}" if summary["slice"] else ""
+    yield "File", f"{summary['file']}{frames} ({summary['format']}, read by {summary['reader']})"
+    yield "Size", size
+    yield "Box", said.box(summary["box"]) + (", at the first frame" if summary["frames"] > 1 else "")
+    if summary["between"]:
+        yield "Between", " and ".join(f"“{one}”" for one in summary["between"])
+    yield "Resolution", resolution(summary["resolution"], said.unit)
+    yield "Took", f"{number(sum(summary['seconds'].values()), 2)} s"
+
+
+def _rules(view: View, said: Written) -> Table:
+    columns = (
+        "rule",
+        "pairs",
+        "flips",
+        "per frame",
+        "undecidable",
+        "median life",
+        "mean life by rate",
+        "chatter",
+    )
+    rows = [
+        (
+            said.rule(one), f"{count(one['pairs_first'])} to {count(one['pairs_last'])}", one["flips"],
+            one["flips_per_frame"], one["ambiguous"], said.life(one["lifetime"]),
+            said.duration(one["lifetime"]["mean_by_rate"]), percent(one["chatter"]["share"]),
+        )
+        for one in view.summary["rules"]
+    ]  # fmt: skip
+    return Table(columns, rows)
+
+
+def _rule_sections(view: View, said: Written, place: int, one: Rule) -> Iterator[Section]:
+    plots: dict[str, list[Plot]] = {}
+    for title, plot in _plots(view, said, place, one) if place < _DRAWN else ():
+        plots.setdefault(title, []).append(replace(plot, name=f"rule{place}-{plot.name}"))
+
+    def section(title: str, *parts: Any, level: Any = 3) -> Section:
+        return Section(_title(title, view, said, one), [*parts, *plots.get(title, [])], level=level)
+
+    yield section("Pairs and flips", pairs(list(_numbers(said, one))), level=2)
+    yield section("How long contacts last", pairs(list(_lifetimes(said, one))))
+    lost = list(_lost(view, said, one))
+    yield section("Between the frames", *([pairs(lost)] if lost else []))
+    tables = [_classes(view, said, "species", one["by_species"])]
+    if one["by_residue_name"]:
+        tables.append(_classes(view, said, "residues by name", one["by_residue_name"]))
+    if len(rows := np.flatnonzero(view.table("residues")["rule"] == place)[:_ROWS]):
+        table = view.table("residues")
+        told = [(str(table["residue"][k]), int(table["between"][k]), int(table["within"][k])) for k in rows]
+        tables.append(Table(("residue", "flips with others", "within itself"), told))
+    yield section("Who flips", *tables)
+    if "Neighbors" in plots:
+        yield section("Neighbors")
+
+
+def _numbers(said: Written, one: Rule) -> Iterator[tuple[str, str]]:
+    around, chatter = one["neighbors"], one["chatter"]
+    yield "Pairs inside at the first frame", count(one["pairs_first"])
+    yield "Pairs inside at the last", count(one["pairs_last"])
+    yield "Pairs inside on average", number(one["pairs_mean"], 5)
+    yield "Flips", f"{count(one['flips'])}: {count(one['entered'])} entered, {count(one['left'])} left"
+    yield "Flips from frame to frame", number(one["flips_per_frame"], 4)
+    yield "Pairs that flip", count(one["pairs_flipped"])
+    yield "Undecidable flips", count(one["ambiguous"])
+    yield "Undecidable pairs at an average frame", number(one["near_mean"])
+    if one["min_margin"] is not None:
+        yield "Closest decision", f"{said.length(one['min_margin'])} from its threshold"
+    span = f"{count(around['fewest'])} to {count(around['most'])}"
+    yield "Neighbors of an atom", f"{span}, {number(around['mean'], 4)} on average"
+    back = f"{many(chatter['undone'], 'flip')} ({percent(chatter['share'])})"
+    yield f"Reversed within {many(chatter['window'], 'frame')}", back
+
+
+def _lifetimes(said: Written, one: Rule) -> Iterator[tuple[str, str]]:
+    seen, life, loose = one["contacts"], one["lifetime"], one["intermittent"]
+    yield "Contacts seen whole", count(seen["seen"])
+    yield "Going on after the last frame (censored on the right)", count(seen["goes_on"])
+    yield "There at the first frame (censored on the left)", count(seen["older"])
+    yield "Throughout", count(seen["throughout"])
+    if not life["followed"]:
+        return
+    yield "Median life", said.life(life)
+    if life["quarter_gone"] is not None:
+        ends = [said.duration(life[name]) for name in ("quarter_gone", "three_quarters_gone")]
+        yield "Quartiles", " and ".join(ends)
+    if life["mean"] is not None:
+        at_least = "" if life["mean_is_whole"] else "at least "
+        yield "Mean life (product-limit)", at_least + said.duration(life["mean"])
+    if life["leaves"]:
+        error = said.duration(life["mean_by_rate_error"], 2)
+        yield (
+            "Mean life (by rate)",
+            f"{said.duration(life['mean_by_rate'])} ± {error}, if leaves are independent",
+        )
+    gaps = f"gaps up to {many(one['chatter']['window'], 'frame')} overlooked"
+    yield f"Median life, {gaps}", said.life(loose)
+    if loose["leaves"]:
+        yield f"Mean life by rate, {gaps}", said.duration(loose["mean_by_rate"])
+
+
+def _lost(view: View, said: Written, one: Rule) -> Iterator[tuple[str, str]]:
+    between, flux = one["stride"]["between"], one["flux"]
+    if between is not None:
+        code = between["reason"]
+        yield (
+            "By leaving frames out",
+            TEXTS("stride_none_lost" if code == "none_lost" else "stride_seen", **between),
+        )
+        if between["lost"] is None:
+            yield "Lost between frames", TEXTS(f"stride_{code}", **between)
+        else:
+            low, high = percent(between["low"]), percent(between["high"])
+            about = f"about {percent(between['lost'])} of all flips ({low} to {high})"
+            yield "Lost between frames", about if between["lost"] else f"below {high} of all flips"
+    if flux is not None and flux["crossed"]:
+        per, lost = f"per {view.summary['time']}", by_velocities(one)
+        yield "Crossings by velocities", f"{number(flux['rate'])} ± {number(flux['error'], 2)} {per}"
+        yield "Crossings in the file", f"{number(flux['seen'])} {per}"
+        none = "too few to resolve" if lost is None else "none beyond chance"
+        yield "Lost by velocities", percent(lost) if lost else none
+
+
+def _classes(view: View, said: Written, title: str, rows: list[Mapping[str, Any]]) -> Table:
+    frames = view.summary["frames"]
+    told = [
+        (
+            f"{one['first']}–{one['second']}", one["inside"] / frames, one["entered"] + one["left"],
+            said.rate((one["entered"] + one["left"]) / max(frames - 1, 1)),
+            said.duration(one["stay"], beyond="–"),
+        )
+        for one in rows[:_ROWS]
+    ]  # fmt: skip
+    return Table((title, "pairs inside", "flips", "rate", "mean stay by rate"), told)
+
+
+def _busiest(view: View) -> Browse | None:
+    """The pairs that flipped most often; None where none did."""
+    table, rules = view.table("busiest"), view.summary["rules"]
+    if not len(table["i"]):
+        return None
+    words = np.array([f"{a} – {b}" for a, b in zip(table["first"], table["second"], strict=True)], object)
+    ranks = np.concatenate([np.arange(1, n + 1) for n in np.unique(table["rule"], return_counts=True)[1]])
+    columns: list[tuple[np.ndarray, int | None]] = [(ranks, None)]
+    columns += [(table[name].astype(int), None) for name in ("i", "j", "rank", "flips", "inside")]
+    columns += [
+        (table["inside"] / view.summary["frames"], 3),
+        (table["rule"].astype(int), None),
+        (words, None),
+    ]
+    names = tuple(one["rule"] for one in rules)
+    return Browse(
+        name="pairs", row_id="pair-rows", label="Search pairs", placeholder="3-17, atom 5",
+        columns=(
+            Column(0, "", kind="count"),
+            *((Column(7, "rule", kind="word", words=names),) if len(rules) > 1 else ()),
+            Column(1, "pair", kind="pair"),
+            *((Column(3, "image", kind="count"),) if table["rank"].any() else ()),
+            Column(8, "of", kind="text"),
+            Column(4, "flips", kind="count"),
+            Column(5, "frames inside", kind="count"),
+            Column(6, "share of frames"),
+        ),
+        rows=plain_rows(columns), subjects=(1, 2), nouns=("atom", "pair"),
+    )  # fmt: skip
+
+
+# ---- figures
+
+
+def _plots(view: View, said: Written, place: int, one: Rule) -> Iterator[tuple[str, Plot]]:
+    """(title of its section, figure) of a rule; those that would be empty are left out."""
+
+    def rows(table: str) -> dict[str, np.ndarray]:
+        whole = view.table(table)
+        return {name: values[whole["rule"] == place] for name, values in whole.items()}
+
+    def plot(name: str, title: str, x: str, y: str, series: list[Series], **more: Any) -> Plot:
+        return Plot(name, title, x, y, tuple(series), caption=TEXTS(f"caption_{name}"), **more)
+
+    frames, moving = rows("frames"), view.summary["frames"] > 1
+    label, x = said.axis(frames)
+    if moving:
+        inside = [Series("pairs inside", x, frames["pairs"].astype(float))]
+        yield "Pairs and flips", plot("pairs", "Pairs inside", label, "pairs inside", inside)
+    if one["flips"]:
+        columns = [x[1:], *(frames[name][1:].astype(float) for name in ("entered", "left", "ambiguous"))]
+        width = -(-len(columns[0]) // _DENSE)
+        whole = len(columns[0]) // width * width
+        at, entered, left, unsure = (values[:whole].reshape(-1, width).mean(1) for values in columns)
+        series = [Series("entered", at, entered), Series("left", at, left, role="second")]
+        series += [Series("undecidable", at, unsure, role="bad")] * bool(unsure.any())
+        y = f"flips per frame{f', mean over {width}' if width > 1 else ''}"
+        yield "Pairs and flips", plot("flips", "Flips from frame to frame", label, y, series)
+    if view.summary["frames"] > 2:
+        table = rows("lifetimes")
+        lags = table["frames"] * (view.summary["interval"] if said.timed else 1.0)
+        lines: list[tuple[str, str, Any, bool]] = [
+            ("lifetime (seen to begin)", "survival", "first", False),
+            (f"gaps up to {view.summary['window']} frames overlooked", "intermittent", "first", True),
+            ("still inside, of those found inside", "residence", "second", False),
+            ("inside again or still", "again", "second", True),
+        ]
+        series = [
+            Series(words, lags[1:], table[name][1:], role=role, dashed=dashed)
+            for words, name, role, dashed in lines
+            if np.isfinite(table[name][1:]).any()
+        ]
+        if series:
+            x_label = f"time ({view.summary['time']})" if said.timed else "frames"
+            title = "How long contacts last"
+            yield title, plot("lifetimes", title, x_label, "share", series, x_scale="log")
+    stride = one["stride"]
+    of = np.array(stride["of"], float)
+    if len(of) > 2 and of.all():
+        left = [Series("", np.array(stride["stride"]), np.array(stride["flips"]) / of, mark="line+points")]
+        title = "Flips that are left when frames are left out"
+        drawn = plot("stride", title, "every nth frame", "share of the flips", left, x_scale="log")
+        yield "Between the frames", drawn
+    if one["chatter"]["undone"]:
+        after = np.arange(1, one["chatter"]["window"] + 1)
+        kinds: list[tuple[str, str, Any]] = [
+            ("left again", "inside", "first"),
+            ("entered again", "outside", "second"),
+        ]
+        series = [
+            Series(words, after, np.array(one["chatter"][name][1:], float), mark="line+points", role=role)
+            for words, name, role in kinds
+        ]
+        title = "Flips that the same pair reverses"
+        yield "Between the frames", plot("chatter", title, "after so many frames", "flips", series)
+    if moving and np.any(frames["fewest"] != frames["most"]):
+        around: list[tuple[str, str, Any]] = [
+            ("most", "most", "second"), ("mean", "neighbors", "first"), ("fewest", "fewest", "third"),
+        ]  # fmt: skip
+        series = [Series(words, x, frames[name].astype(float), role=role) for words, name, role in around]
+        yield "Neighbors", plot("neighbors", "Neighbors of an atom", label, "neighbors", series)
+    table = rows("neighbors")
+    if len(table["neighbors"]) > 1:
+        numbers = np.arange(table["neighbors"].min(), table["neighbors"].max() + 1)
+        share = np.zeros(len(numbers))
+        share[table["neighbors"] - numbers[0]] = table["counted"] / table["counted"].sum()
+        series, title = [Series("", numbers, share, mark="line+points")], "Atoms by their number of neighbors"
+        drawn = plot("distribution", title, "neighbors", "share of atoms and frames", series)
+        yield "Neighbors", drawn

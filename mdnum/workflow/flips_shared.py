@@ -1,0 +1,181 @@
+"""What one trajectory and two share: the summary of a file, and its numbers as people read them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mdnum.errors import InputError
+from mdnum.report.finding import Texts
+from mdnum.report.words import listed, number, plain
+from mdnum.store import RunFolder
+from mdnum.workflow.frame import Progress
+
+if TYPE_CHECKING:
+    from mdnum.trajectories.follow import Groups
+    from mdnum.trajectories.frame import Box
+    from mdnum.trajectories.trajectory import Trajectory
+
+TEXTS = Texts(Path(__file__).with_name("flips.py"))
+
+
+def selected(trajectory: Trajectory, between: tuple[str, str] | None) -> Groups:
+    """Indices of the atoms on either side."""
+    from mdnum.trajectories.source import select
+
+    return (
+        (None, None) if between is None else (select(trajectory, between[0]), select(trajectory, between[1]))
+    )
+
+
+class FolderLog:
+    """Passes progress on, and writes a line of log.txt at each new phase and now and then."""
+
+    def __init__(self, folder: RunFolder, progress: Progress | None):
+        self._folder, self._progress = folder, progress
+        self._last = ("", -1)
+
+    def __call__(self, done: int, of: int, info: dict[str, Any]) -> None:
+        phase, share = str(info["phase"]), 10 * done // of if of else 0
+        if (phase, share) != self._last:
+            self._folder.log(f"{phase}: {done:,} of {of:,} {info['unit']}" if of else phase)
+            self._last = (phase, share)
+        if self._progress is not None:
+            self._progress(done, of, info)
+
+
+def stem(trajectory: Trajectory) -> str:
+    """What a folder is named after; a run's folder says more than the name that all trajectories have."""
+    name = trajectory.path.name.split(".")[0]
+    return trajectory.path.resolve().parent.name if name == "trajectory" else name
+
+
+def name_of(trajectory: Trajectory) -> str:
+    """What a file is called on a page; a run's trajectory by its folder, because all have one name."""
+    own = trajectory.path.name == "trajectory.traj"
+    name = trajectory.path.resolve().parent.name if own else trajectory.name
+    return f"{name}@{trajectory.slice_words}" if trajectory.slice_words else name
+
+
+def about(trajectory: Trajectory, question: str, between: tuple[str, str] | None) -> dict[str, Any]:
+    """What summary.json says of a file."""
+    return {
+        "world": "flips",
+        "question": question,
+        "system": name_of(trajectory),
+        "file": str(trajectory.path),
+        "format": trajectory.format,
+        "reader": trajectory.reader,
+        "atoms": trajectory.atoms,
+        "length": trajectory.length,
+        "time": trajectory.time,
+        "slice": trajectory.slice_words,
+        "between": between,
+        "notes": trajectory.notes,
+    }
+
+
+def ending(stopped: InputError | None, interrupted: bool) -> dict[str, Any]:
+    """What summary.json says of how the reading ended."""
+    return {
+        "stopped": None if stopped is None else str(stopped),
+        "interrupted": interrupted,
+        "status": "stopped" if stopped is not None or interrupted else "complete",
+    }
+
+
+def plain_box(box: Box) -> dict[str, Any]:
+    """A box as plain values."""
+    return {"matrix": np.asarray(box.matrix, float).tolist(), "pbc": np.asarray(box.pbc, bool).tolist()}
+
+
+class Written:
+    """Numbers of a folder of flips as people read them: frames as times, lengths and rules with units.
+
+    Args:
+        summary: of the folder.
+    """
+
+    def __init__(self, summary: Mapping[str, Any]):
+        self.summary = summary
+        self.timed = bool(summary["timed"] and summary["interval"])
+        self.unit: str = summary["length"]
+
+    def time(self, text: str) -> str:
+        """A number with the unit of time; steps are counted, units are not."""
+        unit = self.summary["time"]
+        return f"{text} {unit}{'s' if unit == 'step' and text not in ('1', '1.00', '1.0') else ''}"
+
+    def duration(self, frames: float | None, digits: int = 3, beyond: str = "longer than seen") -> str:
+        """A number of frames as time where the file has times."""
+        if frames is None:
+            return beyond
+        if self.timed:
+            return self.time(number(frames * self.summary["interval"], digits))
+        return f"{plain(frames, digits)} frame{'' if frames == 1 else 's'}"
+
+    def life(self, lifetime: Mapping[str, Any]) -> str:
+        """The median of a lifetime; no shorter than the distance of two frames."""
+        median = lifetime["median"]
+        return f"{'at most ' if median == 1 else ''}{self.duration(median)}"
+
+    def rate(self, per_frame: float) -> str:
+        """A rate per frame as one per time, where the file has times."""
+        if self.timed:
+            return f"{number(per_frame / self.summary['interval'])} per {self.summary['time']}"
+        return f"{number(per_frame)} per frame"
+
+    def length(self, value: float | None) -> str:
+        """A length with its unit."""
+        return f"{number(value)} {self.unit}".rstrip()
+
+    def rule(self, one: Rule) -> str:
+        """A rule with its unit: r < 8.5 Å."""
+        name = one["rule"]
+        return f"{name} {self.unit}" if self.unit and "<" in name and "most" not in name else name
+
+    def box(self, box: Mapping[str, Any]) -> str:
+        """A box: lengths, angles where they are not right, and the axes along which it repeats."""
+        matrix, axes = np.array(box["matrix"]), repeating(box)
+        if not axes:
+            return "no box that repeats"
+        sizes = np.linalg.norm(matrix, axis=1)
+        text = f"{' × '.join(plain(float(one), 9) for one in sizes)} {self.unit}".rstrip()
+        with np.errstate(invalid="ignore", divide="ignore"):
+            a, b, c = matrix / sizes[:, None]
+        angles = np.degrees(np.arccos(np.clip([b @ c, a @ c, a @ b], -1, 1)))
+        if np.isfinite(angles).all() and np.abs(angles - 90).max() > 1e-9:
+            text += f" at {', '.join(plain(float(one), 7) for one in angles)}°"
+        return f"{text}, repeating along {listed(axes)}"
+
+    def axis(self, rows: Mapping[str, np.ndarray]) -> tuple[str, np.ndarray]:
+        """(label, values) of an axis along the trajectory."""
+        if self.timed:
+            return f"time ({self.summary['time']})", rows["time"]
+        return "frame", rows["frame"]
+
+
+def repeating(box: Mapping[str, Any]) -> list[str]:
+    """The axes along which a box repeats."""
+    return [name for name, yes in zip("abc", box["pbc"], strict=True) if yes]
+
+
+def resolution(kept: Mapping[str, Any], length: str) -> str:
+    """How finely a file gives positions, in words."""
+    code = kept["kind"]
+    if not kept["told"]:
+        code = "usual" if kept["step"] else "unknown"
+    elif kept["step"]:
+        code = "digits" if kept["digits"] else "grid"
+    elif code == "float32" and kept["bits"] == 32:
+        code = "narrowed"
+    unit = "of the box" if kept["kind"] == "fractions" else length
+    text = TEXTS(f"resolution_{code}", step=kept["step"], digits=kept["digits"], unit=unit)
+    return (
+        text
+        if kept["moved"] or not kept["told"] or not kept["step"]
+        else f"{text} {TEXTS('resolution_still')}"
+    )

@@ -1,0 +1,232 @@
+"""From words to a calculator, what a mistake in the words says, and what happens when a calculator fails."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import ase.io
+import numpy as np
+import pytest
+from ase import Atoms
+from ase.build import bulk
+from ase.calculators.calculator import Calculator, all_changes
+from ase.calculators.emt import EMT
+from ase.calculators.lj import LennardJones
+from audit.laws import subject
+from audit.planted import codes
+from scipy.spatial import KDTree
+
+from mdnum.audit.checks.state import Alone
+from mdnum.audit.noise import NoiseFloor
+from mdnum.audit.structures import LoadedCalculator, default_structure, load_calculator, read_structure
+from mdnum.audit.subject import CalculatorError, CalculatorSubject, only_trying
+from mdnum.errors import InputError
+
+
+@pytest.mark.parametrize(
+    ("words", "kind", "parameters"),
+    [
+        ("ase.calculators.emt:EMT", EMT, {}),
+        ("ase.calculators.emt:EMT()", EMT, {}),
+        ("ase.calculators.lj:LennardJones(rc=8.5, smooth=True)", LennardJones, {"rc": 8.5, "smooth": True}),
+    ],
+)
+def test_a_class_with_its_arguments(words: str, kind: type, parameters: dict[str, object]):
+    loaded = load_calculator(words)
+    one, other = loaded.make(), loaded.make()
+    assert isinstance(one, kind) and isinstance(one, Calculator) and one is not other
+    assert {name: one.parameters[name] for name in parameters} == parameters
+    assert loaded.stem == kind.__name__
+
+
+@pytest.mark.parametrize(
+    ("name", "body"),
+    [
+        ("calculator", "calculator = LennardJones(epsilon=WELL)\n"),
+        ("calc", "calc = LennardJones(epsilon=WELL)\n"),
+        ("make", "def make():\n    return LennardJones(epsilon=WELL)\n"),
+        ("other", "mine = LennardJones(epsilon=WELL)\n"),
+    ],
+)
+def test_a_file_is_run_again_for_each_calculator(name: str, body: str, tmp_path: Path):
+    (tmp_path / "neighbor.py").write_text("WELL = 0.25\n")
+    text = "from ase.calculators.lj import LennardJones\nfrom neighbor import WELL\n"
+    (tmp_path / f"{name}.py").write_text(text + body)
+    loaded = load_calculator(f"{tmp_path / name}.py{':mine' if name == 'other' else ''}")
+    one, other = loaded.make(), loaded.make()
+    assert one.parameters["epsilon"] == 0.25 and one is not other and loaded.stem == name
+
+
+def test_a_system_brings_its_structure_and_temperature():
+    loaded = load_calculator("argon/crystal-108")
+    assert loaded.atoms is not None and len(loaded.atoms) == 108
+    assert loaded.units.name == "lj" and loaded.kT == pytest.approx(0.02)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("", "no calculator named"),
+        ("nonesuch.package:Thing", "No module named 'nonesuch'"),
+        ("ase.calculators.emt:Emt", "Did you mean EMT"),
+        ("ase.calculators.emt.EMT", "put a colon before its name: ase.calculators.emt:EMT"),
+        ("ase.calculators.emt:EMT(a=open('x'))", "not a literal"),
+        ("ase.calculators.lj:LennardJones(rc=-(-8.5))", "not a literal"),
+        ("ase.calculators.emt:EMT(**{})", "cannot be used here"),
+        ("ase.calculators.emt:EMT().results", "only a name"),
+        ("ase.calculators.emt:EMT(", "not a name with arguments"),
+        ("ase.calculators.lj:LennardJones(3)", "making it failed: TypeError"),
+        ("ase.calculators.tersoff:Tersoff", "Give the arguments it needs"),
+        ("ase.build:molecule('H2O')", "not an ASE calculator"),
+        ("argon/crystl-108", "Did you mean argon/crystal-108"),
+        ("none.py", "no such file"),
+        ("{folder}/fails.py", "ZeroDivisionError"),
+        ("{folder}/empty.py", "no calculator or calc or make"),
+    ],
+)
+def test_a_mistake_says_what_to_write(words: str, message: str, tmp_path: Path):
+    (tmp_path / "fails.py").write_text("1 / 0\n")
+    (tmp_path / "empty.py").write_text("x = 1\n")
+    with pytest.raises(InputError) as error:
+        load_calculator(words.replace("{folder}", str(tmp_path)))
+    assert message in str(error.value)
+
+
+class Counting(Calculator):
+    """Counts how often it was asked, and can be made to fail."""
+
+    implemented_properties = ["energy", "forces"]  # noqa: RUF012
+
+    def __init__(self, energy: object = 1.0, forces: object = None, raises: Exception | None = None):
+        super().__init__()
+        self.asked, self.answer, self.pushes, self.raises = 0, energy, forces, raises
+
+    def calculate(self, atoms=None, properties=None, system_changes=all_changes):
+        super().calculate(atoms, properties, system_changes)
+        self.asked += 1
+        if self.raises:
+            raise self.raises
+        assert isinstance(atoms, Atoms)
+        forces = np.zeros((len(atoms), 3)) if self.pushes is None else np.asarray(self.pushes)
+        self.results = {"energy": self.answer, "forces": forces}
+
+
+def test_the_last_bit_of_a_coordinate_is_a_new_question():
+    """ASE's cache takes coordinates within 1e-15 for the same, hundreds of doubles near 0."""
+    atoms = Atoms("Ar2", [(0.0, 0, 0), (3.0, 0, 0)])
+    asked = subject(Counting, atoms)
+    asked.energy(atoms)
+    asked.forces(atoms)
+    assert asked.calculator.asked == 1
+    atoms.positions[0, 0] = 1e-300
+    asked.energy(atoms)
+    assert asked.calculator.asked == 2
+    asked.forget()
+    asked.energy(atoms)
+    assert asked.calculator.asked == 3
+
+
+@pytest.mark.parametrize(
+    ("calculator", "message"),
+    [
+        (lambda: Counting(energy=float("nan")), "gave an energy of nan"),
+        (lambda: Counting(energy=[1.0, 2.0]), "not one number"),
+        (lambda: Counting(raises=ValueError("no such element")), "raised ValueError.*no such element"),
+        (lambda: Counting(forces=[[0.0, 0.0, 0.0], [0.0, np.inf, 0.0]]), "on atom 1"),
+        (lambda: Counting(forces=[[0.0, 0.0, 0.0]]), r"shape \(1, 3\) for 2 atoms"),
+    ],
+)
+def test_a_calculator_that_fails_leaves_the_structure_to_the_last_bit(calculator, message, tmp_path: Path):
+    rng = np.random.default_rng(0)
+    atoms = Atoms("Ar2", rng.normal(size=(2, 3)), cell=rng.normal(size=(3, 3)), pbc=(True, False, True))
+    asked = CalculatorSubject("planted", calculator, atoms, folder=tmp_path / "made")
+    with pytest.raises(CalculatorError, match=message) as error:
+        asked.energy(atoms)
+        asked.forces(atoms)
+    assert error.value.structure == tmp_path / "made" / "failed-1.extxyz"
+    saved = ase.io.read(error.value.structure)
+    assert isinstance(saved, Atoms) and (saved.pbc == atoms.pbc).all()
+    assert (saved.positions == atoms.positions).all() and (saved.cell.array == atoms.cell.array).all()
+    with only_trying(asked), pytest.raises(CalculatorError) as error:
+        asked.energy(atoms)
+        asked.forces(atoms)
+    assert error.value.structure is None
+
+
+def test_default_structures():
+    """A crystal at the calculator's own least energy with room for two cutoffs, and water for rigid water."""
+    argon = default_structure(
+        load_calculator("ase.calculators.lj:LennardJones(sigma=3.0, epsilon=0.01, rc=7)")
+    )
+    assert set(argon.symbols) == {"Ar"} and argon.cell.lengths().min() >= 14
+    # fcc Lennard-Jones has its nearest neighbors at about 1.09 σ (1.0902 without a cutoff)
+    distances = argon.get_all_distances(mic=True)
+    assert np.median(np.sort(distances, axis=1)[:, 1:13]) == pytest.approx(1.09 * 3.0, rel=0.04)
+    assert default_structure(load_calculator("ase.calculators.emt:EMT")).symbols[0] == "Cu"
+    water = default_structure(load_calculator("ase.calculators.tip3p:TIP3P(rc=4.5)"))
+    assert water.get_chemical_symbols()[:4] == ["O", "H", "H", "O"]
+
+
+def test_a_calculator_that_takes_long_is_asked_about_fewer_atoms(monkeypatch):
+    """Its own work counts, and not the time that passes while other programs are at work."""
+    worked, passed = [0.0], [0.0]
+
+    class Slow(LennardJones):
+        clock = worked
+
+        def calculate(self, *words, **more):
+            self.clock[0] += 0.4 if len(words[0]) > 40 else 0.0
+            super().calculate(*words, **more)
+
+    class Held(Slow):
+        clock = passed
+
+    monkeypatch.setattr(time, "process_time", lambda: worked[0])
+    monkeypatch.setattr(time, "perf_counter", lambda: passed[0])
+    quick, slow, held = (
+        default_structure(LoadedCalculator("x", "x", lambda make=make: make(sigma=3.4, epsilon=0.01, rc=8.0)))
+        for make in (LennardJones, Slow, Held)
+    )
+    assert len(slow) == 32 and len(quick) == len(held) > 100
+    assert f"of {len(quick)} atoms, for two cutoffs" in slow.info["origin"]
+    assert held.info["origin"] == quick.info["origin"]
+
+
+@pytest.mark.parametrize(
+    ("answer", "raises", "cutoff", "code"),
+    [(float("nan"), None, 6.3, "LONELY_NOT_FINITE"), (0.0, ValueError("min()"), 3.4, "LONELY_FAILS")],
+)
+def test_who_fails_without_neighbors_gets_a_structure_and_a_finding(answer, raises, cutoff, code: str):
+    """Two atoms that do not feel one another are asked about first, and are what these fail on."""
+
+    class Lonely(Counting):
+        def calculate(self, atoms=None, properties=None, system_changes=all_changes):
+            assert isinstance(atoms, Atoms)
+            nearest = KDTree(atoms.positions).query(atoms.positions, 2)[0][:, 1]
+            self.answer, self.raises = (0.0, None) if (nearest < cutoff).all() else (answer, raises)
+            super().calculate(atoms, properties, system_changes)
+
+    atoms = default_structure(LoadedCalculator("lonely", "lonely", Lonely))
+    assert cutoff < 6 or atoms.cell.lengths().min() > 2 * cutoff
+    assert code in codes(Alone(subject(Lonely, atoms), atoms, NoiseFloor(1e-12, 1e-12)).findings())
+
+
+def test_who_never_answers_is_named_in_one_line_with_the_structure_saved():
+    with pytest.raises(InputError, match="nor for water") as error:
+        default_structure(LoadedCalculator("never", "never", lambda: Counting(raises=ValueError("no"))))
+    assert "--structure" in str(error.value.remedy)
+    saved = ase.io.read(str(error.value).partition("saved in ")[2].partition(")")[0])
+    assert isinstance(saved, Atoms) and set(saved.symbols) == {"O", "H"}
+
+
+def test_structures_from_files(tmp_path: Path):
+    ase.io.write(tmp_path / "three.extxyz", [bulk("Ar"), bulk("Cu"), bulk("Al")])
+    assert read_structure(tmp_path / "three.extxyz").symbols[0] == "Al"
+    assert read_structure(f"{tmp_path / 'three.extxyz'}@1").symbols[0] == "Cu"
+    (tmp_path / "bad.extxyz").write_text("1\n\nAr 0 nan 0\n")
+    for name, message in {
+        "none.xyz": "no such", "bad.extxyz": "not finite", "three.extxyz@9": "cannot be",
+    }.items():  # fmt: skip
+        with pytest.raises(InputError, match=message):
+            read_structure(tmp_path / name)

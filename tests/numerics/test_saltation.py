@@ -1,0 +1,175 @@
+"""Saltation against motions that are known in closed form."""
+
+from __future__ import annotations
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mdnum.ball.exact import ExactImpact
+from mdnum.errors import NumericalError
+from mdnum.numerics.saltation import GRAZING, carry, grazing, saltation, saltation_flagged, time_shift
+
+EPS = 2.0**-52
+
+
+def impact(v, e, g):
+    """Reset, flows and normal of a ball that meets the floor with velocity v."""
+    return (
+        np.array([[1.0, 0.0], [0.0, -e]]),
+        np.array([v, -g]),
+        np.array([-e * v, -g]),
+        np.array([1.0, 0.0]),
+    )
+
+
+def flight(t):
+    """Tangent of a flight that lasts t."""
+    return np.array([[1.0, t], [0.0, 1.0]])
+
+
+def test_the_matrix_of_an_impact_and_of_a_force_jump_written_out():
+    v, e, g = -3.0, 0.75, 10.0
+    expected = [[-e, 0.0], [-(1 + e) * g / v, -e]]
+    np.testing.assert_allclose(saltation(*impact(v, e, g)), expected, rtol=0, atol=8 * EPS)
+    # a pair that leaves its cutoff with speed 2, where the force would have been -0.5
+    before, after = np.array([2.0, -0.5]), np.array([2.0, 0.0])
+    found = saltation(np.eye(2), before, after, np.array([1.0, 0.0]))
+    np.testing.assert_array_equal(found, [[1.0, 0.0], [0.25, 1.0]])
+
+
+@pytest.mark.parametrize("ball", [(1.0, 0.0, 9.81, 0.8), (0.3, -2.5, 1.62, 0.95), (2.0, 3.0, 9.81, 0.5)])
+def test_flights_and_saltations_multiply_to_the_exact_derivative(ball):
+    """Five impacts: the product of the tangents is the derivative of the closed form."""
+    exact = ExactImpact(*ball)
+    e, g = ball[3], ball[2]
+    times = np.concatenate([[0.0], exact.impact_time(np.arange(1, 6)).value])
+    speeds = exact.impact_speed(np.arange(1, 6)).value
+    t = 0.5 * float(exact.impact_time(5).value + exact.impact_time(6).value)
+    tangent = np.eye(2)
+    for (left, right), speed in zip(itertools.pairwise(times), speeds, strict=True):
+        tangent = saltation(*impact(-speed, e, g)) @ flight(right - left) @ tangent
+    tangent = flight(t - times[-1]) @ tangent
+    y, v = exact.state(t)
+    known = [[float(q.gradient[name]) for name in ("y0", "v0")] for q in (y, v)]
+    np.testing.assert_allclose(tangent, known, rtol=1e-12, atol=1e-14)
+    # and without the saltation, by the reset alone, it is wrong, not merely inexact
+    naive = np.linalg.multi_dot([flight(t), np.diag([1.0, (-e) ** 5])])
+    assert np.max(np.abs(naive - known)) > 0.1
+
+
+def test_the_restitution_itself_is_a_parameter_of_the_reset():
+    ball = ExactImpact(1.0, 0.0, 9.81, 0.8)
+    speed, t_1 = float(ball.impact_speed(1).value), float(ball.impact_time(1).value)
+    t = 1.3 * t_1
+    reset, before, after, normal = impact(-speed, 0.8, 9.81)
+    tangent = carry(np.zeros(2), reset, before, after, normal, reset_rate=np.array([0.0, speed]))
+    found = flight(t - t_1) @ tangent
+    y, v = ball.state(t)
+    np.testing.assert_allclose(
+        found, [float(y.gradient["restitution"]), float(v.gradient["restitution"])], rtol=1e-13
+    )
+
+
+def well(r):
+    """Force of a Lennard-Jones pair of reduced mass 1 and its slope."""
+    return 24 * (2 * r**-13 - r**-7), 24 * (-26 * r**-14 + 7 * r**-8)
+
+
+def leave_the_well(r, v, steps):
+    """State and tangent with respect to the first separation when the pair reaches 2.5, by Runge-Kutta.
+
+    Steps are equal in r, so the last one ends at the cutoff: dt = dr / v.
+    """
+
+    def rate(r, x):
+        v, dr, dv = x
+        force, slope = well(r)
+        return np.array([force, dv, slope * dr]) / v
+
+    x = np.array([v, 1.0, 0.0])
+    h = (2.5 - r) / steps
+    for _ in range(steps):
+        a = rate(r, x)
+        b = rate(r + h / 2, x + h / 2 * a)
+        c = rate(r + h / 2, x + h / 2 * b)
+        d = rate(r + h, x + h * c)
+        r, x = r + h, x + h / 6 * (a + 2 * b + 2 * c + d)
+    return x[0], x[1:]
+
+
+def test_a_pair_that_leaves_a_hard_cutoff():
+    """dv/dr0 of a pair leaving its well through a hard cutoff: u'(1.8) / v = 0.411400, not 0.360."""
+    v, tangent = leave_the_well(1.8, 1.0, 500)
+    energy = 0.5 + 4 * (1.8**-12 - 1.8**-6) - 4 * (2.5**-12 - 2.5**-6)
+    np.testing.assert_allclose(v, np.sqrt(2 * energy), rtol=1e-12)
+    before, after = np.array([v, well(2.5)[0]]), np.array([v, 0.0])
+    found = carry(tangent, None, before, after, np.array([1.0, 0.0]))
+    exact = -well(1.8)[0] / v
+    assert abs(exact - 0.411400) < 5e-7
+    np.testing.assert_allclose(found[1], exact, rtol=1e-11)
+    # what differentiating the steps of the program gives
+    assert abs(tangent[1] - 0.3599) < 1e-4
+    # the same by the matrix
+    matrix = saltation(np.eye(2), before, after, np.array([1.0, 0.0]))
+    np.testing.assert_allclose(matrix @ tangent, found, rtol=1e-14)
+
+
+def test_the_cutoff_as_the_parameter():
+    """A threshold that moves: dv/dr_cut = -u'(r_cut) / v for the pair that leaves, and 0 by steps alone."""
+    v, _ = leave_the_well(1.8, 1.0, 500)
+    force = well(2.5)[0]
+    before, after, normal = np.array([v, force]), np.array([v, 0.0]), np.array([1.0, 0.0])
+    found = carry(np.zeros(2), None, before, after, normal, threshold_rate=-1.0)
+    np.testing.assert_allclose(found[1], force / v, rtol=1e-14)
+    assert found[0] == 0
+    np.testing.assert_allclose(time_shift(np.zeros(2), before, normal, -1.0), 1 / v, rtol=1e-14)
+
+
+def test_batches_and_jax_give_what_single_events_give():
+    rng = np.random.default_rng(3)
+    reset, before, after, normal = (
+        rng.normal(size=shape) for shape in ((4, 3, 5, 5), (4, 3, 5), (4, 3, 5), (4, 3, 5))
+    )
+    tangent = rng.normal(size=(4, 3, 5))
+    matrices = saltation(reset, before, after, normal)
+    carried = carry(tangent, reset, before, after, normal)
+    for place in np.ndindex(4, 3):
+        one = [x[place] for x in (reset, before, after, normal)]
+        np.testing.assert_allclose(matrices[place], saltation(*one), rtol=1e-12, atol=1e-12)
+        speed = one[3] @ one[1]
+        plain = one[0] + np.outer(one[2] - one[0] @ one[1], one[3]) / speed
+        np.testing.assert_allclose(matrices[place], plain, rtol=1e-10, atol=1e-12)
+        np.testing.assert_allclose(carried[place], plain @ tangent[place], rtol=1e-9, atol=1e-11)
+    with jax.enable_x64(True):
+        inside, touch = jax.jit(saltation_flagged)(*map(jnp.asarray, (reset, before, after, normal)))
+        assert not np.any(np.asarray(touch))
+        np.testing.assert_allclose(np.asarray(inside), matrices, rtol=1e-9, atol=1e-11)
+        traced = jax.jit(carry)(*map(jnp.asarray, (tangent, reset, before, after, normal)))
+        np.testing.assert_allclose(np.asarray(traced), carried, rtol=1e-9, atol=1e-11)
+
+
+@pytest.mark.parametrize("speed", [0.0, 0.5 * GRAZING, -0.5 * GRAZING, np.nan])
+def test_a_grazing_event_is_refused_on_the_host_and_flagged_in_jit(speed):
+    reset, before, after, normal = impact(speed * 9.81, 0.8, 9.81)
+    with pytest.raises(NumericalError, match=r"grazes.*expected above.*Move the start"):
+        saltation(reset, before, after, normal)
+    with jax.enable_x64(True):
+        matrix, touch = jax.jit(saltation_flagged)(*map(jnp.asarray, (reset, before, after, normal)))
+        assert bool(touch)
+        np.testing.assert_array_equal(np.asarray(matrix), reset)
+        # and a gradient through the flagged branch is finite
+        slope = jax.grad(lambda f: saltation_flagged(*map(jnp.asarray, (reset, f, after, normal)))[0].sum())
+        if np.isfinite(speed):
+            assert np.all(np.isfinite(np.asarray(slope(jnp.asarray(before)))))
+
+
+def test_the_event_that_grazes_is_named():
+    reset, before, after, normal = (np.stack([x] * 3) for x in impact(-2.0, 0.8, 9.81))
+    before[1, 0] = 0.0
+    assert grazing(before, normal).tolist() == [False, True, False]
+    with pytest.raises(NumericalError, match="event 1"):
+        saltation(reset, before, after, normal)
