@@ -16,7 +16,7 @@ from mdnum.report.section import Key, Page, Plot, Role, Section, Series, Table, 
 from mdnum.report.words import count, many, number
 from mdnum.workflow import frame
 from mdnum.workflow.fork_page import size
-from mdnum.workflow.fork_pair import basics, logged, of_any, of_md
+from mdnum.workflow.fork_pair import basics, few_steps, logged, of_any, of_md
 from mdnum.workflow.frame import Outcome, Progress, View
 
 if TYPE_CHECKING:
@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
 TEXTS = Texts(__file__)
 
-#: Steps of a map of molecular dynamics, which makes hundreds of runs, unless more are asked for.
-FEW_STEPS = 500
 #: Flips that are listed of each kind.
 _LISTED = 10
 #: Jumps that are a smaller share of the range of the loss are shown once more, without its trend: a cubic.
@@ -89,12 +87,10 @@ def fork_map(
         last, kind = system.spec.integrator.steps, str(system.spec.loss.kind)
         lost = {"loss": kind.replace("-", " "), "loss_unit": "m²" if kind == "residual-penetration" else "m"}
     else:
-        last = min(FEW_STEPS, system.spec.dynamics.steps) if steps is None else steps
+        last = few_steps(system, steps)
         lost = {"loss": "mean squared displacement", "loss_unit": f"{system.units.length}²"}
         if loss is not None:
             lost = {"loss": getattr(loss, "__name__", "loss"), "loss_unit": ""}
-    if last < 1:
-        raise InputError(f"steps = {last}; expected at least 1")
     # what cannot be is refused before there is a folder
     spelled = checked(program_of(system), key, low, high)
     with frame.new_folder("map", f"fork-{system.name}", out, system=system) as folder:

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from mdnum.store import RunFolder
     from mdnum.systems import BallSystem, System
 
+#: Steps of what makes hundreds of runs, or follows them by hand, unless more are asked for.
+FEW_STEPS = 500
 _LOG_LINES = 50
 #: A tangent is carried for a share of the steps that were followed, but not for fewer nor for more than this:
 #: its step costs as much as six of a run, so it takes a tenth as long as the runs that are compared.
@@ -74,6 +76,28 @@ def of_any(
             where=system.name,
         )
     return system
+
+
+def is_ball(system: Any) -> bool:
+    """Whether a system, or what is there under a name, is a ball."""
+    from mdnum.systems import BallSystem, System
+    from mdnum.systems.load import world_of
+
+    if isinstance(system, System | BallSystem):
+        return isinstance(system, BallSystem)
+    return world_of(system) == "ball"
+
+
+def few_steps(system: System, steps: int | None) -> int:
+    """The last step: the one asked for, else the system's own, but no more than a few hundred.
+
+    Raises:
+        InputError: steps below 1.
+    """
+    last = min(FEW_STEPS, system.spec.dynamics.steps) if steps is None else steps
+    if last < 1:
+        raise InputError(f"steps = {last}; expected at least 1")
+    return last
 
 
 def of_md(system: Any, overrides: Mapping[str, Any] | None, question: str) -> System:
@@ -245,7 +269,7 @@ def _fit(fit: Any, separation: np.ndarray) -> dict[str, Any]:
 
 def _predicted(made: Fork, summary: Mapping[str, Any]) -> dict[str, Any]:
     """The step at which runs that have not split are expected to: by their own growth, or the exponent."""
-    from mdnum.events.forks import expected
+    from mdnum.numerics.verdicts import expected
 
     exponent = summary.get("lyapunov")
     ways = {"growth": None, "exponent": exponent["rate"] if exponent and exponent["chaotic"] else None}

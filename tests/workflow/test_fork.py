@@ -15,12 +15,11 @@ from command_line import call, printed
 
 import mdnum
 from mdnum.errors import FolderError, InputError
-from mdnum.events.chance import Delay
-from mdnum.events.forks import Dates, Growth
 from mdnum.forks import Twin, choices
 from mdnum.forks.screen import Screened
 from mdnum.forks.tangent import Lyapunov
 from mdnum.forks.worlds import program_of
+from mdnum.numerics.verdicts import Dates, Delay, Growth
 from mdnum.provenance import hashes
 from mdnum.rollout.engine import Engine
 from mdnum.store import RunFolder
