@@ -149,7 +149,7 @@ def answered(words: list[str], turns: int) -> dict[str, Any]:
         "words": words,
         "seconds": median(wall for wall, _ in taken),
         "cpu_seconds": median(busy for _, busy in taken),
-        "verdict": summary["verdict"],
+        "verdict": summary["effect"],
         "steps": summary["steps"],
     }
 

@@ -73,7 +73,7 @@ COLUMNS: Mapping[str, Mapping[str, pa.DataType]] = MappingProxyType(
         "boundaries": _columns(
             below=_FLOAT, above=_FLOAT, step=_INT, i=_SHORT, j=_SHORT, inside=_BOOL, also=_INT,
             margin_below=_FLOAT, margin_above=_FLOAT, bound=_FLOAT, loss_below=_FLOAT, loss_above=_FLOAT,
-            jump=_FLOAT, energy_below=_FLOAT, energy_above=_FLOAT, apart=_FLOAT, confirmed=_TEXT,
+            jump=_FLOAT, energy_below=_FLOAT, energy_above=_FLOAT, separation=_FLOAT, confirmed=_TEXT,
         ),
         "intervals": _columns(
             low=_FLOAT, high=_FLOAT, history=_INT, digest=_TEXT, loss_low=_FLOAT, loss_high=_FLOAT,

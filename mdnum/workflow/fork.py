@@ -22,7 +22,7 @@ from mdnum.report.svg import BAD, FIRST, MUTED, SECOND
 from mdnum.report.words import count, many, number
 from mdnum.workflow import frame
 from mdnum.workflow.fork_page import differences, page, size
-from mdnum.workflow.fork_pair import Asked, basics, check, followed, of_any, of_md
+from mdnum.workflow.fork_pair import PairQuestion, basics, check, followed, of_any, of_md
 from mdnum.workflow.fork_verdict import RANKING, TEXTS, judge, judge_benign, judge_compare, judge_screen
 from mdnum.workflow.frame import Outcome, Progress, View
 
@@ -95,7 +95,7 @@ def fork(
         vary = table.vary if vary is None else vary
         steps = table.steps if steps is None else steps
         split = table.split if split is None else split
-    asked = Asked(steps, split, repeats, counterfactual, back, lyapunov, minimal, pin)
+    asked = PairQuestion(steps, split, repeats, counterfactual, back, lyapunov, minimal, pin)
     check(asked)
     if vary == ALL:
         given = {"split": own_split is not None, "repeats": repeats is not None, "minimal": minimal,
@@ -114,10 +114,14 @@ def fork(
         parse_pin(pin, len(system.atoms))
     word = vary or "precision"
     choice = parse(word)
-    told = {"choice": word, "choice_about": choice.describe(world_of(system)), "must_hold": choice.must_hold}
+    labels = {
+        "choice": word,
+        "choice_about": choice.describe(world_of(system)),
+        "must_hold": choice.must_hold,
+    }
     frame.say(progress, "compile")
     twin = twin_of(choice, system)
-    return followed(system, twin, told, asked, lambda made: {}, out, report, progress)
+    return followed(system, twin, labels, asked, lambda made: {}, out, report, progress)
 
 
 def fork_screen(
@@ -147,7 +151,7 @@ def fork_screen(
     system = of_any(system, overrides)
     if steps is None and system.spec.fork is not None:
         steps = system.spec.fork.steps
-    check(Asked(steps))
+    check(PairQuestion(steps))
     with frame.new_folder("screen", f"fork-{system.name}", out, system=system) as folder:
 
         def note(done: int, count: int, name: str) -> None:
@@ -224,7 +228,7 @@ def fork_folders(
             where=str(found.a),
             remedy="Vary the choice in which they differ: mdnum fork SYSTEM --vary CHOICE",
         )
-    question = Asked(**asked)
+    question = PairQuestion(**asked)
     check(question)
     last = found.steps if question.steps is None else min(question.steps, found.steps)
 
@@ -237,10 +241,10 @@ def fork_folders(
             "reproduced": known == made.dates.fork,
         }
 
-    told = {"choice": "replay", "choice_about": TEXTS("replay"), "must_hold": False}
+    labels = {"choice": "replay", "choice_about": TEXTS("replay"), "must_hold": False}
     frame.say(progress, "compile")
-    twin, question = twin_of(found), Asked(**{**asked, "steps": last})
-    return followed(system, twin, told, question, stored, out, report, progress)
+    twin, question = twin_of(found), PairQuestion(**{**asked, "steps": last})
+    return followed(system, twin, labels, question, stored, out, report, progress)
 
 
 def fork_benign(

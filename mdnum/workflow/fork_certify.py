@@ -257,9 +257,9 @@ def page_certify(view: View, verdict: Verdict) -> Page:
     table, series = view.table("policy_separations"), []
     for k, row in enumerate(rows):
         mine = table["policy"] == row["name"]
-        apart = table["separation"][mine]
-        if np.any(apart > 0):
-            shown = np.where(apart > 0, apart, np.nan)
+        separation = table["separation"][mine]
+        if np.any(separation > 0):
+            shown = np.where(separation > 0, separation, np.nan)
             role = _ROLES[k % len(_ROLES)]
             series.append(Series(row["name"], table["step"][mine], shown, role=role, dashed=k >= len(_ROLES)))
     plots = [Plot(
@@ -345,13 +345,13 @@ def fork_processes(
     with frame.new_folder("processes", f"fork-{loaded.name}", out, system=loaded) as folder:
         note = logged(folder, progress)
 
-        def told(done: int, of: int, name: str) -> None:
+        def ended(done: int, of: int, name: str) -> None:
             note(done, of, {"phase": "running in processes of their own", "unit": "variants"})
             if name:
                 folder.log(f"  {name} has ended")
 
-        told(0, len(asked), "")
-        found = variants(loaded, last, asked, told)
+        ended(0, len(asked), "")
+        found = variants(loaded, last, asked, ended)
         tables: dict[str, Any] = {}
         summary = basics(loaded, found.steps) | {"steps_asked": last} | _programs(found, tables)
         frame.store(folder, summary | {"seconds": time.perf_counter() - began}, tables)
@@ -442,9 +442,9 @@ def page_processes(view: View, verdict: Verdict) -> Page:
     table, series = view.table("variant_separations"), []
     for k, names in enumerate(s["clusters"]):
         longest = max((table["variant"] == name for name in names), key=np.count_nonzero)
-        step, apart = table["step"][longest], table["separation"][longest]
-        if k and np.any(apart > 0):
-            shown = np.where(apart > 0, apart, np.nan)
+        step, separation = table["step"][longest], table["separation"][longest]
+        if k and np.any(separation > 0):
+            shown = np.where(separation > 0, separation, np.nan)
             series.append(Series("; ".join(names), step, shown, role=_ROLES[(k - 1) % len(_ROLES)]))
     plots = [Plot(
         "separations", "Separation of programs from the reference", "step",

@@ -16,7 +16,7 @@ from mdnum.report.section import Key, Page, Plot, Role, Section, Series, Table, 
 from mdnum.report.words import count, many, number
 from mdnum.workflow import frame
 from mdnum.workflow.fork_page import size
-from mdnum.workflow.fork_pair import basics, logged, of_any, of_md
+from mdnum.workflow.fork_pair import basics, few_steps, logged, of_any, of_md
 from mdnum.workflow.frame import Outcome, Progress, View
 
 if TYPE_CHECKING:
@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
 TEXTS = Texts(__file__)
 
-#: Steps of a map of molecular dynamics, which makes hundreds of runs, unless more are asked for.
-FEW_STEPS = 500
 #: Flips that are listed of each kind.
 _LISTED = 10
 #: Jumps that are a smaller share of the range of the loss are shown once more, without its trend: a cubic.
@@ -89,12 +87,10 @@ def fork_map(
         last, kind = system.spec.integrator.steps, str(system.spec.loss.kind)
         lost = {"loss": kind.replace("-", " "), "loss_unit": "m²" if kind == "residual-penetration" else "m"}
     else:
-        last = min(FEW_STEPS, system.spec.dynamics.steps) if steps is None else steps
+        last = few_steps(system, steps)
         lost = {"loss": "mean squared displacement", "loss_unit": f"{system.units.length}²"}
         if loss is not None:
             lost = {"loss": getattr(loss, "__name__", "loss"), "loss_unit": ""}
-    if last < 1:
-        raise InputError(f"steps = {last}; expected at least 1")
     # what cannot be is refused before there is a folder
     spelled = checked(program_of(system), key, low, high)
     with frame.new_folder("map", f"fork-{system.name}", out, system=system) as folder:
@@ -154,7 +150,7 @@ def _row(edge: Boundary) -> dict[str, Any]:
         "also": edge.also, "margin_below": below.margin, "margin_above": above.margin, "bound": edge.bound,
         "loss_below": below.loss, "loss_above": above.loss, "jump": edge.jump,
         **(gradients if edge.channel != "pair" else {}),
-        "energy_below": below.energy, "energy_above": above.energy, "apart": edge.apart,
+        "energy_below": below.energy, "energy_above": above.energy, "separation": edge.apart,
         "confirmed": {True: "yes", False: "no", None: "not asked"}[edge.confirmed],
     }  # fmt: skip
 
@@ -236,7 +232,8 @@ def page_map(view: View, verdict: Verdict) -> Page:
     rows = [
         (k + 1, repr(edge["below"]), repr(edge["above"]), edge["step"], edge["who"], edge["way"],
          edge["also"], edge["margin_below"], edge["margin_above"], edge["bound"], edge["jump"],
-         *((edge["gradient_below"], edge["gradient_above"]) if ball else (edge["apart"],)), edge["confirmed"])
+         *((edge["gradient_below"], edge["gradient_above"]) if ball else (edge["separation"],)),
+         edge["confirmed"])
         for k, edge in enumerate(edges)
     ]  # fmt: skip
     columns = ("", "below", "above", "step", "decision", "differs", "others", "margin below", "margin above",
@@ -327,13 +324,14 @@ def _map_figures(view: View, numbered: bool) -> Iterator[Plot]:
     if len(edges) < 2:
         return
     where = np.array([edge["above"] for edge in edges])
-    jump, apart = (
-        np.abs([np.nan if edge[name] is None else edge[name] for edge in edges]) for name in ("jump", "apart")
+    jump, separation = (
+        np.abs([np.nan if edge[name] is None else edge[name] for edge in edges])
+        for name in ("jump", "separation")
     )
     series = [Series(_with_unit("jump of the loss", s["loss_unit"]), where, jump, "points", "bad")]
-    if np.isfinite(apart).any():
+    if np.isfinite(separation).any():
         text = f"separation of the final states ({view.units.length})"
-        series.append(Series(text, where, apart, "points", "muted"))
+        series.append(Series(text, where, separation, "points", "muted"))
     yield Plot("jumps", "What changes at each boundary", label, "across the boundary", tuple(series),
                y_scale="log", caption=TEXTS("jumps_caption"))  # fmt: skip
 

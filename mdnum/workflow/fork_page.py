@@ -25,7 +25,7 @@ FITS = 0.8
 #: Rows of the table of decisions that the page carries.
 TABLE_ROWS = 5_000
 SPACES = {"r2": "r²", "r": "r", "height": "minus the height", "residual": "tolerance minus residual"}
-#: A split that is expected is shown up to so many times the steps that were followed.
+#: A split that is expected is shown up to this multiple of the steps that were followed.
 _BEYOND = 2.0
 #: The longest arrow, in cutoffs.
 _ARROW = 0.5
@@ -229,7 +229,7 @@ def _atoms(view: View, table: Mapping[str, np.ndarray], figure: Canvas) -> None:
         if name == "B" and factor:
             panel.quiver(flat[:, 0], flat[:, 1], factor * shift[:, 0], factor * shift[:, 1], angles="xy",
                          scale_units="xy", scale=1.0, color=BAD, width=0.005)  # fmt: skip
-            panel.set_ylabel(f"arrows × {factor:.0e}")
+            panel.set_ylabel(f"arrows × {number(factor, 1)}")
         reach = 1.12 * max(float(np.abs(flat[:, :2]).max()), 1.5 * cutoff)
         panel.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
         panel.set_xlabel(f"along the pair ({view.units.length})")
@@ -284,7 +284,9 @@ def _minimal(s: Mapping[str, Any]) -> Iterator[Any]:
     minimal = s.get("minimal")
     if minimal is None:
         return
-    yield TEXTS("minimal_tests" if minimal["tests"] else "minimal_none", **minimal)
+    reason = minimal["reason"]
+    values = {**minimal, "reason": reason[:1].upper() + reason[1:]}
+    yield TEXTS("minimal_tests" if minimal["tests"] else "minimal_none", **values)
     if minimal["pairs"]:
         rows = []
         for pair in minimal["pairs"]:

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from mdnum.store import RunFolder
     from mdnum.systems import BallSystem, System
 
+#: Steps of what makes hundreds of runs, or follows them by hand, unless more are asked for.
+FEW_STEPS = 500
 _LOG_LINES = 50
 #: A tangent is carried for a share of the steps that were followed, but not for fewer nor for more than this:
 #: its step costs as much as six of a run, so it takes a tenth as long as the runs that are compared.
@@ -39,7 +41,7 @@ _MD_ALONE = ("energy_back", "nearest_a", "nearest_b", "ambiguous_a", "ambiguous_
 
 
 @dataclass(frozen=True)
-class Asked:
+class PairQuestion:
     """What is to be found out about a pair of runs; the arguments of `fork`."""
 
     steps: int | None = None
@@ -74,6 +76,28 @@ def of_any(
             where=system.name,
         )
     return system
+
+
+def is_ball(system: Any) -> bool:
+    """Whether a system, or what is there under a name, is a ball."""
+    from mdnum.systems import BallSystem, System
+    from mdnum.systems.load import world_of
+
+    if isinstance(system, System | BallSystem):
+        return isinstance(system, BallSystem)
+    return world_of(system) == "ball"
+
+
+def few_steps(system: System, steps: int | None) -> int:
+    """The last step: the one asked for, else the system's own, but no more than a few hundred.
+
+    Raises:
+        InputError: steps below 1.
+    """
+    last = min(FEW_STEPS, system.spec.dynamics.steps) if steps is None else steps
+    if last < 1:
+        raise InputError(f"steps = {last}; expected at least 1")
+    return last
 
 
 def of_md(system: Any, overrides: Mapping[str, Any] | None, question: str) -> System:
@@ -115,7 +139,7 @@ def basics(system: System | BallSystem, steps: int | None) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def check(asked: Asked) -> None:
+def check(asked: PairQuestion) -> None:
     """Refuses what cannot be, before a folder is made."""
     from mdnum.forks.pair import repeats_asked
 
@@ -149,8 +173,8 @@ def logged(folder: RunFolder, progress: Progress | None) -> Progress:
 def followed(
     system: System | BallSystem,
     twin: Twin,
-    told: Mapping[str, Any],
-    asked: Asked,
+    labels: Mapping[str, Any],
+    asked: PairQuestion,
     further: Callable[[Fork], dict[str, Any]],
     out: str | Path | None,
     report: bool,
@@ -159,7 +183,7 @@ def followed(
     """Follow a twin and leave a fork folder.
 
     Args:
-        told: entries of the summary on what is varied; further: those that need the pair.
+        labels: entries of the summary on what is varied; further: those that need the pair.
     """
     from mdnum.forks import fork as follow
     from mdnum.forks.pair import counterfactuals
@@ -170,7 +194,7 @@ def followed(
     counterfactuals(twin, **options)
     with frame.new_folder("fork", f"fork-{system.name}", out, system=system) as folder:
         made = follow(twin, asked.steps, split=asked.split, progress=logged(folder, progress), **options)
-        summary = basics(system, asked.steps) | dict(told) | _numbers(made)
+        summary = basics(system, asked.steps) | dict(labels) | _numbers(made)
         tables = {"separation": _separation(made, is_ball)}
         if is_ball:
             summary |= {"decision": _decision(made), **_ball_flips(made, tables)}
@@ -245,7 +269,7 @@ def _fit(fit: Any, separation: np.ndarray) -> dict[str, Any]:
 
 def _predicted(made: Fork, summary: Mapping[str, Any]) -> dict[str, Any]:
     """The step at which runs that have not split are expected to: by their own growth, or the exponent."""
-    from mdnum.events.forks import expected
+    from mdnum.numerics.verdicts import expected
 
     exponent = summary.get("lyapunov")
     ways = {"growth": None, "exponent": exponent["rate"] if exponent and exponent["chaotic"] else None}
@@ -284,7 +308,7 @@ def _decision(made: Fork) -> dict[str, Any] | None:
         thresholds = [one.decider.thresholds[kind].value for one in (a, b, run)]
         space, protects = run.decider.space, 2
         if space == "r2":
-            # the margin of r² is so many times that of r
+            # the margin of r² is this factor times that of r
             length = found.margin / (2.0 * run.decider.r_cut[kind])
         quantity = thresholds[2] - found.margin
         distance, *cutoffs = (
@@ -303,7 +327,9 @@ def _decision(made: Fork) -> dict[str, Any] | None:
     }  # fmt: skip
 
 
-def _of_md(made: Fork, asked: Asked, tables: dict[str, Any], progress: Progress | None) -> dict[str, Any]:
+def _of_md(
+    made: Fork, asked: PairQuestion, tables: dict[str, Any], progress: Progress | None
+) -> dict[str, Any]:
     """Entries and tables of a pair of molecular dynamics."""
     from mdnum.forks.certified import certified
     from mdnum.forks.replays import neighborhood

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mdnum.events.chance import REPEATS
+from mdnum.numerics.verdicts import REPEATS
 from mdnum.report.finding import Finding, Texts, Verdict, conclude
 from mdnum.report.words import listed
 

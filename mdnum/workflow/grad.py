@@ -17,7 +17,7 @@ from mdnum.report.finding import Finding, Verdict, conclude
 from mdnum.report.words import listed, percent
 from mdnum.store.atomic import write_bytes
 from mdnum.workflow import frame, grad_page
-from mdnum.workflow.fork_question import Log, is_ball, loaded, steps_of
+from mdnum.workflow.fork_pair import few_steps, is_ball, logged, of_any
 from mdnum.workflow.frame import Outcome, Progress, Verb, View
 from mdnum.workflow.grad_page import TEXTS, by, closeness, digits_note, digits_of, magnitude, slope
 
@@ -112,15 +112,15 @@ def grad(
         ball = _ball_system(system, of, names, steps, overrides)
         chosen = _ball_methods(asked)
         with frame.new_folder("grad", f"grad-{ball.name}", out, system=ball) as folder:
-            result, summary = _differentiated(ball, chosen, Log(folder, progress))
+            result, summary = _differentiated(ball, chosen, logged(folder, progress))
             frame.store(folder, {**summary, "seconds": time.perf_counter() - began}, {})
         return frame.finish(folder, report=report, result=result, progress=progress)
 
-    md = loaded(system, overrides)
+    md: Any = of_any(system, overrides)
     problem, names = _problem(md, of, names, steps)
     chosen, left = plan(problem, names, asked, replicas)
     with frame.new_folder("grad", f"grad-{md.name}", out, system=md) as folder:
-        log = Log(folder, progress)
+        log = logged(folder, progress)
         result = _diagnosed(problem, names, chosen, left, further, replicas, half_step, log)
         summary = _summary(problem, names, result)
         summary["left_out"] = [*_not_run(md, steps, problem, result, replicas, further, half_step), *left]
@@ -150,7 +150,7 @@ def _problem(
     if of is None:
         remedy = f"Add --of LOSS. There are {', '.join(LOSSES)}"
         raise InputError("no loss to differentiate", where=system.name, remedy=remedy)
-    last, simulation = steps_of(system, steps), build(system)
+    last, simulation = few_steps(system, steps), build(system)
     loss = parse(of, simulation, last)
     if not names:
         remedy = f"Add --wrt NAME,NAME. There are {', '.join(parameters.names(simulation))}"

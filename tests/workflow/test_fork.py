@@ -15,12 +15,11 @@ from command_line import call, printed
 
 import mdnum
 from mdnum.errors import FolderError, InputError
-from mdnum.events.chance import Delay
-from mdnum.events.forks import Dates, Growth
 from mdnum.forks import Twin, choices
 from mdnum.forks.screen import Screened
 from mdnum.forks.tangent import Lyapunov
 from mdnum.forks.worlds import program_of
+from mdnum.numerics.verdicts import Dates, Delay, Growth
 from mdnum.provenance import hashes
 from mdnum.rollout.engine import Engine
 from mdnum.store import RunFolder
@@ -254,7 +253,8 @@ def test_a_choice_that_changes_nothing_is_said_to(tmp_path):
 @pytest.mark.parametrize("world", ["md", "ball"])
 def test_a_promise_that_is_broken_is_an_error(tmp_path, monkeypatch, file, world):
     name, changed, steps = {
-        "md": ("pair/at-cutoff", {"cutoff.radius": 2.4}, 400), "ball": (file, {"start.height": [0.3, 0.301, 0.53]}, 60),
+        "md": ("pair/at-cutoff", {"cutoff.radius": 2.4}, 400),
+        "ball": (file, {"start.height": [0.3, 0.301, 0.53]}, 60),
     }[world]  # fmt: skip
     other = load(name, changed)
     use(
