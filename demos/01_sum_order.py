@@ -9,9 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from mdnum.ball import BallRun, GlobalSum, Projection, SemiImplicitEuler, World, simulate
-from mdnum.precision.policy import RolePrecision
-from mdnum.precision.reductions import BY_NAME, Reduction
-from mdnum.precision.running import RunningSum, running_sum_table
+from mdnum.numerics.reductions import BY_NAME
+from mdnum.numerics.roles import RolePrecision
+from mdnum.numerics.running import RunningSum, running_sum_table
+from mdnum.numerics.sums import Reduction
 from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
 
 #: The tolerance, and five penetrations (m) whose exact sum it is: one just below it and four that are each

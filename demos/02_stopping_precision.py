@@ -20,10 +20,10 @@ from mdnum.ball import (
 from mdnum.errors import InputError
 from mdnum.gradients.ball import ThroughIterations
 from mdnum.gradients.problem import Gradient
-from mdnum.precision import RolePrecision, neighbor
-from mdnum.precision.policy import ALL
-from mdnum.precision.reductions import Reduction, Sequential
-from mdnum.precision.running import RunningSum, running_sum_table
+from mdnum.numerics.roles import ALL, RolePrecision
+from mdnum.numerics.rounding import neighbor
+from mdnum.numerics.running import RunningSum, running_sum_table
+from mdnum.numerics.sums import Reduction, Sequential
 from mdnum.workflow.demos import Claim, Demo, Plot, Series, Table, table
 
 K = ALPHA = 0.5

@@ -15,7 +15,7 @@ from mdnum.ball import (
     first_difference,
     simulate,
 )
-from mdnum.precision import neighbor, ordinal, ulp_distance
+from mdnum.numerics.rounding import neighbor, ordinal, ulp_distance
 from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
 
 H, STEPS = 0.01, 200

@@ -19,7 +19,7 @@ from mdnum.ball.integrators import BallVerlet, ExplicitEuler, ImplicitMidpoint, 
 from mdnum.ball.state import BallDecisions
 from mdnum.ball.world import World
 from mdnum.errors import InputError
-from mdnum.precision.policy import RolePrecision
+from mdnum.numerics.roles import RolePrecision
 from mdnum.workflow.demos import Claim, Demo, Plot, Region, Series, Table, table
 
 SCHEMES = {

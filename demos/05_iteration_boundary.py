@@ -10,7 +10,7 @@ from functools import cache
 import numpy as np
 
 from mdnum.ball import BallProblem, GlobalSum, Projection, ResidualPenetration, SemiImplicitEuler, World
-from mdnum.precision import neighbor, ulp_distance
+from mdnum.numerics.rounding import neighbor, ulp_distance
 from mdnum.workflow.demos import Claim, Demo, Plot, Series, Table, table
 
 ALPHA, DEPTH, TOL = 0.5, 0.45, 1e-4

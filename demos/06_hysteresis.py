@@ -17,8 +17,9 @@ from mdnum.ball import (
     World,
     simulate,
 )
-from mdnum.precision import RolePrecision
-from mdnum.precision.reductions import Reduction, parse
+from mdnum.numerics.reductions import parse
+from mdnum.numerics.roles import RolePrecision
+from mdnum.numerics.sums import Reduction
 from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
 
 #: A ball that rests on a soft spring and is shaken: it wavers about the floor.

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mdnum.precision.coalesce import orders, scatter_add, segment_sum
-from mdnum.precision.reductions import Exact, FixedPoint, Sequential
+from mdnum.numerics.reductions import Exact, FixedPoint, orders, scatter_add, segment_sum
+from mdnum.numerics.sums import Sequential
 from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
 
 #: Contacts, the floor panels that they load, and the orders in which they may be stored.

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from mdnum.ball import EventLocated, ExactImpact, Impact, SemiImplicitEuler, World, arrive
 from mdnum.errors import InputError
-from mdnum.events.saltation import carry
+from mdnum.numerics.saltation import carry
 from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
 
 TIME = 2.0

@@ -15,7 +15,7 @@ from jax import lax
 
 from mdnum.ball import BallRun, Impact, SemiImplicitEuler, World, simulate
 from mdnum.errors import NumericalError
-from mdnum.precision import neighbor
+from mdnum.numerics.rounding import neighbor
 from mdnum.safe_path import environment, python
 from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
 

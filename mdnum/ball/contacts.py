@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Int
 from mdnum.ball.integrators import Balls, EventLocated, Push, Rounding, Scheme
 from mdnum.ball.state import BallRecord, Reason, Solve
 from mdnum.ball.stopping import StopRule, elementwise, iterate, no_solve
-from mdnum.precision.policy import RolePrecision
+from mdnum.numerics.roles import RolePrecision
 
 
 class Motion(NamedTuple):

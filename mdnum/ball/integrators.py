@@ -17,8 +17,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mdnum.ball.state import Solve
 from mdnum.ball.stopping import Maximum, StopRule, iterate, no_solve
-from mdnum.precision.exact import fence
-from mdnum.precision.policy import RolePrecision
+from mdnum.numerics.exact import fence
+from mdnum.numerics.roles import RolePrecision
 
 Balls = Float[Array, "balls"]
 
@@ -27,7 +27,7 @@ class Rounding(eqx.Module):
     """Rounds a product (or anything) before it is used: the fence, with the zero it needs.
 
     Attributes:
-        zero: an integer zero that the compiler must not know (see mdnum.precision.exact).
+        zero: an integer zero that the compiler must not know (see mdnum.numerics.exact).
     """
 
     zero: Int[Array, ""]

@@ -19,7 +19,7 @@ from mdnum.ball.problem import START, BallProblem
 from mdnum.ball.rollout import BallRun, simulate
 from mdnum.ball.state import BallDecisions
 from mdnum.errors import InputError
-from mdnum.events.ledger import Ledger
+from mdnum.numerics.events import Ledger
 from mdnum.program import Decision, DecisionHistory, Differing, Number, PairRows
 
 #: Words of system files for what the world calls otherwise.

@@ -17,8 +17,8 @@ from mdnum.ball.contacts import Penalty
 from mdnum.ball.state import BallDecisions, BallState, Reason
 from mdnum.ball.world import World
 from mdnum.errors import InputError
-from mdnum.events import Ledger, changes_in_time
-from mdnum.precision.bounds import gamma
+from mdnum.numerics.events import Ledger, changes_in_time
+from mdnum.numerics.rounding import gamma
 
 #: Balls times steps that leave the device at once.
 _CHUNK = 2**21

@@ -19,9 +19,9 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float, Int
 
 from mdnum.ball.state import Reason, Solve
-from mdnum.events import Threshold
-from mdnum.precision.policy import RolePrecision
-from mdnum.precision.reductions import Pairwise, Reduction
+from mdnum.numerics.events import Threshold
+from mdnum.numerics.roles import RolePrecision
+from mdnum.numerics.sums import Pairwise, Reduction
 
 #: function(inputs, rest) -> (outputs, record); inputs and outputs are tuples of arrays of shape (balls,).
 Map = Callable[[tuple, Any], tuple[tuple, Any]]

@@ -17,10 +17,10 @@ from mdnum.ball.contacts import Contact, Impact, Motion, Penalty, Projection
 from mdnum.ball.integrators import Balls, EventLocated, Rounding, Scheme
 from mdnum.ball.state import BallDecisions, BallRecord, BallState
 from mdnum.errors import InputError
-from mdnum.events import Hysteresis, Threshold
-from mdnum.precision.exact import zero_bits
-from mdnum.precision.formats import stochastic_round
-from mdnum.precision.policy import RolePrecision
+from mdnum.numerics.events import Hysteresis, Threshold
+from mdnum.numerics.exact import zero_bits
+from mdnum.numerics.formats import stochastic_round
+from mdnum.numerics.roles import RolePrecision
 
 #: Where each parameter lives; the first place that a world has is meant.
 _PLACES: Mapping[str, tuple[tuple[str, ...], ...]] = {

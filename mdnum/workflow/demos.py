@@ -18,11 +18,11 @@ import numpy as np
 
 from mdnum.errors import InputError
 from mdnum.plain import plain
+from mdnum.registry import nearest
 from mdnum.report.finding import Texts, Verdict, conclude
 from mdnum.report.section import Page, Plot, Region, Section, Series, Table, pairs
 from mdnum.report.words import typeset
-from mdnum.systems.find import shipped_folder
-from mdnum.systems.messages import nearest
+from mdnum.systems.load import shipped_folder
 from mdnum.workflow import frame
 from mdnum.workflow.frame import Outcome, Progress, Verb, View
 

@@ -8,7 +8,8 @@ import pytest
 from mdnum import ball
 from mdnum.ball import limits
 from mdnum.errors import InputError
-from mdnum.precision import RolePrecision, neighbor
+from mdnum.numerics.roles import RolePrecision
+from mdnum.numerics.rounding import neighbor
 from mdnum.systems import build_ball, load
 
 #: alpha and k whose product is a share that an iteration takes.

@@ -11,8 +11,8 @@ from ball import oracles
 from mdnum import ball
 from mdnum.ball import rollout
 from mdnum.errors import InputError
-from mdnum.events import broken_alternations
-from mdnum.precision.policy import RolePrecision
+from mdnum.numerics.events import broken_alternations
+from mdnum.numerics.roles import RolePrecision
 
 WORLDS = {
     "penalty": (ball.Penalty(900.0), ball.SemiImplicitEuler(0.01)),

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from mdnum import ball
 from mdnum.errors import InputError
-from mdnum.precision.policy import RolePrecision
-from mdnum.precision.reductions import Sequential
+from mdnum.numerics.roles import RolePrecision
+from mdnum.numerics.sums import Sequential
 
 
 def solve(depths, stop, k=0.5, alpha=0.5, policy=None, steps=1):

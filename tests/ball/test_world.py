@@ -11,8 +11,8 @@ from ball import oracles
 from mdnum import ball
 from mdnum.ball.state import BallDecisions
 from mdnum.errors import InputError
-from mdnum.precision.policy import RolePrecision
-from mdnum.precision.reductions import Sequential
+from mdnum.numerics.roles import RolePrecision
+from mdnum.numerics.sums import Sequential
 
 SCHEMES = {
     "explicit-euler": ball.ExplicitEuler,

@@ -18,8 +18,7 @@ import pytest
 from mpmath import mpf
 
 from mdnum.errors import InputError
-from mdnum.precision.coalesce import orders
-from mdnum.precision.reductions import Exact
+from mdnum.numerics.reductions import Exact, orders
 from mdnum.workflow import demos
 from mdnum.workflow.demos import Demo
 
