@@ -39,11 +39,11 @@ from cutoff_sensitivity import variant
 from matplotlib.colors import LogNorm
 
 from mdnum.errors import InputError, MdnumError
-from mdnum.events.chance import REPEATS
 from mdnum.forks import fork
 from mdnum.forks.choices import Choice, parse, shipped, unavailable
 from mdnum.forks.worlds import varied
 from mdnum.md.cutoffs import BY_NAME as CUTOFFS
+from mdnum.numerics.verdicts import REPEATS
 from mdnum.systems import System, load
 
 KINDS = ("hard", "shifted", "force-shifted", "switched")

@@ -31,7 +31,7 @@ from _output import COLORS, figure, parser, save, say, start, table
 
 from mdnum.forks import Fork, fork
 from mdnum.forks.choices import Order, Summation, unavailable
-from mdnum.precision import reductions
+from mdnum.numerics import reductions
 from mdnum.systems import Simulation, System, load
 
 

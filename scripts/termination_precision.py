@@ -29,9 +29,9 @@ from _output import COLORS, figure, parser, save, say, start, table
 
 from mdnum.ball import BallProblem, GlobalSum, Projection, ResidualPenetration, SemiImplicitEuler, World
 from mdnum.gradients.ball import ThroughIterations
-from mdnum.precision import RolePrecision
-from mdnum.precision.policy import ALL
-from mdnum.precision.reductions import parse
+from mdnum.numerics import RolePrecision
+from mdnum.numerics.reductions import parse
+from mdnum.numerics.roles import ALL
 
 ORDERS = ("sequential", "pairwise", "exact")
 SHAKE = 3.0

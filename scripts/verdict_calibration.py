@@ -38,11 +38,10 @@ from ase import Atoms
 from ase.build import bulk
 from scipy.stats import beta
 
-from mdnum.events.chance import Delay, count
-from mdnum.events.forks import Dates, Verdict, growth, judge
 from mdnum.forks import fork
 from mdnum.forks.choices import parse
 from mdnum.forks.pair import SPLIT, perturbation
+from mdnum.numerics.verdicts import Dates, Delay, ForkVerdict, count, growth, judge
 from mdnum.rollout.engine import Engine
 from mdnum.systems import System, SystemSpec, build, load
 
@@ -194,7 +193,9 @@ def delays(rows: np.ndarray) -> list[Delay]:
     ]
 
 
-def verdict(one: dict[str, np.ndarray], repeats: list[Delay], handed: np.ndarray | None = None) -> Verdict:
+def verdict(
+    one: dict[str, np.ndarray], repeats: list[Delay], handed: np.ndarray | None = None
+) -> ForkVerdict:
     """The verdict of a start, with as many repeats as it wants."""
     dates = Dates(*(None if at < 0 else int(at) for at in one["dates"]))
     told = one["B|A"] if handed is None else handed

@@ -45,7 +45,7 @@ def run(
             "--set would make the rest of a resumed run another run", remedy="Start a new run instead"
         )
     if resume is None:
-        from mdnum.store.naming import default_folder
+        from mdnum.store.files import default_folder
 
         out = default_folder(str(system)) if out is None else out
 
@@ -56,7 +56,7 @@ def run(
     def go_on() -> str | None:
         if folder is None or not folder.exists():
             return None
-        from mdnum.store.manifest import resumable
+        from mdnum.store.files import resumable
 
         if resumable(folder):
             return f"Continue with `mdnum run --resume {folder}`"

@@ -18,7 +18,7 @@ import numpy as np
 from mdnum.errors import InputError
 from mdnum.forks.child import digests_elsewhere
 from mdnum.forks.worlds import program_of
-from mdnum.precision.ulp import neighbor, ordinal
+from mdnum.numerics.rounding import neighbor, ordinal
 from mdnum.program import DecisionHistory, Number, Program
 from mdnum.systems import BallSystem, System, load
 

@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from mdnum.forks.pair import Fork
 from mdnum.md.decide import PairDecider
-from mdnum.precision.ulp import unit_roundoff
+from mdnum.numerics.rounding import unit_roundoff
 from mdnum.program import Twin
 from mdnum.systems.build import Simulation
 

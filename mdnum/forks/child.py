@@ -64,7 +64,7 @@ def _stepped(simulation: Any, steps: int, program: ProgramName) -> np.ndarray:
     import jax.numpy as jnp
     from jax import lax
 
-    from mdnum.md.stepper import MdState, PairDynamics
+    from mdnum.md.pairforce import MdState, PairDynamics
     from mdnum.rollout.engine import first_state
 
     start = first_state(simulation)

@@ -10,9 +10,22 @@ import numpy as np
 from jaxtyping import Shaped
 
 from mdnum.errors import InputError
-from mdnum.events.chance import FEWEST, REPEATS, Delay
-from mdnum.events.forks import PATIENCE, Dates, Growth, Verdict, growth, judge, split_of
-from mdnum.events.shares import Cell, Share, shares, table
+from mdnum.numerics.verdicts import (
+    FEWEST,
+    PATIENCE,
+    REPEATS,
+    Dates,
+    Delay,
+    ForkVerdict,
+    Growth,
+    Share,
+    SplitCell,
+    growth,
+    judge,
+    shares,
+    split_of,
+    table,
+)
 from mdnum.program import Decision, PairRows, Twin
 
 #: The split tolerance as a share of the longest cutoff, or of the largest start height. Flips that part a
@@ -75,9 +88,9 @@ class Fork:
     doubts: dict[str, Any]
     growth: dict[str, Growth]
     splits: dict[str, int | None]
-    table: tuple[Cell, ...]
+    table: tuple[SplitCell, ...]
     shares: tuple[Share, ...]
-    verdict: Verdict
+    verdict: ForkVerdict
     repeats: tuple[Delay, ...]
     failed: dict[str, str]
     runs: dict[str, Any]

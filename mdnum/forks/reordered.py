@@ -20,8 +20,8 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from jaxtyping import Bool, Int
 
-from mdnum.md.verlet import ListBuilder, PairTable, VerletList
-from mdnum.precision.orders import Halves, Reduction, Sequential, Twice
+from mdnum.md.neighbors import ListBuilder, PairTable, VerletList
+from mdnum.numerics.sums import Halves, Reduction, Sequential, Twice
 from mdnum.systems.build import Simulation
 
 #: The sums that go with each format.

@@ -15,15 +15,14 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mdnum.errors import InputError
-from mdnum.events.forks import split_of
 from mdnum.forks.pair import Fork
 from mdnum.md.cell import HostCell
-from mdnum.rollout.compared import Apart
+from mdnum.numerics.verdicts import split_of
+from mdnum.rollout.compared import Apart, Frame
 from mdnum.rollout.engine import Engine, Segment
+from mdnum.rollout.epoch import Pin, Pins
 from mdnum.rollout.flips import PairRecorder, decided_pairs
-from mdnum.rollout.frame import Frame
 from mdnum.rollout.lockstep import apart
-from mdnum.rollout.pins import Pin, Pins
 from mdnum.rollout.program import MdProgram, pair_bound, pair_margin
 from mdnum.rollout.tracks import Track
 

@@ -20,9 +20,8 @@ from jax import lax
 from jaxtyping import Array, Float, Int, UInt8
 
 from mdnum.errors import InputError
-from mdnum.events.forks import Growth
-from mdnum.md.pairforce import PairForce
-from mdnum.md.stepper import MdState, PairDynamics
+from mdnum.md.pairforce import MdState, PairDynamics, PairForce
+from mdnum.numerics.verdicts import Growth
 from mdnum.rollout.engine import FAILURES, Engine, Segment, Start
 from mdnum.systems.build import Simulation
 

@@ -25,8 +25,7 @@ from mdnum.gradients.losses import LossFrame
 from mdnum.gradients.parameters import Cotangents, quantities
 from mdnum.gradients.tape import RunTape, TapeStretch, frame_of, over_rows, unsorted
 from mdnum.md.integrators import Integrator
-from mdnum.md.manyforce import ManyBodyForce
-from mdnum.md.pairforce import PairForce
+from mdnum.md.pairforce import ManyBodyForce, PairForce
 
 #: Everything that a run is made of.
 ALL = frozenset((MODEL, SCALE, FORCE))

@@ -28,8 +28,8 @@ from mdnum.gradients.tape import KEPT, RunTape, frame_of
 from mdnum.md.cell import displacement
 from mdnum.md.cutoffs import Hard
 from mdnum.md.integrators import Langevin
+from mdnum.md.neighbors import BUILDERS, RebuildRule, VerletList
 from mdnum.md.pairforce import PairForce
-from mdnum.md.verlet import BUILDERS, RebuildRule, VerletList
 from mdnum.systems.build import Simulation
 
 #: Widths of the kernel, each half of the one before.

@@ -16,9 +16,9 @@ from mdnum.ball.problem import START, BallProblem
 from mdnum.ball.state import BallDecisions, BallRecord, BallState
 from mdnum.ball.world import World
 from mdnum.errors import NumericalError
-from mdnum.events.saltation import carry, grazing
 from mdnum.gradients.ball import BallMethod, Used, origin, scaled, start_of, used
 from mdnum.gradients.problem import Gradient
+from mdnum.numerics.saltation import carry, grazing
 
 #: Parameters of how a projection is solved, not of what it stands for.
 _SOLVER = ("k", "alpha", "tol", "enter")

@@ -2,7 +2,7 @@
 
 Where the force jumps, a perturbed pair feels it earlier or later, and its momentum is another one ever
 after. Differentiating the steps of a program never sees that, because the steps do not move with the
-crossing; the error does not shrink with the time step. The term is the saltation term of mdnum.events, with
+crossing; the error does not shrink with the time step. The term is the saltation term of mdnum.numerics, with
 the cutoff's sphere as the threshold, written for the reverse pass.
 
 A loss that sees the potential energy or the virial jumps with them too, in the frames that it looks at: where
@@ -21,9 +21,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from mdnum.events import Ledger
-from mdnum.events.saltation import saltation_flagged
 from mdnum.md.cell import HostCell
+from mdnum.numerics import Ledger
+from mdnum.numerics.saltation import saltation_flagged
 from mdnum.systems.build import Simulation
 
 

@@ -89,7 +89,7 @@ def dependence(
 
     Error: none in the marks. They follow the branches of this compiled program; one whose decisions lie
     within a rounding of their thresholds may branch otherwise when compiled alone, unless its arithmetic is
-    fenced (`mdnum.precision.exact`).
+    fenced (`mdnum.numerics.exact`).
     """
     names = list(values) if names is None else list(names)
     for name in names:

@@ -15,8 +15,8 @@ from jaxtyping import Float
 from mdnum.errors import InputError
 from mdnum.gradients import parameters
 from mdnum.gradients.problem import Gradient, Method, Problem, Progress, scalars_only
-from mdnum.precision import PrecisionPolicy
-from mdnum.precision.policy import LATTICE
+from mdnum.numerics import PrecisionPolicy
+from mdnum.numerics.roles import LATTICE
 from mdnum.systems.build import Simulation
 
 #: The widest step that is tried, and the spacing of the values that the noise is estimated from in rounding

@@ -23,11 +23,10 @@ from mdnum.gradients.parameters import quantities, with_quantities
 from mdnum.md.decide import PairDecider, Tables, displacements, halves_of, unpacked
 from mdnum.md.jaxmd import Format, NeighborList
 from mdnum.md.manybody import ManyBody, Smoothness
-from mdnum.md.manyforce import ManyBodyForce
-from mdnum.md.pairforce import PairForce
+from mdnum.md.neighbors import check_radius
+from mdnum.md.pairforce import ManyBodyForce, PairForce
 from mdnum.md.potentials import CutPotential, of_type
-from mdnum.md.verlet import check_radius
-from mdnum.precision import PrecisionPolicy
+from mdnum.numerics import PrecisionPolicy
 from mdnum.systems.build import Simulation
 
 

@@ -19,8 +19,7 @@ from jaxtyping import Array, Float
 from mdnum.errors import InputError
 from mdnum.md.cell import Cell
 from mdnum.md.integrators import Integrator, Langevin
-from mdnum.md.manyforce import ManyBodyForce
-from mdnum.md.pairforce import PairForce
+from mdnum.md.pairforce import ManyBodyForce, PairForce
 from mdnum.registry import nearest
 from mdnum.systems.build import Simulation
 

@@ -31,7 +31,7 @@ from mdnum.gradients.problem import (
 )
 from mdnum.gradients.tangents import by_column, tangents
 from mdnum.gradients.tape import KEPT, ReversibleTape, RunTape, TapeStretch
-from mdnum.md.latticestep import forgotten_bits
+from mdnum.md.lattice import forgotten_bits
 from mdnum.systems.build import Simulation
 from mdnum.systems.schema import ONSET_FRACTION
 

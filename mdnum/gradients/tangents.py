@@ -32,8 +32,7 @@ from mdnum.gradients.parameters import (
 from mdnum.gradients.tape import RunTape, TapeStretch, frame_of, over_rows, unsorted
 from mdnum.md.decide import Tables
 from mdnum.md.integrators import Integrator
-from mdnum.md.manyforce import ManyBodyForce
-from mdnum.md.pairforce import Forces, PairForce
+from mdnum.md.pairforce import Forces, ManyBodyForce, PairForce
 
 
 class TangentCarry(NamedTuple):

@@ -20,10 +20,10 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from mdnum.errors import NumericalError
-from mdnum.events import Ledger
 from mdnum.gradients.losses import Loss, LossContext, LossFrame
-from mdnum.md.latticestep import LatticeLangevin
-from mdnum.md.verlet import PairTable
+from mdnum.md.lattice import LatticeLangevin
+from mdnum.md.neighbors import PairTable
+from mdnum.numerics import Ledger
 from mdnum.rollout.backward import BackwardRun, Stretched
 from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, first_state, resume_point
 from mdnum.rollout.flips import PairRecorder

@@ -34,7 +34,7 @@ from mdnum.gradients.parameters import Cotangents, quantities, with_quantities
 from mdnum.gradients.problem import Method, Problem, Progress, independent, rounded
 from mdnum.gradients.tape import RunTape, surroundings
 from mdnum.md.decide import Tables
-from mdnum.md.verlet import PairTable
+from mdnum.md.neighbors import PairTable
 from mdnum.rollout.engine import first_state
 
 #: Steps of a chunk, at most.

@@ -282,7 +282,7 @@ def expected(
 
 
 @dataclass(frozen=True)
-class Verdict:
+class ForkVerdict:
     """Whether the flips caused a split, accelerated it, or only came along.
 
     Attributes:
@@ -324,7 +324,7 @@ def judge(
     most: int = REPEATS,
     *,
     ended: str | None = None,
-) -> Verdict:
+) -> ForkVerdict:
     """The verdict on a pair of runs.
 
     Args:
@@ -340,13 +340,13 @@ def judge(
     last = len(free) - 1
     if ended is not None:
         before = f"no decision differs in the {last} steps before"
-        return Verdict("open", dates.split, None, None, (f"{ended}: that is the fork; {before}",))
+        return ForkVerdict("open", dates.split, None, None, (f"{ended}: that is the fork; {before}",))
     if dates.seed is None:
-        return Verdict("same", None, None, None, (f"no bit differs in {last} steps",))
+        return ForkVerdict("same", None, None, None, (f"no bit differs in {last} steps",))
     if dates.fork is None:
         text = f"no decision differs in {last} steps; the separation reaches {np.nanmax(free):.2g}"
         reasons = (text,) if dates.split is not None else (text, *_outlook(free, tolerance))
-        return Verdict("no fork", dates.split, None, None, reasons)
+        return ForkVerdict("no fork", dates.split, None, None, reasons)
     if dates.split is None:
         reasons = _outlook(free, tolerance)
         other = None if handed is None else split_of(handed, tolerance)
@@ -355,16 +355,16 @@ def judge(
                 f"under the first run's decisions the runs do split, at step {other}: the decisions that "
                 "differ keep them together",
             )
-        return Verdict("open", None, other, None, reasons)
+        return ForkVerdict("open", None, other, None, reasons)
     if dates.split < dates.fork:
         text = (
             f"the runs had split at step {dates.split}, before any decision differed (step {dates.fork}): no "
             "flip had a part in it"
         )
-        return Verdict("bystander", dates.split, None, None, (text,))
+        return ForkVerdict("bystander", dates.split, None, None, (text,))
     if handed is None:
         text = f"split at step {dates.split}; without a counterfactual nothing is said about the cause"
-        return Verdict("open", dates.split, None, None, (text,))
+        return ForkVerdict("open", dates.split, None, None, (text,))
     delay = Delay.of(free, handed, tolerance)
     fit = growth(free, tolerance)
     rate = fit.rate if fit.plain else None
@@ -380,7 +380,7 @@ def judge(
 
 def _counted(
     delays: tuple[Delay, ...], most: int, rate: float | None, gained: float, reasons: tuple[str, ...]
-) -> Verdict:
+) -> ForkVerdict:
     """The verdict where the runs split either way: how many of the pair and its repeats split later."""
     pair = delays[0]
     threshold = 0.0 if rate is None else NATS / rate
@@ -405,7 +405,7 @@ def _counted(
             if need is None
             else f"that is not clear: {need[1]} of {need[0]} would be",
         )
-    return Verdict(word, pair.free, pair.handed, nats, reasons, threshold, found)
+    return ForkVerdict(word, pair.free, pair.handed, nats, reasons, threshold, found)
 
 
 def _kept(
@@ -415,7 +415,7 @@ def _kept(
     delays: tuple[Delay, ...],
     most: int,
     rate: float | None,
-) -> Verdict:
+) -> ForkVerdict:
     """The verdict where the runs do not split under the first run's decisions."""
     some = np.isfinite(handed)
     seen = int(np.flatnonzero(some)[-1]) if some.any() else 0
@@ -432,19 +432,19 @@ def _kept(
             if seen > free
             else "where it was ended"
         )
-        return Verdict("open", free, None, None, (text, more))
+        return ForkVerdict("open", free, None, None, (text, more))
     late = _expected(handed, tolerance, seen)
     if late is not None and late < _SAVED * free:
         more = f"it grows and is expected to split about step {late:.0f}: later, but not saved"
         return _counted(delays, most, rate, late - free, (text, more))
     if below < NATS:
         more = "which is within one e-folding of it: no cause without a longer run"
-        return Verdict("open", free, None, None, (text, more))
+        return ForkVerdict("open", free, None, None, (text, more))
     basis = (
         f"the word cause rests on that: no split within {seen / free:.2g} times the steps to the free one, "
         "and none on its way"
     )
-    return Verdict("cause", free, None, float("inf"), (text, basis))
+    return ForkVerdict("cause", free, None, float("inf"), (text, basis))
 
 
 def _outlook(free: Float[np.ndarray, "steps"], tolerance: float) -> tuple[str, ...]:
@@ -486,7 +486,7 @@ SERIES: Mapping[tuple[Name, Name, Name], str] = {
 
 
 @dataclass(frozen=True)
-class Cell:
+class SplitCell:
     """When one run splits from another.
 
     Attributes:
@@ -527,7 +527,7 @@ class Share:
     nats: float | None
 
 
-def table(series: Mapping[str, Shaped[np.ndarray, "steps"]], tolerance: float) -> tuple[Cell, ...]:
+def table(series: Mapping[str, Shaped[np.ndarray, "steps"]], tolerance: float) -> tuple[SplitCell, ...]:
     """Splits of all runs from A, then from B: (A, A), (B, B), (B, A) and (A, B), those that were run.
 
     Args:
@@ -540,7 +540,7 @@ def table(series: Mapping[str, Shaped[np.ndarray, "steps"]], tolerance: float) -
         for arithmetic, decisions in _RUNS:
             last = len(series["B"]) - 1
             if arithmetic == decisions == reference:
-                cells.append(Cell(arithmetic, decisions, reference, None, last))
+                cells.append(SplitCell(arithmetic, decisions, reference, None, last))
                 continue
             name = "B" if arithmetic == decisions else SERIES[arithmetic, decisions, reference]
             if name not in series:
@@ -548,11 +548,11 @@ def table(series: Mapping[str, Shaped[np.ndarray, "steps"]], tolerance: float) -
             seen = np.flatnonzero(np.isfinite(series[name]))
             if len(seen):
                 split = split_of(series[name], tolerance)
-                cells.append(Cell(arithmetic, decisions, reference, split, int(seen[-1])))
+                cells.append(SplitCell(arithmetic, decisions, reference, split, int(seen[-1])))
     return tuple(cells)
 
 
-def shares(cells: tuple[Cell, ...], rate: float) -> tuple[Share, ...]:
+def shares(cells: tuple[SplitCell, ...], rate: float) -> tuple[Share, ...]:
     """What the decisions and the arithmetic contribute, each as seen from A and from B.
 
     Args:

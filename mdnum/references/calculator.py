@@ -87,7 +87,7 @@ class MdnumCalculator(Calculator):
         super().calculate(atoms, properties or ["energy"], system_changes)
         atoms = cast(Atoms, self.atoms)
         if self._evaluator is None or _REBUILD & set(system_changes):
-            from mdnum.systems.evaluate import Evaluator
+            from mdnum.systems.build import Evaluator
 
             # only what the forces depend on: constraints and the like stay with ASE
             bare = Atoms(numbers=atoms.numbers, positions=atoms.positions, cell=atoms.cell, pbc=atoms.pbc)

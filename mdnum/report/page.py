@@ -15,7 +15,7 @@ from markupsafe import Markup
 from mdnum.report import svg
 from mdnum.report.section import cell
 from mdnum.report.words import heading, many, typeset
-from mdnum.store.atomic import subfolder, write_text
+from mdnum.store.files import subfolder, write_text
 
 if TYPE_CHECKING:
     from mdnum.report.finding import Finding, Verdict

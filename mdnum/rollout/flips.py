@@ -86,7 +86,7 @@ def _at(values: np.ndarray, row: np.ndarray, place: np.ndarray) -> np.ndarray:
     return out.T
 
 
-class Ambiguous(NamedTuple):
+class AmbiguousPairs(NamedTuple):
     """Pair decisions that another legitimate rounding could have made otherwise, a row each.
 
     Attributes:
@@ -101,12 +101,12 @@ class Ambiguous(NamedTuple):
     margin: Float[np.ndarray, "rows"]
     bound: Float[np.ndarray, "rows"]
 
-    def where(self, chosen) -> Ambiguous:
+    def where(self, chosen) -> AmbiguousPairs:
         """Some of the rows: a mask, a slice or indices."""
-        return Ambiguous(*(column[chosen] for column in self))
+        return AmbiguousPairs(*(column[chosen] for column in self))
 
     @classmethod
-    def joined(cls, parts: list[Ambiguous]) -> Ambiguous:
+    def joined(cls, parts: list[AmbiguousPairs]) -> AmbiguousPairs:
         """The rows of several, one after the other."""
         whole, real = np.zeros(0, np.int64), np.zeros(0)
         parts = [cls(whole, whole, whole, real, real), *parts]
@@ -159,9 +159,9 @@ class PairRecorder:
         """Pairs whose decision another legitimate rounding could have changed, at every step of a segment."""
         return np.bincount(self.doubtful(segment).step - segment.first, minlength=segment.rows)
 
-    def doubtful(self, segment: Segment) -> Ambiguous:
+    def doubtful(self, segment: Segment) -> AmbiguousPairs:
         """The pairs that `ambiguous` counts, in the order of their steps."""
-        parts: list[Ambiguous] = []
+        parts: list[AmbiguousPairs] = []
         bounds, table = self.bounds(segment), segment.table
         # almost always no pair comes that close; where one does, the host looks again
         close = np.flatnonzero(segment.rows_of("nearest") <= bounds.max(axis=1))
@@ -179,9 +179,9 @@ class PairRecorder:
             at = at[sort_rows(np.zeros(len(at), np.int64), np.stack([i[at], j[at]], axis=1))]
             step = np.full(len(at), segment.first + row, np.int64)
             parts.append(
-                Ambiguous(step, i[at].astype(np.int64), j[at].astype(np.int64), margin[at], bound[at])
+                AmbiguousPairs(step, i[at].astype(np.int64), j[at].astype(np.int64), margin[at], bound[at])
             )
-        return Ambiguous.joined(parts)
+        return AmbiguousPairs.joined(parts)
 
     def _margins(self, start, end, i, j):
         """Pair types and margins of pairs at given positions, with the bits of the program's decision."""

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from mdnum.program import PairRows
 from mdnum.rollout.compared import Apart, CrossFlip, CrossRecorder, Frame, differ
 from mdnum.rollout.engine import Segment, Start
-from mdnum.rollout.flips import Ambiguous
+from mdnum.rollout.flips import AmbiguousPairs
 from mdnum.rollout.tracks import Handed, Overridden, Rows, Track, joined
 from mdnum.systems.build import Simulation
 
@@ -191,7 +191,7 @@ def _energy(a: Rows, other: Rows | None) -> Float[np.ndarray, "rows"]:
     return np.full(len(a), np.nan) if other is None else _padded(other.energy, a)
 
 
-def _per_row(doubts: Ambiguous, rows: Rows) -> Int[np.ndarray, "rows"]:
+def _per_row(doubts: AmbiguousPairs, rows: Rows) -> Int[np.ndarray, "rows"]:
     return np.bincount(doubts.step - rows.first, minlength=len(rows))
 
 

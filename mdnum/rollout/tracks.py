@@ -18,7 +18,7 @@ from mdnum.numerics import Ledger
 from mdnum.rollout.compared import Apart, Frame, PairFlips, in_user_order
 from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, first_state
 from mdnum.rollout.epoch import EpochRecord, EpochState, Pins, empty_record, run_epoch
-from mdnum.rollout.flips import Ambiguous, PairRecorder, decided_pairs
+from mdnum.rollout.flips import AmbiguousPairs, PairRecorder, decided_pairs
 from mdnum.systems.build import Simulation
 
 
@@ -102,7 +102,7 @@ class Track:
         self._listener = listener
         self._ahead: list[Rows] = []
         self._flips: list[PairFlips] = []
-        self._doubts: list[Ambiguous] = []
+        self._doubts: list[AmbiguousPairs] = []
         self.first_pairs: Int[np.ndarray, "pairs"] | None = None
         self.failed = ""
 
@@ -144,9 +144,9 @@ class Track:
         self._flips = [every.where(every.step > last)]
         return (joined(taken) if taken else None), every.where(every.step <= last)
 
-    def doubts(self, last: int) -> Ambiguous:
+    def doubts(self, last: int) -> AmbiguousPairs:
         """The ambiguous decisions up to a step that were not yet asked for, in the first run's labels."""
-        every = Ambiguous.joined(self._doubts)
+        every = AmbiguousPairs.joined(self._doubts)
         taken = every.where(every.step <= last)
         self._doubts = [every.where(every.step > last)]
         i, j = np.divmod(self.frame.keys_of(taken.i, taken.j), self.simulation.atoms)

@@ -140,7 +140,7 @@ def _ambiguous(simulation: Any, found: Certificate, note: Progress, tables: dict
     """Each policy's decisions against their rounding bounds; the ambiguous ones in exact arithmetic too."""
     from mdnum.forks.exact.bounds import certified_horizon
     from mdnum.forks.exact.program import with_policy
-    from mdnum.precision import PrecisionPolicy
+    from mdnum.numerics import PrecisionPolicy
 
     numbers, rows = {}, []
     for k, row in enumerate(found.ranking):

@@ -27,7 +27,7 @@ from mdnum.plain import plain
 from mdnum.report.finding import Finding, Verdict, restore
 from mdnum.report.section import Page
 from mdnum.store import RunFolder
-from mdnum.store.naming import default_folder
+from mdnum.store.files import default_folder
 
 if TYPE_CHECKING:
     from mdnum.units import Units

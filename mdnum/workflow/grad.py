@@ -15,7 +15,7 @@ from mdnum.errors import InputError
 from mdnum.plain import plain
 from mdnum.report.finding import Finding, Verdict, conclude
 from mdnum.report.words import listed, percent
-from mdnum.store.atomic import write_bytes
+from mdnum.store.files import write_bytes
 from mdnum.workflow import frame, grad_page
 from mdnum.workflow.fork_pair import few_steps, is_ball, logged, of_any
 from mdnum.workflow.frame import Outcome, Progress, Verb, View

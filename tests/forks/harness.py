@@ -54,5 +54,7 @@ def made(word: str, system: Any) -> Twin:
 def balls(a: Any, b: Any, y_a: Any, y_b: Any = None, steps: int = 1000, **program: Any) -> Twin:
     """The twin of two worlds of a ball and their start heights."""
     y_b = y_a if y_b is None else y_b
-    one, other = (BallProblem(world, np.asarray(y, np.float64), 0.0, steps) for world, y in ((a, y_a), (b, y_b)))
+    one, other = (
+        BallProblem(world, np.asarray(y, np.float64), 0.0, steps) for world, y in ((a, y_a), (b, y_b))
+    )
     return Twin(BallProgram(one), BallProgram(other, **program), "two programs")

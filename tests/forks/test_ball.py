@@ -17,7 +17,7 @@ from mdnum.forks.boundaries import boundaries
 from mdnum.forks.choices import parse, shipped, unavailable
 from mdnum.forks.screen import screen
 from mdnum.forks.worlds import program_of
-from mdnum.precision import RolePrecision, neighbor
+from mdnum.numerics import RolePrecision, neighbor
 from mdnum.systems import BallSystem, load
 
 # --- verdicts -----------------------------------------------------------------------------------------

@@ -22,8 +22,8 @@ from mdnum.forks.screen import Screened, screen
 from mdnum.forks.worlds import flat, varied
 from mdnum.md.cell import Cell, wrap_positions
 from mdnum.md.integrators import Langevin
-from mdnum.md.verlet import BUILDERS
-from mdnum.precision import reductions
+from mdnum.md.neighbors import BUILDERS
+from mdnum.numerics import reductions
 from mdnum.rollout.engine import first_state
 from mdnum.systems.build import Simulation, build
 from mdnum.systems.load import System, load

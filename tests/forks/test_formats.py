@@ -18,9 +18,9 @@ from mdnum.forks.choices.lists import FORMATS
 from mdnum.forks.reordered import FormattedSimulation
 from mdnum.md.cell import wrap_positions
 from mdnum.md.jaxmd import as_neighbor_list, displacement, upstream
-from mdnum.precision.orders import Halves, Sequential, Twice
-from mdnum.precision.reductions import Exact
-from mdnum.precision.running import Tap
+from mdnum.numerics.reductions import Exact
+from mdnum.numerics.running import Tap
+from mdnum.numerics.sums import Halves, Sequential, Twice
 from mdnum.systems.build import Simulation, build
 
 

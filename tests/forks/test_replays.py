@@ -11,9 +11,9 @@ from forks.harness import crystal, followed, moved
 from mdnum.errors import InputError
 from mdnum.forks import Fork
 from mdnum.forks.replays import disagreements, minimal_cause, parse_pin, pinned
+from mdnum.rollout.compared import Frame
 from mdnum.rollout.engine import Engine
-from mdnum.rollout.frame import Frame
-from mdnum.rollout.pins import Pin, Pins
+from mdnum.rollout.epoch import Pin, Pins
 
 
 @pytest.fixture(scope="module")

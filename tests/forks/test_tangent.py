@@ -13,9 +13,9 @@ from forks.harness import crystal, pair
 from small_systems import LENNARD_JONES, make
 
 from mdnum.errors import InputError
-from mdnum.events.forks import Growth, growth
 from mdnum.forks.forecast import forecast
 from mdnum.forks.tangent import lyapunov, tangents
+from mdnum.numerics.verdicts import Growth, growth
 from mdnum.rollout.engine import Engine
 from mdnum.rollout.flips import decided_pairs
 from mdnum.rollout.program import MdProgram

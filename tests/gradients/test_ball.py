@@ -14,7 +14,7 @@ from mdnum.ball.stopping import GlobalSum, PerInstance
 from mdnum.ball.world import World
 from mdnum.errors import InputError, NumericalError
 from mdnum.gradients.ball import BALL_METHODS, compare
-from mdnum.precision.policy import RolePrecision
+from mdnum.numerics.roles import RolePrecision
 
 
 def method(name: str, **options):

@@ -15,7 +15,7 @@ from mdnum.gradients.parameters import names, value
 from mdnum.gradients.problem import Problem
 from mdnum.gradients.recorded import EventAware, Forward, Symmetric
 from mdnum.gradients.unrolled import Unrolled
-from mdnum.md.displacement import neighbor_vectors
+from mdnum.md.jaxmd import neighbor_vectors
 from mdnum.systems import build
 
 ONSET, RADIUS = 1.8, 2.2

@@ -9,7 +9,7 @@ import pytest
 
 from mdnum.errors import InputError
 from mdnum.gradients.dependence import dependence
-from mdnum.precision.exact import fence, zero_bits
+from mdnum.numerics.exact import fence, zero_bits
 
 
 def relax(tol: float, cap: int = 40):

@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from mdnum.forks.reordered import ShuffledSimulation
 from mdnum.md.cell import displacement
-from mdnum.md.verlet import BUILDERS, RebuildRule, VerletList
+from mdnum.md.neighbors import BUILDERS, RebuildRule, VerletList
 from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, first_state, resume_point
 from mdnum.rollout.program import MdProgram
 from mdnum.systems.build import Simulation

@@ -16,8 +16,8 @@ from mdnum.forks.choices.base import (
     world_of,
 )
 from mdnum.forks.worlds import not_possible, twin
-from mdnum.precision import reductions
-from mdnum.precision.policy import ALL, WIDE, check_role
+from mdnum.numerics import reductions
+from mdnum.numerics.roles import ALL, WIDE, check_role
 from mdnum.program import Twin
 from mdnum.systems.ball import FixedRule, RelativeRule, SumRule
 
@@ -40,7 +40,7 @@ class PrecisionChoice(Choice):
     """Another float in one role, or in several.
 
     Sixteen bits are for pair forces alone in molecular dynamics: in any other role they make another model
-    rather than another rounding (`mdnum.precision.policy.check_role` says why).
+    rather than another rounding (`mdnum.numerics.roles.check_role` says why).
 
     Attributes:
         role: "state", "force" (of a ball "arithmetic"), "decision" or "accumulate"; None for all of a ball,
@@ -123,7 +123,7 @@ class Summation(Choice):
     """Another order of a sum: of the forces on an atom, of the residuals that stop a solver.
 
     Attributes:
-        word: as `mdnum.precision.reductions.parse` reads it: "exact", "permuted:3", "blocked:8".
+        word: as `mdnum.numerics.reductions.parse` reads it: "exact", "permuted:3", "blocked:8".
     """
 
     shown = True

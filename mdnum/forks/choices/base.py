@@ -11,7 +11,7 @@ from typing_extensions import dataclass_transform
 
 from mdnum.errors import InputError
 from mdnum.forks.worlds import changes, program_of, varied
-from mdnum.precision import reductions
+from mdnum.numerics import reductions
 from mdnum.program import Twin
 from mdnum.registry import Registry
 from mdnum.systems import BallSystem, System

@@ -31,7 +31,7 @@ _AXES = re.compile(r"(?!.*([xyz]).*\1)(-?[xyz]){3}")
 
 
 def _frame(simulation: Any, **parts: Any) -> Any:
-    from mdnum.rollout.frame import Frame
+    from mdnum.rollout.compared import Frame
 
     return replace(Frame.same(simulation.atoms), **parts)
 

@@ -20,7 +20,7 @@ from mdnum.forks.choices.base import (
     world_of,
 )
 from mdnum.forks.worlds import as_used, floats, not_possible, program_of, twin, varied
-from mdnum.precision.ulp import neighbor
+from mdnum.numerics.rounding import neighbor
 from mdnum.program import Twin
 from mdnum.systems import System
 from mdnum.systems.ball import FixedRule

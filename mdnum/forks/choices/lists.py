@@ -27,7 +27,7 @@ from mdnum.forks.choices.base import (
     world_of,
 )
 from mdnum.forks.worlds import program_of, varied
-from mdnum.precision import reductions
+from mdnum.numerics import reductions
 from mdnum.program import Twin
 from mdnum.systems import System
 from mdnum.systems.ball import MaximumRule, RelativeRule, SumRule
@@ -202,7 +202,7 @@ class Builder(Summed):
     word: str | None = None
 
     def __post_init__(self):
-        from mdnum.md.verlet import BUILDERS
+        from mdnum.md.neighbors import BUILDERS
 
         super().__post_init__()
         if self.word is not None and self.word not in BUILDERS:
@@ -216,7 +216,7 @@ class Builder(Summed):
         return no_sums(system, self.both)
 
     def make(self, system: System) -> Twin:
-        from mdnum.md.verlet import BUILDERS
+        from mdnum.md.neighbors import BUILDERS
 
         a = built(system, self.both)
         word = self.word or next(name for name in BUILDERS if name != a.builder)

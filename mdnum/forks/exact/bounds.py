@@ -18,9 +18,9 @@ from mdnum.errors import InputError
 from mdnum.forks.exact.tape import DecisionTape
 from mdnum.md.cell import Cell, HostCell
 from mdnum.md.decide import PairDecider
+from mdnum.rollout.compared import Frame
 from mdnum.rollout.engine import FAILURES, Engine, Segment, Start
 from mdnum.rollout.flips import PairRecorder, decided_pairs
-from mdnum.rollout.frame import Frame
 from mdnum.rollout.tracks import rows_of
 from mdnum.systems.build import Simulation
 

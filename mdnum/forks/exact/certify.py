@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from mdnum.errors import InputError
-from mdnum.events.forks import Growth, growth
 from mdnum.forks.worlds import program_of, varied
+from mdnum.numerics.verdicts import Growth, growth
 from mdnum.program import Decision, Program
 from mdnum.systems import BallSystem, System
 
@@ -168,7 +168,7 @@ def _certify_md(system: System, last: int, policies: Mapping[str, Roles], note: 
     from mdnum.forks.exact.program import ExactProgram, unsupported, with_policy
     from mdnum.forks.exact.tape import first_difference
     from mdnum.md.cell import HostCell
-    from mdnum.precision import PrecisionPolicy
+    from mdnum.numerics import PrecisionPolicy
 
     program: Any = program_of(system)
     simulation = program.simulation

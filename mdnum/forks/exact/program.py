@@ -26,7 +26,7 @@ from mdnum.md.cell import complete
 from mdnum.md.cutoffs import Undecided
 from mdnum.md.integrators import VelocityVerlet
 from mdnum.md.potentials import LennardJones
-from mdnum.precision import PrecisionPolicy, gamma
+from mdnum.numerics import PrecisionPolicy, gamma
 from mdnum.rollout.engine import Start, first_state
 from mdnum.systems.build import Simulation
 

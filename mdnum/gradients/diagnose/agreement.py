@@ -18,7 +18,7 @@ from mdnum.errors import InputError, MdnumError
 from mdnum.gradients import parameters
 from mdnum.gradients.problem import METHODS, Gradient, Method, Problem, Progress
 from mdnum.gradients.problem import method as by_name
-from mdnum.precision import unit_roundoff
+from mdnum.numerics import unit_roundoff
 
 #: Below this number of rounding errors, times what they grew by, two derivatives agree.
 _ROUNDINGS = 1e4

@@ -19,7 +19,7 @@ from mdnum.gradients.problem import Problem, Progress, in_phase
 from mdnum.gradients.recorded import passed, tape_of
 from mdnum.gradients.tangents import tangents
 from mdnum.md.cell import HostCell
-from mdnum.precision.ulp import ordinal
+from mdnum.numerics.rounding import ordinal
 from mdnum.program import Number
 from mdnum.rollout.program import MdProgram
 from mdnum.systems.build import Simulation

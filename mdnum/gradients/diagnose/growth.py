@@ -24,7 +24,7 @@ from mdnum.gradients.parameters import Cotangents
 from mdnum.gradients.problem import Problem, Progress
 from mdnum.gradients.recorded import passed
 from mdnum.gradients.tape import TapeStretch
-from mdnum.precision import formats
+from mdnum.numerics import formats
 from mdnum.systems.build import Simulation
 
 #: Time steps that turn a velocity into a length: of the order of the time in which an atom feels its cage.

@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mdnum.errors import InputError
-from mdnum.events import Ledger
 from mdnum.gradients import parameters
 from mdnum.gradients.losses import Loss
 from mdnum.gradients.parameters import ParameterEntry, columns_of
@@ -21,6 +20,7 @@ from mdnum.gradients.problem import Problem, Progress, in_phase
 from mdnum.gradients.recorded import GUARD, radial_speed
 from mdnum.gradients.tangents import StretchTangents, tangents
 from mdnum.gradients.tape import RunTape, TapeStretch
+from mdnum.numerics import Ledger
 
 #: The parameter by which derivatives at half the time step are twice as large.
 TIMESTEP = "dynamics.timestep"

@@ -25,8 +25,7 @@ from mdnum.gradients.recorded import tape_of
 from mdnum.gradients.tape import RunTape, TapeStretch, over_rows
 from mdnum.md.decide import Tables
 from mdnum.md.integrators import Integrator
-from mdnum.md.pairforce import PairForce
-from mdnum.md.stepper import MdState, PairDynamics
+from mdnum.md.pairforce import MdState, PairDynamics, PairForce
 
 #: Beyond this many e-foldings between vectors, the product of triangles is read off its diagonal.
 _RANGE = 30.0

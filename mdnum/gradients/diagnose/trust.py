@@ -36,7 +36,7 @@ from mdnum.gradients.problem import Problem, Progress
 from mdnum.gradients.recorded import MOST, ReversePass, passed
 from mdnum.gradients.tape import pace_of
 from mdnum.md.integrators import Langevin
-from mdnum.precision import PrecisionPolicy
+from mdnum.numerics import PrecisionPolicy
 from mdnum.rollout.engine import Engine
 from mdnum.rollout.flips import PairRecorder
 from mdnum.systems.build import Simulation

@@ -20,7 +20,7 @@ from mdnum.forks.exact.program import ExactProgram, with_policy
 from mdnum.forks.exact.tape import first_difference
 from mdnum.md.cell import Cell, HostCell
 from mdnum.md.decide import CONVENTIONS, PairDecider
-from mdnum.precision import PrecisionPolicy
+from mdnum.numerics import PrecisionPolicy
 from mdnum.rollout.engine import Engine
 from mdnum.rollout.flips import PairRecorder
 from mdnum.systems import System, load

@@ -1,2 +1,0 @@
-# shim
-from mdnum.numerics import *  # noqa: F403

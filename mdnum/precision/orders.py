@@ -1,5 +1,0 @@
-# shim
-import importlib
-import sys
-
-sys.modules[__name__] = importlib.import_module("mdnum.numerics.sums")
