@@ -13,7 +13,7 @@ from mdnum.numerics.reductions import BY_NAME
 from mdnum.numerics.roles import RolePrecision
 from mdnum.numerics.running import RunningSum, running_sum_table
 from mdnum.numerics.sums import Reduction
-from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
+from mdnum.verbs.demos import Claim, Demo, Plot, Series, table
 
 #: The tolerance, and five penetrations (m) whose exact sum it is: one just below it and four that are each
 #: a quarter of its last place.

@@ -24,7 +24,7 @@ from mdnum.numerics.roles import ALL, RolePrecision
 from mdnum.numerics.rounding import neighbor
 from mdnum.numerics.running import RunningSum, running_sum_table
 from mdnum.numerics.sums import Reduction, Sequential
-from mdnum.workflow.demos import Claim, Demo, Plot, Series, Table, table
+from mdnum.verbs.demos import Claim, Demo, Plot, Series, Table, table
 
 K = ALPHA = 0.5
 STEPS, MAX_ITER, TOL, SMALL = 4, 25, 1e-3, 8

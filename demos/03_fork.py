@@ -16,7 +16,7 @@ from mdnum.ball import (
     simulate,
 )
 from mdnum.numerics.rounding import neighbor, ordinal, ulp_distance
-from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
+from mdnum.verbs.demos import Claim, Demo, Plot, Series, table
 
 H, STEPS = 0.01, 200
 #: Heights (m) with different first contacts, between which the boundary lies.

@@ -20,7 +20,7 @@ from mdnum.ball.state import BallDecisions
 from mdnum.ball.world import World
 from mdnum.errors import InputError
 from mdnum.numerics.roles import RolePrecision
-from mdnum.workflow.demos import Claim, Demo, Plot, Region, Series, Table, table
+from mdnum.verbs.demos import Claim, Demo, Plot, Region, Series, Table, table
 
 SCHEMES = {
     "explicit-euler": ExplicitEuler,

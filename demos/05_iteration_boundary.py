@@ -11,7 +11,7 @@ import numpy as np
 
 from mdnum.ball import BallProblem, GlobalSum, Projection, ResidualPenetration, SemiImplicitEuler, World
 from mdnum.numerics.rounding import neighbor, ulp_distance
-from mdnum.workflow.demos import Claim, Demo, Plot, Series, Table, table
+from mdnum.verbs.demos import Claim, Demo, Plot, Series, Table, table
 
 ALPHA, DEPTH, TOL = 0.5, 0.45, 1e-4
 LOW, HIGH, POINTS = 0.48, 0.53, 101

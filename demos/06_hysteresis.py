@@ -20,7 +20,7 @@ from mdnum.ball import (
 from mdnum.numerics.reductions import parse
 from mdnum.numerics.roles import RolePrecision
 from mdnum.numerics.sums import Reduction
-from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
+from mdnum.verbs.demos import Claim, Demo, Plot, Series, table
 
 #: A ball that rests on a soft spring and is shaken: it wavers about the floor.
 BALLS, STEPS, H, STIFFNESS, DAMPING, SHAKE = 16, 2000, 5e-3, 1000.0, 5.0, 9.0

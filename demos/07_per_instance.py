@@ -20,7 +20,7 @@ from mdnum.ball import (
     World,
 )
 from mdnum.gradients.ball import scaled
-from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
+from mdnum.verbs.demos import Claim, Demo, Plot, Series, table
 
 K = ALPHA = 0.5
 TOL, CAP = 1e-3, 100

@@ -15,7 +15,7 @@ from mdnum.ball import BallProblem, GlobalSum, Projection, ResidualPenetration, 
 from mdnum.ball.stopping import elementwise
 from mdnum.gradients.ball import scaled
 from mdnum.gradients.ball_contacts import FixedPointRule, Implicit, fixed_point_tangent
-from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
+from mdnum.verbs.demos import Claim, Demo, Plot, Series, table
 
 K = ALPHA = 0.5
 DEPTH = 0.45

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, Int8
 from mdnum.ball.state import Reason
 from mdnum.errors import InputError
 from mdnum.numerics.formats import matmul
-from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
+from mdnum.verbs.demos import Claim, Demo, Plot, Series, table
 
 Vector = Float[Array, "n"]
 

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from mdnum.ball import Penalty, SemiImplicitEuler, World
 from mdnum.errors import InputError
 from mdnum.numerics.formats import quantize
-from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
+from mdnum.verbs.demos import Claim, Demo, Plot, Series, table
 
 #: Binary digits of the constants after the point.
 _SHIFT = 24

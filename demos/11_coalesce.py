@@ -8,7 +8,7 @@ import numpy as np
 
 from mdnum.numerics.reductions import Exact, FixedPoint, orders, scatter_add, segment_sum
 from mdnum.numerics.sums import Sequential
-from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
+from mdnum.verbs.demos import Claim, Demo, Plot, Series, table
 
 #: Contacts, the floor panels that they load, and the orders in which they may be stored.
 CONTACTS, PANELS, ORDERS = 96, 6, 1000

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from mdnum.ball import EventLocated, ExactImpact, Impact, SemiImplicitEuler, World, arrive
 from mdnum.errors import InputError
 from mdnum.numerics.saltation import carry
-from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
+from mdnum.verbs.demos import Claim, Demo, Plot, Series, table
 
 TIME = 2.0
 COUNTS = (200, 632, 2000, 6325, 20_000, 63_246, 200_000)

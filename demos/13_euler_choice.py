@@ -21,7 +21,7 @@ from mdnum.ball import (
     arrive,
     simulate,
 )
-from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
+from mdnum.verbs.demos import Claim, Demo, Plot, Series, table
 
 K, TIME, STEPS = 100.0, 2.0, 200
 COUNTS = (400, 800, 1600, 3200, 6400)

@@ -10,7 +10,7 @@ from jax import lax
 from jaxtyping import Array
 
 from mdnum.ball import EventLocated, ExactImpact, Impact, Reason, SemiImplicitEuler, World, simulate
-from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
+from mdnum.verbs.demos import Claim, Demo, Plot, Series, table
 
 G, E = 9.81, 0.8
 REST_SPEED = 1e-12

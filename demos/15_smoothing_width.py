@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mdnum.ball import BallVerlet, ExactPenalty, Penalty, SemiImplicitEuler, World, arrive
-from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
+from mdnum.verbs.demos import Claim, Demo, Plot, Series, table
 
 K, TIME, STEPS = 3000.0, 2.0, 200
 WIDTHS = (0.0, 0.001, 0.003, 0.01, 0.02, 0.03, 0.05, 0.1)

@@ -17,7 +17,7 @@ from mdnum.ball import BallRun, Impact, SemiImplicitEuler, World, simulate
 from mdnum.errors import NumericalError
 from mdnum.numerics.rounding import neighbor
 from mdnum.safe_path import environment, python
-from mdnum.workflow.demos import Claim, Demo, Plot, Series, table
+from mdnum.verbs.demos import Claim, Demo, Plot, Series, table
 
 #: What of a run is hashed: every state, and every decision.
 _PARTS = ("y", "v", "contact", "iterations", "reason")

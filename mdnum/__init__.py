@@ -19,22 +19,22 @@ _HOMES = {
     "MdnumCalculator": "mdnum.references:MdnumCalculator",
     "MdnumError": "mdnum.errors:MdnumError",
     "NumericalError": "mdnum.errors:NumericalError",
-    "audit_calculator": "mdnum.workflow:audit",
-    "bounce": "mdnum.workflow:bounce",
+    "audit_calculator": "mdnum.verbs:audit",
+    "bounce": "mdnum.verbs:bounce",
     "build": "mdnum.systems:build",
-    "conform": "mdnum.workflow:conform",
-    "demonstrate": "mdnum.workflow:demonstrate",
+    "conform": "mdnum.verbs:conform",
+    "demonstrate": "mdnum.verbs:demonstrate",
     "diagnose": "mdnum.doctor:diagnose",
-    "flips": "mdnum.workflow:flips",
-    "fork": "mdnum.workflow:fork",
-    "fork_certify": "mdnum.workflow:fork_certify",
-    "fork_folders": "mdnum.workflow:fork_folders",
-    "fork_forecast": "mdnum.workflow:fork_forecast",
-    "fork_map": "mdnum.workflow:fork_map",
-    "fork_processes": "mdnum.workflow:fork_processes",
-    "grad": "mdnum.workflow:grad",
+    "flips": "mdnum.verbs:flips",
+    "fork": "mdnum.verbs:fork",
+    "fork_certify": "mdnum.verbs:fork_certify",
+    "fork_folders": "mdnum.verbs:fork_folders",
+    "fork_forecast": "mdnum.verbs:fork_forecast",
+    "fork_map": "mdnum.verbs:fork_map",
+    "fork_processes": "mdnum.verbs:fork_processes",
+    "grad": "mdnum.verbs:grad",
     "load": "mdnum.systems:load",
-    "run": "mdnum.workflow:run",
+    "run": "mdnum.verbs:run",
     "systems": "mdnum.systems",
 }
 
@@ -49,19 +49,19 @@ if TYPE_CHECKING:
     from mdnum.references import MdnumCalculator as MdnumCalculator
     from mdnum.systems import build as build
     from mdnum.systems import load as load
-    from mdnum.workflow import audit as audit_calculator
-    from mdnum.workflow import bounce as bounce
-    from mdnum.workflow import conform as conform
-    from mdnum.workflow import demonstrate as demonstrate
-    from mdnum.workflow import flips as flips
-    from mdnum.workflow import fork as fork
-    from mdnum.workflow import fork_certify as fork_certify
-    from mdnum.workflow import fork_folders as fork_folders
-    from mdnum.workflow import fork_forecast as fork_forecast
-    from mdnum.workflow import fork_map as fork_map
-    from mdnum.workflow import fork_processes as fork_processes
-    from mdnum.workflow import grad as grad
-    from mdnum.workflow import run as run
+    from mdnum.verbs import audit as audit_calculator
+    from mdnum.verbs import bounce as bounce
+    from mdnum.verbs import conform as conform
+    from mdnum.verbs import demonstrate as demonstrate
+    from mdnum.verbs import flips as flips
+    from mdnum.verbs import fork as fork
+    from mdnum.verbs import fork_certify as fork_certify
+    from mdnum.verbs import fork_folders as fork_folders
+    from mdnum.verbs import fork_forecast as fork_forecast
+    from mdnum.verbs import fork_map as fork_map
+    from mdnum.verbs import fork_processes as fork_processes
+    from mdnum.verbs import grad as grad
+    from mdnum.verbs import run as run
 
 __all__ = [
     "CapacityError",

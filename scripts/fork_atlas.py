@@ -42,7 +42,7 @@ from mdnum.errors import InputError, MdnumError
 from mdnum.forks import fork
 from mdnum.forks.choices import Choice, parse, shipped, unavailable
 from mdnum.forks.worlds import varied
-from mdnum.md.cutoffs import BY_NAME as CUTOFFS
+from mdnum.md.cutoffs import CUTOFFS
 from mdnum.numerics.verdicts import REPEATS
 from mdnum.systems import System, load
 

@@ -31,8 +31,8 @@ from mdnum import units
 from mdnum.errors import InputError
 from mdnum.report import analysis
 from mdnum.store import RunFolder
-from mdnum.workflow import frame
-from mdnum.workflow.run_page import Record, load
+from mdnum.verbs import frame
+from mdnum.verbs.run_page import Record, load
 
 CHATTER = 5
 

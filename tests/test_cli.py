@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from command_line import call
 
-import mdnum.workflow
+import mdnum.verbs
 from mdnum.cli import main, output
 from mdnum.cli.progress import ProgressBar, describe
 from mdnum.errors import InputError, NumericalError
@@ -24,7 +24,7 @@ from mdnum.plain import plain
 from mdnum.report.finding import conclude, restore
 from mdnum.report.section import Key, Page, Section, records
 from mdnum.store.files import default_folder
-from mdnum.workflow.frame import Outcome
+from mdnum.verbs.frame import Outcome
 
 SUMMARY: dict[str, Any] = {
     "system": "argon/crystal-108",
@@ -74,7 +74,7 @@ class Recorder:
 def rollout(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Recorder:
     """`mdnum run` in an empty folder with the rollout replaced by a recorder."""
     recorder = Recorder()
-    monkeypatch.setattr(mdnum.workflow, "run", recorder)
+    monkeypatch.setattr(mdnum.verbs, "run", recorder)
     monkeypatch.chdir(tmp_path)
     return recorder
 

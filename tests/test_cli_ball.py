@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from command_line import call
 
-import mdnum.workflow
+import mdnum.verbs
 from mdnum.cli.progress import ProgressBar
 from mdnum.errors import InputError
-from mdnum.workflow import demos
-from mdnum.workflow.demos import Claim, Demo, Plot, Region, Series, table
+from mdnum.verbs import demos
+from mdnum.verbs.demos import Claim, Demo, Plot, Region, Series, table
 
 
 @dataclass
@@ -32,7 +32,7 @@ class Recorder:
 def bounce(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Recorder:
     """`mdnum ball` in an empty folder with the run replaced by a recorder."""
     recorder = Recorder()
-    monkeypatch.setattr(mdnum.workflow, "bounce", recorder)
+    monkeypatch.setattr(mdnum.verbs, "bounce", recorder)
     monkeypatch.chdir(tmp_path)
     return recorder
 

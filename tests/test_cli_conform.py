@@ -21,7 +21,7 @@ from mdnum.references.conformance.results import Report
 from mdnum.references.conformance.suite import examine
 from mdnum.report.finding import Finding, Verdict
 from mdnum.store import RunFolder
-from mdnum.workflow.conform import _summary, judge
+from mdnum.verbs.conform import _summary, judge
 
 _MINE = """
 import numpy as np

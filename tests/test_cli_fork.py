@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from command_line import call, printed
 
-import mdnum.workflow
+import mdnum.verbs
 from mdnum.cli.fork import interval
 from mdnum.cli.progress import ProgressBar
 from mdnum.errors import InputError
@@ -44,9 +44,9 @@ class Recorder:
 def verb(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Recorder:
     """The questions of `mdnum fork` in an empty folder, replaced by a recorder."""
     recorder = Recorder()
-    for name in mdnum.workflow.__all__:
+    for name in mdnum.verbs.__all__:
         if name.startswith("fork"):
-            monkeypatch.setattr(mdnum.workflow, name, recorder)
+            monkeypatch.setattr(mdnum.verbs, name, recorder)
     monkeypatch.chdir(tmp_path)
     return recorder
 

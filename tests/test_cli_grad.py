@@ -17,11 +17,11 @@ from mdnum.gradients.ensemble import Ensemble, SmoothedDifferences
 from mdnum.gradients.losses import parse
 from mdnum.store import RunFolder
 from mdnum.systems import build
-from mdnum.workflow import frame
+from mdnum.verbs import frame
 
 WELL = "pair/leaving-well"
 # the package has the function of this name
-grad: Any = importlib.import_module("mdnum.workflow.grad")
+grad: Any = importlib.import_module("mdnum.verbs.grad")
 
 
 @pytest.mark.parametrize(

@@ -122,13 +122,13 @@ def test_names_of_a_system_reach_no_terminal_raw(campaign: Any, tmp_path: Path, 
 
 
 def test_a_backend_that_jax_does_not_have_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys):
-    import mdnum.workflow
+    import mdnum.verbs
 
     def run(*_: Any, **__: Any) -> None:
         raise RuntimeError("Unable to initialize backend 'nonsense': Backend 'nonsense' is not in the list")
 
     monkeypatch.setenv("JAX_PLATFORMS", "nonsense")
-    monkeypatch.setattr(mdnum.workflow, "run", run)
+    monkeypatch.setattr(mdnum.verbs, "run", run)
     assert call("run", "x") == 2
     said = capsys.readouterr().err
     assert said.startswith("mdnum: jax cannot use JAX_PLATFORMS='nonsense'") and said.count("\n") == 1

@@ -347,7 +347,7 @@ _ANSWERS = {
 )  # fmt: skip
 @pytest.mark.parametrize("listed", [True, False])
 def test_answers_of_another_shape_are_told_in_a_line(tmp_path, where, value, listed):
-    from mdnum.workflow.conform import conform
+    from mdnum.verbs.conform import conform
 
     folder = RunFolder.create(tmp_path / "run", world="conform")
     folder.close()
@@ -366,7 +366,7 @@ def test_answers_of_another_shape_are_told_in_a_line(tmp_path, where, value, lis
 
 
 def test_more_questions_than_anybody_waits_for_are_refused(tmp_path):
-    from mdnum.workflow.conform import conform
+    from mdnum.verbs.conform import conform
 
     with pytest.raises(InputError, match="1,000,000,000 random cases"):
         conform("ase", cases=10**9, out=tmp_path / "run")
@@ -418,7 +418,7 @@ def test_answers_of_an_audit_of_another_shape_are_named_in_a_line(tmp_path, wher
 
 
 def test_tables_that_are_written_anew_leave_no_rows_of_an_end_that_was_killed(tmp_path):
-    from mdnum.workflow.conform import conform
+    from mdnum.verbs.conform import conform
 
     folder = RunFolder.create(tmp_path / "run", world="conform")
     atomic.write_text(folder.path / "answers.json", "{}")
@@ -445,7 +445,7 @@ def test_tables_that_are_written_anew_leave_no_rows_of_an_end_that_was_killed(tm
 def test_scripts_of_a_person_stay(tmp_path):
     from types import SimpleNamespace
 
-    from mdnum.workflow.conform import _write_scripts
+    from mdnum.verbs.conform import _write_scripts
 
     folder = RunFolder.create(tmp_path / "run", world="conform")
     stale = folder.path / "reproduce-3-missing.py"
@@ -467,7 +467,7 @@ def test_scripts_of_a_person_stay(tmp_path):
     ],
 )
 def test_advice_on_a_folder_of_another_verb_can_be_followed(tmp_path, world, state, advice):
-    from mdnum.workflow import run
+    from mdnum.verbs import run
 
     folder = RunFolder.create(tmp_path / "killed", world=world)
     folder.write_provenance({})

@@ -57,7 +57,7 @@ class Meter:
 
 @dataclass(frozen=True)
 class Observed:
-    """What a check found: a code, and values for its sentences in mdnum/workflow/audit.toml.
+    """What a check found: a code, and values for its sentences in mdnum/verbs/audit.toml.
 
     Attributes:
         code: short stable name.

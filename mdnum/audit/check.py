@@ -70,7 +70,7 @@ class AuditCheck:
     """One question to a calculator: a file in `mdnum.audit.checks`, or an entry point of another package.
 
     A subclass has a name, a title, a one-line docstring and `ask`; its sentences are in
-    mdnum/workflow/audit.toml under the codes of its findings. To add one, add the file `checks/NAME.py`
+    mdnum/verbs/audit.toml under the codes of its findings. To add one, add the file `checks/NAME.py`
     with the class `NameCheck`.
 
     Attributes:

@@ -54,8 +54,8 @@ def audit(
     Runs the Python that makes the calculator, with --resume what the folder names. No other verb but
     `conform` runs Python that it is given.
     """
-    from mdnum.workflow.audit import AuditStopped
-    from mdnum.workflow.audit import audit as ask
+    from mdnum.verbs.audit import AuditStopped
+    from mdnum.verbs.audit import audit as ask
 
     stopped = False
     folder = resume or out

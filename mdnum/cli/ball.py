@@ -39,7 +39,7 @@ def ball(
                 remedy="Leave one of them out",
                 where="--demo",
             )
-        from mdnum.workflow.demos import demonstrate
+        from mdnum.verbs.demos import demonstrate
 
         with watched() as progress:
             outcome = demonstrate(demo, out=out, report=not no_report, progress=progress)
@@ -47,7 +47,7 @@ def ball(
     if system is None:
         return _list(as_json)
     overrides = output.parse_overrides(settings)
-    from mdnum.workflow import bounce
+    from mdnum.verbs import bounce
 
     with watched() as progress:
         outcome = bounce(
@@ -65,7 +65,7 @@ def ball(
 def _list(as_json: bool) -> int:
     """What there is to run, for somebody who named nothing."""
     from mdnum import systems
-    from mdnum.workflow import demos
+    from mdnum.verbs import demos
 
     balls = [systems.load(name, world="ball") for name in systems.names("ball")]
     rows = [{"name": one.name, "balls": one.balls, "about": one.spec.about} for one in balls]

@@ -38,7 +38,7 @@ def dynamics(
 
 def _check(question: str, title: str, name: str, settings: list[str] | None, as_json: bool) -> int:
     from mdnum import systems
-    from mdnum.workflow.check import check
+    from mdnum.verbs.check import check
 
     checked = check(question, systems.load(name, output.parse_overrides(settings), world="md"))
     if as_json:

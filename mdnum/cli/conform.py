@@ -57,7 +57,7 @@ def conform(
     if pairs is None and resume is None:
         return _names(as_json)
     if resume is not None:
-        from mdnum.workflow import frame
+        from mdnum.verbs import frame
 
         given = {
             "LIST": pairs, "--cases": cases, "--seed": seed, "--full": full, "--precision": precision,
@@ -65,7 +65,7 @@ def conform(
         }  # fmt: skip
         asked = {name: value not in (None, False, 0) for name, value in given.items()}
         frame.refuse(asked, "of a new examination", "Leave it out beside --resume, or begin in a new folder")
-    from mdnum.workflow.conform import conform as examine
+    from mdnum.verbs.conform import conform as examine
 
     words = tuple(word.strip() for one in limits or () for word in one.split(",") if word.strip())
     notes = output.noted(resume)

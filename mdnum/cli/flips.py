@@ -58,7 +58,7 @@ def flips(
     as_json: bool = output.JSON_OPTION,
 ) -> int:
     """Find every pair that entered or left a cutoff between frames, and say what that tells and what not."""
-    from mdnum.workflow import flips as look
+    from mdnum.verbs import flips as look
 
     with watched() as progress:
         result = look(

@@ -86,7 +86,7 @@ def vary(
     as_json: bool = output.JSON_OPTION,
 ) -> int:  # fmt: skip
     """Vary one choice, and find where the runs fork, where they split, and what the flips did to that."""
-    from mdnum.workflow import fork as compare
+    from mdnum.verbs import fork as compare
 
     overrides = output.parse_overrides(settings)
     with watched() as progress:
@@ -183,7 +183,7 @@ def compare(
     as_json: bool = output.JSON_OPTION,
 ) -> int:
     """Compare two finished runs: what was different, and where they diverge."""
-    from mdnum.workflow import fork_folders
+    from mdnum.verbs import fork_folders
 
     given: dict[str, Any] = {
         "steps": steps, "split": split, "repeats": repeats, "minimal": minimal or None, "pin": pin,
@@ -230,12 +230,12 @@ def benign(
 def _answered(
     name: str, asked: Any, settings: Any, out: Path | None, no_report: bool, as_json: bool, **options: Any
 ) -> int:
-    """Asks a question of `mdnum.workflow`, and prints the answer."""
-    from mdnum import workflow
+    """Asks a question of `mdnum.verbs`, and prints the answer."""
+    from mdnum import verbs
 
     overrides = output.parse_overrides(settings)
     with watched() as progress:
-        outcome = getattr(workflow, name)(
+        outcome = getattr(verbs, name)(
             *asked, out=out, overrides=overrides, report=not no_report, progress=progress, **options
         )
     return output.print_outcome(outcome, as_json=as_json)

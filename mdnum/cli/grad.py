@@ -48,7 +48,7 @@ def grad(
 ) -> int:
     """Differentiate a loss through a rollout, compare the ways of doing it, and say how far to trust it."""
     overrides = output.parse_overrides(settings)
-    from mdnum.workflow import grad as differentiate
+    from mdnum.verbs import grad as differentiate
 
     with watched() as progress:
         outcome = differentiate(

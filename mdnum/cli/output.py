@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from mdnum.report.section import Table
-    from mdnum.workflow.frame import Outcome
+    from mdnum.verbs.frame import Outcome
 
 EXIT_FINE = 0
 EXIT_FINDINGS = 1

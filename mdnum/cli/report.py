@@ -14,7 +14,7 @@ def report(
     as_json: bool = output.JSON_OPTION,
 ) -> int:
     """Write the report of a run folder again."""
-    from mdnum.workflow import frame
+    from mdnum.verbs import frame
 
     written = frame.finish(folder).folder / "report.html"
     output.print_notes(folder)

@@ -49,7 +49,7 @@ def run(
 
         out = default_folder(str(system)) if out is None else out
 
-    from mdnum.workflow import run as run_system
+    from mdnum.verbs import run as run_system
 
     folder = resume or out
 

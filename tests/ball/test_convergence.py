@@ -23,7 +23,7 @@ from mdnum.ball import (
     World,
     simulate,
 )
-from mdnum.workflow import demos
+from mdnum.verbs import demos
 
 # step sizes down to a ten-thousandth
 pytestmark = pytest.mark.slow

@@ -19,8 +19,8 @@ from mpmath import mpf
 
 from mdnum.errors import InputError
 from mdnum.numerics.reductions import Exact, orders
-from mdnum.workflow import demos
-from mdnum.workflow.demos import Demo
+from mdnum.verbs import demos
+from mdnum.verbs.demos import Demo
 
 G, H, E = 9.81, 0.01, 0.8
 #: These take seconds each.

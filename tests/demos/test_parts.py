@@ -13,7 +13,7 @@ import pytest
 
 from mdnum.ball import Penalty, Reason, World
 from mdnum.errors import InputError
-from mdnum.workflow import demos
+from mdnum.verbs import demos
 
 G = 9.81
 

@@ -14,7 +14,7 @@ from mdnum.plain import plain
 from mdnum.references.ase_models import reference
 from mdnum.references.energy_check import _growth, _sudden, check_dynamics, check_energy
 from mdnum.systems import build
-from mdnum.workflow.check import dynamics_findings, energy_findings
+from mdnum.verbs.check import dynamics_findings, energy_findings
 
 HARD = {"kind": "hard", "radius": 2.5}
 SHORT = {"kind": "hard", "radius": 2.2}

@@ -24,7 +24,7 @@ from mdnum.references.pair_check import (
     effective_cutoff,
     own_searches,
 )
-from mdnum.workflow.check import pair_findings
+from mdnum.verbs.check import pair_findings
 
 HARD = {"kind": "hard", "radius": 2.5}
 LIBRARIES: tuple = ("numpy-r2", "numpy", "ase", "ase-primitive", "vesin", "vesin-half", "mdanalysis",

@@ -10,8 +10,8 @@ import subprocess
 import pytest
 from report.synthetic import make_run
 
-from mdnum.workflow import frame
-from mdnum.workflow.run_page import TABLE_ROWS, load
+from mdnum.verbs import frame
+from mdnum.verbs.run_page import TABLE_ROWS, load
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 

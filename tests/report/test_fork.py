@@ -27,8 +27,8 @@ from report.test_browser import BROWSER
 from mdnum.errors import FolderError
 from mdnum.report.section import Plot, Table
 from mdnum.store import RunFolder
-from mdnum.workflow import fork_verdict, frame
-from mdnum.workflow.frame import View
+from mdnum.verbs import fork_verdict, frame
+from mdnum.verbs.frame import View
 
 
 @pytest.fixture(scope="module")

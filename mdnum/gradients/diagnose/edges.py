@@ -109,7 +109,7 @@ def edges(
         raise InputError(f"{full} = {value:g} and reach = {reach:g}; expected a number, and a share below 1")
     program = MdProgram(problem.simulation)
     line = NumberLine(program, _number(program, full, value), problem.steps, _no_loss)
-    ahead = _forecast(problem, full, budget, progress)
+    ahead = _forecast(problem, full, progress)
     below, above = (_edge(problem, line, full, value, sign, ahead[sign], reach, progress) for sign in (-1, 1))
     return DecisionEdges(full, value, below, above)
 

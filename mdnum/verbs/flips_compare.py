@@ -19,9 +19,9 @@ from mdnum.trajectories.compare import ComparedSide, NeighborSets, follow_both, 
 from mdnum.trajectories.follow import atoms_of
 from mdnum.trajectories.resolution import infer
 from mdnum.trajectories.tracker import Tracker
-from mdnum.workflow.flips_shared import FolderLog, Written, about, ending, name_of, resolution, selected, stem
-from mdnum.workflow.frame import Outcome, Progress, Verb, View, finish, new_folder, store
-from mdnum.workflow.interrupt import asked_to_stop
+from mdnum.verbs.flips_shared import FolderLog, Written, about, ending, name_of, resolution, selected, stem
+from mdnum.verbs.frame import Outcome, Progress, Verb, View, finish, new_folder, store
+from mdnum.verbs.interrupt import asked_to_stop
 
 if TYPE_CHECKING:
     from mdnum.trajectories.rules import Rule
@@ -45,7 +45,7 @@ def compare(
     report: bool = True,
     progress: Progress | None = None,
 ) -> Outcome:
-    """Where two trajectories diverge; see `mdnum.workflow.flips.flips`.
+    """Where two trajectories diverge; see `mdnum.verbs.flips.flips`.
 
     Raises:
         InputError: they are not of the same atoms.

@@ -12,8 +12,8 @@ import numpy as np
 from mdnum.errors import InputError
 from mdnum.report.finding import Finding, Verdict, conclude
 from mdnum.report.words import count, listed, number
-from mdnum.workflow import frame
-from mdnum.workflow.ball_page import (
+from mdnum.verbs import frame
+from mdnum.verbs.ball_page import (
     TEXTS,
     applied,
     decision,
@@ -25,7 +25,7 @@ from mdnum.workflow.ball_page import (
     parameters,
     time_of,
 )
-from mdnum.workflow.frame import Outcome, Progress, Verb, View
+from mdnum.verbs.frame import Outcome, Progress, Verb, View
 
 if TYPE_CHECKING:
     from mdnum.ball.problem import BallProblem
@@ -69,7 +69,7 @@ def bounce(
         InputError: the system cannot be run. FolderError: the folder cannot be used.
     """
     from mdnum.systems.build_ball import build_ball
-    from mdnum.workflow import ball_record
+    from mdnum.verbs import ball_record
 
     simulation = build_ball(_loaded(system, overrides, against), steps=steps)
     with frame.new_folder("ball", simulation.system.name, out, system=simulation.system) as folder:
@@ -146,7 +146,7 @@ def _differentiated(
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Loss, derivatives, closed form and variants; and the separations from the variants."""
     from mdnum.ball.compare import first_difference
-    from mdnum.workflow import ball_record
+    from mdnum.verbs import ball_record
 
     problem, asked = simulation.problem, simulation.system.spec.gradient
     frame.say(progress, "gradient", run.steps)

@@ -20,11 +20,11 @@ from mdnum.report.finding import Verdict
 from mdnum.report.section import Figure, Key, Page, Section, Table, pairs
 from mdnum.report.svg import BAD, FIRST, MUTED, SECOND
 from mdnum.report.words import count, many, number
-from mdnum.workflow import frame
-from mdnum.workflow.fork_page import differences, page, size
-from mdnum.workflow.fork_pair import PairQuestion, basics, check, followed, of_any, of_md
-from mdnum.workflow.fork_verdict import RANKING, TEXTS, judge, judge_benign, judge_compare, judge_screen
-from mdnum.workflow.frame import Outcome, Progress, View
+from mdnum.verbs import frame
+from mdnum.verbs.fork_page import differences, page, size
+from mdnum.verbs.fork_pair import PairQuestion, basics, check, followed, of_any, of_md
+from mdnum.verbs.fork_verdict import RANKING, TEXTS, judge, judge_benign, judge_compare, judge_screen
+from mdnum.verbs.frame import Outcome, Progress, View
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas

@@ -13,7 +13,7 @@ from mdnum.report.finding import Texts, Verdict
 from mdnum.report.section import Figure, Key, Mark, Page, Plot, Role, Section, Series, Table, pairs
 from mdnum.report.svg import FIRST, MUTED, SECOND
 from mdnum.report.words import count, many, number
-from mdnum.workflow.frame import View
+from mdnum.verbs.frame import View
 
 TEXTS = Texts(Path(__file__).with_name("ball.toml"))
 #: Rows of a table that the page carries.

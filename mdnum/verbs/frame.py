@@ -37,17 +37,17 @@ Progress = Callable[[int, int, dict[str, Any]], None]
 
 #: The module whose VERBS judge and show a kind of folder.
 KINDS: dict[str, str] = {
-    "md": "mdnum.workflow.run",
-    "ball": "mdnum.workflow.ball",
-    "demos": "mdnum.workflow.demos",
-    "grad": "mdnum.workflow.grad",
-    "flips": "mdnum.workflow.flips",
-    "flips-compare": "mdnum.workflow.flips_compare",
-    "audit": "mdnum.workflow.audit",
-    "conform": "mdnum.workflow.conform",
-    **dict.fromkeys(("fork", "screen", "compare", "benign"), "mdnum.workflow.fork"),
-    **dict.fromkeys(("map", "forecast"), "mdnum.workflow.fork_map"),
-    **dict.fromkeys(("certify", "processes"), "mdnum.workflow.fork_certify"),
+    "md": "mdnum.verbs.run",
+    "ball": "mdnum.verbs.ball",
+    "demos": "mdnum.verbs.demos",
+    "grad": "mdnum.verbs.grad",
+    "flips": "mdnum.verbs.flips",
+    "flips-compare": "mdnum.verbs.flips_compare",
+    "audit": "mdnum.verbs.audit",
+    "conform": "mdnum.verbs.conform",
+    **dict.fromkeys(("fork", "screen", "compare", "benign"), "mdnum.verbs.fork"),
+    **dict.fromkeys(("map", "forecast"), "mdnum.verbs.fork_map"),
+    **dict.fromkeys(("certify", "processes"), "mdnum.verbs.fork_certify"),
 }
 
 

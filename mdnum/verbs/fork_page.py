@@ -13,12 +13,12 @@ from mdnum.report.finding import Verdict
 from mdnum.report.section import Figure, Key, Page, Plot, Role, Section, Series, Table, pairs
 from mdnum.report.svg import BAD, FIRST, MUTED, SECOND
 from mdnum.report.words import count, listed, many, number, plain
-from mdnum.workflow.fork_verdict import DECISION, TEXTS, TWO_BY_TWO, WHAT, agreeing, sides, subject
+from mdnum.verbs.fork_verdict import DECISION, TEXTS, TWO_BY_TWO, WHAT, agreeing, sides, subject
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
-    from mdnum.workflow.frame import View
+    from mdnum.verbs.frame import View
 
 #: r² from which a separation counts as one exponential.
 FITS = 0.8

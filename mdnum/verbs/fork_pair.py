@@ -12,9 +12,9 @@ import numpy as np
 
 from mdnum.errors import InputError
 from mdnum.plain import plain
-from mdnum.workflow import frame
-from mdnum.workflow.fork_verdict import TEXTS
-from mdnum.workflow.frame import Outcome, Progress
+from mdnum.verbs import frame
+from mdnum.verbs.fork_verdict import TEXTS
+from mdnum.verbs.frame import Outcome, Progress
 
 if TYPE_CHECKING:
     from mdnum.forks import Fork, Twin

@@ -12,8 +12,8 @@ from mdnum.report.browse import Browse, Column, plain_rows
 from mdnum.report.finding import Finding, Verdict, conclude
 from mdnum.report.section import Key, Page, Plot, Section, Series, Table, pairs
 from mdnum.report.words import count, many, number, percent, plain
-from mdnum.workflow.flips_shared import TEXTS, Written, repeating, resolution
-from mdnum.workflow.frame import View
+from mdnum.verbs.flips_shared import TEXTS, Written, repeating, resolution
+from mdnum.verbs.frame import View
 
 #: Share of flips that the file leaves undecided, or hides or makes up, above which it is worth a warning.
 UNDECIDED = 0.02

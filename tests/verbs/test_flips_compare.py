@@ -19,8 +19,8 @@ from mdnum.trajectories import compare
 from mdnum.trajectories.frame import Box, Frame
 from mdnum.trajectories.rules import Capped, CutoffRule, Nearest, Rule
 from mdnum.trajectories.tracker import Tracker
-from mdnum.workflow.flips_compare import TEXTS
-from mdnum.workflow.frame import Outcome
+from mdnum.verbs.flips_compare import TEXTS
+from mdnum.verbs.frame import Outcome
 
 
 def looked(a: Path, b: Path, out: Path, **options: Any) -> Outcome:

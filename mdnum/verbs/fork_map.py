@@ -14,10 +14,10 @@ from mdnum.plain import plain
 from mdnum.report.finding import Finding, Texts, Verdict, conclude
 from mdnum.report.section import Key, Page, Plot, Role, Section, Series, Table, pairs
 from mdnum.report.words import count, many, number
-from mdnum.workflow import frame
-from mdnum.workflow.fork_page import size
-from mdnum.workflow.fork_pair import basics, few_steps, logged, of_any, of_md
-from mdnum.workflow.frame import Outcome, Progress, View
+from mdnum.verbs import frame
+from mdnum.verbs.fork_page import size
+from mdnum.verbs.fork_pair import basics, few_steps, logged, of_any, of_md
+from mdnum.verbs.frame import Outcome, Progress, View
 
 if TYPE_CHECKING:
     from mdnum.forks.boundaries import Boundary

@@ -16,9 +16,9 @@ from mdnum.errors import FolderError
 from mdnum.report import analysis, svg
 from mdnum.rollout.summary import LineFit
 from mdnum.store import RunFolder
-from mdnum.workflow import frame
-from mdnum.workflow.run import judge
-from mdnum.workflow.run_page import TABLE_ROWS, TEXTS, load, page
+from mdnum.verbs import frame
+from mdnum.verbs.run import judge
+from mdnum.verbs.run_page import TABLE_ROWS, TEXTS, load, page
 
 
 @pytest.fixture(scope="module")

@@ -16,10 +16,10 @@ from mdnum.ball import first_difference
 from mdnum.errors import FolderError, InputError
 from mdnum.store import TABLES, RunFolder
 from mdnum.systems import build_ball, load
-from mdnum.workflow import ball_record, bounce, frame, run
-from mdnum.workflow.ball import VERBS, differs, judge
-from mdnum.workflow.ball_page import TEXTS, page
-from mdnum.workflow.frame import Outcome, View
+from mdnum.verbs import ball_record, bounce, frame, run
+from mdnum.verbs.ball import VERBS, differs, judge
+from mdnum.verbs.ball_page import TEXTS, page
+from mdnum.verbs.frame import Outcome, View
 
 PROJECTION = """\
 world = "ball"

@@ -17,7 +17,7 @@ from mdnum.forks.exact.program import installed
 from mdnum.forks.variants import Ran, Variant
 from mdnum.store import RunFolder
 from mdnum.systems import load
-from mdnum.workflow import frame
+from mdnum.verbs import frame
 
 STEPS = 240
 #: Heights that sums and products of few digits reach: plain rationals follow it.

@@ -15,7 +15,7 @@ from mdnum.report.section import Code, Key, Page, Plot, Role, Section, Series, T
 from mdnum.report.words import MINUS, count, heading, many, number, percent, power
 
 if TYPE_CHECKING:
-    from mdnum.workflow.frame import View
+    from mdnum.verbs.frame import View
 
 TEXTS = Texts(Path(__file__).with_name("grad.py"))
 #: Colors of parameters, in order.

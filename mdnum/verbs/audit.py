@@ -26,8 +26,8 @@ from mdnum.report.words import count, heading, many, number
 from mdnum.store import RunFolder
 from mdnum.store.answers import Answers, take
 from mdnum.store.files import read_text, remove, subfolder, write_text
-from mdnum.workflow import frame
-from mdnum.workflow.frame import Outcome, Progress, Verb, View
+from mdnum.verbs import frame
+from mdnum.verbs.frame import Outcome, Progress, Verb, View
 
 if TYPE_CHECKING:
     from ase import Atoms

@@ -23,8 +23,8 @@ from mdnum.report.finding import Texts, Verdict, conclude
 from mdnum.report.section import Page, Plot, Region, Section, Series, Table, pairs
 from mdnum.report.words import typeset
 from mdnum.systems.load import shipped_folder
-from mdnum.workflow import frame
-from mdnum.workflow.frame import Outcome, Progress, Verb, View
+from mdnum.verbs import frame
+from mdnum.verbs.frame import Outcome, Progress, Verb, View
 
 __all__ = ["Claim", "Demo", "Plot", "Region", "Series", "Table", "demonstrate", "names", "table"]
 

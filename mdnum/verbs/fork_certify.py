@@ -15,10 +15,10 @@ from mdnum.report.finding import Texts, Verdict, conclude
 from mdnum.report.section import Figure, Key, Page, Plot, Role, Section, Series, Table, pairs
 from mdnum.report.svg import FIRST, MUTED
 from mdnum.report.words import count, many, number, typeset
-from mdnum.workflow import frame
-from mdnum.workflow.fork_page import size
-from mdnum.workflow.fork_pair import basics, logged, of_any, of_md
-from mdnum.workflow.frame import Outcome, Progress, View
+from mdnum.verbs import frame
+from mdnum.verbs.fork_page import size
+from mdnum.verbs.fork_pair import basics, logged, of_any, of_md
+from mdnum.verbs.frame import Outcome, Progress, View
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas

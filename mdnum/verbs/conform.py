@@ -25,8 +25,8 @@ from mdnum.report.svg import BAD, FIRST, MUTED, SECOND
 from mdnum.report.words import count, listed, many, number
 from mdnum.store import RunFolder, answers, files
 from mdnum.store.files import read_text, write_text
-from mdnum.workflow import frame
-from mdnum.workflow.frame import Outcome, Progress, Verb, View
+from mdnum.verbs import frame
+from mdnum.verbs.frame import Outcome, Progress, Verb, View
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas

@@ -17,9 +17,9 @@ from ase.io import iread, write
 import mdnum
 from mdnum.errors import InputError
 from mdnum.store import RunFolder
-from mdnum.workflow.flips import rules
-from mdnum.workflow.flips_page import by_velocities, judge, page
-from mdnum.workflow.frame import Outcome, View, finish
+from mdnum.verbs.flips import rules
+from mdnum.verbs.flips_page import by_velocities, judge, page
+from mdnum.verbs.frame import Outcome, View, finish
 
 
 @pytest.fixture(scope="module")
@@ -173,7 +173,7 @@ def test_the_page_holds_what_the_folder_holds(examined) -> None:
 
 def test_a_ledger_in_parts_is_counted_as_whole(examined, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = examined("gas.extxyz", gas(5, frames=40))
-    monkeypatch.setattr(sys.modules["mdnum.workflow.flips"], "_PART_ROWS", 100)
+    monkeypatch.setattr(sys.modules["mdnum.verbs.flips"], "_PART_ROWS", 100)
     parts = examined("gas.extxyz")
     assert whole.summary["rules"] == parts.summary["rules"]
     for table in ("contacts", "lifetimes", "busiest", "neighbors"):

@@ -12,7 +12,7 @@ from mdnum.errors import InputError
 from mdnum.report.finding import Texts
 from mdnum.report.words import listed, number, plain
 from mdnum.store import RunFolder
-from mdnum.workflow.frame import Progress
+from mdnum.verbs.frame import Progress
 
 if TYPE_CHECKING:
     from mdnum.trajectories.follow import Groups

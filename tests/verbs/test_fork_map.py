@@ -16,7 +16,7 @@ from mdnum.errors import FolderError, InputError
 from mdnum.rollout.engine import Engine
 from mdnum.store import RunFolder
 from mdnum.systems import build
-from mdnum.workflow import frame
+from mdnum.verbs import frame
 
 APART, RADIUS, SPEED, STEPS = 3.0, 2.5, 1.25, 9
 

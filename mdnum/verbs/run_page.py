@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
     from mdnum.store import RunFolder
-    from mdnum.workflow.frame import View
+    from mdnum.verbs.frame import View
 
 TEXTS = Texts(Path(__file__).with_name("run.py"))
 

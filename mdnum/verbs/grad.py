@@ -16,10 +16,10 @@ from mdnum.plain import plain
 from mdnum.report.finding import Finding, Verdict, conclude
 from mdnum.report.words import listed, percent
 from mdnum.store.files import write_bytes
-from mdnum.workflow import frame, grad_page
-from mdnum.workflow.fork_pair import few_steps, is_ball, logged, of_any
-from mdnum.workflow.frame import Outcome, Progress, Verb, View
-from mdnum.workflow.grad_page import TEXTS, by, closeness, digits_note, digits_of, magnitude, slope
+from mdnum.verbs import frame, grad_page
+from mdnum.verbs.fork_pair import few_steps, is_ball, logged, of_any
+from mdnum.verbs.frame import Outcome, Progress, Verb, View
+from mdnum.verbs.grad_page import TEXTS, by, closeness, digits_note, digits_of, magnitude, slope
 
 if TYPE_CHECKING:
     from mdnum.gradients import Gradient, Method, Problem
@@ -455,7 +455,7 @@ def _ball_system(
 def _differentiated(system: BallSystem, methods: list[str], log: Progress) -> tuple[Any, dict[str, Any]]:
     from mdnum.gradients.ball import compare
     from mdnum.systems.build_ball import build_ball
-    from mdnum.workflow.ball_record import exact
+    from mdnum.verbs.ball_record import exact
 
     spec, problem = system.spec, build_ball(system).problem
     log(0, 0, {"phase": "run"})

@@ -11,7 +11,7 @@ from mdnum.report.finding import Finding, Texts, Verdict, conclude
 from mdnum.report.words import listed
 
 if TYPE_CHECKING:
-    from mdnum.workflow.frame import View
+    from mdnum.verbs.frame import View
 
 TEXTS = Texts(Path(__file__).with_name("fork.py"))
 

@@ -28,8 +28,8 @@ from mdnum.errors import InputError
 from mdnum.plain import plain
 from mdnum.store import RunFolder
 from mdnum.units import LJ
-from mdnum.workflow import frame
-from mdnum.workflow.audit import _headline, _in_units
+from mdnum.verbs import frame
+from mdnum.verbs.audit import _headline, _in_units
 
 QUICK = "invariance,forces"
 CHECKS = ["invariance", "smoothness", "forces", "curl", "state", "dynamics"]
@@ -170,7 +170,7 @@ def part(name: str, *found: tuple[str, str], asked: int = 1, possible: int = 1) 
 
 
 def judged(parts: list[CheckResult], wanted: list[str] | None = None) -> tuple[str, str, str]:
-    from mdnum.workflow.audit import _finding
+    from mdnum.verbs.audit import _finding
 
     names = wanted or [one.name for one in parts]
     state = AuditState("x", True, encoded(Atoms("Ar")), 1.0, "metal", names, None, None, None, parts)

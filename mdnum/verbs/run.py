@@ -13,9 +13,9 @@ from mdnum.plain import plain
 from mdnum.report import analysis
 from mdnum.report.finding import Finding, Verdict, conclude
 from mdnum.store import RunFolder
-from mdnum.workflow import run_page
-from mdnum.workflow.frame import Outcome, Progress, Verb, View, finish, say
-from mdnum.workflow.run_page import CHATTER_STEPS, TEXTS, Record, load, residual
+from mdnum.verbs import run_page
+from mdnum.verbs.frame import Outcome, Progress, Verb, View, finish, say
+from mdnum.verbs.run_page import CHATTER_STEPS, TEXTS, Record, load, residual
 
 if TYPE_CHECKING:
     from mdnum.rollout.run import RunResult
@@ -97,7 +97,7 @@ def run(
 def _compare(folder: RunFolder, result: RunResult) -> None:
     """Puts the comparison of the first and the last frame with ASE into the summary."""
     from mdnum.references.energy_check import check_energy
-    from mdnum.workflow.check import energy_findings
+    from mdnum.verbs.check import energy_findings
 
     frames = {}
     for name, positions in zip(("initial", "last"), result.frames, strict=True):

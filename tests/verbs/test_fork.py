@@ -25,10 +25,10 @@ from mdnum.rollout.engine import Engine
 from mdnum.store import RunFolder
 from mdnum.systems import load
 from mdnum.systems.load import copy
-from mdnum.workflow import fork_pair, frame
+from mdnum.verbs import fork_pair, frame
 
-#: `mdnum.workflow.fork` is the function.
-MODULE = sys.modules["mdnum.workflow.fork"]
+#: `mdnum.verbs.fork` is the function.
+MODULE = sys.modules["mdnum.verbs.fork"]
 STEPS = 680
 #: Free runs only.
 BARE: dict[str, Any] = {"counterfactual": False, "repeats": 0}
@@ -491,7 +491,7 @@ def test_what_a_ball_cannot_be_asked_says_what_can(tmp_path, monkeypatch):
     for ask, words in (
         (lambda: mdnum.fork_processes(load("ball/drop")), "mdnum ball --demo determinism"),
         (lambda: mdnum.fork_forecast("ball/drop", 1e-6), "the margin that mdnum ball records"),
-        (lambda: mdnum.workflow.fork_benign("ball/drop", "start"), "no ensemble"),
+        (lambda: mdnum.verbs.fork_benign("ball/drop", "start"), "no ensemble"),
     ):
         with pytest.raises(InputError, match=words):
             ask()

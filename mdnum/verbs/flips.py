@@ -15,10 +15,10 @@ import numpy as np
 from mdnum.errors import InputError
 from mdnum.store import RunFolder
 from mdnum.store.tables import TableStream
-from mdnum.workflow.flips_page import judge, page
-from mdnum.workflow.flips_shared import FolderLog, about, ending, plain_box, selected, stem
-from mdnum.workflow.frame import Outcome, Progress, Verb, finish, new_folder, store
-from mdnum.workflow.interrupt import asked_to_stop
+from mdnum.verbs.flips_page import judge, page
+from mdnum.verbs.flips_shared import FolderLog, about, ending, plain_box, selected, stem
+from mdnum.verbs.frame import Outcome, Progress, Verb, finish, new_folder, store
+from mdnum.verbs.interrupt import asked_to_stop
 
 if TYPE_CHECKING:
     from mdnum.trajectories.follow import Followed, Groups, Pass
@@ -90,7 +90,7 @@ def flips(
         raise InputError(f"window = {window}; expected at least 1 frame")
     asked = rules(cutoffs, pairs, nearest, most)
     if other is not None:
-        from mdnum.workflow.flips_compare import compare
+        from mdnum.verbs.flips_compare import compare
 
         _refuse_topology_first(trajectory, other, topology)
         a, b = (open_trajectory(path, topology, format=format) for path in (trajectory, other))
