@@ -317,7 +317,7 @@ def result(folder: Path, words: tuple[str, ...], out: str) -> dict[str, object]:
         made["page"] = (folder / "report.html").read_text()
         made["summary"] = _TIMES.sub("", (folder / "summary.json").read_text())
     elif "--json" in words:
-        made["out"] = out
+        made["out"] = _TIMES.sub("", out)
     else:
         where = folder if "--resume" in words else folder.parent / "new"
         if words[0] in ("audit", "conform"):
