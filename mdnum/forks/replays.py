@@ -18,7 +18,7 @@ from mdnum.errors import InputError
 from mdnum.forks.pair import Fork
 from mdnum.md.cell import HostCell
 from mdnum.numerics.verdicts import split_of
-from mdnum.rollout.compared import Apart, Frame
+from mdnum.rollout.compared import Apart, ReferenceFrame
 from mdnum.rollout.engine import Engine, Segment
 from mdnum.rollout.epoch import Pin, Pins
 from mdnum.rollout.flips import PairRecorder, decided_pairs
@@ -84,7 +84,7 @@ def neighborhood(fork: Fork, reach: float = REACH) -> Neighborhood | None:
     chosen = np.concatenate([[i, j], chosen[(chosen != i) & (chosen != j)]])
     moved = np.stack(cell.displacement(x_a[chosen], x_b[chosen]), axis=-1)
     margins = pair_margin(a, x_a, i, j), pair_margin(b, x_b, i, j, labels=a)
-    frame = program_b.frame or Frame.same(b.atoms)
+    frame = program_b.frame or ReferenceFrame.same(b.atoms)
     kind = int(a.type_of(np.array([i]), np.array([j]))[0])
     own = frame.inverse.positions(x_b.T[None])
     bounds = pair_bound(a, x_a, i, j), float(b.decider.bounds_at(own)[0, kind])

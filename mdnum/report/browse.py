@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -9,7 +10,6 @@ from typing import Any, Literal
 import numpy as np
 from markupsafe import Markup
 
-from mdnum.report.page import script_safe
 from mdnum.report.words import count, number
 
 #: Rows that are there without a script, and on paper.
@@ -116,6 +116,11 @@ class Browse:
     def json(self) -> Markup:
         """The rows, for a script element."""
         return script_safe(self.rows)
+
+
+def script_safe(value: Any) -> Markup:
+    """JSON that can stand in a script element: "</script>" inside a string would end it."""
+    return Markup(json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"))
 
 
 def plain_rows(columns: Sequence[tuple[np.ndarray, int | None]]) -> list[list[Any]]:

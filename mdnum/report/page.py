@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from importlib.resources import files
@@ -13,6 +12,7 @@ from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup
 
 from mdnum.report import svg
+from mdnum.report.browse import Browse
 from mdnum.report.section import cell
 from mdnum.report.words import heading, many, typeset
 from mdnum.store.files import subfolder, write_text
@@ -35,7 +35,6 @@ def write(folder: RunFolder, page: Page, verdict: Verdict) -> Path:
         FolderError: the folder cannot be written.
     """
     from mdnum.report import drawing
-    from mdnum.report.browse import Browse
     from mdnum.report.section import Figure, Plot
 
     parts = [part for section in page.sections for part in section.parts]
@@ -143,11 +142,6 @@ def flat(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]
             yield name, ", ".join(texts) or "none"
         else:
             yield name, _short(item)
-
-
-def script_safe(value: Any) -> Markup:
-    """JSON that can stand in a script element: "</script>" inside a string would end it."""
-    return Markup(json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"))
 
 
 def _text(name: str) -> str:

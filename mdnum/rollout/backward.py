@@ -23,7 +23,7 @@ from mdnum.md.decide import Tables
 from mdnum.md.lattice import LatticeLangevin
 from mdnum.md.neighbors import PairTable, VerletList
 from mdnum.rollout.engine import Engine
-from mdnum.rollout.epoch import EpochRecord, EpochState, Program, write_row
+from mdnum.rollout.epoch import EpochProgram, EpochRecord, EpochState, write_row
 from mdnum.systems.build import Simulation
 
 
@@ -67,12 +67,12 @@ class Stretched(NamedTuple):
 @partial(jax.jit, static_argnames=("structure",))
 def _undrifted(leaves, structure, state: EpochState) -> Back:
     """Where a rollout stood before the last drift."""
-    program: Program = jax.tree.unflatten(structure, leaves)
+    program: EpochProgram = jax.tree.unflatten(structure, leaves)
     order = jnp.arange(state.x.shape[1])
     return _before(program, program.masses, order, Back(state.step, *state[1:4], state.bath))
 
 
-def _before(program: Program, masses, order, back: Back) -> Back:
+def _before(program: EpochProgram, masses, order, back: Back) -> Back:
     """Undo the drift that led to a state: positions, velocities and bath of the step before."""
     step = back.step - 1
     x, v, bath = program.integrator.undrift(  # type: ignore[attr-defined]
@@ -86,7 +86,7 @@ def _before(program: Program, masses, order, back: Back) -> Back:
 @partial(jax.jit, static_argnames=("structure",), donate_argnames=("record",))
 def _run_back(leaves, structure, tables: Tables, back: Back, record: EpochRecord):
     """Undo steps until the skin is used up, the record is full or the bath is to be changed."""
-    program: Program = jax.tree.unflatten(structure, leaves)
+    program: EpochProgram = jax.tree.unflatten(structure, leaves)
     order = tables.order
 
     masses = program.masses[order]

@@ -15,7 +15,7 @@ from mdnum.md.neighbors import PairTable
 
 
 @dataclass(frozen=True)
-class Frame:
+class ReferenceFrame:
     """A run seen from the labels and axes of another.
 
     Attributes:
@@ -31,7 +31,7 @@ class Frame:
     shift: Float[np.ndarray, "3"]
 
     @classmethod
-    def same(cls, atoms: int) -> Frame:
+    def same(cls, atoms: int) -> ReferenceFrame:
         """Nothing is different."""
         return cls(np.arange(atoms), np.arange(3), np.ones(3), np.zeros(3))
 
@@ -46,11 +46,11 @@ class Frame:
         )
 
     @property
-    def inverse(self) -> Frame:
+    def inverse(self) -> ReferenceFrame:
         """The other run, seen from the labels and axes of this one."""
         shift = -self.signs * self.shift[self.axes]
         axes = np.argsort(self.axes)
-        return Frame(np.argsort(self.labels), axes, self.signs[axes], shift)
+        return ReferenceFrame(np.argsort(self.labels), axes, self.signs[axes], shift)
 
     def positions(self, x: Float[np.ndarray, "rows 3 atoms"]) -> Float[np.ndarray, "rows 3 atoms"]:
         """Positions of this run as the other run would have them, up to lattice vectors."""

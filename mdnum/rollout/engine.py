@@ -17,7 +17,15 @@ from jaxtyping import Float, Int, UInt8
 
 from mdnum.md.cell import wrap_positions
 from mdnum.md.neighbors import PairTable, VerletList
-from mdnum.rollout.epoch import EpochOutcome, EpochRecord, EpochState, Pins, Program, empty_record, run_epoch
+from mdnum.rollout.epoch import (
+    EpochOutcome,
+    EpochProgram,
+    EpochRecord,
+    EpochState,
+    Pins,
+    empty_record,
+    run_epoch,
+)
 from mdnum.systems.build import Simulation
 
 # bytes that the rows of one epoch's record may take, and the most rows; both bound memory, not accuracy
@@ -169,7 +177,7 @@ class Engine:
         self.verlet: VerletList = simulation.verlet_list()
         self.verlet.slots = self.start.slots
         rule = simulation.rule
-        self.program = Program(
+        self.program = EpochProgram(
             simulation.force,
             simulation.propagator,
             simulation.cell.astype(np.float64),

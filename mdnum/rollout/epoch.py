@@ -86,7 +86,7 @@ class Pins:
 # --- the life of one Verlet list: a jitted loop that advances with fixed pairs and records as it goes -
 
 
-class Program(eqx.Module):
+class EpochProgram(eqx.Module):
     """Everything about a rollout that stays the same from epoch to epoch.
 
     Attributes:
@@ -234,7 +234,7 @@ def run_epoch(
             pair potentials only.
         pinned: the slots of each row at which it acts on what it is told; everywhere when None.
     """
-    program: Program = jax.tree.unflatten(structure, leaves)
+    program: EpochProgram = jax.tree.unflatten(structure, leaves)
     order = tables.order
     dtype = state.x.dtype
     x, v, images = state.x[:, order], state.v[:, order], state.images[:, order]

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mdnum.program import PairRows
-from mdnum.rollout.compared import Apart, CrossFlip, CrossRecorder, Frame, differ
+from mdnum.rollout.compared import Apart, CrossFlip, CrossRecorder, ReferenceFrame, differ
 from mdnum.rollout.engine import Segment, Start
 from mdnum.rollout.flips import AmbiguousPairs
 from mdnum.rollout.tracks import Handed, Overridden, Rows, Track, joined
@@ -27,7 +27,7 @@ def lockstep(
     *,
     start_a: Start | None = None,
     start_b: Start | None = None,
-    frame: Frame | None = None,
+    frame: ReferenceFrame | None = None,
     handed: bool = True,
     back: bool = False,
     guard: float | None = None,
@@ -47,7 +47,7 @@ def lockstep(
     Raises:
         InputError: a counterfactual of many-body potentials was asked for.
     """
-    frame = frame or Frame.same(a.atoms)
+    frame = frame or ReferenceFrame.same(a.atoms)
     forward = Counterfactual(Handed(b, a, start_b, frame), guard) if handed else None
     backward = Counterfactual(Handed(a, b, start_a, frame.inverse), guard) if back else None
     leader = Track(a, last, start_a, listener=forward)
@@ -89,7 +89,7 @@ def lockstep(
             separation["A|B"] = _padded(apart(cell_a, rows_b, rows), rows_a)
             separation["A|B from A"] = apart(cell_a, rows_a, rows)
         nearest = {"A": _nearest(a, rows_a, rows_a), "B": _nearest(b, rows_b, rows_a)}
-        bound = {"A": _bound(a, rows_a, Frame.same(a.atoms)), "B": _bound(b, rows_b, frame)}
+        bound = {"A": _bound(a, rows_a, ReferenceFrame.same(a.atoms)), "B": _bound(b, rows_b, frame)}
         doubts = {"A": leader.doubts(end), "B": follower.doubts(end)}
         ambiguous = {
             name: np.where(np.isnan(nearest[name]), np.nan, _per_row(doubts[name], rows_a)) for name in doubts
@@ -166,7 +166,7 @@ class Counterfactual:
         return joined(taken), Overridden.joined(notes)
 
 
-def _in_frame(rows: Rows, frame: Frame) -> Rows:
+def _in_frame(rows: Rows, frame: ReferenceFrame) -> Rows:
     return Rows(rows.first, frame.positions(rows.x), frame.vectors(rows.v), rows.energy, rows.failed)
 
 
@@ -210,7 +210,7 @@ def _nearest(run: Simulation, rows: Rows | None, clock: Rows) -> Float[np.ndarra
     return _padded(margin, clock)
 
 
-def _bound(run: Simulation, rows: Rows | None, frame: Frame) -> Float[np.ndarray, "rows"]:
+def _bound(run: Simulation, rows: Rows | None, frame: ReferenceFrame) -> Float[np.ndarray, "rows"]:
     """The largest rounding bound of any pair type at each step of a run as a length."""
     if rows is None:
         return np.zeros(0)

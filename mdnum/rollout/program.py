@@ -14,7 +14,7 @@ from jaxtyping import Float, Int, UInt64
 from mdnum.errors import InputError
 from mdnum.md.cell import HostCell
 from mdnum.program import Decision, DecisionHistory, Differing, Number, PairRows
-from mdnum.rollout.compared import Apart, CrossFlip, Frame
+from mdnum.rollout.compared import Apart, CrossFlip, ReferenceFrame
 from mdnum.rollout.dials import Dial, dial, unit
 from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, first_state, unwrapped
 from mdnum.rollout.flips import decided_pairs, fingerprint_of_bits
@@ -43,7 +43,7 @@ class MdProgram:
 
     simulation: Simulation
     begin: Start | None = None
-    frame: Frame | None = None
+    frame: ReferenceFrame | None = None
 
     @property
     def name(self) -> str:
@@ -124,7 +124,7 @@ class MdProgram:
     ) -> list[tuple[Float[np.ndarray, "steps"], Float[np.ndarray, "steps"]]]:
         """Separations of perturbed runs, all beside one run of this program (see `Program.repeats`)."""
         a = self.simulation
-        frame = others[0].frame or Frame.same(a.atoms)
+        frame = others[0].frame or ReferenceFrame.same(a.atoms)
         imposed = [Counterfactual(Handed(b.simulation, a, b.begin, frame), guard) for b in others]
 
         def listen(segment: Segment) -> None:

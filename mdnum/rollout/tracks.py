@@ -15,7 +15,7 @@ from mdnum.errors import InputError
 from mdnum.md.neighbors import PairTable
 from mdnum.md.potentials import pair_type
 from mdnum.numerics import Ledger
-from mdnum.rollout.compared import Apart, Frame, PairFlips, in_user_order
+from mdnum.rollout.compared import Apart, PairFlips, ReferenceFrame, in_user_order
 from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, first_state
 from mdnum.rollout.epoch import EpochRecord, EpochState, Pins, empty_record, run_epoch
 from mdnum.rollout.flips import AmbiguousPairs, PairRecorder, decided_pairs
@@ -87,14 +87,14 @@ class Track:
         simulation: Simulation,
         last: int,
         start: Start | None = None,
-        frame: Frame | None = None,
+        frame: ReferenceFrame | None = None,
         *,
         flips: bool = True,
         listener: Callable[[Segment], None] | None = None,
         pins: Pins | None = None,
     ):
         self.simulation = simulation
-        self.frame = frame or Frame.same(simulation.atoms)
+        self.frame = frame or ReferenceFrame.same(simulation.atoms)
         self.start = start or first_state(simulation)
         self._engine = Engine(simulation, last, start=self.start, pins=pins)
         self._segments = self._engine.segments()
@@ -153,13 +153,13 @@ class Track:
         return taken._replace(i=i, j=j)
 
 
-def _flips_of(ledger: Ledger, frame: Frame) -> PairFlips:
+def _flips_of(ledger: Ledger, frame: ReferenceFrame) -> PairFlips:
     """The columns that a comparison needs, in the labels of the first run."""
     keys = frame.keys_of(ledger.subject[:, 0], ledger.subject[:, 1])
     return PairFlips(ledger.step, keys, ledger.entered, ledger.margin, ledger.bound)
 
 
-def rows_of(segment: Segment, frame: Frame, failed: str) -> Rows:
+def rows_of(segment: Segment, frame: ReferenceFrame, failed: str) -> Rows:
     """A segment's rows in the user's order of atoms."""
     x, v = (in_user_order(segment.rows_of(name), segment.table.order) for name in ("x", "v"))
     energy = segment.rows_of("potential") + segment.rows_of("kinetic")
@@ -210,7 +210,7 @@ class Handed:
         simulation: Simulation,
         leader: Simulation,
         start: Start | None = None,
-        frame: Frame | None = None,
+        frame: ReferenceFrame | None = None,
     ):
         if not simulation.pairwise or not leader.pairwise:
             raise InputError(
@@ -221,7 +221,7 @@ class Handed:
         self._engine = Engine(simulation, 0, start=start)
         self.state: EpochState = self._engine.start.state
         # with the same kind of list the leader's own lists serve, and its rebuilds with them
-        self.frame = frame or Frame.same(simulation.atoms)
+        self.frame = frame or ReferenceFrame.same(simulation.atoms)
         self._shares = self.frame.is_same and simulation.lists == leader.lists
         self._flat = self._program(shared=self._shares)
         self._own: tuple[PairTable, Any, int] | None = None

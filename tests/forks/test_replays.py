@@ -11,7 +11,7 @@ from forks.harness import crystal, followed, moved
 from mdnum.errors import InputError
 from mdnum.forks import Fork
 from mdnum.forks.replays import disagreements, minimal_cause, parse_pin, pinned
-from mdnum.rollout.compared import Frame
+from mdnum.rollout.compared import ReferenceFrame
 from mdnum.rollout.engine import Engine
 from mdnum.rollout.epoch import Pin, Pins
 
@@ -77,7 +77,7 @@ def test_what_cannot_be_pinned_is_refused(found):
             pinned(found, [bad])
     with pytest.raises(InputError, match="do not fork"):
         pinned(replace(found, decision=None))
-    labels = Frame(np.roll(np.arange(108), 1), np.arange(3), np.ones(3), np.zeros(3))
+    labels = ReferenceFrame(np.roll(np.arange(108), 1), np.arange(3), np.ones(3), np.zeros(3))
     other = replace(found.twin, b=replace(found.twin.b, frame=labels))
     with pytest.raises(InputError, match="other labels"):
         pinned(replace(found, twin=other))

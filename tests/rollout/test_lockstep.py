@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mdnum.md.neighbors import RebuildRule
-from mdnum.rollout.compared import Frame
+from mdnum.rollout.compared import ReferenceFrame
 from mdnum.rollout.engine import Engine
 from mdnum.rollout.flips import decided_pairs, true_pairs
 from mdnum.rollout.lockstep import lockstep
@@ -169,7 +169,7 @@ def test_a_frame_undoes_labels_axes_and_shifts():
     rng = np.random.default_rng(1)
     labels = rng.permutation(7)
     axes, signs, shift = np.array([2, 0, 1]), np.array([1.0, -1.0, 1.0]), np.array([0.5, 0.0, -2.0])
-    frame = Frame(labels, axes, signs, shift)
+    frame = ReferenceFrame(labels, axes, signs, shift)
     x = rng.standard_normal((3, 3, 7))
     other = np.empty_like(x)
     # what the other run holds, made from the definition atom by atom

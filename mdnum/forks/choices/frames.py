@@ -31,9 +31,9 @@ _AXES = re.compile(r"(?!.*([xyz]).*\1)(-?[xyz]){3}")
 
 
 def _frame(simulation: Any, **parts: Any) -> Any:
-    from mdnum.rollout.compared import Frame
+    from mdnum.rollout.compared import ReferenceFrame
 
-    return replace(Frame.same(simulation.atoms), **parts)
+    return replace(ReferenceFrame.same(simulation.atoms), **parts)
 
 
 @choice("relabel")

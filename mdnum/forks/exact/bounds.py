@@ -18,7 +18,7 @@ from mdnum.errors import InputError
 from mdnum.forks.exact.tape import DecisionTape
 from mdnum.md.cell import Cell, HostCell
 from mdnum.md.decide import PairDecider
-from mdnum.rollout.compared import Frame
+from mdnum.rollout.compared import ReferenceFrame
 from mdnum.rollout.engine import FAILURES, Engine, Segment, Start
 from mdnum.rollout.flips import PairRecorder, decided_pairs
 from mdnum.rollout.tracks import rows_of
@@ -95,7 +95,7 @@ class Taped:
 def taped(simulation: Simulation, steps: int, start: Start | None = None) -> Taped:
     """Run a simulation and keep every decision and position up to a step."""
     engine, recorder = Engine(simulation, steps, start=start), PairRecorder(simulation)
-    frame = Frame.same(simulation.atoms)
+    frame = ReferenceFrame.same(simulation.atoms)
     first, failed, last = np.empty(0, np.int64), "", 0
     rows, at, keys, entered = [], [], [], []
     for segment in engine.segments():
