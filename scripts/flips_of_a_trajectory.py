@@ -68,9 +68,9 @@ def at_strides(chosen: argparse.Namespace, folder: Path) -> list[dict[str, Any]]
 
 def told(row: dict[str, Any], whole: int) -> list[Any]:
     """A line of the first table."""
-    between, life = row["stride"], row["lifetime"]
+    between, life = row["stride"]["between"], row["lifetime"]
     said = None
-    if between["lost"] is not None:
+    if between and between["lost"] is not None:
         lost, low, high = (f"{100 * between[name]:.2g}" for name in ("lost", "low", "high"))
         said = f"{lost}% ({low} to {high})"
     share = row["flips"] / whole if whole else float("nan")

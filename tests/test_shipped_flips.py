@@ -44,6 +44,10 @@ def check(tmp_path, name, steps, **overrides):
 QUICK = {"argon/crystal-108", "argon/tilted-500", "pair/at-cutoff"}
 
 
+#: Of the longer trajectories, those that every change is held against.
+LONGER = ("argon/crystal-108", "argon/tilted-500")
+
+
 @pytest.mark.jax_md
 @pytest.mark.parametrize(
     "name", [pytest.param(n, marks=() if n in QUICK else pytest.mark.slow) for n in names("md")]
@@ -54,7 +58,9 @@ def test_flips_are_those_of_the_trajectory(tmp_path, name):
 
 @pytest.mark.slow
 @pytest.mark.jax_md
-@pytest.mark.parametrize("name", names("md"))
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=() if n in LONGER else pytest.mark.nightly) for n in names("md")]
+)
 def test_flips_are_those_of_a_longer_trajectory_over_several_lists(tmp_path, name):
     check(tmp_path, name, STEPS.get(name, 100), **{"neighbors.skin": 0.15})
 

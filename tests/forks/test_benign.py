@@ -132,7 +132,7 @@ def test_another_well_is_seen_in_many_features(hot, calibrated):
 
 def test_a_run_that_blows_up_is_not_benign(hot, calibrated):
     found = benign(pair(hot, slower(hot, 30), "a wild time step"), calibration=calibrated)
-    assert not found.passed and "3 of 3 runs of B blew up" in found.says
+    assert not found.passed and np.isnan(found.scores).any(axis=1).all() and len(found.scores) == 3
     assert np.isnan(found.scores).all()
 
 
@@ -305,6 +305,7 @@ def test_planted_changes_change_what_they_say(hot):
 
 @pytest.mark.slow
 @pytest.mark.jax_md
+@pytest.mark.nightly
 def test_false_positives_and_power_over_many_tries(hot):
     found = calibrate(hot, members=60, held_out=120, tries=4)
     assert found.triples == 40

@@ -20,7 +20,7 @@ from mdnum.rollout.engine import Engine
 from mdnum.systems import System
 from mdnum.systems.build import build
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.nightly]
 
 SIGMA = 3.405
 POTENTIAL = {"kind": "lennard-jones", "sigma": SIGMA, "epsilon": 0.0103235}

@@ -113,14 +113,14 @@ QUICK = ("hard", "switched", "quintic")
 
 
 @pytest.mark.parametrize(
-    "kind", [pytest.param(k, marks=() if k in QUICK else pytest.mark.nightly) for k in CUTOFFS]
+    "kind", [pytest.param(k, marks=() if k in QUICK else pytest.mark.slow) for k in CUTOFFS]
 )
 def test_a_mixture_in_a_tilted_box(tmp_path, kind):
     atoms = mixture(tilt=True)
     compare(build(load(write_system(tmp_path, atoms, **tables(kind)))), kind, atoms)
 
 
-@pytest.mark.nightly
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", CUTOFFS)
 @pytest.mark.parametrize("pbc", [(True, True, True), (True, False, True), (False, False, False)])
 def test_one_species_in_boxes_of_every_kind(tmp_path, kind, pbc):
@@ -131,7 +131,7 @@ def test_one_species_in_boxes_of_every_kind(tmp_path, kind, pbc):
     compare(build(load(path)), kind, atoms)
 
 
-@pytest.mark.nightly
+@pytest.mark.slow
 @pytest.mark.jax_md
 @pytest.mark.filterwarnings("ignore:scatter inputs")
 def test_the_list_of_jax_md_gives_the_same(tmp_path):
@@ -188,7 +188,7 @@ def shell(shift=0.0):
 
 
 @pytest.mark.parametrize(
-    "compare", [pytest.param(c, marks=pytest.mark.nightly if c.startswith("r ") else ()) for c in COMPARISONS]
+    "compare", [pytest.param(c, marks=pytest.mark.slow if c.startswith("r ") else ()) for c in COMPARISONS]
 )
 def test_at_the_cutoff_the_convention_decides_and_the_energy_follows(tmp_path, compare):
     path = write_system(

@@ -19,7 +19,7 @@ from mdnum.systems import load
 from mdnum.systems.build import build
 
 # a force is compiled for every reduction
-pytestmark = pytest.mark.nightly
+pytestmark = pytest.mark.slow
 
 #: All of them in float32; each compiles the force anew, so a few in float64.
 NAMES = {"float32": tuple(BY_NAME), "float64": ("sequential", "pairwise", "blocked", "kahan", "exact")}

@@ -59,9 +59,9 @@ def kicks(simulation, timestep):
         ("hard", 1),
         ("switched", 2),
         ("quintic", 3),
-        pytest.param("shifted", 1, marks=pytest.mark.nightly),
-        pytest.param("force-shifted", 2, marks=pytest.mark.nightly),
-        pytest.param("cosine", 2, marks=pytest.mark.nightly),
+        pytest.param("shifted", 1, marks=pytest.mark.slow),
+        pytest.param("force-shifted", 2, marks=pytest.mark.slow),
+        pytest.param("cosine", 2, marks=pytest.mark.slow),
     ],
 )
 def test_the_random_kick_of_a_crossing_scales_with_its_smoothness(tmp_path, kind, order):

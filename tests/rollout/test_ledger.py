@@ -190,7 +190,7 @@ def cloud() -> Atoms:
     return atoms
 
 
-@pytest.mark.nightly
+@pytest.mark.slow
 def test_a_free_cloud_that_collapses_makes_its_list_grow_on_the_way(tmp_path):
     path = write_system(tmp_path, cloud(), dynamics={"timestep": 0.004})
     result, folder = go(tmp_path, path, 127, save_every=1)
@@ -206,10 +206,10 @@ def test_a_free_cloud_that_collapses_makes_its_list_grow_on_the_way(tmp_path):
     "tilt, pbc",
     [
         (True, (True, True, False)),
-        pytest.param(True, (True, True, True), marks=pytest.mark.nightly),
-        pytest.param(False, (True, False, False), marks=pytest.mark.nightly),
-        pytest.param(True, (False, False, True), marks=pytest.mark.nightly),
-        pytest.param(False, (False, False, False), marks=pytest.mark.nightly),
+        pytest.param(True, (True, True, True), marks=pytest.mark.slow),
+        pytest.param(False, (True, False, False), marks=pytest.mark.slow),
+        pytest.param(True, (False, False, True), marks=pytest.mark.slow),
+        pytest.param(False, (False, False, False), marks=pytest.mark.slow),
     ],
 )
 def test_boxes_of_every_kind(tmp_path, tilt, pbc):
@@ -222,7 +222,7 @@ def test_boxes_of_every_kind(tmp_path, tilt, pbc):
     assert summary["energy_budget_closes"]
 
 
-@pytest.mark.nightly
+@pytest.mark.slow
 @pytest.mark.parametrize("compare", ["r2 <=", "r <", "r <="])
 def test_every_convention(tmp_path, compare):
     path = write_system(tmp_path, liquid(), cutoff={"compare": compare}, dynamics={"temperature": 2.0})
@@ -230,7 +230,7 @@ def test_every_convention(tmp_path, compare):
     assert assert_ledger_is_complete(result, folder) > 300
 
 
-@pytest.mark.nightly
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 def test_random_mixtures(tmp_path, seed):
     """Two species with cutoffs of their own, any box, any kind of cutoff."""

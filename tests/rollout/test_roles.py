@@ -57,14 +57,14 @@ def test_everything_narrow(path, tmp_path):
     assert list(zip(*(flips[n].tolist() for n in ("step", "i", "j", "entered")), strict=True)) == rows
 
 
-@pytest.mark.nightly
+@pytest.mark.slow
 def test_a_wide_decision_on_a_narrow_state_is_the_exact_one(path, tmp_path):
     result, folder = go(tmp_path, path, 70, {"precision.state": "float32"}, save_every=1)
     assert assert_ledger_is_complete(result, folder) > 100
     assert result.summary["energy_budget_closes"]
 
 
-@pytest.mark.nightly
+@pytest.mark.slow
 @pytest.mark.parametrize("role", ROLES)
 def test_one_narrow_role_at_a_time(path, tmp_path, role):
     result, folder = go(tmp_path / "n", path, 70, {f"precision.{role}": "float32"}, save_every=1)

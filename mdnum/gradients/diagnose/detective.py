@@ -38,7 +38,9 @@ _PARTS = (
     ("look", "loss"),
     ("seen_at", "loss"),
     ("observe", "loss"),
-    ("pull_back", "forces"),
+    # an operation in a loop remembers the function that the loop stands in, and none further out
+    ("_of_pairs", "forces"),
+    ("_of_energy", "forces"),
     ("drift", "drift"),
 )
 _NOWHERE = (-1, -1, float("nan"))
