@@ -61,16 +61,22 @@ def at_strides(chosen: argparse.Namespace, folder: Path) -> list[dict[str, Any]]
             out=folder / f"stride-{stride}", report=False,
         ).summary  # fmt: skip
         rows.append(
-            {"every": stride, "interval": found["interval"], "unit": found["time"], **found["rules"][0]}
+            {
+                "every": stride,
+                "interval": found["interval"],
+                "unit": found["time"],
+                **found["rules"][0],
+                "stride": found["rules"][0]["stride"]["between"] or {"lost": None},
+            }
         )
     return rows
 
 
 def told(row: dict[str, Any], whole: int) -> list[Any]:
     """A line of the first table."""
-    between, life = row["stride"]["between"], row["lifetime"]
+    between, life = row["stride"], row["lifetime"]
     said = None
-    if between and between["lost"] is not None:
+    if between["lost"] is not None:
         lost, low, high = (f"{100 * between[name]:.2g}" for name in ("lost", "low", "high"))
         said = f"{lost}% ({low} to {high})"
     share = row["flips"] / whole if whole else float("nan")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from textwrap import fill
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -31,16 +32,16 @@ def draw(figure: Figure | Plot) -> Canvas:
     return canvas(figure.draw, figure.height)
 
 
-def canvas(fill: Callable[[Canvas], None], height: float) -> Canvas:
+def canvas(draw_into: Callable[[Canvas], None], height: float) -> Canvas:
     """A figure in the report's style.
 
     Args:
-        fill: draws into it.
+        draw_into: draws.
         height: inches.
     """
     with style():
         figure = Canvas(figsize=(WIDTH, height), layout="constrained")
-        fill(figure)
+        draw_into(figure)
         figure.align_ylabels()
         for axes in figure.axes:
             axes.grid(True, color=GRID, lw=0.6)
@@ -132,7 +133,8 @@ def _plot(plot: Plot, figure: Canvas) -> None:
         (axes.set_xlabel, plot.x_label, bases["x"]),
         (axes.set_ylabel, plot.y_label, bases["y"]),
     ):
-        setter(f"{typeset(label)} {MINUS} {base!r}" if base else typeset(label))
+        text = f"{typeset(label)} {MINUS} {base!r}" if base else typeset(label)
+        setter(fill(text, 90 if setter == axes.set_xlabel else 40))
     if len(plot.series) > 1 or plot.region is not None:
         legend(axes)
 

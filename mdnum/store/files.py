@@ -260,7 +260,7 @@ def load(root: Path) -> Manifest | None:
         # names of files in the folder, or in one of the folders in it
         if not all(map(_INSIDE.fullmatch, files)):
             raise ValueError("it lists files of elsewhere")
-        return Manifest(str(held["world"]), bool(held["finished"]), files, str(held["version"]))
+        return Manifest(str(held["world"]), bool(held["finished"]), files, str(held.get("version", "")))
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise FolderError(
             "is damaged, so that the other files cannot be checked against it",

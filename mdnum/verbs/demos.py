@@ -274,7 +274,7 @@ def _table(stored: Mapping[str, Any]) -> Table:
     """A table whose numbers have the fewest digits, five at least, that tell those of a column apart."""
     columns = []
     for values in zip(*stored["rows"], strict=True):
-        digits = _digits(values, 5)
+        digits = _digits(values, 10)
         columns.append(
             [shown(value, digits) if isinstance(value, float | list) else value for value in values]
         )

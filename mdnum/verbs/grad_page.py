@@ -178,8 +178,8 @@ def page(view: View, verdict: Verdict) -> Page:
     )  # fmt: skip
     sections = [
         Section("By method", list(_methods(view)), terminal=True),
-        Section("Against the horizon", list(_horizons(view))),
-        Section("How far it is trusted", list(_trust(view)), terminal=False),
+        Section("Against the horizon", list(_horizons(view)), terminal=True),
+        Section("How far it is trusted", list(_trust(view)), terminal=True),
         Section("Flips on the way", list(_flips(view))),
         Section("How changes stretch", list(_spectrum(view))),
         Section("The nearest other histories", list(_edges(view))),

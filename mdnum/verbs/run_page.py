@@ -160,6 +160,8 @@ def _keys(view: View, run: Record) -> Iterator[Key]:
     closes = summary.get("energy_budget_closes")
     budget = "" if closes is None else "; budget closes" if closes else "; budget is open"
     yield Key("Budget residual", number(residual(view, run), 2), view.units.energy + budget)
+    drift, per = summary.get("energy_drift"), f"{view.units.energy}/atom/{view.units.time}"
+    yield Key("Energy drift", number(drift, 2, signed=True), per)
     ase = summary.get("ase") or {}
     compared = "relative energy difference" if ase.get("energy_rel") is not None else "not compared"
     yield Key("Against ASE", number(ase.get("energy_rel"), 2), compared)

@@ -179,7 +179,8 @@ def parse(text: str) -> Choice:
         takes = {one.name for one in fields(kind)}  # type: ignore[arg-type]
         if (not role or "role" in takes) and (not both or "both" in takes):
             return kind.parse(argument, role, both or None)
-    close = difflib.get_close_matches(text, [*CHOICES, *shipped("md"), *shipped("ball")], n=3)
+    known = dict.fromkeys([*CHOICES, *shipped("md"), *shipped("ball")])
+    close = difflib.get_close_matches(text, known, n=3)
     near = f"Did you mean {' or '.join(close)}? " if close else ""
     raise InputError(
         f"no choice {text!r}", remedy=f"{near}There are {', '.join(CHOICES)}; `mdnum fork` lists all"
