@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any, Protocol
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt64
+from jaxtyping import Bool, Float, Int, Real, UInt64
 
 
 class Program(Protocol):
@@ -150,7 +150,8 @@ class PairRows:
         energy: by run, shape (rows,).
         cross: decisions in which A and B differ, shape (rows,).
         flips: cross-run flips of these steps, in order; each has a `step`.
-        overridden: by counterfactual: decisions it would have made otherwise, shape (rows,).
+        overridden: by counterfactual: decisions it would have made otherwise, shape (rows,); floats where
+            rows after the end of a run are NaN.
         furthest: by counterfactual: distance of the furthest of them from its threshold, length.
         nearest: of A and B, distance of the decision nearest to its threshold from it, length, shape (rows,).
         bound: of A and B, how far rounding can move what is compared, length, shape (rows,).
@@ -166,7 +167,7 @@ class PairRows:
     energy: dict[str, Float[np.ndarray, "rows"]]
     cross: Int[np.ndarray, "rows"]
     flips: Sequence[Any]
-    overridden: dict[str, Float[np.ndarray, "rows"]]
+    overridden: dict[str, Real[np.ndarray, "rows"]]
     furthest: dict[str, Float[np.ndarray, "rows"]]
     nearest: dict[str, Float[np.ndarray, "rows"]]
     bound: dict[str, Float[np.ndarray, "rows"]]

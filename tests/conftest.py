@@ -48,7 +48,7 @@ _CHECKED = [
     "mdnum.numerics",
     "mdnum.md",
     "mdnum.ball",
-    "mdnum.dynamics",
+    "mdnum.program",
     "mdnum.store",
     "mdnum.systems",
     "mdnum.rollout",

@@ -292,7 +292,7 @@ class ManyBodyForce(eqx.Module):
         return total, slope, strain
 
 
-# --- one step of molecular dynamics that is told its decisions: the contract of mdnum.dynamics --------
+# --- one step of molecular dynamics that is told its decisions: the contract of mdnum.program ---------
 
 
 class MdState(NamedTuple):

@@ -456,6 +456,67 @@ def test_boundaries_of_a_ball_are_adjacent_floats_with_the_decision_between_them
         assert np.isfinite([edge.below.gradient, edge.above.gradient, edge.below.margin, edge.jump]).all()
 
 
+def relaxation(folder, tol: float, extra: str = "") -> BallSystem:
+    """One ball 0.45 m under the floor, without gravity, whose loss is what one solve leaves, squared."""
+    path = folder / "relaxation.toml"
+    path.write_text(
+        'world = "ball"\nstart = { height = [-0.45] }\nflight = { gravity = 0.0 }\n'
+        'contact = { kind = "projection", k = 0.5, alpha = 0.5 }\n'
+        f'stop = {{ rule = "sum", tol = {tol!r}, max_iter = 200 }}\n'
+        'integrator = { kind = "semi-implicit-euler", timestep = 1.0, steps = 1 }\n'
+        f'loss = {{ kind = "residual-penetration" }}\n{extra}\n'
+    )
+    return load(path, world="ball")
+
+
+def solved(k, tol: float, kind: Any = np.float64) -> tuple[int, list[float], float]:
+    """Iterations, the penetration after each, and the last one's derivative by k, in a plain loop."""
+    gain, y, slope = kind(0.5) * kind(k), -kind(0.45), 0.0
+    left = [float(-y)]
+    while -y >= kind(tol):
+        slope = slope * (1 - float(gain)) - 0.5 * float(-y)
+        y = y + gain * -y
+        left.append(float(-y))
+    return len(left) - 1, left, slope
+
+
+def test_the_loss_margin_and_jump_on_both_sides_are_those_of_a_plain_loop(tmp_path):
+    tol = 1e-4
+    found = boundaries(relaxation(tmp_path, tol), "k", 0.5, 0.51, cells=2, confirm=False)
+    (edge,) = found.boundaries
+    assert (edge.below.at, edge.above.at) == (0.5035674359581246, 0.5035674359581247)
+    assert (edge.channel, edge.step, edge.subject) == ("stop", 1, ()) and found.evaluations < 64
+    (few, under, low), (count, over, high) = (solved(side.at, tol) for side in (edge.below, edge.above))
+    assert (edge.below.decided, edge.above.decided) == (few, count) == (30, 29)
+    assert (edge.below.loss, edge.above.loss) == (under[-1] ** 2, over[-1] ** 2)
+    # after 29 iterations one goes on and the other stops
+    assert edge.below.margin == tol - under[29] <= 0 < edge.above.margin == tol - over[29]
+    slopes = 2 * under[-1] * low, 2 * over[-1] * high
+    np.testing.assert_allclose([edge.below.gradient, edge.above.gradient], slopes, rtol=1e-12)
+    assert edge.jump == over[-1] ** 2 - under[-1] ** 2
+    # 2.5e-5 m between two floats 1.1e-16 apart
+    assert np.sqrt(edge.above.loss) - np.sqrt(edge.below.loss) == pytest.approx(2.518e-5, rel=1e-3)
+
+
+def test_every_boundary_among_all_float16_values_of_an_interval(tmp_path):
+    tol = float(np.float16(1e-2))
+    roles = ("state", "arithmetic", "decision", "accumulate", "loss")
+    precision = "precision = { " + ", ".join(f'{role} = "float16"' for role in roles) + " }"
+    found = boundaries(relaxation(tmp_path, tol, precision), "k", 0.3, 0.9, cells=64, confirm=False)
+    first, last = (int(np.float16(end).view(np.int16)) for end in (0.3, 0.9))
+    every = np.arange(first, last + 1, dtype=np.int16).view(np.float16)
+    counts = [solved(k, tol, np.float16)[0] for k in every]
+    edges = [
+        (float(every[n]), float(every[n + 1]), counts[n], counts[n + 1])
+        for n in range(len(every) - 1)
+        if counts[n] != counts[n + 1]
+    ]
+    assert len(edges) > 10 and found.evaluations < len(every)
+    assert [
+        (edge.below.at, edge.above.at, edge.below.decided, edge.above.decided) for edge in found.boundaries
+    ] == edges
+
+
 def test_every_float_of_a_narrow_number_is_run(systems):
     """In float32 an interval of a few floats is complete, and its ends are floats of that format."""
     at = np.float32(0.5)

@@ -42,6 +42,29 @@ def test_the_decision_at_the_fork_alone(found):
     assert [at for spell in disagreements(found, i, j) for at in spell if at is not None] == steps
 
 
+def test_spells_are_the_steps_at_which_the_distances_disagree(found):
+    """Every pair that was decided differently, judged by the positions of two runs of their own."""
+    inside = []
+    pairs = sorted({(flip.i, flip.j) for flip in found.flips})
+    i, j = np.array(pairs).T
+    for simulation in (crystal(), moved(crystal(), 1e-7)):
+        box = np.diag(simulation.cell.matrix)
+        rows = [
+            segment.unsorted("x", row).astype(np.float64)
+            for segment in Engine(simulation, found.steps).segments()
+            for row in range(segment.rows)
+        ]
+        d = np.stack([x[i] - x[j] for x in rows])
+        d -= box * np.rint(d / box)
+        inside.append(np.sum(d**2, axis=2) < simulation.r_cut**2)
+    assert len(pairs) > 1 and len(inside[0]) == found.steps + 1
+    differ = inside[0] != inside[1]
+    for k, (i, j) in enumerate(pairs):
+        changes = (np.flatnonzero(np.diff(differ[:, k])) + 1).tolist()
+        expected = [*changes, None] if differ[-1, k] else changes
+        assert disagreements(found, i, j) == list(zip(expected[::2], expected[1::2], strict=True))
+
+
 def test_a_named_pair_over_the_whole_run_removes_the_split(found):
     i, j = found.decision.subject
     whole = pinned(found, [(j, i)])

@@ -130,6 +130,15 @@ def test_the_epoch_table_accounts_for_every_step(path, tmp_path):
         steps = slice(start, start + epochs["length"][row])
         moved = np.linalg.norm(unwrapped[steps] - unwrapped[start], axis=2).max(axis=1)
         assert np.allclose(series["displacement"][steps], moved, rtol=0, atol=1e-12)
+        assert (
+            epochs["skin_consumed"][row] == pytest.approx(2 * moved.max() / 0.2, abs=1e-11)
+            and moved.max() <= 0.1
+        )
+        if row + 1 < len(epochs["start"]):
+            # the next list begins at the first step that would have overdrawn this one's skin
+            then = np.linalg.norm(unwrapped[steps.stop] - unwrapped[start], axis=1).max()
+            assert epochs["start"][row + 1] == steps.stop and then > 0.1
+            assert epochs["margin"][row] == pytest.approx(0.1 - then, abs=1e-12)
         _, _, d = all_pairs(wrapped[start], cell, (True,) * 3)
         assert epochs["pairs_listed"][row] == np.sum(np.linalg.norm(d, axis=1) <= R_CUT + 0.2)
         assert epochs["occupancy"][row] <= epochs["capacity"][row]
