@@ -185,8 +185,9 @@ def test_a_gradient_method(site):
     ("old", "new", "message"),
     [
         ("w - share", "w + share", "its slope is not the derivative of its energy at r = 1, r_cut = 2"),
-        ("u - share * r2", "u - share * r2 + 1", "its energy at r_cut is 1, and its smoothness is 0"),
-        ("smoothness = 0", "smoothness = 1", "its slope at r_cut is"),
+        ("u - share * r2", "u - share * r2 + 1", "its energy jumps by -1 at r_cut, and its smoothness is 0"),
+        ("smoothness = 0", "smoothness = 1", "its slope jumps by 0.125 at r_cut, and its smoothness is 1"),
+        ("smoothness = 0", "smoothness = -1", "its smoothness is -1, and its energy does not jump"),
         ("name = ", "nam = ", "it has no name"),
     ],
 )

@@ -136,34 +136,81 @@ class Cutoff(ABC):
         return hash((type(self), *vars(self).values()))
 
 
-def check(cutoff: type[Cutoff] | Cutoff) -> None:
-    """That a cutoff is what it says: its slope that of its energy, its jumps those of its smoothness.
+#: Derivatives of the energy by r² that `check` examines, by order.
+_DERIVATIVES = ("energy", "slope", *(f"derivative {order} by r²" for order in range(2, 7)))
+_ORDERS = len(_DERIVATIVES) - 1
 
-    Tried on u = 1/r² with r_cut = 2, onset 1.6.
+
+def check(cutoff: type[Cutoff] | Cutoff) -> None:
+    """That a cutoff is what it says: its slope that of its energy, its jumps and smoothness those there are.
+
+    Tried on u = 1/r² and u = 1/r⁶ with r_cut = 2, onset 1.6. The derivatives of the energy by r² (nested jvp)
+    are examined 2⁻⁴⁶ from r_cut and from both sides of the onset, to the order after the one claimed, where
+    one of them must jump for one of the two potentials. The energy jumps above 1e-9 u(r_cut), derivative k
+    above 1e-5 u(r_cut) k! / (r_cut² - r_onset²)^k: a smaller jump is not seen. Nor is one elsewhere, or above
+    the sixth derivative: a claim of 6 or more is held to 6.
 
     Raises:
         ValueError: it is not; names the quantity and the distance.
     """
+    import jax
+
     made = cutoff if isinstance(cutoff, Cutoff) else cutoff()
     if not isinstance(getattr(made, "name", None), str):
         raise ValueError("it has no name")
-    at = AtCutoff(*map(np.float64, (2.0, 1.6, 0.25, -0.25)))
+    with jax.enable_x64(True):
+        ends = [_ends(made, power) for power in (1, 3)]
+    if made.smoothness < _ORDERS and not any(ends):
+        after = _DERIVATIVES[max(made.smoothness + 1, 0)]
+        raise ValueError(f"its smoothness is {made.smoothness}, and its {after} does not jump")
+
+
+def _ends(made: Cutoff, power: int) -> bool:
+    """The part of `check` with u = r^(-2 power); whether a derivative jumps that may."""
+    import jax
+    import jax.numpy as jnp
+
+    at = AtCutoff(*map(np.float64, (2.0, 1.6, 4.0**-power, -power * 4.0**-power)))
+    claimed, ends = made.smoothness, False
+
+    def cut(x):
+        return made.cut(x, x**-power, -power / x ** (power + 1), at)
+
+    def derivative_of(function):
+        return lambda x: jax.jvp(function, (x,), (jnp.ones_like(x),))[1]
+
     r = np.linspace(1.0, 2.0, 41)[:-1]
-    energy, slope = made.cut(r**2, r**-2, -(r**-4), at)
-    _, derivative = Cutoff.reference(made, r, r**-2, -2 * r**-3, at)
-    off = np.abs(2 * r * slope - derivative) > 1e-9
+    energy, slope = cut(r**2)
+    derivatives = [lambda x: cut(x)[0]]
+    for _ in range(min(max(claimed, 0) + 1, _ORDERS)):
+        derivatives.append(derivative_of(derivatives[-1]))
+    off = ~(np.abs(2 * r * (slope - derivatives[1](jnp.asarray(r**2)))) <= 1e-9)
     if off.any():
         raise ValueError(
             f"its slope is not the derivative of its energy at r = {r[off.argmax()]:g}, r_cut = 2"
         )
-    limits = {"energy": made._limits(at)[0], "slope": made._limits(at)[1]}
-    for order, (name, limit) in enumerate(limits.items()):
-        if made.smoothness >= order and not abs(limit) < 1e-9:
-            raise ValueError(
-                f"its {name} at r_cut is {float(limit):g}, and its smoothness is {made.smoothness}"
-            )
-    if made.switches and not np.allclose(energy[r < 1.6], r[r < 1.6] ** -2, rtol=1e-12):
+    if made.switches and not np.allclose(energy[r < 1.6], r[r < 1.6] ** (-2 * power), rtol=1e-12):
         raise ValueError("it switches, and changes the energy below the onset")
+
+    edges = np.array([1.6**2 * (1 - 2**-46), 1.6**2 * (1 + 2**-46), 4 * (1 - 2**-46)])
+    for order in range(min(claimed + 1, _ORDERS) + 1):
+        below, above, last = map(float, derivatives[order](jnp.asarray(edges)))
+        least = (1e-5 if order else 1e-9) * at.energy * math.factorial(order) / (2.0**2 - 1.6**2) ** order
+        for place, jump in (("the onset", above - below), ("r_cut", -last)):
+            if abs(jump) <= least:
+                continue
+            # no event tells of a jump of the energy at the onset, whatever is claimed
+            if order <= claimed or (order == 0 and place == "the onset"):
+                raise ValueError(
+                    f"its {_DERIVATIVES[order]} jumps by {jump:g} at {place}, and its smoothness is {claimed}"
+                )
+            ends = True
+    inside, steep = (float(value[2]) for value in cut(edges))
+    for name, limit, least in (("energy", inside, 1e-9 * at.energy), ("force", -4 * steep, -1e-5 * at.slope)):
+        told = float(getattr(made, f"{name}_jump")(at))
+        if not abs(told - limit) <= least:
+            raise ValueError(f"its {name}_jump is {told:g}, and its {name} inside r_cut is {limit:g}")
+    return ends
 
 
 #: Every cutoff by its name; a package adds one by an entry point of this group.

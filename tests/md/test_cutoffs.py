@@ -68,6 +68,50 @@ def test_energy_and_slope_are_those_of_the_closed_form(kind):
             )
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_jumps_are_the_limits_from_inside(kind):
+    at, smoothness = mpmath.mpf(R_CUT), CUTOFFS.parse(kind).smoothness
+    energy, force = model(kind).jumps()
+    slope = mpmath.diff(lambda r: closed_form(kind, r), at, direction=-1)
+    assert energy.shape == force.shape == (1,)
+    assert energy[0] == pytest.approx(float(closed_form(kind, at)), rel=1e-14, abs=1e-30)
+    assert force[0] == pytest.approx(float(-slope), rel=1e-12, abs=1e-12)
+    assert (energy[0] == 0) == (smoothness >= 0)
+    # attractive at the cutoff: a pair that enters brings a pull
+    assert force[0] == 0 if smoothness >= 1 else force[0] < 0
+
+
+def test_the_constants_at_the_cutoff_are_the_bare_potential_there():
+    at = AtCutoff(*(float(constant[0]) for constant in model("hard").at_cutoff()))
+    assert at.energy == pytest.approx(float(bare(R_CUT)), rel=1e-14)
+    assert at.slope == pytest.approx(float(mpmath.diff(bare, R_CUT)), rel=1e-12)
+    assert (at.r_cut, at.r_onset) == (R_CUT, R_ONSET)
+
+
+def one_sided(kind, order, place, side):
+    """A derivative by differences on one side only, in 60 digits."""
+    if side > 0 and place == R_CUT:
+        return mpmath.mpf(0)
+    h = side * mpmath.mpf(10) ** -20
+    points = [closed_form(kind, place + h * (k + mpmath.mpf(10) ** -8)) for k in range(order + 1)]
+    return (
+        sum((-1) ** (order - k) * mpmath.binomial(order, k) * point for k, point in enumerate(points))
+        / h**order
+    )
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_smoothness_claimed_is_the_one_there_is(kind):
+    def continuous(order, place):
+        left, right = (one_sided(kind, order, place, side) for side in (-1, 1))
+        return abs(left - right) <= 1e-6 * (abs(left) + abs(right) + EPSILON)
+
+    cutoff = CUTOFFS.parse(kind)
+    with mpmath.workdps(60):
+        smooth = [all(continuous(order, place) for place in (R_CUT, R_ONSET)) for order in range(4)]
+    assert smooth.index(False) - 1 == cutoff.smoothness, smooth
+
+
 def test_hard_and_shifted_have_the_same_forces_bit_for_bit_and_energies_apart_by_a_constant():
     r2 = np.linspace(0.9, R_CUT, 300) ** 2
     (hard, hard_slope), (shifted, shifted_slope) = evaluate("hard", r2), evaluate("shifted", r2)
@@ -125,6 +169,61 @@ def test_a_cutoff_is_what_it_says(kind):
     assert np.allclose(
         Level(cutoff).cut(r**2, r**-2, -(r**-4), at)[0], level.cut(r**2, r**-2, -(r**-4), at)[0]
     )
+
+
+def claims(kind, **other):
+    return type("Other", (type(CUTOFFS.parse(kind)),), other)
+
+
+class Ramp(Cutoff):
+    """A switch that is smooth at r_cut only: share ((r_cut - r) / (r_cut - r_onset))^power."""
+
+    name = "ramp"
+    smoothness = 2
+    switches = True
+    power, share = 3, 1.0
+
+    def cut(self, r2, u, w, at):
+        xp = r2.__array_namespace__()
+        r, width = xp.sqrt(r2), at.r_cut - at.r_onset
+        left = (at.r_cut - r) / width
+        s = self.share * left**self.power
+        ds = -self.share * self.power * left ** (self.power - 1) / width / (r + r)
+        inside = r > at.r_onset
+        return xp.where(inside, u * s, u), xp.where(inside, w * s + u * ds, w)
+
+
+@pytest.mark.parametrize(
+    ("cutoff", "message"),
+    [
+        (claims("quintic", smoothness=5), "derivative 3 by r² jumps by .* at the onset.* smoothness is 5"),
+        (claims("switched", smoothness=4), "derivative 2 by r² jumps by .* at the onset.* smoothness is 4"),
+        (claims("cosine", smoothness=3), "derivative 2 by r² jumps by .* at the onset.* smoothness is 3"),
+        (claims("force-shifted", smoothness=2), "derivative 2 by r² jumps by .* at r_cut"),
+        (claims("hard", smoothness=0), "energy jumps by .* at r_cut"),
+        (claims("switched", smoothness=-1), "smoothness is -1, and its energy does not jump"),
+        (claims("shifted", smoothness=-1), "smoothness is -1, and its energy does not jump"),
+        (claims("quintic", smoothness=1), "smoothness is 1, and its derivative 2 by r² does not jump"),
+        (claims("hard", energy_jump=lambda self, at: 0 * at.energy), "energy_jump is 0, .* is 0.25"),
+        (claims("hard", force_jump=lambda self, at: 0 * at.slope), "force_jump is -?0, .* is 0.25"),
+        (claims("hard", force_jump=lambda self, at: at.slope), "force_jump is -0.25, .* is 0.25"),
+        (Ramp, "slope jumps by .* at the onset"),
+        (type("Kinked", (Ramp,), {"smoothness": 1}), "slope jumps by .* at the onset"),
+        (type("Half", (Ramp,), {"share": 0.5}), "energy jumps by .* at the onset"),
+        (
+            type("HalfOfHard", (Ramp,), {"share": 0.5, "power": 0, "smoothness": -1}),
+            "energy jumps by .* onset",
+        ),
+    ],
+)
+def test_a_cutoff_that_claims_what_it_is_not_is_refused(cutoff, message):
+    with pytest.raises(ValueError, match=message):
+        check(cutoff)
+
+
+@pytest.mark.parametrize("made", [type("Kinked", (Ramp,), {"smoothness": 0}), Level(CUTOFFS.parse("hard"))])
+def test_a_cutoff_that_says_how_rough_it_is_is_accepted(made):
+    check(made)
 
 
 @pytest.mark.parametrize("kind", KINDS)
