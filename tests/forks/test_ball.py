@@ -502,7 +502,7 @@ def test_every_boundary_among_all_float16_values_of_an_interval(tmp_path):
     tol = float(np.float16(1e-2))
     roles = ("state", "arithmetic", "decision", "accumulate", "loss")
     precision = "precision = { " + ", ".join(f'{role} = "float16"' for role in roles) + " }"
-    found = boundaries(relaxation(tmp_path, tol, precision), "k", 0.3, 0.9, cells=64, confirm=False)
+    found = boundaries(relaxation(tmp_path, tol, precision), "k", 0.3, 0.9, cells=4, confirm=False)
     first, last = (int(np.float16(end).view(np.int16)) for end in (0.3, 0.9))
     every = np.arange(first, last + 1, dtype=np.int16).view(np.float16)
     counts = [solved(k, tol, np.float16)[0] for k in every]
