@@ -167,7 +167,7 @@ def _ask_all(
     if state.thresholds is not None:
         subject.known["thresholds"] = state.thresholds
     settings = Settings(_internal(state.timestep, loaded.units), state.steps)
-    log = frame.Log(folder, progress)
+    log = frame.logged(folder, progress)
     earlier, state.during, state.why = state.cut, None, ""
     for name in state.left:
         check = CHECKS[name](settings)
@@ -211,7 +211,7 @@ def _ask_all(
     return outcome
 
 
-def _ask(check: AuditCheck, subject: CalculatorSubject, log: frame.Log) -> CheckResult:
+def _ask(check: AuditCheck, subject: CalculatorSubject, log: frame.Progress) -> CheckResult:
     """A check's answer; where the calculator fails and it cannot continue, the failure as a finding."""
     from mdnum.audit.base import CheckResult, finding
     from mdnum.audit.subject import CalculatorError

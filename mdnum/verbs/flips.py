@@ -16,8 +16,8 @@ from mdnum.errors import InputError
 from mdnum.store import RunFolder
 from mdnum.store.tables import TableStream
 from mdnum.verbs.flips_page import judge, page
-from mdnum.verbs.flips_shared import FolderLog, about, ending, plain_box, selected, stem
-from mdnum.verbs.frame import Outcome, Progress, Verb, finish, new_folder, store
+from mdnum.verbs.flips_shared import about, ending, plain_box, selected, stem
+from mdnum.verbs.frame import Outcome, Progress, Verb, finish, logged, new_folder, store
 from mdnum.verbs.interrupt import asked_to_stop
 
 if TYPE_CHECKING:
@@ -105,7 +105,7 @@ def flips(
     # no folder for a file whose first frame cannot be used
     found, interrupted, began = next(passes), False, time.perf_counter()
     with new_folder("flips", f"flips-{stem(opened)}", out) as folder:
-        log = FolderLog(folder, progress)
+        log = logged(folder, progress)
         with asked_to_stop() as stop:
             while True:
                 rows.checkpoint(folder, found.frames)
@@ -325,7 +325,7 @@ def _rule_told(
     trajectory: Trajectory,
     groups: Groups,
     window: int,
-    log: FolderLog,
+    log: Progress,
 ) -> dict[str, Any]:
     """What one rule's ledger says, worked out pair by pair; its tables go into the folder."""
     from mdnum.trajectories.statistics import Labels, Statistics

@@ -19,8 +19,8 @@ from mdnum.trajectories.compare import ComparedSide, NeighborSets, follow_both, 
 from mdnum.trajectories.follow import atoms_of
 from mdnum.trajectories.resolution import infer
 from mdnum.trajectories.tracker import Tracker
-from mdnum.verbs.flips_shared import FolderLog, Written, about, ending, name_of, resolution, selected, stem
-from mdnum.verbs.frame import Outcome, Progress, Verb, View, finish, new_folder, store
+from mdnum.verbs.flips_shared import Written, about, ending, name_of, resolution, selected, stem
+from mdnum.verbs.frame import Outcome, Progress, Verb, View, finish, logged, new_folder, store
 from mdnum.verbs.interrupt import asked_to_stop
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ def compare(
     # no folder for files whose first frames cannot be used
     found, interrupted = next(passes), False
     with new_folder("flips-compare", f"flips-{stem(a)}", out) as folder:
-        log = FolderLog(folder, progress)
+        log = logged(folder, progress)
         total = min((one.count for one in (a, b) if one.count is not None), default=0)
         with asked_to_stop() as stop:
             while True:

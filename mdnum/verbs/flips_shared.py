@@ -11,8 +11,6 @@ import numpy as np
 from mdnum.errors import InputError
 from mdnum.report.finding import Texts
 from mdnum.report.words import listed, number, plain
-from mdnum.store import RunFolder
-from mdnum.verbs.frame import Progress
 
 if TYPE_CHECKING:
     from mdnum.trajectories.follow import Groups
@@ -29,22 +27,6 @@ def selected(trajectory: Trajectory, between: tuple[str, str] | None) -> Groups:
     return (
         (None, None) if between is None else (select(trajectory, between[0]), select(trajectory, between[1]))
     )
-
-
-class FolderLog:
-    """Passes progress on, and writes a line of log.txt at each new phase and now and then."""
-
-    def __init__(self, folder: RunFolder, progress: Progress | None):
-        self._folder, self._progress = folder, progress
-        self._last = ("", -1)
-
-    def __call__(self, done: int, of: int, info: dict[str, Any]) -> None:
-        phase, share = str(info["phase"]), 10 * done // of if of else 0
-        if (phase, share) != self._last:
-            self._folder.log(f"{phase}: {done:,} of {of:,} {info['unit']}" if of else phase)
-            self._last = (phase, share)
-        if self._progress is not None:
-            self._progress(done, of, info)
 
 
 def stem(trajectory: Trajectory) -> str:

@@ -17,7 +17,7 @@ from mdnum.report.svg import FIRST, MUTED
 from mdnum.report.words import count, many, number, typeset
 from mdnum.verbs import frame
 from mdnum.verbs.fork_page import size
-from mdnum.verbs.fork_pair import basics, logged, of_any, of_md
+from mdnum.verbs.fork_pair import basics, of_any, of_md
 from mdnum.verbs.frame import Outcome, Progress, View
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ def fork_certify(
         if (error := unsupported(simulation)) is not None:
             raise error
     with frame.new_folder("certify", f"fork-{system.name}", out, system=system) as folder:
-        note = logged(folder, progress)
+        note = frame.logged(folder, progress, frame.STEPWISE)
         found = ball or certify(system, steps, policies, note)
         tables: dict[str, Any] = {}
         summary = basics(system, found.steps) | _certified(found, tables)
@@ -343,7 +343,7 @@ def fork_processes(
         )
     asked = VARIANTS if which is None else tuple(which)
     with frame.new_folder("processes", f"fork-{loaded.name}", out, system=loaded) as folder:
-        note = logged(folder, progress)
+        note = frame.logged(folder, progress, frame.STEPWISE)
 
         def ended(done: int, of: int, name: str) -> None:
             note(done, of, {"phase": "running in processes of their own", "unit": "variants"})

@@ -16,7 +16,7 @@ from mdnum.report.section import Key, Page, Plot, Role, Section, Series, Table, 
 from mdnum.report.words import count, many, number
 from mdnum.verbs import frame
 from mdnum.verbs.fork_page import size
-from mdnum.verbs.fork_pair import basics, few_steps, logged, of_any, of_md
+from mdnum.verbs.fork_pair import basics, few_steps, of_any, of_md
 from mdnum.verbs.frame import Outcome, Progress, View
 
 if TYPE_CHECKING:
@@ -96,7 +96,7 @@ def fork_map(
     with frame.new_folder("map", f"fork-{system.name}", out, system=system) as folder:
         found = boundaries(
             system, spelled.key, low, high, last, cells=cells, most=most, loss=loss, confirm=confirm,
-            progress=logged(folder, progress),
+            progress=frame.logged(folder, progress, frame.STEPWISE),
         )  # fmt: skip
         edges = [_row(edge) for edge in found.boundaries]
         intervals = plain(found.intervals)
@@ -389,7 +389,7 @@ def fork_forecast(
     if last < 1:
         raise InputError(f"steps = {last}; expected at least 1")
     with frame.new_folder("forecast", f"fork-{loaded.name}", out, system=loaded) as folder:
-        logged(folder, progress)(0, 0, {"phase": "carrying a tangent along"})
+        frame.logged(folder, progress, frame.STEPWISE)(0, 0, {"phase": "carrying a tangent along"})
         found = forecast(simulation, last)
         flips = {"first": found.first(size, _LISTED), "nearest": found.nearest(_LISTED)}
         good = found.good_until(size)

@@ -18,12 +18,10 @@ from mdnum.verbs.frame import Outcome, Progress
 
 if TYPE_CHECKING:
     from mdnum.forks import Fork, Twin
-    from mdnum.store import RunFolder
     from mdnum.systems import BallSystem, System
 
 #: Steps of what makes hundreds of runs, or follows them by hand, unless more are asked for.
 FEW_STEPS = 500
-_LOG_LINES = 50
 #: A tangent is carried for a share of the steps that were followed, but not for fewer nor for more than this:
 #: its step costs as much as six of a run, so it takes a tenth as long as the runs that are compared.
 _SHARE, _FEWEST, _MOST = 0.25, 400, 2_000
@@ -150,23 +148,6 @@ def check(asked: PairQuestion) -> None:
     repeats_asked(asked.repeats, asked.counterfactual)
 
 
-def logged(folder: RunFolder, progress: Progress | None) -> Progress:
-    """Passes progress on, and writes a line of log.txt at each new phase and now and then."""
-    last: tuple[str, float] = ("", -1.0)
-
-    def note(step: int, steps: int, info: dict[str, Any]) -> None:
-        nonlocal last
-        phase, share = str(info.get("phase", "run")), _LOG_LINES * step // steps if steps else 0
-        if (phase, share) != last:
-            unit, last = info.get("unit", "steps"), (phase, share)
-            size = f", separation {info['separation']:.6e}" if "separation" in info else ""
-            folder.log(f"{phase}: {step:,} of {steps:,} {unit}{size}" if steps else phase)
-        if progress is not None:
-            progress(step, steps, info)
-
-    return note
-
-
 # -- a pair of runs, into a folder ---------------------------------------------------------------------
 
 
@@ -193,7 +174,13 @@ def followed(
     options = {name: getattr(asked, name) for name in ("counterfactual", "back", "repeats")}
     counterfactuals(twin, **options)
     with frame.new_folder("fork", f"fork-{system.name}", out, system=system) as folder:
-        made = follow(twin, asked.steps, split=asked.split, progress=logged(folder, progress), **options)
+        made = follow(
+            twin,
+            asked.steps,
+            split=asked.split,
+            progress=frame.logged(folder, progress, frame.STEPWISE),
+            **options,
+        )
         summary = basics(system, asked.steps) | dict(labels) | _numbers(made)
         tables = {"separation": _separation(made, is_ball)}
         if is_ball:

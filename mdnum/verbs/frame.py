@@ -35,6 +35,9 @@ if TYPE_CHECKING:
 #: Called now and then with (done, of how many, {"phase": ..., "unit": ...}); of how many is 0 if not known.
 Progress = Callable[[int, int, dict[str, Any]], None]
 
+#: Lines of log.txt for a phase of a run that is followed step by step.
+STEPWISE = 50
+
 #: The module whose VERBS judge and show a kind of folder.
 KINDS: dict[str, str] = {
     "md": "mdnum.verbs.run",
@@ -208,24 +211,6 @@ def say(progress: Progress | None, phase: str, step: int = 0, steps: int = 0, **
         progress(step, steps, {"phase": phase, **counts})
 
 
-class Log:
-    """Passes progress on, and writes a line of log.txt at each new phase and now and then."""
-
-    def __init__(self, folder: RunFolder, progress: Progress | None):
-        self._folder, self._progress = folder, progress
-        self._last = ("", -1.0)
-
-    def __call__(self, step: int, steps: int, info: dict[str, Any]) -> None:
-        """As a rollout calls it."""
-        phase, share = str(info.get("phase", "run")), 10 * step // steps if steps else 0
-        if (phase, share) != self._last:
-            unit = info.get("unit", "steps")
-            self._folder.log(f"{phase}: {step:,} of {steps:,} {unit}" if steps else phase)
-            self._last = (phase, share)
-        if self._progress is not None:
-            self._progress(step, steps, info)
-
-
 def store(folder: RunFolder, summary: Mapping[str, Any], tables: Mapping[str, Mapping[str, Any]]) -> None:
     """Ends the filling of a folder: its tables, then its summary.
 
@@ -255,15 +240,21 @@ def refuse(given: Mapping[str, bool], whose: str, remedy: str) -> None:
         raise InputError(f"{' and '.join(names)} {what} {whose}", remedy=remedy)
 
 
-def logged(folder: RunFolder, progress: Progress | None) -> Progress:
-    """Passes progress on, and writes a line of log.txt at each new phase and now and then."""
+def logged(folder: RunFolder, progress: Progress | None, lines: int = 10) -> Progress:
+    """Passes progress on, and writes a line of log.txt at each new phase and now and then.
+
+    Args:
+        lines: of a phase that counts its steps, about.
+    """
     last = ("", -1)
 
     def report(step: int, steps: int, info: dict[str, Any]) -> None:
         nonlocal last
-        now = str(info.get("phase", "run")), 10 * step // steps if steps else 0
+        now = str(info.get("phase", "run")), lines * step // steps if steps else 0
         if now != last:
-            folder.log(f"{now[0]}: {step:,} of {steps:,} {info.get('unit', 'steps')}" if steps else now[0])
+            size = f", separation {info['separation']:.6e}" if "separation" in info else ""
+            counted = f": {step:,} of {steps:,} {info.get('unit', 'steps')}{size}" if steps else ""
+            folder.log(now[0] + counted)
             last = now
         if progress is not None:
             progress(step, steps, info)

@@ -17,7 +17,7 @@ from mdnum.report.finding import Finding, Verdict, conclude
 from mdnum.report.words import listed, percent
 from mdnum.store.files import write_bytes
 from mdnum.verbs import frame, grad_page
-from mdnum.verbs.fork_pair import few_steps, is_ball, logged, of_any
+from mdnum.verbs.fork_pair import few_steps, is_ball, of_any
 from mdnum.verbs.frame import Outcome, Progress, Verb, View
 from mdnum.verbs.grad_page import TEXTS, by, closeness, digits_note, digits_of, magnitude, slope
 
@@ -112,7 +112,7 @@ def grad(
         ball = _ball_system(system, of, names, steps, overrides)
         chosen = _ball_methods(asked)
         with frame.new_folder("grad", f"grad-{ball.name}", out, system=ball) as folder:
-            result, summary = _differentiated(ball, chosen, logged(folder, progress))
+            result, summary = _differentiated(ball, chosen, frame.logged(folder, progress, frame.STEPWISE))
             frame.store(folder, {**summary, "seconds": time.perf_counter() - began}, {})
         return frame.finish(folder, report=report, result=result, progress=progress)
 
@@ -120,7 +120,7 @@ def grad(
     problem, names = _problem(md, of, names, steps)
     chosen, left = plan(problem, names, asked, replicas)
     with frame.new_folder("grad", f"grad-{md.name}", out, system=md) as folder:
-        log = logged(folder, progress)
+        log = frame.logged(folder, progress, frame.STEPWISE)
         result = _diagnosed(problem, names, chosen, left, further, replicas, half_step, log)
         summary = _summary(problem, names, result)
         summary["left_out"] = [*_not_run(md, steps, problem, result, replicas, further, half_step), *left]

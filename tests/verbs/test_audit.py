@@ -287,7 +287,8 @@ def test_a_killed_audit_is_resumed_and_ends_as_one_that_was_not(tmp_path, monkey
     write_structure("argon.extxyz", Atoms("Ar3", planted.chain().positions[:3]))
     words = ["audit", "mine.py:Killed", "-s", "argon.extxyz", "--checks", "invariance,forces", "-o"]
     asked = []
-    monkeypatch.setattr(frame.Log, "__call__", lambda self, step, steps, info: asked.append(info["phase"]))
+    note = lambda step, steps, info: asked.append(info["phase"])  # noqa: E731
+    monkeypatch.setattr(frame, "logged", lambda folder, progress: note)
     assert call(*words, "whole") == 0
     expected = json.loads((tmp_path / "whole/summary.json").read_text())
     calls = (tmp_path / "calls").stat().st_size
