@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from mdnum.report.browse import Browse, Column, plain_rows
+from mdnum.report.browse import Browse, Column, flipped
+from mdnum.report.drawing import FIRST, MUTED, SECOND
 from mdnum.report.finding import Texts, Verdict
 from mdnum.report.section import Figure, Key, Mark, Page, Plot, Role, Section, Series, Table, pairs
-from mdnum.report.svg import FIRST, MUTED, SECOND
 from mdnum.report.words import count, many, number
 from mdnum.verbs.frame import View
 
@@ -336,33 +336,18 @@ def _contacts(view: View) -> Iterator[Any]:
         yield TEXTS("no_contacts")
         return
     chosen = np.sort(np.argsort(ratio, kind="stable")[:TABLE_ROWS])
-    columns: list[tuple[np.ndarray, int | None]] = [
-        (rows[name][chosen].astype(int), None) for name in ("step", "ball", "entered")
-    ]
-    columns += [(rows[name][chosen].astype(float), 4) for name in ("height", "margin", "velocity")]
-    columns.append((ratio[chosen].astype(float), 3))
     yield TEXTS("contacts", shown=len(chosen), rows=len(ratio))
-    yield Browse(
-        name="contacts",
-        row_id="contact-rows",
-        label="Search contacts",
-        placeholder="ball 3, step:100..200, entered",
-        columns=(
-            Column(0, "step", kind="count"),
-            Column(1, "ball", kind="count"),
-            Column(2, "decision", kind="word", words=("left", "entered"), colors=("out", "in")),
-            Column(3, "height", "m"),
-            Column(4, "margin", "m"),
-            Column(5, "velocity", "m/s"),
-            Column(6, "margin", "÷ bound", digits=2, missing="∞"),
-        ),
-        rows=plain_rows(columns),
-        words={"entered": (2, 1), "in": (2, 1), "left": (2, 0), "out": (2, 0)},
-        ranges={"step": 0, "ball": 1},
-        subjects=(1,),
-        nouns=("ball",),
-        ambiguous=6,
+    near = {name: values[chosen] for name, values in rows.items()}
+    columns = (
+        Column("step", near["step"], "count"),
+        Column("ball", near["ball"], "count", subject=True),
+        flipped(near["entered"]),
+        Column("height", near["height"], unit="m"),
+        Column("margin", near["margin"], unit="m"),
+        Column("velocity", near["velocity"], unit="m/s"),
+        Column("margin", ratio[chosen], "ratio", "÷ bound", digits=2),
     )
+    yield Browse("contacts", "contacts", "ball 3, step:100..200, entered", columns)
 
 
 def _stop_decisions(view: View) -> Iterator[Any]:
@@ -370,31 +355,17 @@ def _stop_decisions(view: View) -> Iterator[Any]:
     rows = view.table("solver")
     if not len(rows["step"]):
         return
-    near = np.abs(rows["margin"].astype(float))
-    chosen = np.sort(np.argsort(near, kind="stable")[:TABLE_ROWS])
-    codes = np.array([_REASONS.index(word) for word in rows["reason"].astype(str)[chosen].tolist()], int)
-    columns: list[tuple[np.ndarray, int | None]] = [
-        (rows[name][chosen].astype(int), None) for name in ("step", "ball", "iteration")
+    chosen = np.sort(np.argsort(np.abs(rows["margin"].astype(float)), kind="stable")[:TABLE_ROWS])
+    near = {name: values[chosen] for name, values in rows.items()}
+    codes = [_REASONS.index(word) for word in near["reason"].astype(str).tolist()]
+    columns = [
+        Column("step", near["step"], "count"),
+        *[Column("ball", near["ball"], "count")] * bool(np.any(rows["ball"] >= 0)),
+        Column("iteration", near["iteration"], "count"),
+        Column("residual", near["residual"], digits=4),
+        Column("margin", near["margin"], unit="tolerance − residual"),
+        Column("decision", near["stopped"], "word", words=("continued", "stopped"), colors=("out", "in")),
+        Column("ended by", codes, "word", words=_REASONS),
     ]
-    columns += [(rows[name][chosen].astype(float), 5) for name in ("residual", "margin")]
-    columns += [(rows["stopped"][chosen].astype(int), None), (codes, None)]
-    each = bool(np.any(rows["ball"] >= 0))
-    shown = [
-        Column(0, "step", kind="count"), Column(1, "ball", kind="count"),
-        Column(2, "iteration", kind="count"),
-        Column(3, "residual", digits=4), Column(4, "margin", "tolerance − residual", digits=3),
-        Column(5, "decision", kind="word", words=("continued", "stopped"), colors=("out", "in")),
-        Column(6, "ended by", kind="word", words=("", *_REASONS[1:])),
-    ]  # fmt: skip
-    yield TEXTS("stops", shown=len(chosen), rows=len(near))
-    yield Browse(
-        name="stops",
-        row_id="stop-rows",
-        label="Search stop decisions",
-        placeholder="step:100..200, iteration:5.., stopped, cap",
-        columns=tuple(column for column in shown if each or column.at != 1),
-        rows=plain_rows(columns),
-        words={"stopped": (5, 1), "continued": (5, 0), "tolerance": (6, 2), "cap": (6, 3), "fixed": (6, 4),
-               "rest": (6, 6)},
-        ranges={"step": 0, "ball": 1, "iteration": 2},
-    )  # fmt: skip
+    yield TEXTS("stops", shown=len(chosen), rows=len(rows["step"]))
+    yield Browse("stops", "stop decisions", "step:100..200, iteration:5.., stopped, cap", columns)

@@ -19,9 +19,9 @@ from mdnum.references.conformance.case import AREAS
 from mdnum.references.conformance.judge import CODES, DOUBLE, SILENT, SINGLE
 from mdnum.references.conformance.lists import LIMITS, PairList
 from mdnum.references.conformance.results import CaseAnswers, Failed, Report
+from mdnum.report.drawing import BAD, FIRST, MUTED, SECOND
 from mdnum.report.finding import Finding, Texts, Verdict, conclude
 from mdnum.report.section import Code, Figure, Key, Page, Section, Table, pairs
-from mdnum.report.svg import BAD, FIRST, MUTED, SECOND
 from mdnum.report.words import count, listed, many, number
 from mdnum.store import RunFolder, answers, files
 from mdnum.store.files import read_text, write_text

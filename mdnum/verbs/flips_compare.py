@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mdnum.errors import InputError
-from mdnum.report.browse import Browse, Column, plain_rows
+from mdnum.report.browse import Browse, Column
 from mdnum.report.finding import Finding, Texts, Verdict, conclude
 from mdnum.report.section import Key, Page, Plot, Section, Series, Table, pairs
 from mdnum.report.words import count, many, number
@@ -459,31 +459,20 @@ def _differing(shown: _Shown, table: Mapping[str, np.ndarray]) -> Iterator[Any]:
     rows = shown.view.table("differing")
     if not len(rows["i"]):
         return
-    columns: list[tuple[np.ndarray, int | None]] = [
-        (rows[name].astype(int), None) for name in ("frame", "i", "j")
-    ]
-    columns.append(((rows["inside"] == "B").astype(int), None))
-    columns += [(rows[name], 6) for name in ("distance_a", "distance_b", "margin_a", "margin_b")]
-    columns += [(rows[name].astype(int), None) for name in ("ambiguous", "rule")]
     rules, unit = tuple(shown.said.rule(one) for one in shown.summary["rules"]), shown.said.unit
     yield TEXTS("browse")
-    yield Browse(
-        name="pairs", row_id="pair-rows", label="Search pairs",
-        placeholder="3-17, atom 5, frame:100..200, undecidable",
-        columns=(
-            Column(0, "frame", kind="count"),
-            Column(1, "pair", kind="pair"),
-            Column(3, "inside in", kind="word", words=("A only", "B only")),
-            Column(4, "r in A", unit, digits=5),
-            Column(5, "r in B", unit, digits=5),
-            Column(6, "margin in A", unit),
-            Column(7, "margin in B", unit),
-            Column(8, "decided", kind="word", words=("yes", "no")),
-            *((Column(9, "rule", kind="word", words=rules),) if len(rules) > 1 else ()),
-        ),
-        rows=plain_rows(columns), words={"undecidable": (8, 1)}, ranges={"frame": 0}, subjects=(1, 2),
-        nouns=("atom", "pair"),
-    )  # fmt: skip
+    columns = [
+        Column("frame", rows["frame"], "count"),
+        Column("pair", (rows["i"], rows["j"]), "pair"),
+        Column("inside in", rows["inside"] == "B", "word", words=("A only", "B only")),
+        Column("r in A", rows["distance_a"], unit=unit, digits=5),
+        Column("r in B", rows["distance_b"], unit=unit, digits=5),
+        Column("margin in A", rows["margin_a"], unit=unit),
+        Column("margin in B", rows["margin_b"], unit=unit),
+        Column("decided", rows["ambiguous"], "word", words=("yes", "no"), aliases=("", "undecidable")),
+        *[Column("rule", rows["rule"], "word", words=rules)] * (len(rules) > 1),
+    ]
+    yield Browse("pairs", "pairs", "3-17, atom 5, frame:100..200, undecidable", columns)
 
 
 def _input(shown: _Shown, size: str) -> Iterator[tuple[str, str]]:

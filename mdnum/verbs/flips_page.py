@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mdnum.report.browse import Browse, Column, plain_rows
+from mdnum.report.browse import Browse, Column
 from mdnum.report.finding import Finding, Verdict, conclude
 from mdnum.report.section import Key, Page, Plot, Section, Series, Table, pairs
 from mdnum.report.words import count, many, number, percent, plain
@@ -390,28 +390,19 @@ def _busiest(view: View) -> Browse | None:
         return None
     words = np.array([f"{a} – {b}" for a, b in zip(table["first"], table["second"], strict=True)], object)
     ranks = np.concatenate([np.arange(1, n + 1) for n in np.unique(table["rule"], return_counts=True)[1]])
-    columns: list[tuple[np.ndarray, int | None]] = [(ranks, None)]
-    columns += [(table[name].astype(int), None) for name in ("i", "j", "rank", "flips", "inside")]
-    columns += [
-        (table["inside"] / view.summary["frames"], 3),
-        (table["rule"].astype(int), None),
-        (words, None),
-    ]
     names = tuple(one["rule"] for one in rules)
-    return Browse(
-        name="pairs", row_id="pair-rows", label="Search pairs", placeholder="3-17, atom 5",
-        columns=(
-            Column(0, "", kind="count"),
-            *((Column(7, "rule", kind="word", words=names),) if len(rules) > 1 else ()),
-            Column(1, "pair", kind="pair"),
-            *((Column(3, "image", kind="count"),) if table["rank"].any() else ()),
-            Column(8, "of", kind="text"),
-            Column(4, "flips", kind="count"),
-            Column(5, "frames inside", kind="count"),
-            Column(6, "share of frames"),
-        ),
-        rows=plain_rows(columns), subjects=(1, 2), nouns=("atom", "pair"),
-    )  # fmt: skip
+    share = table["inside"] / view.summary["frames"]
+    columns = [
+        Column("", ranks, "count"),
+        *[Column("rule", table["rule"], "word", words=names)] * (len(rules) > 1),
+        Column("pair", (table["i"], table["j"]), "pair"),
+        *[Column("image", table["rank"], "count")] * bool(table["rank"].any()),
+        Column("of", words, "text"),
+        Column("flips", table["flips"], "count"),
+        Column("frames inside", table["inside"], "count"),
+        Column("share of frames", share),
+    ]
+    return Browse("pairs", "pairs", "3-17, atom 5", columns)
 
 
 # ---- figures

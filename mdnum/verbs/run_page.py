@@ -13,12 +13,11 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from mdnum.errors import FolderError
 from mdnum.report import analysis
-from mdnum.report.browse import Browse, Column, plain_rows
-from mdnum.report.drawing import envelope, few_ticks, legend, line
+from mdnum.report.browse import Browse, Column, flipped
+from mdnum.report.drawing import BAD, FIRST, MUTED, SECOND, THIRD, envelope, few_ticks, legend, line
 from mdnum.report.finding import Texts, Verdict
 from mdnum.report.page import in_words
 from mdnum.report.section import Figure, Key, Page, Plot, Section, Series, Table, pairs
-from mdnum.report.svg import BAD, FIRST, MUTED, SECOND, THIRD
 from mdnum.report.words import count, many, number, percent, plain
 
 if TYPE_CHECKING:
@@ -414,40 +413,20 @@ def _nearest(view: View, run: Record) -> Iterator[Any]:
         yield TEXTS("no_flips")
         return
     compare = str(run.cutoff.get("compare", "r2 <"))
-    columns: list[tuple[np.ndarray, int | None]] = [(flips[name], None) for name in ("step", "i", "j")]
-    columns.append((flips["entered"].astype(int), None))
-    for name, digits in (
-        ("distance", 9),
-        ("margin", 4),
-        ("radial_speed", 4),
-        ("energy_jump", 4),
-        ("ratio", 3),
-    ):
-        columns.append((flips[name], digits))
-    rows = plain_rows(columns)
-    yield TEXTS("nearest", shown=len(rows), flips=run.flips.total, compare=compare)
+    yield TEXTS("nearest", shown=len(flips["step"]), flips=run.flips.total, compare=compare)
     yield Browse(
-        name="flips",
-        row_id="flip-rows",
-        label="Search flips",
-        placeholder="atom 17, pair 17-203, step:100..200, entered, ambiguous",
-        columns=(
-            Column(0, "step", kind="count"),
-            Column(1, "pair", kind="pair"),
-            Column(3, "decision", kind="word", words=("left", "entered"), colors=("out", "in")),
-            Column(4, "distance", units.length, kind="fixed", digits=6),
-            Column(5, "margin", compare),
-            Column(6, "radial speed", f"{units.length}/{units.time}"),
-            Column(7, "energy jump", units.energy),
-            Column(8, "margin", "÷ bound", digits=2, missing="∞"),
+        "flips", "flips", "atom 17, pair 17-203, step:100..200, entered, ambiguous",
+        (
+            Column("step", flips["step"], "count"),
+            Column("pair", (flips["i"], flips["j"]), "pair"),
+            flipped(flips["entered"]),
+            Column("distance", flips["distance"], "fixed", units.length, digits=6),
+            Column("margin", flips["margin"], unit=compare),
+            Column("radial speed", flips["radial_speed"], unit=f"{units.length}/{units.time}"),
+            Column("energy jump", flips["energy_jump"], unit=units.energy),
+            Column("margin", flips["ratio"], "ratio", "÷ bound", digits=2),
         ),
-        rows=rows,
-        words={"entered": (3, 1), "in": (3, 1), "left": (3, 0), "out": (3, 0)},
-        ranges={"step": 0},
-        subjects=(1, 2),
-        nouns=("atom", "pair"),
-        ambiguous=8,
-    )
+    )  # fmt: skip
 
 
 def _ase(view: View) -> Iterator[Any]:

@@ -13,7 +13,7 @@ import pytest
 from report.synthetic import TOML, make_run
 
 from mdnum.errors import FolderError
-from mdnum.report import analysis, svg
+from mdnum.report import analysis, drawing
 from mdnum.rollout.summary import LineFit
 from mdnum.store import RunFolder
 from mdnum.verbs import frame
@@ -230,7 +230,7 @@ def test_one_whole_file_that_loads_nothing(html, folder):
 def test_the_page_states_what_the_folder_holds(html, folder, good):
     for text in (TEXTS("notes"), "HARD_CUTOFF", "Liquid argon (Rahman 1964)", "9f1c52d0a7b3e4c8"):
         assert text in html
-    rows = json.loads(re.search(r'id="flip-rows">(.*?)</script>', html, re.DOTALL)[1])
+    rows = json.loads(re.search(r'id="flips-rows">(.*?)</script>', html, re.DOTALL)[1])
     flips = folder.read("flips")
     assert len(rows) == min(TABLE_ROWS, good.extra.flips.total)
     shown = {(step, i, j) for step, i, j, *_ in rows}
@@ -245,9 +245,9 @@ def test_figures_are_files_of_their_own(folder, html):
     for name in names:
         text = (folder.path / "figures" / name).read_text(encoding="utf-8")
         ElementTree.fromstring(text)
-        assert set(re.findall(r"var\(--(\w+)\)", text)) <= set(svg.LIGHT) == set(svg.DARK)
+        assert set(re.findall(r"var\(--(\w+)\)", text)) <= set(drawing.LIGHT) == set(drawing.DARK)
         # a color that no theme knows would vanish on one of the two backgrounds
-        assert set(re.findall(r"#[0-9a-f]{6}\b", text)) <= {*svg.LIGHT.values(), *svg.DARK.values()}
+        assert set(re.findall(r"#[0-9a-f]{6}\b", text)) <= {*drawing.LIGHT.values(), *drawing.DARK.values()}
 
 
 def test_text_from_a_file_is_no_markup(tmp_path):
