@@ -48,18 +48,6 @@ _UNIT = re.compile(r"(?<![\w./])(m?)eV(?![A-Za-z0-9_]|\.\w)|Å(?![A-Za-z0-9_])")
 _ROLES = ("first", "second", "third", "bad", "muted", "ink")
 
 
-class AuditStopped(KeyboardInterrupt):
-    """Somebody pressed control-C after a check was done: what had been found is in the folder.
-
-    Args:
-        outcome: the audit without the checks that were not done.
-    """
-
-    def __init__(self, outcome: Outcome):
-        super().__init__("stopped")
-        self.outcome = outcome
-
-
 def audit(
     calculator: str | Callable[[], Any] | None = None,
     structure: Atoms | str | Path | None = None,
@@ -103,7 +91,7 @@ def audit(
     Raises:
         InputError: no such calculator, structure or check; something that a resumed audit has already.
         FolderError: the folder cannot be used.
-        AuditStopped: a KeyboardInterrupt came after a check was done; what was found till then has been
+        frame.Interrupted: control-C was pressed after a check was done; what was found till then has been
             written, its page included, and is the exception's `outcome`.
     """
     from mdnum.audit.record import AuditState, encoded, kept
@@ -207,7 +195,7 @@ def _ask_all(
         folder, report=report, result={one.name: one for one in state.shown}, progress=progress
     )
     if state.why == "stopped":
-        raise AuditStopped(outcome)
+        raise frame.Interrupted(outcome)
     return outcome
 
 

@@ -17,8 +17,7 @@ from mdnum.store import RunFolder
 from mdnum.store.tables import TableStream
 from mdnum.verbs.flips_page import judge, page
 from mdnum.verbs.flips_shared import about, ending, plain_box, selected, stem
-from mdnum.verbs.frame import Outcome, Progress, Verb, finish, logged, new_folder, store
-from mdnum.verbs.interrupt import asked_to_stop
+from mdnum.verbs.frame import Outcome, Progress, Verb, asked_to_stop, finish, logged, new_folder, store
 
 if TYPE_CHECKING:
     from mdnum.trajectories.follow import Followed, Groups, Pass

@@ -20,8 +20,7 @@ from mdnum.trajectories.follow import atoms_of
 from mdnum.trajectories.resolution import infer
 from mdnum.trajectories.tracker import Tracker
 from mdnum.verbs.flips_shared import Written, about, ending, name_of, resolution, selected, stem
-from mdnum.verbs.frame import Outcome, Progress, Verb, View, finish, logged, new_folder, store
-from mdnum.verbs.interrupt import asked_to_stop
+from mdnum.verbs.frame import Outcome, Progress, Verb, View, asked_to_stop, finish, logged, new_folder, store
 
 if TYPE_CHECKING:
     from mdnum.trajectories.rules import Rule

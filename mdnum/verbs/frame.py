@@ -12,6 +12,8 @@ goes into the folder first: judge and page read the folder alone, so a page can 
 from __future__ import annotations
 
 import importlib
+import signal
+import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -134,6 +136,41 @@ class Outcome:
     verdict: Verdict
     page: Page
     result: Any = None
+
+
+class Interrupted(KeyboardInterrupt):
+    """Somebody pressed control-C where there was an answer already, which is in its folder.
+
+    Args:
+        outcome: that answer.
+    """
+
+    def __init__(self, outcome: Outcome):
+        super().__init__("stopped")
+        self.outcome = outcome
+
+
+@contextmanager
+def asked_to_stop() -> Iterator[Callable[[], bool]]:
+    """Control-C as a wish: whether it was pressed since; pressed again, it interrupts as it always does.
+
+    Outside of the main thread, where Python hands no signals over, nobody ever asks.
+    """
+    asked = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield asked.is_set
+        return
+    before = signal.getsignal(signal.SIGINT)
+
+    def ask(number: int, frame: Any) -> None:
+        signal.signal(signal.SIGINT, before)
+        asked.set()
+
+    signal.signal(signal.SIGINT, ask)
+    try:
+        yield asked.is_set
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @contextmanager
