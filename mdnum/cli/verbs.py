@@ -367,7 +367,7 @@ def doctor(as_json: bool = output.JSON_OPTION) -> int:
 
     diagnosis = diagnose()
     if as_json:
-        output.print_json(diagnosis.to_dict())
+        output.print_json({"ok": diagnosis.ok, **vars(diagnosis)})
     else:
         rows = [(row.status, row.name, row.seen) for row in diagnosis.rows]
         output.print_table("", ("status", "test", "seen"), rows)

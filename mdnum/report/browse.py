@@ -50,7 +50,7 @@ class Column:
 
     @property
     def plain(self) -> list[list[Any]]:
-        """Lists of plain values, numbers with no more digits than are shown; None for what is not finite."""
+        """Lists of plain values, None for what is not finite."""
         if self.kind == "pair":
             return [np.asarray(values).astype(int).tolist() for values in self.values]
         values = np.asarray(self.values)
@@ -58,7 +58,8 @@ class Column:
             return [values.astype(int).tolist()]
         if self.kind == "text":
             return [values.tolist()]
-        kept = self.digits + (3 if self.kind == "fixed" else 1)
+        # more digits than are shown, so that rounding twice shows as rounding once
+        kept = self.digits + 3
         return [[float(f"{x:.{kept}g}") if np.isfinite(x) else None for x in values.astype(float).tolist()]]
 
     def text(self, row: Sequence[Any], at: int) -> str:

@@ -279,14 +279,13 @@ def _ledger(view: View) -> Iterator[Finding]:
     flips = int(series["entered"].sum(dtype=np.int64) + series["left"].sum(dtype=np.int64))
     order = np.lexsort((contacts["step"], contacts["ball"]))
     ball, entered = contacts["ball"][order], contacts["entered"][order].astype(bool)
-    section = "Contacts"
     if wrong.any():
         step = int(series["step"][np.argmax(wrong)])
-        yield TEXTS.finding("LEDGER_INCOMPLETE", "balance", step=step, section=section)
+        yield TEXTS.finding("LEDGER_INCOMPLETE", "balance", step=step)
     elif flips != len(ball):
-        yield TEXTS.finding("LEDGER_INCOMPLETE", "rows", flips=flips, rows=len(ball), section=section)
+        yield TEXTS.finding("LEDGER_INCOMPLETE", "rows", flips=flips, rows=len(ball))
     elif np.any((ball[1:] == ball[:-1]) & (entered[1:] == entered[:-1])):
-        yield TEXTS.finding("LEDGER_INCOMPLETE", "twice", section=section)
+        yield TEXTS.finding("LEDGER_INCOMPLETE", "twice")
 
 
 def _finite_gradient(view: View) -> Iterator[Finding]:
@@ -297,7 +296,7 @@ def _finite_gradient(view: View) -> Iterator[Finding]:
         if value is None or not np.isfinite(value)
     ]
     if found:
-        yield TEXTS.finding("GRADIENT_NOT_FINITE", which=listed(found), section="Gradient")
+        yield TEXTS.finding("GRADIENT_NOT_FINITE", which=listed(found))
 
 
 def _independent(view: View) -> Iterator[Finding]:
@@ -318,7 +317,6 @@ def _independent(view: View) -> Iterator[Finding]:
         names = listed(list(dict.fromkeys(name for names in places.values() for name in names)))
         finding = TEXTS.finding(
             "LOSS_INDEPENDENT", *variants, names=names, places=listed(list(places)), told=told,
-            section="Gradient",
         )  # fmt: skip
         yield finding
     zero: dict[str, list[str]] = {}
@@ -327,22 +325,21 @@ def _independent(view: View) -> Iterator[Finding]:
             if value == 0 and (made.get("depends") or {}).get(name, True):
                 zero.setdefault(name, []).append(made["method"])
     for name, methods in zero.items():
-        yield TEXTS.finding("ZERO_GRADIENT", name=name, methods=listed(methods), section="Gradient")
+        yield TEXTS.finding("ZERO_GRADIENT", name=name, methods=listed(methods))
 
 
 def _ambiguous(view: View) -> Iterator[Finding]:
-    section = "Margins of decisions"
     if contacts := view.summary["ambiguous_contacts"]:
-        yield TEXTS.finding("AMBIGUOUS_CONTACTS", contacts=contacts, section=section)
+        yield TEXTS.finding("AMBIGUOUS_CONTACTS", contacts=contacts)
     if stops := view.summary["ambiguous_stops"]:
-        yield TEXTS.finding("AMBIGUOUS_STOPS", stops=stops, section=section)
+        yield TEXTS.finding("AMBIGUOUS_STOPS", stops=stops)
 
 
 def _cap(view: View) -> Iterator[Finding]:
     solves = ended(view)
     if capped := solves.get("cap", 0):
         yield TEXTS.finding(
-            "SOLVER_CAP", section="Iterations per step", capped=capped, solves=sum(solves.values()),
+            "SOLVER_CAP", capped=capped, solves=sum(solves.values()),
             step=first_step(view, "cap"), cap=(view.system.get("stop") or {}).get("max_iter", 0),
         )  # fmt: skip
 
@@ -379,13 +376,12 @@ def _disagree(view: View) -> Iterator[Finding]:
         ]
         known = any(name in exact for name in apart)
         yield TEXTS.finding(
-            "METHODS_DISAGREE", *(["right"] if right else ["none"] if known else []), section="Gradient",
+            "METHODS_DISAGREE", *(["right"] if right else ["none"] if known else []),
             names=listed([f"dloss/d{name}" for name in apart]), told=told(apart),
             right=listed(right) if right else "",
         )  # fmt: skip
     if off:
-        section = "Against the closed form"
-        yield TEXTS.finding("OFF_CLOSED_FORM", names=listed(off), told=told(off), section=section)
+        yield TEXTS.finding("OFF_CLOSED_FORM", names=listed(off), told=told(off))
 
 
 def _forks(view: View) -> Iterator[Finding]:
@@ -411,7 +407,7 @@ def _forks(view: View) -> Iterator[Finding]:
         words = ["precision"] * precise + ["others"] * (len(group) > _NAMED)
         words += ["moved"] * (precise and any(map(moved, group)))
         values: dict[str, Any] = {"variants": len(group), "told": told, "others": len(group) - _NAMED}
-        yield TEXTS.finding("FORKED", *words, section="Variants", **values)
+        yield TEXTS.finding("FORKED", *words, **values)
 
 
 def _iterations(view: View) -> Iterator[Finding]:
@@ -421,23 +417,23 @@ def _iterations(view: View) -> Iterator[Finding]:
             [TEXTS("differs_at", name=one["name"], steps=one["iterations_differ"]) for one in found]
         )
         counted = "impacts" if located(view) else "iterations"
-        yield TEXTS.finding("ITERATIONS_DIFFER", counted=counted, told=told, section="Variants")
+        yield TEXTS.finding("ITERATIONS_DIFFER", counted=counted, told=told)
 
 
 def _resting(view: View) -> Iterator[Finding]:
-    series, section = view.table("steps"), "Heights and contacts"
+    series = view.table("steps")
     if ended(view).get("rest"):
         step = first_step(view, "rest")
         rest = (view.summary["exact"] or {}).get("rest_time")
         words = ["exact"] * (rest is not None)
         time = float(time_of(view, np.array(step)))
-        yield TEXTS.finding("RESTING", *words, step=step, time=time, rest=rest, section=section)
+        yield TEXTS.finding("RESTING", *words, step=step, time=time, rest=rest)
         return
     off = series["contacts"] < view.summary["balls"]
     last = int(np.flatnonzero(off)[-1]) + 1 if off.any() else 0
     if len(off) - last > max(10, 0.05 * view.summary["steps"]):
         since = int(series["step"][last])
-        yield TEXTS.finding("RESTING", "floor", step=since, section=section)
+        yield TEXTS.finding("RESTING", "floor", step=since)
 
 
 VERBS = {"ball": Verb(judge, page)}

@@ -401,7 +401,7 @@ def _failures(summary: Mapping[str, Any]) -> Iterator[Finding]:
         ends = any("exit" in row["text"].lower() for row in rows)
         variants = ["rounding"] * rounding + ["exit"] * ends
         yield TEXTS.finding(
-            code, *variants, seen=seen, **values, section="Failures, reproduced", cause=cause
+            code, *variants, seen=seen, **values, cause=cause
         )  # fmt: skip
 
 
@@ -409,11 +409,11 @@ def _conduct(summary: Mapping[str, Any], answered: int) -> Iterator[Finding]:
     """What is nobody's mistake and good to know."""
     ties = summary["ties"]
     if ties["counted"] and ties["not_counted"]:
-        yield TEXTS.finding("TIES", **ties, section="Conventions")
+        yield TEXTS.finding("TIES", **ties)
     if "float32" in summary["found_out"]:
-        yield TEXTS.finding("SINGLE_PRECISION", case=summary["single"], section="Conventions")
+        yield TEXTS.finding("SINGLE_PRECISION", case=summary["single"])
     if summary["keeps_order"] is False:
-        yield TEXTS.finding("ORDER", section="Conventions")
+        yield TEXTS.finding("ORDER")
     if summary["aliased"] is not None:
         yield TEXTS.finding("ALIASED", case=summary["aliased"])
     for refusal in summary["refusals"]:
@@ -424,11 +424,11 @@ def _conduct(summary: Mapping[str, Any], answered: int) -> Iterator[Finding]:
         (row, one) for row in summary["areas"] for one in row["why"] if row["refused"] and ": " in one["why"]
     ]
     often = max(reasons, key=lambda each: each[1]["cases"], default=({"area": ""}, {"why": ""}))
-    total, section = _total(summary, "refused"), "Cases by what they are about"
+    total = _total(summary, "refused")
     values = {"refused": total, "exception": often[1]["why"].rstrip(". "), "area": often[0]["area"]}
     if not answered:
         variants = ["time"] * (not summary["asked"]) + ["first"] * bool(reasons)
-        yield TEXTS.finding("NOTHING_ANSWERED", *variants, **values, section=section)
+        yield TEXTS.finding("NOTHING_ANSWERED", *variants, **values)
     elif reasons:
         others = [one for one in summary["refusals"] if one["answers"]]
         also = " ".join(
@@ -436,7 +436,7 @@ def _conduct(summary: Mapping[str, Any], answered: int) -> Iterator[Finding]:
             for one in others
         )  # fmt: skip
         variants = ["many"] * (total > 0.2 * summary["asked"]) + ["also"] * bool(also)
-        yield TEXTS.finding("REFUSES", *variants, **values, also=also, section=section)
+        yield TEXTS.finding("REFUSES", *variants, **values, also=also)
 
 
 def page(view: View, verdict: Verdict) -> Page:

@@ -315,7 +315,7 @@ def _findings(shown: _Shown) -> Iterator[Finding]:
         made = []
         for one in unsure:
             variants = ["minor"] * (not shown.certain) + ["never"] * (one["certain"] is None)
-            made.append(TEXTS.finding("WITHIN_RESOLUTION", *variants, section="Rules", **shown.values(one)))
+            made.append(TEXTS.finding("WITHIN_RESOLUTION", *variants, **shown.values(one)))
         text = " ".join([*(one.text for one in made), TEXTS.entries["WITHIN_RESOLUTION"]["why"]])
         yield replace(made[0], text=text)
     boxes, beyond = summary["other_box"], summary["beyond"]

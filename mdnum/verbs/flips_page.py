@@ -100,7 +100,7 @@ def _of_rules(view: View, said: Written) -> Iterator[Finding]:
     by_code: dict[str, list[Finding]] = {}
     for place, one in enumerate(view.summary["rules"]):
         for code, variants, values in _limits(view, said, place, one):
-            section = _title(_SECTIONS[code], view, said, one)
+            section = _title(TEXTS.entries[code].get("section", ""), view, said, one)
             made = TEXTS.finding(code, *variants, section=section, rule=said.rule(one), **values)
             by_code.setdefault(code, []).append(made)
     for code, several in by_code.items():
@@ -205,12 +205,6 @@ def _others(view: View, said: Written) -> Iterator[Finding]:
 
 
 # ---- sections
-
-_SECTIONS = {
-    "EVENT_ALGEBRA": "Pairs and flips", "UNDECIDABLE": "Pairs and flips", "IMAGES": "Pairs and flips",
-    "FRAMES_FAR_APART": "Between the frames", "BETWEEN_FRAMES": "Between the frames",
-    "FLUX": "Between the frames", "CHATTER": "Between the frames", "CENSORED": "How long contacts last",
-}  # fmt: skip
 
 
 def _title(title: str, view: View, said: Written, one: Rule) -> str:

@@ -169,23 +169,22 @@ def _status(view: View, run: Record) -> Iterator[Finding]:
 
 def _lists(view: View, run: Record) -> Iterator[Finding]:
     lost, dangerous = run.total("lost_pairs"), run.total("dangerous_builds", "dangerous")
-    section = "List health"
     if lost:
         firsts = run.epochs["first_lost_step"]
         since = int(firsts[firsts >= 0].min()) if np.any(firsts >= 0) else None
         rebuild = (view.system.get("neighbors") or {}).get("rebuild") or {}
         variants = ["since"] * (since is not None) + ["blind"] * (rebuild.get("check") is False)
         yield TEXTS.finding(
-            "LOST_PAIRS", *variants, section=section, lost=lost, pair_steps=run.total("lost_pair_steps"),
-            since=since, every=rebuild.get("every", 1),
+            "LOST_PAIRS", *variants, lost=lost, pair_steps=run.total("lost_pair_steps"), since=since,
+            every=rebuild.get("every", 1),
         )  # fmt: skip
     # a list that is known to have lost pairs disagrees with the next one for that reason
     elif mismatches := view.summary.get("count_mismatches"):
-        yield TEXTS.finding("LISTS_DISAGREE", section=section, mismatches=mismatches)
+        yield TEXTS.finding("LISTS_DISAGREE", mismatches=mismatches)
     if dangerous:
         overdrawn = float(np.max(-run.epochs["margin"][run.epochs["dangerous"]], initial=0.0))
         yield TEXTS.finding(
-            "DANGEROUS_BUILDS", "lost" if lost else "sound", section=section, dangerous=dangerous,
+            "DANGEROUS_BUILDS", "lost" if lost else "sound", dangerous=dangerous,
             lists=len(run.epochs["epoch"]), overdrawn=overdrawn, unit=view.units.length,
         )  # fmt: skip
 
@@ -197,7 +196,7 @@ def _ledger(view: View, run: Record) -> Iterator[Finding]:
         yield TEXTS.finding("EVENT_ALGEBRA", *lost, step=run.step(wrong[0]), steps=len(wrong))
     counted = int(run.series["entered"].sum(dtype=np.int64) + run.series["left"].sum(dtype=np.int64))
     wrong = np.flatnonzero(~run.flips.matches(run.series))
-    values = {"counted": counted, "listed": run.flips.total, "section": "Flips"}
+    values = {"counted": counted, "listed": run.flips.total}
     if counted != run.flips.total:
         yield TEXTS.finding("LEDGER_INCOMPLETE", **values)
     elif len(wrong):
@@ -214,17 +213,17 @@ def _energy(view: View, run: Record) -> Iterator[Finding]:
     variants = ["lost"] * bool(run.total("lost_pairs")) + ["jump"] * bool(run.jump and len(moves))
     worst = int(np.argmax(moves)) if len(moves) else 0
     yield TEXTS.finding(
-        "BUDGET_OPEN", *variants, section="Energy and its budget", residual=residual(view, run),
+        "BUDGET_OPEN", *variants, residual=residual(view, run),
         unit=view.units.energy, tolerance=view.summary.get("energy_budget_tolerance"), jump=abs(run.jump),
         largest=float(moves[worst]) if len(moves) else None, step=run.step(worst + 1) if len(moves) else None,
     )  # fmt: skip
 
 
 def _ase(view: View) -> Iterator[Finding]:
-    ase, section = view.summary.get("ase") or {}, "Agreement with ASE"
+    ase = view.summary.get("ase") or {}
     if ase.get("ok") is False:
         yield TEXTS.finding(
-            "ASE_DISAGREES", section=section, energy=ase.get("energy_rel"), force=ase.get("force_max"),
+            "ASE_DISAGREES", energy=ase.get("energy_rel"), force=ase.get("force_max"),
             scale=ase.get("force_scale"), unit=f"{view.units.energy}/{view.units.length}",
         )  # fmt: skip
     elif ase.get("ok") is None:
@@ -238,17 +237,14 @@ def _decisions(view: View, run: Record) -> Iterator[Finding]:
         yield TEXTS.finding("TIE_AT_CUTOFF", margin=margin)
     ambiguous = view.summary.get("ambiguous") or int(run.series["ambiguous"].sum(dtype=np.int64))
     if ambiguous:
-        yield TEXTS.finding(
-            "AMBIGUOUS_DECISIONS", section="Margins in units of rounding", ambiguous=ambiguous,
-            expected=run.expected_ambiguous,
-        )  # fmt: skip
+        yield TEXTS.finding("AMBIGUOUS_DECISIONS", ambiguous=ambiguous, expected=run.expected_ambiguous)
     undone = run.flips.stays.undone_within(CHATTER_STEPS)
     # a handful of flips says nothing about the cutoff
     if run.flips.total >= 20 and undone >= CHATTER_SHARE * run.flips.total:
         busiest = run.flips.busiest
         smooth = not run.jump and not run.cutoff.get("force_jump")
         yield TEXTS.finding(
-            "CHATTER", *["smooth"] * smooth, section="Chatter and residence", undone=undone,
+            "CHATTER", *["smooth"] * smooth, undone=undone,
             flips=run.flips.total, share=undone / run.flips.total, within=CHATTER_STEPS,
             pair=f"{busiest.i[0]}–{busiest.j[0]}", times=int(busiest.flips[0]),
         )  # fmt: skip
@@ -273,7 +269,7 @@ def _drift(view: View, run: Record) -> Iterator[Finding]:
         moved = abs(float(drift)) * span
         if moved >= DRIFT_SHARE * thermal:
             yield TEXTS.finding(
-                "DRIFT", *["jump"] * bool(run.cutoff.get("force_jump")), section="Energy and its budget",
+                "DRIFT", *["jump"] * bool(run.cutoff.get("force_jump")),
                 drift=float(drift), moved=moved, share=moved / thermal, time=span, energy=units.energy,
                 time_unit=units.time,
             )  # fmt: skip
@@ -282,9 +278,7 @@ def _drift(view: View, run: Record) -> Iterator[Finding]:
         low, high = min(float(moves.min()), 0.0), max(float(moves.max()), 0.0)
         share = (high - low) / (atoms * thermal)
         if share >= DRIFT_SHARE:
-            yield TEXTS.finding(
-                "WANDER", section="Energy and its budget", low=low, high=high, share=share, unit=units.energy
-            )
+            yield TEXTS.finding("WANDER", low=low, high=high, share=share, unit=units.energy)
 
 
 def _cutoff(view: View, run: Record) -> Iterator[Finding]:
