@@ -63,12 +63,10 @@ class View:
     Attributes:
         folder: on disk.
         summary: as written, without what was judged.
-        extra: what the verb's own `load` made of its tables, None without one.
     """
 
     folder: RunFolder
     summary: Mapping[str, Any]
-    extra: Any = None
     _tables: dict[str, Mapping[str, np.ndarray]] = field(default_factory=dict, repr=False)
 
     @property
@@ -110,13 +108,13 @@ class Verb:
     Attributes:
         judge: findings and headline, from the folder alone.
         page: everything else that is shown.
-        load: reads what both need once; default nothing beyond the summary.
+        view: how they read the folder.
         unfinished: whether a folder without a summary can be judged (a run that was killed can).
     """
 
-    judge: Callable[[View], Verdict]
-    page: Callable[[View, Verdict], Page]
-    load: Callable[[RunFolder], Any] | None = None
+    judge: Callable[[Any], Verdict]
+    page: Callable[[Any, Verdict], Page]
+    view: type[View] = View
     unfinished: bool = False
 
 
@@ -226,7 +224,7 @@ def finish(
                 remedy=folder.again,
                 where=str(folder.path),
             )
-        view = View(folder, summary, verb.load(folder) if verb.load is not None else None)
+        view = verb.view(folder, summary)
         verdict = verb.judge(view)
         judged = verdict.store(folder, summary)
         page = verb.page(view, verdict)
