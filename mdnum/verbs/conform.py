@@ -447,17 +447,7 @@ def page(view: View, verdict: Verdict) -> Page:
 
 def _tables(summary: Mapping[str, Any]) -> Iterator[Table]:
     """A row for each area: of lists at one moment, and of lists in use."""
-    columns = (
-        "area",
-        "asked",
-        "right",
-        "wrong",
-        "no answer",
-        "refused",
-        "not asked",
-        "about",
-        "not answered",
-    )
+    counts = ("asked", "right", "wrong", "no answer", "refused", "not asked")
     for title, used in (("a list asked once", False), ("a list in use", True)):
         rows = [
             (
