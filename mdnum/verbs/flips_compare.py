@@ -19,8 +19,8 @@ from mdnum.trajectories.compare import ComparedSide, NeighborSets, follow_both, 
 from mdnum.trajectories.follow import atoms_of
 from mdnum.trajectories.resolution import infer
 from mdnum.trajectories.tracker import Tracker
-from mdnum.verbs.flips_shared import FlipsView, about, ending, name_of, resolution, selected, stem
-from mdnum.verbs.frame import Outcome, Progress, Verb, asked_to_stop, finish, logged, new_folder, store
+from mdnum.verbs.flips_shared import FlipsView, HeldRows, about, ending, name_of, resolution, selected, stem
+from mdnum.verbs.frame import Outcome, Progress, Verb, finish, logged, new_folder, store
 
 if TYPE_CHECKING:
     from mdnum.trajectories.rules import Rule
@@ -63,25 +63,14 @@ def compare(
         ])
         for rule in asked
     ]  # fmt: skip
-    held: list[tuple[str, dict[str, Any]]] = []
-    passes = follow_both(sets, atoms_of(groups), lambda table, rows: held.append((table, rows)))
+    rows = HeldRows()
+    passes = follow_both(sets, atoms_of(groups), rows.add)
     # no folder for files whose first frames cannot be used
-    found, interrupted = next(passes), False
+    found = next(passes)
     with new_folder("flips-compare", f"flips-{stem(a)}", out) as folder:
         log = logged(folder, progress)
         total = min((one.count for one in (a, b) if one.count is not None), default=0)
-        with asked_to_stop() as stop:
-            while True:
-                for table, rows in held:
-                    folder.append(table, rows)
-                held.clear()
-                folder.checkpoint({"frames": found.frames})
-                log(found.frames, total, {"phase": "run", "unit": "frames"})
-                if interrupted := stop():
-                    break
-                if next(passes, None) is None:
-                    break
-        folder.checkpoint({"frames": found.frames}, force=True)
+        interrupted = rows.drain(folder, passes, found, total, log)
         table = folder.read("apart")
         told = [
             {

@@ -179,7 +179,7 @@ def test_a_folder_of_the_ball_is_complete_and_its_own(three: Outcome):
     assert [variant.name for variant in again.variants] == ["stop.rule=per-instance"]
     with pytest.raises(FolderError, match="already holds a run"):
         bounce("ball/drop", out=three.folder)
-    with pytest.raises(InputError, match=r"run of the ball.*Run it again with `mdnum ball"):
+    with pytest.raises(InputError, match="is the folder of `mdnum ball`"):
         run(None, resume=three.folder)
 
 
@@ -338,7 +338,7 @@ def test_every_planted_defect_is_found_and_nothing_else(good: BallView):
     own, exact = good.summary["gradient"][0], {"height_error": 1e-9, "height_error_largest": 1e-9}
     contacts, series = good.table("contacts"), {k: v.copy() for k, v in good.table("steps").items()}
     short = {name: values[1:] for name, values in contacts.items()}
-    planted: dict[str, View] = {
+    planted: dict[str, BallView] = {
         "NOT_FINITE": altered(good, not_finite=17, status="failed"),
         "LEDGER_INCOMPLETE": altered(good, {"contacts": short, "steps": series}),
         "GRADIENT_NOT_FINITE": altered(good, gradient=[made("unrolled", {"k": None})]),
