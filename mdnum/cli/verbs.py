@@ -349,8 +349,7 @@ def _lists(as_json: bool) -> int:
 
 @app.command()
 def report(
-    folder: Path = typer.Argument(metavar="DIR", help="A run folder."),
-    as_json: bool = output.JSON_OPTION,
+    folder: Path = typer.Argument(metavar="DIR", help="A run folder."), as_json: bool = output.JSON_OPTION
 ) -> int:
     """Write the report of a run folder again."""
     from mdnum.verbs import frame
@@ -398,9 +397,7 @@ def list_systems(as_json: bool = output.JSON_OPTION) -> int:
 
 @systems.command()
 def show(
-    system: str = _SYSTEM,
-    settings: list[str] | None = output.SET_OPTION,
-    as_json: bool = output.JSON_OPTION,
+    system: str = _SYSTEM, settings: list[str] | None = output.SET_OPTION, as_json: bool = output.JSON_OPTION
 ) -> int:
     """Print a system file with every default filled in."""
     text = _load(system, settings).to_toml(beside=False)
@@ -409,9 +406,7 @@ def show(
 
 @systems.command("check")
 def check_system(
-    system: str = _SYSTEM,
-    settings: list[str] | None = output.SET_OPTION,
-    as_json: bool = output.JSON_OPTION,
+    system: str = _SYSTEM, settings: list[str] | None = output.SET_OPTION, as_json: bool = output.JSON_OPTION
 ) -> int:
     """Read a system file and its structure, and say whether it can be run."""
     loaded = _load(system, settings)

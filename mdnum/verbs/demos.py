@@ -87,11 +87,7 @@ def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> 
 
 
 def demonstrate(
-    name: str,
-    *,
-    out: str | Path | None = None,
-    report: bool = True,
-    progress: Progress | None = None,
+    name: str, *, out: str | Path | None = None, report: bool = True, progress: Progress | None = None
 ) -> Outcome:
     """Run a demonstration, or all of them.
 

@@ -364,11 +364,7 @@ def _rules(view: ComparisonView) -> Table:
     for one in view.summary["rules"]:
         first = one["first"] or {}
         rows.append(
-            (
-                view.rule(one),
-                *(first.get(name) for name in ("frame", "pairs", "ambiguous")),
-                one["certain"],
-            )
+            (view.rule(one), *(first.get(name) for name in ("frame", "pairs", "ambiguous")), one["certain"])
         )
     return Table(columns, rows)
 
@@ -386,9 +382,7 @@ def _first_pairs(view: ComparisonView) -> Iterator[Table]:
         ]  # fmt: skip
         if rows:
             yield Table(
-                columns,
-                rows,
-                f"{view.rule(one)}: the first pairs to differ, {view.values(one)['first']}",
+                columns, rows, f"{view.rule(one)}: the first pairs to differ, {view.values(one)['first']}"
             )
 
 

@@ -185,10 +185,7 @@ def test_a_folder_of_the_ball_is_complete_and_its_own(three: Outcome):
 
 def test_a_rule_per_ball_records_each_ball(file: Path, tmp_path: Path):
     made = bounce(
-        file,
-        out=tmp_path / "own",
-        overrides={"stop.rule": "per-instance", "gradient.of": []},
-        report=False,
+        file, out=tmp_path / "own", overrides={"stop.rule": "per-instance", "gradient.of": []}, report=False
     )
     solver = RunFolder.open(made.folder).read("solver")
     counts = made.result.iterations
