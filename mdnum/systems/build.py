@@ -215,15 +215,7 @@ class Simulation:
         positions: Float[np.ndarray, "atoms 3"] | None = None,
         cell: Float[np.ndarray, "3 3"] | None = None,
     ) -> Evaluation:
-        """Energy, forces, stress and pairs of one configuration, with a list of its own.
-
-        Args:
-            positions: length; default the structure's.
-            cell: lattice vectors as rows; default the system's.
-
-        Raises:
-            InputError: the cutoff exceeds half the smallest perpendicular width.
-        """
+        """As `Evaluator`, for one configuration, with a list of its own."""
         return Evaluator(self, skin=0.0)(positions, cell)
 
     def energy(self, positions: Float[np.ndarray, "atoms 3"] | None = None) -> float:
@@ -273,9 +265,8 @@ def _many_body_model(system: System):
     a, b, c = (bool(flag) for flag in system.atoms.pbc)
     pbc = (a, b, c)
     if isinstance(potential, schema.EmbeddedAtomTable):
-        return embedded_atom.embedded_atom(
-            system.folder / potential.file, system.atoms.get_chemical_symbols(), pbc
-        )
+        symbols = system.atoms.get_chemical_symbols()
+        return embedded_atom.embedded_atom(system.folder / potential.file, symbols, pbc)
     if isinstance(potential, schema.TersoffTable):
         return manybody.tersoff(potential.parameters, pbc)
     assert isinstance(potential, schema.StillingerWeberTable)
@@ -330,15 +321,11 @@ def build(system: System | str, overrides: Mapping[str, Any] | None = None) -> S
     rebuild = spec.neighbors.rebuild
     builder = spec.neighbors.builder
     timestep = jnp.asarray(spec.dynamics.timestep * units.time_factor, jnp.float64)
+    integrator: Integrator = VelocityVerlet(timestep)
     if isinstance(spec.dynamics, schema.LangevinTable):
-        integrator: Integrator = Langevin(
-            timestep,
-            jnp.asarray(spec.dynamics.friction / units.time_factor, jnp.float64),
-            jnp.asarray(units.k_B * spec.dynamics.temperature, jnp.float64),
-            jax.random.key(spec.dynamics.seed),
-        )
-    else:
-        integrator = VelocityVerlet(timestep)
+        friction = jnp.asarray(spec.dynamics.friction / units.time_factor, jnp.float64)
+        kT = jnp.asarray(units.k_B * spec.dynamics.temperature, jnp.float64)
+        integrator = Langevin(timestep, friction, kT, jax.random.key(spec.dynamics.seed))
     simulation = Simulation(
         system,
         cell,
