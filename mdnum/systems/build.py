@@ -18,8 +18,7 @@ from mdnum.md.cell import Cell, displacement, wrap_positions
 from mdnum.md.cutoffs import CUTOFFS, Cutoff
 from mdnum.md.decide import PairDecider, Tables
 from mdnum.md.integrators import Integrator, Langevin, VelocityVerlet
-from mdnum.md.lattice import Lattice, LatticeDecider, LatticeStep, on_lattice
-from mdnum.md.latticeforce import LatticeForce
+from mdnum.md.lattice import Lattice, LatticeDecider, LatticeForce, LatticeStep, on_lattice
 from mdnum.md.neighbors import BUILDERS, SLOTS, PairTable, RebuildRule, VerletList, check_radius
 from mdnum.md.pairforce import ManyBodyForce, PairForce
 from mdnum.md.potentials import POTENTIALS, CutPotential, pair_type
@@ -259,14 +258,14 @@ def _pair_model(system: System) -> CutPotential:
 
 
 def _many_body_model(system: System):
-    from mdnum.md import embedded_atom, manybody
+    from mdnum.md import manybody
 
     potential = system.spec.potential
     a, b, c = (bool(flag) for flag in system.atoms.pbc)
     pbc = (a, b, c)
     if isinstance(potential, schema.EmbeddedAtomTable):
         symbols = system.atoms.get_chemical_symbols()
-        return embedded_atom.embedded_atom(system.folder / potential.file, symbols, pbc)
+        return manybody.embedded_atom(system.folder / potential.file, symbols, pbc)
     if isinstance(potential, schema.TersoffTable):
         return manybody.tersoff(potential.parameters, pbc)
     assert isinstance(potential, schema.StillingerWeberTable)
