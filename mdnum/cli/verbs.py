@@ -327,7 +327,7 @@ def conform(
 
 def _lists(as_json: bool) -> int:
     """The lists that have a name."""
-    from mdnum.references.conformance.loading import known
+    from mdnum.references.conformance.peers import known
 
     rows = [
         {"list": one.name, "version": one.version, "kept": one.kept, "what": one.description}

@@ -20,8 +20,8 @@ from mdnum.verbs.frame import Outcome, Progress, Verb
 if TYPE_CHECKING:
     from mdnum.ball.problem import BallProblem
     from mdnum.ball.rollout import BallRun
-    from mdnum.systems.ball_system import BallSystem
     from mdnum.systems.build_ball import BallSimulation
+    from mdnum.systems.load import BallSystem
 
 #: Balls times steps of which every state is kept, and residuals of stop decisions kept.
 _STATES, _RESIDUALS = 20_000_000, 5_000_000
@@ -205,7 +205,7 @@ def judge(view: BallView) -> Verdict:
     summary = view.summary
     rules = (
         _finite, _ledger, _finite_gradient, _independent, _ambiguous, _cap, _disagree, _forks, _iterations,
-        _resting,
+        _resting, _remarks,
     )  # fmt: skip
     found = [finding for rule in rules for finding in rule(view)]
     sizes = {"balls": summary["balls"], "steps": summary["steps"]}
@@ -399,6 +399,14 @@ def _iterations(view: BallView) -> Iterator[Finding]:
         )
         counted = "impacts" if view.located else "iterations"
         yield TEXTS.finding("ITERATIONS_DIFFER", counted=counted, told=told)
+
+
+def _remarks(view: BallView) -> Iterator[Finding]:
+    """What the system file says that runs, and is probably not what was meant."""
+    from mdnum.systems.ball import BallSpec, remarks
+
+    for code, values in remarks(BallSpec.model_validate(view.system)):
+        yield TEXTS.finding(code, **values)
 
 
 def _resting(view: BallView) -> Iterator[Finding]:

@@ -161,6 +161,7 @@ def _keys(run: RunView) -> Iterator[Key]:
     yield Key("Energy drift", number(drift, 2, signed=True), per)
     error = run.ase.get("energy_rel")
     compared = "not compared" if error is None else "relative energy difference"
+    compared += " of a sample" if "sampled" in run.ase else ""
     yield Key("Against ASE", number(error, 2), compared)
     speed = summary.get("steps_per_second")
     yield Key("Speed", number(speed), "steps per second" if speed else "too short a run to tell")
@@ -433,7 +434,8 @@ def _ase(run: RunView) -> Iterator[Any]:
         yield TEXTS("not_compared")
         return
     if ase.get("reference"):
-        yield TEXTS("compared", reference=ase["reference"])
+        key = "compared_sampled" if "sampled" in ase else "compared"
+        yield TEXTS(key, reference=ase["reference"], sampled=ase.get("sampled"), atoms=view.summary["atoms"])
     rows = [("energy", ase["energy_rel"], "relative")]
     if ase.get("force_max") is not None:
         scale = ase.get("force_scale")
