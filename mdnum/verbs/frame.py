@@ -12,12 +12,13 @@ goes into the folder first: judge and page read the folder alone, so a page can 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from time import perf_counter
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 
@@ -25,7 +26,7 @@ from mdnum import units
 from mdnum.errors import FolderError, InputError
 from mdnum.plain import plain
 from mdnum.report.finding import Finding, Verdict, restore
-from mdnum.report.section import Page
+from mdnum.report.section import Key, Page, Section
 from mdnum.store import RunFolder
 from mdnum.store.files import default_folder
 
@@ -100,6 +101,11 @@ class View:
         found = self.summary.get("findings") or ()
         return [restore(each) for each in found if each.get("code") not in codes]
 
+    def page(self, title: str, about: str, keys: Iterable[Key], sections: Iterable[Section]) -> Page:
+        """A page of this folder, with its system and provenance; sections without content are left out."""
+        kept = [section for section in sections if section.parts]
+        return Page(title, about, list(keys), kept, self.system_toml, self.folder.provenance)
+
 
 @dataclass(frozen=True)
 class Verb:
@@ -134,6 +140,70 @@ class Outcome:
     verdict: Verdict
     page: Page
     result: Any = None
+
+
+class Keep(TypedDict, total=False):
+    """Keyword arguments of every question that is asked of a system.
+
+    Attributes:
+        out: the new folder; default runs/<verb>-<name>-<n>.
+        overrides: dotted keys of the system file to values, such as {"cutoff.kind": "switched"}.
+        report: write report.html; default True.
+        progress: called now and then with what is done, of how much, and a dictionary that names the phase.
+    """
+
+    out: str | Path | None
+    overrides: Mapping[str, Any] | None
+    report: bool
+    progress: Progress | None
+
+
+@dataclass
+class Answer:
+    """What a question puts into its folder while it is answered.
+
+    Attributes:
+        folder: that is filled.
+        log: passes progress on and writes it to log.txt.
+        summary: of summary.json, anything with plain values.
+        tables: equally long arrays by column name, by table.
+        result: for who asked from Python.
+        outcome: judged and shown, once it is filled.
+    """
+
+    folder: RunFolder
+    log: Progress
+    summary: dict[str, Any] = field(default_factory=dict)
+    tables: dict[str, Mapping[str, Any]] = field(default_factory=dict)
+    result: Any = None
+    outcome: Outcome = field(init=False)
+
+
+@contextmanager
+def answering(
+    kind: str,
+    name: str,
+    system: Any = None,
+    *,
+    out: str | Path | None = None,
+    report: bool = True,
+    progress: Progress | None = None,
+) -> Iterator[Answer]:
+    """A new folder that is filled, then stored with the seconds that it took, judged and shown.
+
+    Args:
+        kind, name, system: as for `new_folder`.
+        out, report, progress: as in `Keep`.
+
+    Raises:
+        FolderError: the folder cannot be used.
+    """
+    began = perf_counter()
+    with new_folder(kind, name, out, system=system) as folder:
+        answer = Answer(folder, logged(folder, progress, STEPWISE))
+        yield answer
+        store(folder, {**answer.summary, "seconds": perf_counter() - began}, answer.tables)
+    answer.outcome = finish(folder, report=report, result=answer.result, progress=progress)
 
 
 @contextmanager
