@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -28,6 +29,7 @@ _PIPE_WIDTH = 200
 # records that are easier to read side by side than as rows
 _FEW, _MANY = 3, 6
 _MOST_ROWS = 12
+_ALONE = inspect.Parameter.KEYWORD_ONLY
 
 # how a person should read a severity; the exit code is 1 for the last two
 _STYLE = {"info": "dim", "ok": "green", "warning": "yellow", "error": "bold red", "unsafe": "bold red"}
@@ -35,6 +37,9 @@ _STYLE = {"info": "dim", "ok": "green", "warning": "yellow", "error": "bold red"
 JSON_OPTION = typer.Option(False, "--json", help="Print one JSON document instead of text.")
 SET_OPTION = typer.Option(
     None, "--set", metavar="KEY=VALUE", help="Override a key of the system file; repeatable."
+)
+SYSTEM_ARGUMENT = typer.Argument(
+    metavar="SYSTEM", help="A name from `mdnum systems list`, or the path of a TOML file."
 )
 
 
@@ -63,6 +68,56 @@ def parse_overrides(settings: Sequence[str] | None) -> dict[str, str]:
             raise InputError(f"--set gives {key!r} twice", remedy="Keep one of them")
         overrides[key] = value.strip()
     return overrides
+
+
+def changed(settings: list[str] | None = SET_OPTION) -> dict[str, Any]:
+    """Changes to a system file, as a verb takes them."""
+    return {"overrides": parse_overrides(settings)}
+
+
+def kept(
+    out: Path | None = typer.Option(
+        None, "-o", "--out", metavar="DIR", help="The new folder; runs/VERB-NAME-N by default."
+    ),
+    no_report: bool = typer.Option(False, "--no-report", help="Do not write report.html."),
+) -> dict[str, Any]:
+    """Where the answer goes, as a verb takes it."""
+    return {"out": out, "report": not no_report}
+
+
+def question(
+    *groups: Callable[..., dict[str, Any]], notes: Sequence[str] = ()
+) -> Callable[[Callable[..., Any]], Callable[..., int]]:
+    """Makes a command of a function that asks a verb: with the options of these groups, printing its outcome.
+
+    Args:
+        groups: functions whose parameters are options of the command too; what they return, and the progress,
+            the function gets in one dictionary, `how`.
+        notes: parameters that are folders whose damage is said on stderr.
+    """
+
+    def decorate(ask: Callable[..., Any]) -> Callable[..., int]:
+        def command(*, as_json: bool, **given: Any) -> int:
+            from mdnum.cli.progress import watched
+
+            how: dict[str, Any] = {}
+            for group in groups:
+                how |= group(**{name: given.pop(name) for name in inspect.signature(group).parameters})
+            with watched() as progress:
+                outcome = ask(**given, how={**how, "progress": progress})
+            print_notes(*(given[name] for name in notes))
+            return print_outcome(outcome, as_json=as_json)
+
+        whole: Any = command
+        named = [inspect.signature(one, eval_str=True).parameters for one in (ask, *groups)]
+        parameters = {name: each for one in named for name, each in one.items() if name != "how"}
+        parameters["as_json"] = inspect.Parameter("as_json", _ALONE, default=JSON_OPTION, annotation=bool)
+        whole.__signature__ = inspect.Signature([each.replace(kind=_ALONE) for each in parameters.values()])
+        whole.__annotations__ = {name: each.annotation for name, each in parameters.items()}
+        whole.__name__, whole.__doc__ = ask.__name__, ask.__doc__
+        return command
+
+    return decorate
 
 
 def print_json(document: Mapping[str, Any]) -> None:

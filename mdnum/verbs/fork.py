@@ -113,7 +113,7 @@ def fork(
 
         parse_pin(pin, len(system.atoms))
     word = vary or "precision"
-    choice = parse(word)
+    choice = parse(word, world_of(system))
     labels = {
         "choice": word,
         "choice_about": choice.describe(world_of(system)),
@@ -273,7 +273,7 @@ def fork_benign(
 
     began = time.perf_counter()
     system = of_md(system, overrides, "benign")
-    twin = twin_of(parse(vary), system)
+    twin = twin_of(parse(vary, "md"), system)
     with frame.new_folder("benign", f"fork-{system.name}", out, system=system) as folder:
         found = benign(twin, steps=steps, progress=progress)
         summary = basics(system, found.window) | {"choice": vary, "difference": twin.difference}
