@@ -284,9 +284,11 @@ def _minimal(s: Mapping[str, Any]) -> Iterator[Any]:
     minimal = s.get("minimal")
     if minimal is None:
         return
-    reason = minimal["reason"]
-    values = {**minimal, "reason": reason[:1].upper() + reason[1:]}
-    yield TEXTS("minimal_tests" if minimal["tests"] else "minimal_none", **values)
+    values = {**minimal, "n": len(minimal["pairs"] or ())}
+    if not minimal["tests"]:
+        yield TEXTS("minimal_refused", **values)
+        return
+    yield f"{TEXTS('minimal_' + minimal['reason'], **values)} {TEXTS('minimal_tests', **values)}"
     if minimal["pairs"]:
         rows = []
         for pair in minimal["pairs"]:
@@ -467,6 +469,11 @@ def size(view: View) -> list[tuple[str, str]]:
     return [*rows, ("Size", text + kind)]
 
 
+def took(s: Mapping[str, Any]) -> tuple[str, str]:
+    """A row on the time that it took."""
+    return "Took", f"{number(s['seconds'], 2)} s"
+
+
 def _what(view: View, s: Mapping[str, Any]) -> Iterator[Any]:
     rows = [
         *size(view),
@@ -485,7 +492,7 @@ def _what(view: View, s: Mapping[str, Any]) -> Iterator[Any]:
         rows.append(("Counterfactual", TEXTS("no_counterfactual")))
     if s["count"] and s["count"]["pairs"] > 1:
         rows.append(("Chance", TEXTS("chance", repeats=s["count"]["pairs"] - 1, agreeing=agreeing(s))))
-    yield pairs([*rows, ("Took", f"{number(s['seconds'], 2)} s")])
+    yield pairs([*rows, took(s)])
     if s.get("differences"):
         yield differences(s)
     elif s["changes"]:

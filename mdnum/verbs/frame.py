@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
 import numpy as np
 
@@ -166,7 +166,7 @@ class Answer:
         folder: that is filled.
         log: passes progress on and writes it to log.txt.
         summary: of summary.json, anything with plain values.
-        tables: equally long arrays by column name, by table.
+        tables: as `store` takes them.
         result: for who asked from Python.
         outcome: judged and shown, once it is filled.
     """
@@ -174,35 +174,28 @@ class Answer:
     folder: RunFolder
     log: Progress
     summary: dict[str, Any] = field(default_factory=dict)
-    tables: dict[str, Mapping[str, Any]] = field(default_factory=dict)
+    tables: dict[str, Any] = field(default_factory=dict)
     result: Any = None
     outcome: Outcome = field(init=False)
 
 
 @contextmanager
-def answering(
-    kind: str,
-    name: str,
-    system: Any = None,
-    *,
-    out: str | Path | None = None,
-    report: bool = True,
-    progress: Progress | None = None,
-) -> Iterator[Answer]:
+def answering(kind: str, name: str, system: Any = None, **keep: Unpack[Keep]) -> Iterator[Answer]:
     """A new folder that is filled, then stored with the seconds that it took, judged and shown.
 
     Args:
         kind, name, system: as for `new_folder`.
-        out, report, progress: as in `Keep`.
+        keep: its overrides are in the system already.
 
     Raises:
         FolderError: the folder cannot be used.
     """
-    began = perf_counter()
-    with new_folder(kind, name, out, system=system) as folder:
+    began, progress = perf_counter(), keep.get("progress")
+    with new_folder(kind, name, keep.get("out"), system=system) as folder:
         answer = Answer(folder, logged(folder, progress, STEPWISE))
         yield answer
         store(folder, {**answer.summary, "seconds": perf_counter() - began}, answer.tables)
+    report = keep.get("report", True)
     answer.outcome = finish(folder, report=report, result=answer.result, progress=progress)
 
 
@@ -281,15 +274,19 @@ def say(progress: Progress | None, phase: str, step: int = 0, steps: int = 0, **
         progress(step, steps, {"phase": phase, **counts})
 
 
-def store(folder: RunFolder, summary: Mapping[str, Any], tables: Mapping[str, Mapping[str, Any]]) -> None:
+def store(folder: RunFolder, summary: Mapping[str, Any], tables: Mapping[str, Any]) -> None:
     """Ends the filling of a folder: its tables, then its summary.
 
     Args:
         summary: anything with plain values, dataclasses and arrays included.
-        tables: equally long arrays by column name, by table; those of the kind without rows may be left out.
+        tables: by table, equally long arrays by column name, or rows; those of the kind without rows may be
+            left out.
     """
     for name, columns in tables.items():
-        folder.append(name, columns)
+        if not isinstance(columns, Mapping):
+            columns = {key: [row[key] for row in columns] for key in columns[0]} if columns else {}
+        if columns:
+            folder.append(name, columns)
     folder.finalize()
     folder.write_summary(plain(summary))
 

@@ -63,7 +63,7 @@ def use(monkeypatch, make, **looks):
         def make(self, system):
             return make(system)
 
-    monkeypatch.setattr(choices, "parse", lambda text: StandIn())
+    monkeypatch.setattr(choices, "parse", lambda *text: StandIn())
 
 
 def codes(outcome) -> list[str]:
