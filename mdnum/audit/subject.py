@@ -18,6 +18,7 @@ from jaxtyping import Float
 from mdnum.audit.base import Meter, Observed, finding
 from mdnum.errors import MdnumError
 from mdnum.store.files import write_text
+from mdnum.systems.structures import to_extxyz
 from mdnum.units import METAL, Units
 
 #: A calculator that fails is asked hundreds of times; this many structures are kept.
@@ -487,23 +488,8 @@ def only_trying(subject: CalculatorSubject) -> Iterator[None]:
 
 
 def exact_extxyz(atoms: Atoms) -> str:
-    """A structure as extended XYZ without losing a bit (ASE's own writer keeps eight decimals).
-
-    Args:
-        atoms: any; of its arrays, symbols, positions, initial charges and initial magnetic moments are kept.
-    """
-    columns, arrays = ["species:S:1", "pos:R:3"], [atoms.positions]
-    for name in ("initial_charges", "initial_magmoms"):
-        if name in atoms.arrays:
-            arrays.append(np.asarray(atoms.arrays[name], np.float64).reshape(len(atoms), -1))
-            columns.append(f"{name}:R:{arrays[-1].shape[1]}")
-    lattice = " ".join(repr(float(x)) for x in atoms.cell.array.ravel())
-    periodic = " ".join("T" if yes else "F" for yes in atoms.pbc)
-    cell = f'Lattice="{lattice}" ' if atoms.cell.array.any() else ""
-    lines = [str(len(atoms)), f'{cell}Properties={":".join(columns)} pbc="{periodic}"']
-    for symbol, row in zip(atoms.get_chemical_symbols(), np.hstack(arrays), strict=True):
-        lines.append(" ".join([symbol, *(repr(float(x)) for x in row)]))
-    return "\n".join(lines) + "\n"
+    """A structure as text without losing a bit: symbols, positions, initial charges and magnetic moments."""
+    return to_extxyz(atoms, ("initial_charges", "initial_magmoms"))
 
 
 def rms(forces: np.ndarray) -> float:

@@ -5,7 +5,10 @@ Every verb is a function that returns its exit code: 0 fine, 1 findings, 2 a mis
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import os
+import platform
 import sys
 from typing import Any, NoReturn
 
@@ -68,6 +71,27 @@ def _top(
     pass
 
 
+def _keep_programs() -> None:
+    """Let jax keep what it compiles for the next command, unless the environment says otherwise.
+
+    A program compiled for one kind of processor is not offered to another: home folders are shared.
+    """
+    if "JAX_COMPILATION_CACHE_DIR" in os.environ:
+        return
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    features = platform.machine()
+    with contextlib.suppress(OSError), open("/proc/cpuinfo") as file:
+        features = next((line for line in file if line.startswith(("flags", "Features"))), features)
+    kind = hashlib.sha256(features.encode()).hexdigest()[:12]
+    folder = os.path.join(home, "mdnum", f"programs-{kind}")
+    with contextlib.suppress(OSError):
+        os.makedirs(folder, exist_ok=True)
+    if os.access(folder, os.W_OK):
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = folder
+        os.environ["JAX_COMPILATION_CACHE_MAX_SIZE"] = str(512 * 2**20)
+        os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.1"
+
+
 def main(arguments: list[str] | None = None) -> NoReturn:
     """Run the command line and exit.
 
@@ -76,6 +100,7 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     as_json = "--json" in arguments
+    _keep_programs()
     try:
         code = app(arguments, standalone_mode=False, prog_name="mdnum")
     except MdnumError as error:

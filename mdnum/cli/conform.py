@@ -97,7 +97,7 @@ def _to_go_on(folder: Path | None) -> str:
 
 def _names(as_json: bool) -> int:
     """The lists that have a name."""
-    from mdnum.references.conformance.loading import known
+    from mdnum.references.conformance.peers import known
 
     rows = [
         {"list": one.name, "version": one.version, "kept": one.kept, "what": one.description}

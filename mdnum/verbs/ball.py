@@ -30,8 +30,8 @@ from mdnum.verbs.frame import Outcome, Progress, Verb, View
 if TYPE_CHECKING:
     from mdnum.ball.problem import BallProblem
     from mdnum.ball.rollout import BallRun
-    from mdnum.systems.ball_system import BallSystem
     from mdnum.systems.build_ball import BallSimulation
+    from mdnum.systems.load import BallSystem
 
 #: Balls times steps of which every state is kept, and residuals of stop decisions kept.
 _STATES, _RESIDUALS = 20_000_000, 5_000_000
@@ -221,7 +221,7 @@ def judge(view: View) -> Verdict:
     summary = view.summary
     rules = (
         _finite, _ledger, _finite_gradient, _independent, _ambiguous, _cap, _disagree, _forks, _iterations,
-        _resting,
+        _resting, _remarks,
     )  # fmt: skip
     found = [finding for rule in rules for finding in rule(view)]
     sizes = {"balls": summary["balls"], "steps": summary["steps"]}
@@ -422,6 +422,14 @@ def _iterations(view: View) -> Iterator[Finding]:
         )
         counted = "impacts" if located(view) else "iterations"
         yield TEXTS.finding("ITERATIONS_DIFFER", counted=counted, told=told, section="Variants")
+
+
+def _remarks(view: View) -> Iterator[Finding]:
+    """What the system file says that runs, and is probably not what was meant."""
+    from mdnum.systems.ball import BallSpec, remarks
+
+    for code, values in remarks(BallSpec.model_validate(view.system)):
+        yield TEXTS.finding(code, **values)
 
 
 def _resting(view: View) -> Iterator[Finding]:

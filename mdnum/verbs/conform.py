@@ -16,9 +16,8 @@ from annotated_types import Ge, Le
 from mdnum.deadline import Deadline
 from mdnum.errors import InputError
 from mdnum.references.conformance.case import AREAS
-from mdnum.references.conformance.judge import CODES, DOUBLE, SILENT, SINGLE
+from mdnum.references.conformance.judge import CODES, DOUBLE, SILENT, SINGLE, CaseAnswers, Failed, Report
 from mdnum.references.conformance.lists import LIMITS, PairList
-from mdnum.references.conformance.results import CaseAnswers, Failed, Report
 from mdnum.report.finding import Finding, Texts, Verdict, conclude
 from mdnum.report.section import Code, Figure, Key, Page, Section, Table, pairs
 from mdnum.report.svg import BAD, FIRST, MUTED, SECOND
@@ -136,7 +135,8 @@ def conform(
             it is not the one that a folder was begun with.
         FolderError: the folder cannot be used.
     """
-    from mdnum.references.conformance.loading import from_object, load
+    from mdnum.references.conformance.lists import from_object
+    from mdnum.references.conformance.peers import load
     from mdnum.references.conformance.suite import CASES, Examiner, examine
 
     deadline = Deadline(time)
@@ -283,8 +283,9 @@ def _summary(found: Report, scripts: list[str], seed: int) -> dict[str, Any]:
         "silent": sum(tally.silent for tally in found.areas.values()),
         "conforms": found.conforms,
         "areas": [
-            {"area": area, "about": AREAS[area], "passed": tally.passed, "silent": tally.silent}
-            | asdict(tally)
+            asdict(tally)
+            | {name: getattr(tally, name) for name in ("passed", "failed", "silent")}
+            | {"area": area, "about": AREAS[area]}
             | {"why": [{"why": text, "cases": cases} for text, cases in why[area]]}
             for area, tally in found.areas.items()
         ],
@@ -301,7 +302,7 @@ def _failure(failed: Failed, script: str) -> dict[str, Any]:
     return {
         "code": failed.code,
         "area": failed.case.area,
-        "case": failed.asked.name,
+        "case": failed.case.name,
         "atoms": failed.case.atoms,
         "steps": failed.case.steps,
         "step": failed.worst.step,

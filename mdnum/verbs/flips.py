@@ -388,8 +388,8 @@ def _rule_told(
 
 def _counted(total: Statistics) -> dict[str, Any]:
     """Plain values of what was counted, lengths of time in frames."""
+    from mdnum.trajectories.history import between_frames
     from mdnum.trajectories.statistics import Lifetime
-    from mdnum.trajectories.stride import between_frames
 
     durations, chatter = total.durations, total.chatter
     between = between_frames(total.strides)

@@ -381,7 +381,7 @@ def _ball_system(
     system: Any, of: str | None, names: Sequence[str], steps: int | None, overrides: Mapping[str, Any] | None
 ) -> BallSystem:
     """The ball with the loss and the parameters that were asked for in its own tables."""
-    from mdnum.systems import BallSystem, ball, ball_checks, load
+    from mdnum.systems import BallSystem, ball, load
 
     kinds = get_args(ball.LossTable.model_fields["kind"].annotation)
     if of is not None and of not in kinds:
@@ -389,7 +389,7 @@ def _ball_system(
     changes: dict[str, Any] = {} if of is None else {"loss.kind": of}
     changes |= {"gradient.of": list(names)} if names else {}
     made: Any = of_any(system, overrides)
-    known = (*ball_checks.PARAMETERS[made.spec.contact.kind], *ball_checks.ALWAYS)
+    known = ball.parameters(made.spec.contact.kind)
     unknown = [name for name in names if name not in known]
     if unknown or not (names or made.spec.gradient.of):
         seen = f"no parameter {unknown[0]!r}" if unknown else "no parameter to differentiate by"

@@ -310,7 +310,8 @@ def _evidence(view: View, run: Record) -> Iterator[str]:
     ase = summary.get("ase") or {}
     if ase.get("ok") and ase.get("energy_rel") is not None:
         yield TEXTS(
-            "ase_agrees", reference=ase.get("reference") or "ASE", energy=ase["energy_rel"],
+            "ase_agrees_sampled" if "sampled" in ase else "ase_agrees", sampled=ase.get("sampled"),
+            atoms=summary.get("atoms"), reference=ase.get("reference") or "ASE", energy=ase["energy_rel"],
             force=ase.get("force_max"), unit=f"{units.energy}/{units.length}",
         )  # fmt: skip
 

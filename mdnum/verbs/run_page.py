@@ -164,6 +164,7 @@ def _keys(view: View, run: Record) -> Iterator[Key]:
     yield Key("Energy drift", number(drift, 2, signed=True), per)
     ase = summary.get("ase") or {}
     compared = "relative energy difference" if ase.get("energy_rel") is not None else "not compared"
+    compared += " of a sample" if "sampled" in ase else ""
     yield Key("Against ASE", number(ase.get("energy_rel"), 2), compared)
     speed = summary.get("steps_per_second")
     yield Key("Speed", number(speed), "steps per second" if speed else "too short a run to tell")
@@ -456,7 +457,8 @@ def _ase(view: View) -> Iterator[Any]:
         yield TEXTS("not_compared")
         return
     if ase.get("reference"):
-        yield TEXTS("compared", reference=ase["reference"])
+        key = "compared_sampled" if "sampled" in ase else "compared"
+        yield TEXTS(key, reference=ase["reference"], sampled=ase.get("sampled"), atoms=view.summary["atoms"])
     rows = [("energy", ase["energy_rel"], "relative")]
     if ase.get("force_max") is not None:
         scale = ase.get("force_scale")

@@ -11,8 +11,10 @@ from ase.build import bulk
 from small_systems import KOB_ANDERSEN, LENNARD_JONES, crystal, make, mixture
 
 from mdnum.plain import plain
+from mdnum.references import energy_check
 from mdnum.references.ase_models import reference
 from mdnum.references.energy_check import _growth, _sudden, check_dynamics, check_energy
+from mdnum.references.neighborhoods import neighborhoods
 from mdnum.systems import build
 from mdnum.verbs.check import dynamics_findings, energy_findings
 
@@ -214,3 +216,26 @@ def test_growth_and_sudden_steps():
     assert _sudden(chaotic, floor=1e-13) is None
     forked = [*chaotic[:50], *(1e-7 * np.exp(0.05 * step) for step in range(50))]
     assert _sudden(forked, floor=1e-13) == 50
+
+
+@pytest.mark.parametrize("atoms", [crystal(), mixture()], ids=["crystal", "mixture"])
+def test_a_sample_has_the_numbers_of_the_whole(atoms, monkeypatch):
+    # a group at a corner sees its neighbors through the faces of the box
+    potential = LENNARD_JONES if len(set(atoms.numbers)) == 1 else KOB_ANDERSEN
+    cutoff = (
+        {"kind": "hard", "radius": 2.2} if potential is LENNARD_JONES else {"kind": "hard", "in_sigma": 2.2}
+    )
+    system = make(atoms, potential, cutoff)
+    whole = reference(system)
+    forces = whole.make().get_property("forces", atoms)
+    energies = whole.make().get_property("energies", atoms)
+    for cluster, chosen in neighborhoods(atoms, build(system).r_cut, places=5, count=9):
+        seen = whole.make()
+        np.testing.assert_allclose(seen.get_property("forces", cluster)[:9], forces[chosen], atol=1e-12)
+        np.testing.assert_allclose(seen.get_property("energies", cluster)[:9], energies[chosen], atol=1e-12)
+    monkeypatch.setattr(energy_check, "SAMPLED", 10)
+    report = check_energy(system, {"initial": atoms})
+    assert report.ok and report.sampled and report.sampled > 80 and len(report.frames) == 8
+    # a force that is wrong everywhere is found in any sample
+    off = replace(build(system), model=build(make(atoms, potential, {**cutoff, "kind": "shifted"})).model)
+    assert not check_energy(off, {"initial": atoms}).ok

@@ -13,7 +13,7 @@ from small_systems import KOB_ANDERSEN, LENNARD_JONES, crystal, make, mixture
 
 from mdnum.plain import plain
 from mdnum.references.conformance.lists import PairList
-from mdnum.references.conformance.loading import load
+from mdnum.references.conformance.peers import load
 from mdnum.references.oracle import all_pairs, exactly_inside
 from mdnum.references.pair_check import (
     Search,

@@ -328,6 +328,14 @@ def altered(view: View, tables: dict[str, dict[str, np.ndarray]] | None = None, 
     return replace(view, summary={**view.summary, **summary}, _tables=tables or {})
 
 
+def of(view: View, system: str, **overrides: Any) -> View:
+    """The same run, said to be of another system."""
+    view = altered(view)
+    spec = load(system, {key.replace("__", "."): value for key, value in overrides.items()}).spec
+    vars(view)["system"] = spec.model_dump(exclude_none=True)
+    return view
+
+
 def codes(view: View) -> dict[str, Any]:
     return {finding.code: finding for finding in judge(view).findings}
 
@@ -350,6 +358,11 @@ def test_every_planted_defect_is_found_and_nothing_else(good: View):
         "FORKED": altered(good, variants=[SAME | FORK | {"gradient": {"k": -1.0}}]),
         "ITERATIONS_DIFFER": altered(good, variants=[SAME | {"iterations_differ": 4}]),
         "RESTING": altered(good, ended={"rest": 4}),
+        "TOLERANCE_BELOW_ROUNDING": of(
+            good, "ball/batch-on-the-boundary", start__height=1.0, flight__gravity=9.81, stop__tol=1e-10
+        ),
+        "PROJECTION_OVERSHOOTS": of(good, "ball/batch-on-the-boundary", contact__k=3.0),
+        "STEP_BEYOND_STABILITY": of(good, "ball/drop", contact__k=1e7),
     }
     assert set(planted) == set(TEXTS.entries) - {"sentences"}
     assert codes(good) == {}
