@@ -140,7 +140,7 @@ def test_an_interval_is_a_key_and_two_numbers():
         (("argon/crystal-108", "--vary", "vmap"), "mdnum fork processes"),
         (("argon/crystal-108", "--vary", "presicion"), "Did you mean precision"),
         (("argon/crystal-108", "--vary", "zzz"), "no choice 'zzz'. There are precision, reduction,"),
-        (("ball/drop", "--vary", "zzz"), "There are precision, reduction, stop, contact,"),
+        (("ball/drop", "--vary", "zzz"), "There are precision, reduction, order, stop, max_iter, contact,"),
         (("argon/crystal-108", "--along", "sigma=1:2"), "`mdnum fork map SYSTEM KEY=LOW:HIGH`"),
         (("silicon/tersoff-512", "--vary", "precision"), "`mdnum fork` lists them"),
         (("forecast", "argon/crystal-108", "0"), "expected a length above 0"),
