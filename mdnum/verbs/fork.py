@@ -306,7 +306,7 @@ def page_compare(view: View, verdict: Verdict) -> Page:
             ("fork", "Fork", "a stored decision differs"),
         )
     ]
-    different = differences(s) if s["differences"] else TEXTS("folders_0_causes")
+    different = differences(s["differences"]) if s["differences"] else TEXTS("folders_0_causes")
     sections = [Section("What was different", [different], terminal=True)]
     if s["decisions"]:
         rows = [

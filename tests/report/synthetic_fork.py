@@ -129,7 +129,7 @@ def make_fork(
             "fork_time": 4.0 if forks else None,
             "split": split, "split_time": None if split is None else 0.01 * split, "tolerance": TOLERANCE,
             "decision": DECISION if forks else None, "effect": "cause" if forks else "no fork",
-            "reasons": ["free, split at step 1321; under the first run's decisions not", "and so on"],
+            "reasons": [{"code": "not_run", "split": 1321}, {"code": "within"}],
             "growth_rate": RATE if forks else None, "growth_rate_time": RATE / 0.01 if forks else None,
             "r_squared": 0.99 if forks else None, "growth": {"B": fit if forks else dict.fromkeys(fit)},
             "predicted_split": None, "predicted_by": None,
