@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from command_line import Recorder, call, printed
 
-import mdnum.verbs
+import mdnum
 from mdnum.cli import main, output
 from mdnum.cli.progress import ProgressBar, describe
 from mdnum.errors import InputError, NumericalError
@@ -34,7 +34,7 @@ SUMMARY: dict[str, Any] = {
 def rollout(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Recorder:
     """`mdnum run` in an empty folder with the rollout replaced by a recorder."""
     recorder = Recorder(dict(SUMMARY))
-    monkeypatch.setattr(mdnum.verbs, "run", recorder)
+    monkeypatch.setattr(mdnum, "run", recorder)
     monkeypatch.chdir(tmp_path)
     return recorder
 

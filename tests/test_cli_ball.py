@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from command_line import Recorder, call, printed
 
-import mdnum.verbs
+import mdnum
 from mdnum.cli.progress import ProgressBar
 from mdnum.errors import InputError
 from mdnum.verbs import demos
@@ -20,7 +20,7 @@ from mdnum.verbs.demos import Claim, Demo, Plot, Region, Series, table
 def bounce(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Recorder:
     """`mdnum ball` in an empty folder with the run replaced by a recorder."""
     recorder = Recorder()
-    monkeypatch.setattr(mdnum.verbs, "bounce", recorder)
+    monkeypatch.setattr(mdnum, "bounce", recorder)
     monkeypatch.chdir(tmp_path)
     return recorder
 

@@ -78,7 +78,7 @@ class FolderFork:
             then what bits depend on.
         causes: what a fork may be put down to: keys of the system file, "start", "arithmetic".
         steps: steps that both have.
-        seed: first step at which a stored number differs; None where none does.
+        first_bit: first step at which a stored number differs; None where none does.
         fork: first step at which a stored decision differs; None where none does.
         channel: of the decision at the fork; "" without one.
         iterations: of both solvers of a ball at the fork, where they differ.
@@ -92,7 +92,7 @@ class FolderFork:
     differences: tuple[Difference, ...]
     causes: tuple[str, ...]
     steps: int
-    seed: int | None
+    first_bit: int | None
     fork: int | None
     channel: str
     iterations: tuple[int, int] | None

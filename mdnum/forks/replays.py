@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -268,6 +268,9 @@ def disagreements(fork: Fork, i: int, j: int) -> list[tuple[int, int | None]]:
 # --- minimal causes -----------------------------------------------------------------------------------
 
 
+MinimalReason = Literal["alone", "fewest", "spent", "none"]
+
+
 @dataclass(frozen=True)
 class Minimal:
     """A smallest set of pairs that restores agreement.
@@ -280,7 +283,9 @@ class Minimal:
         candidates: pairs that the runs decided differently before the split.
         tests: runs that were made.
         horizon: up to which step B had to stay with A.
-        reason: one sentence.
+        reason: "alone" (the pair at the fork is enough), "fewest" (none of them can be left out), "spent"
+            (they are enough; the runs allowed did not show whether fewer are), or "none" (with all of them
+            pinned the runs split as well: no set of pairs is the cause).
     """
 
     pairs: tuple[tuple[int, int], ...] | None
@@ -289,7 +294,7 @@ class Minimal:
     candidates: int
     tests: int
     horizon: int
-    reason: str
+    reason: MinimalReason
 
 
 def minimal_cause(
@@ -316,23 +321,15 @@ def minimal_cause(
     differing = (flip for flip in fork.flips if flip.differs and flip.step < split)
     keys = list(dict.fromkeys(flip.i * atoms + flip.j for flip in differing))
     search = _Search(fork, keys, int(_BEYOND * split) + 1, tests, progress)
-    whose = f"their decisions from the start to step {search.horizon:,} are A's"
     i, j = fork.decision.subject
     if search.holds([i * atoms + j]):
-        reason = f"the pair at the fork alone is enough ({whose}: {search.horizon + 1:,} decisions)"
-        return search.answer([i * atoms + j], True, reason)
+        return search.answer([i * atoms + j], "alone")
     if not search.holds(keys):
-        return search.answer(
-            None, False, "with all of them pinned the runs split as well: no set of pairs is the cause"
-        )
+        return search.answer(None, "none")
     # bisection is quick where the decisions do not depend on one another; what it leaves is thinned further
     best = _required(keys, search, search.made + (tests - search.made) // 2)
     best = _ddmin(best if search.known(best) else keys, search)
-    if search.spent:
-        reason = f"{len(best)} pairs are enough; {search.made} runs did not show whether fewer are ({whose})"
-        return search.answer(best, False, reason, proven=False)
-    reason = f"{len(best)} pairs are enough, and none of them can be left out ({whose})"
-    return search.answer(best, False, reason)
+    return search.answer(best, "spent" if search.spent else "fewest")
 
 
 class _Search:
@@ -364,11 +361,11 @@ class _Search:
         """Whether these pairs are known to be enough."""
         return self._known.get(frozenset(keys), False)
 
-    def answer(self, keys: Sequence[int] | None, alone: bool, reason: str, *, proven: bool = True) -> Minimal:
+    def answer(self, keys: Sequence[int] | None, reason: MinimalReason) -> Minimal:
         """The outcome."""
         atoms = self.fork.twin.a.size
         pairs = None if keys is None else tuple(divmod(key, atoms) for key in sorted(keys))
-        proven = proven and pairs is not None
+        proven, alone = reason in ("alone", "fewest"), reason == "alone"
         return Minimal(pairs, proven, alone, self.candidates, self.made, self.horizon, reason)
 
     def _keep(self, segment: Segment) -> None:

@@ -18,7 +18,7 @@ class Screened:
     Attributes:
         choice: its name.
         difference: one line; why it does not apply where it does not.
-        seed, fork, split: dates, steps; None where they did not come.
+        first_bit, fork, split: dates, steps; None where they did not come.
         must_hold: whether it cannot change a bit by design.
         reason_unavailable: why it was not run; None where it was.
         steps: last step that was compared; 0 where it was not run.
@@ -27,7 +27,7 @@ class Screened:
 
     choice: str
     difference: str
-    seed: int | None
+    first_bit: int | None
     fork: int | None
     split: int | None
     must_hold: bool
@@ -38,7 +38,7 @@ class Screened:
     @property
     def held(self) -> bool | None:
         """Whether no bit differed within the horizon; None where it was not run."""
-        return None if self.reason_unavailable is not None else self.seed is None
+        return None if self.reason_unavailable is not None else self.first_bit is None
 
     @property
     def finding(self) -> bool:
@@ -87,5 +87,5 @@ def screen(
 def _rank(row: Screened) -> tuple[bool, float, float, float]:
     """Those that were run first, the earliest fork first."""
     late = float("inf")
-    fork, seed, split = (late if date is None else date for date in (row.fork, row.seed, row.split))
-    return row.reason_unavailable is not None, fork, seed, split
+    fork, bit, split = (late if date is None else date for date in (row.fork, row.first_bit, row.split))
+    return row.reason_unavailable is not None, fork, bit, split

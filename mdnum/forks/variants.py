@@ -19,6 +19,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from threading import Lock
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -77,7 +78,7 @@ class Ran:
         variant: which.
         hashes: of the positions at steps 1, 2, ..., hexadecimal; empty where it failed.
         cluster: number of the variants that agree with it, from 0; -1 where it failed.
-        seed: first step whose positions are not those of the reference; None where all are.
+        first_bit: first step whose positions are not those of the reference; None where all are.
         separation: largest distance from the reference's atoms at the last common step, length.
         seconds: of its process.
         failed: the last line that a failed process said.
@@ -87,7 +88,7 @@ class Ran:
     variant: Variant
     hashes: tuple[str, ...]
     cluster: int
-    seed: int | None
+    first_bit: int | None
     separation: float
     seconds: float
     failed: str = ""
@@ -102,13 +103,13 @@ class Variants:
         rows: one a variant, in the order asked for.
         reference: name of the one that the others are compared with: the first that ran.
         steps: that it ran.
-        causes: what tells the clusters apart, sentence by sentence.
+        causes: what tells the clusters apart: codes, each with its values.
     """
 
     rows: tuple[Ran, ...]
     reference: str
     steps: int
-    causes: tuple[str, ...]
+    causes: tuple[tuple[str, dict[str, Any]], ...]
 
     @property
     def clusters(self) -> list[list[str]]:
@@ -224,12 +225,12 @@ def _dated(row: Ran, x: np.ndarray | None, reference: Ran, x_reference: np.ndarr
         return row
     common = min(len(row.hashes), len(reference.hashes))
     pairs = zip(row.hashes[:common], reference.hashes[:common], strict=True)
-    seed = next((step for step, (one, other) in enumerate(pairs, 1) if one != other), None)
+    first_bit = next((step for step, (one, other) in enumerate(pairs, 1) if one != other), None)
     separations = np.zeros(common)
     for step in range(common):
         dx, dy, dz = displacement(cell, x_reference[step].T, x[step].T)
         separations[step] = np.sqrt((dx * dx + dy * dy + dz * dz).max())
-    return replace(row, seed=seed, separation=float(separations[-1]), separations=separations)
+    return replace(row, first_bit=first_bit, separation=float(separations[-1]), separations=separations)
 
 
 def _agree(one: Ran, other: Ran) -> bool:
@@ -253,11 +254,11 @@ def _clustered(rows: list[Ran], reference: Ran | None = None) -> list[Ran]:
     return [replace(row, cluster=numbers.get(row.variant.name, -1)) for row in rows]
 
 
-def _causes(rows: Sequence[Ran]) -> list[str]:
+def _causes(rows: Sequence[Ran]) -> list[tuple[str, dict[str, Any]]]:
     """What the pattern of agreement says; nothing is said of variants that were not run."""
     by_name = {row.variant.name: row for row in rows if not row.failed}
     reference = next(iter(by_name.values()))
-    told = []
+    found: list[tuple[str, dict[str, Any]]] = []
 
     def same(one: str, other: str) -> bool | None:
         if one not in by_name or other not in by_name:
@@ -267,44 +268,21 @@ def _causes(rows: Sequence[Ran]) -> list[str]:
     plain = [name for name in ("AVX", "SSE4.2", "unoptimized") if name in by_name]
     fused = [name for name in plain if not _agree(by_name[name], reference)]
     if len(plain) > 1 and fused == plain:
-        if all(same(plain[0], name) for name in plain[1:]):
-            told.append(
-                f"Fused multiply-add: {', '.join(plain)} cannot fuse or do not, agree with one another, and "
-                f"leave the reference at step {by_name[plain[0]].seed}."
-            )
-        else:
-            told.append(f"{', '.join(plain)} differ from the reference and among each other.")
+        alike = all(same(plain[0], name) for name in plain[1:])
+        step = by_name[plain[0]].first_bit
+        found.append(("fused" if alike else "unlike", {"names": ", ".join(plain), "step": step}))
     elif plain and not fused:
-        told.append(f"{', '.join(plain)} agree with the reference: no fused multiply-add shows in it.")
+        found.append(("not_fused", {"names": ", ".join(plain)}))
     alike, without = same("eager", "scan"), same("eager", "AVX")
-    if alike and without and fused:
-        told.append("The eager program ran too few steps to tell which of the others it agrees with.")
-    elif alike:
-        told.append("The eager program has the reference's bits as far as it ran.")
-    elif without:
-        told.append("Operation by operation there is nothing to fuse: the eager program agrees with AVX.")
-    elif alike is False:
-        told.append(f"The eager program leaves the reference at step {by_name['eager'].seed}.")
-    for name, what in (
-        ("rollout", "The rollout's loop"),
-        ("vmap", "A batch"),
-        ("grad", "The primal inside value_and_grad"),
-    ):
+    if alike is not None or without:
+        short = alike and without and fused
+        code = "short" if short else "same" if alike else "plain" if without else "leaves"
+        found.append((f"eager_{code}", {"step": by_name["eager"].first_bit}))
+    for name in ("rollout", "vmap", "grad"):
         alike, without = same(name, "scan"), same(f"{name}, AVX", "AVX")
-        if alike:
-            told.append(f"{what} has the reference's bits.")
-        elif alike is False and without:
-            told.append(
-                f"{what} leaves the reference at step {by_name[name].seed} because it fuses other products: "
-                "without fused multiply-add the two agree."
-            )
-        elif alike is False and without is False:
-            told.append(
-                f"{what} leaves the reference at step {by_name[name].seed}, without fused multiply-add too: "
-                "the compiler orders its operations otherwise."
-            )
-        elif alike is False:
-            told.append(f"{what} leaves the reference at step {by_name[name].seed}.")
+        if alike is not None:
+            code = "same" if alike else {True: "fuses", False: "ordered", None: "leaves"}[without]
+            found.append((code, {"program": name, "step": by_name[name].first_bit}))
     if same("reversed", "scan") is False:
-        told.append(f"Order: sums in reverse leave the reference at step {by_name['reversed'].seed}.")
-    return told
+        found.append(("reversed", {"step": by_name["reversed"].first_bit}))
+    return found

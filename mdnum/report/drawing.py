@@ -162,7 +162,8 @@ def _plot(plot: Plot, figure: Canvas) -> None:
     ):
         text = f"{typeset(label)} {MINUS} {base!r}" if base else typeset(label)
         setter(fill(text, 90 if setter == axes.set_xlabel else 40))
-    if len(plot.series) > 1 or plot.region is not None:
+    # a line alone is named too, unless the axis names it
+    if plot.region is not None or any(one.label != plot.y_label for one in plot.series):
         legend(axes)
 
 

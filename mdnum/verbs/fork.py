@@ -6,10 +6,9 @@ are compared or followed again (`fork_folders`), or ensembles are (`fork_benign`
 
 from __future__ import annotations
 
-import time
-from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 
@@ -23,7 +22,7 @@ from mdnum.verbs import frame
 from mdnum.verbs.fork_page import differences, page, size
 from mdnum.verbs.fork_pair import PairQuestion, basics, check, followed, of_any, of_md
 from mdnum.verbs.fork_verdict import RANKING, TEXTS, judge, judge_benign, judge_compare, judge_screen
-from mdnum.verbs.frame import Outcome, Progress, View
+from mdnum.verbs.frame import Keep, Outcome, View
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -47,10 +46,7 @@ def fork(
     lyapunov: bool = True,
     minimal: bool = False,
     pin: str | None = None,
-    out: str | Path | None = None,
-    overrides: Mapping[str, Any] | None = None,
-    report: bool = True,
-    progress: Progress | None = None,
+    **keep: Unpack[Keep],
 ) -> Outcome:
     """Run a system and its twin that differs in one choice, and say where and why they diverge.
 
@@ -71,10 +67,7 @@ def fork(
             together; it takes up to 80 runs.
         pin: a decision to override with A's in one more run of B: "fork", a pair "3-75", or a pair over a
             window "3-75:600..700". minimal and pin are of molecular dynamics.
-        out: the new fork folder; default runs/fork-<name>-<n>.
-        overrides: dotted keys to values, such as {"cutoff.kind": "switched"}.
-        report: write report.html.
-        progress: called now and then with step, steps and a dictionary of figures.
+        keep: see `mdnum.verbs.frame.Keep`.
 
     Returns:
         its result is a `mdnum.forks.Fork`, and where all choices were screened a list of
@@ -88,106 +81,74 @@ def fork(
     from mdnum.forks.choices import parse, twin_of, world_of
     from mdnum.systems import BallSystem
 
-    system = of_any(system, overrides)
-    table, own_split = system.spec.fork, split
-    if table is not None:
-        vary = table.vary if vary is None else vary
-        steps = table.steps if steps is None else steps
-        split = table.split if split is None else split
+    system = of_any(system, keep.pop("overrides", None))
+    own = system.spec.fork
     asked = PairQuestion(steps, split, repeats, counterfactual, back, lyapunov, minimal, pin)
+    if own is not None:
+        vary = own.vary if vary is None else vary
+        asked = replace(
+            asked, steps=own.steps if steps is None else steps, split=own.split if split is None else split
+        )
     check(asked)
     if vary == ALL:
-        given = {"split": own_split is not None, "repeats": repeats is not None, "minimal": minimal,
+        given = {"split": split is not None, "repeats": repeats is not None, "minimal": minimal,
                  "counterfactual": not counterfactual, "back": back is not None,
                  "pin": pin is not None}  # fmt: skip
         frame.refuse(given, "of one comparison, and all choices were asked for", "Give one choice to vary")
-        return fork_screen(system, steps=steps, out=out, report=report, progress=progress)
+        return fork_screen(system, steps=asked.steps, **keep)
     if isinstance(system, BallSystem):
         remedy = 'A decision of a ball is overridden by itself by the choice "contact=STEP:BALL"'
         given = {"minimal": minimal, "pin": pin is not None}
         frame.refuse(given, f"of molecular dynamics, and {system.name} is a ball", remedy)
-        system = system if steps is None else system.for_steps(steps)
+        system = system if asked.steps is None else system.for_steps(asked.steps)
     elif pin is not None:
         from mdnum.forks.replays import parse_pin
 
         parse_pin(pin, len(system.atoms))
-    word = vary or "precision"
-    choice = parse(word)
-    labels = {
-        "choice": word,
-        "choice_about": choice.describe(world_of(system)),
-        "must_hold": choice.must_hold,
-    }
-    frame.say(progress, "compile")
-    twin = twin_of(choice, system)
-    return followed(system, twin, labels, asked, lambda made: {}, out, report, progress)
+    word, world = vary or "precision", world_of(system)
+    choice = parse(word, world)
+    labels = {"choice": word, "choice_about": choice.describe(world), "must_hold": choice.must_hold}
+    frame.say(keep.get("progress"), "compile")
+    return followed(system, twin_of(choice, system), labels, asked, **keep)
 
 
 def fork_screen(
-    system: System | BallSystem | str | Path,
-    *,
-    steps: int | None = None,
-    out: str | Path | None = None,
-    overrides: Mapping[str, Any] | None = None,
-    report: bool = True,
-    progress: Progress | None = None,
+    system: System | BallSystem | str | Path, *, steps: int | None = None, **keep: Unpack[Keep]
 ) -> Outcome:
     """Follow the free runs of every choice, and rank the choices by when they fork.
 
     Counterfactuals are left to the choices that turn out to matter.
 
     Args:
-        system, out, overrides, report: as for `fork`.
+        system: as for `fork`.
         steps: last step; default that of the [fork] table, or the system's own.
-        progress: called with choices done, how many there are, and the name of the next as the phase.
+        keep: see `mdnum.verbs.frame.Keep`.
 
     Returns:
         its result is a list of `mdnum.forks.screen.Screened`.
     """
     from mdnum.forks.screen import screen
 
-    began = time.perf_counter()
-    system = of_any(system, overrides)
+    system = of_any(system, keep.pop("overrides", None))
     if steps is None and system.spec.fork is not None:
         steps = system.spec.fork.steps
     check(PairQuestion(steps))
-    with frame.new_folder("screen", f"fork-{system.name}", out, system=system) as folder:
+    with frame.answering("screen", f"fork-{system.name}", system, **keep) as answer:
 
         def note(done: int, count: int, name: str) -> None:
-            folder.log(f"{done:4d} of {count}  {name}")
-            if progress is not None:
-                progress(done, count, {"phase": f"{name} ({done + 1} of {count})"})
+            answer.log(done, count, {"phase": f"{name} ({done + 1} of {count})"})
 
-        rows = screen(system, steps, progress=note)
-        ran = [row for row in rows if row.reason_unavailable is None]
-        summary = basics(system, steps) | {
-            "ranking": [
-                {
-                    "choice": row.choice, "difference": row.difference, "first_bit": row.seed,
-                    "fork": row.fork, "split": row.split, "must_hold": row.must_hold, "held": row.held,
-                    "steps": row.steps, "failed": row.failed,
-                }
-                for row in ran
-            ],
-            "not_applicable": [
-                {"choice": row.choice, "reason": row.reason_unavailable} for row in rows if row not in ran
-            ],
-            "seconds": time.perf_counter() - began,
-        }  # fmt: skip
-        frame.store(folder, summary, {})
-    return frame.finish(folder, report=report, result=rows, progress=progress)
+        answer.result = screen(system, steps, progress=note)
+        ran = [row for row in answer.result if row.reason_unavailable is None]
+        left = [row for row in answer.result if row.reason_unavailable is not None]
+        answer.summary = basics(system, steps) | {
+            "ranking": [plain(row) | {"held": row.held} for row in ran],
+            "not_applicable": [{"choice": row.choice, "reason": row.reason_unavailable} for row in left],
+        }
+    return answer.outcome
 
 
-def fork_folders(
-    a: str | Path,
-    b: str | Path,
-    *,
-    replay: bool = False,
-    out: str | Path | None = None,
-    report: bool = True,
-    progress: Progress | None = None,
-    **asked: Any,
-) -> Outcome:
+def fork_folders(a: str | Path, b: str | Path, *, replay: bool = False, **asked: Any) -> Outcome:
     """Compare two finished runs of one world: what was different, and where they diverge.
 
     Args:
@@ -195,10 +156,8 @@ def fork_folders(
         replay: follow both again (molecular dynamics), and judge the flip at their fork as `fork` does. The
             summary then says whether the replay diverges where the stored tables do: it has their bits where
             versions and processor are the same. Else nothing is run: dates are those of the stored tables.
-        out: the new fork folder; default runs/fork-<name>-<n>.
-        report, progress: as for `fork`.
-        asked: of a replay, steps, split, repeats, counterfactual, back, lyapunov, minimal and pin of `fork`;
-            no more steps than both runs have.
+        asked: out, report and progress; of a replay also steps, split, repeats, counterfactual, back,
+            lyapunov, minimal and pin of `fork`, and no more steps than both runs have.
 
     Returns:
         its result is a `mdnum.forks.folders.FolderFork`, of a replay a `mdnum.forks.Fork`.
@@ -210,17 +169,15 @@ def fork_folders(
     from mdnum.forks.folders import compare_folders, twin_of
     from mdnum.systems.load import load
 
-    began = time.perf_counter()
-    frame.say(progress, "compare")
+    keep: Any = {name: asked.pop(name) for name in ("out", "report", "progress") if name in asked}
+    frame.say(keep.get("progress"), "compare")
     found = compare_folders(a, b)
     system: Any = load(found.a)
     if not replay:
         frame.refuse(dict.fromkeys(asked, True), "of a replay", "Add replay=True, or leave them out")
-        with frame.new_folder("compare", f"fork-{system.name}", out, system=system) as folder:
-            row = plain(found)
-            row |= {"first_bit": row.pop("seed"), "seconds": time.perf_counter() - began}
-            frame.store(folder, basics(system, found.steps) | row, {})
-        return frame.finish(folder, report=report, result=found, progress=progress)
+        with frame.answering("compare", f"fork-{system.name}", system, **keep) as answer:
+            answer.result, answer.summary = found, basics(system, found.steps) | plain(found)
+        return answer.outcome
     if found.world != "md":
         raise InputError(
             "runs of a ball are not followed again",
@@ -229,32 +186,23 @@ def fork_folders(
         )
     question = PairQuestion(**asked)
     check(question)
-    last = found.steps if question.steps is None else min(question.steps, found.steps)
+    last = min(found.steps, question.steps or found.steps)
 
     def stored(made: Fork) -> dict[str, Any]:
         known = found.fork if found.fork is not None and found.fork <= made.steps else None
         return {
-            "runs": [found.a, found.b],
-            "differences": found.differences,
-            "stored": {"steps": found.steps, "first_bit": found.seed, "fork": known},
+            "runs": [found.a, found.b], "differences": found.differences,
+            "stored": {"steps": found.steps, "first_bit": found.first_bit, "fork": known},
             "reproduced": known == made.dates.fork,
-        }
+        }  # fmt: skip
 
     labels = {"choice": "replay", "choice_about": TEXTS("replay"), "must_hold": False}
-    frame.say(progress, "compile")
-    twin, question = twin_of(found), PairQuestion(**{**asked, "steps": last})
-    return followed(system, twin, labels, question, stored, out, report, progress)
+    frame.say(keep.get("progress"), "compile")
+    return followed(system, twin_of(found), labels, replace(question, steps=last), stored, **keep)
 
 
 def fork_benign(
-    system: System | str | Path,
-    vary: str,
-    *,
-    steps: int | None = None,
-    out: str | Path | None = None,
-    overrides: Mapping[str, Any] | None = None,
-    report: bool = True,
-    progress: Progress | None = None,
+    system: System | str | Path, vary: str, *, steps: int | None = None, **keep: Unpack[Keep]
 ) -> Outcome:
     """Whether a choice changes anything that would be measured: an ensemble-consistency test.
 
@@ -262,7 +210,7 @@ def fork_benign(
         system: of molecular dynamics, as for `fork`.
         vary: the choice.
         steps: at which the ensembles are compared; default calibrated.
-        out, overrides, report, progress: as for `fork`.
+        keep: see `mdnum.verbs.frame.Keep`.
 
     Returns:
         its result is a `mdnum.forks.benign.Benign`.
@@ -270,15 +218,13 @@ def fork_benign(
     from mdnum.forks.benign import benign
     from mdnum.forks.choices import parse, twin_of
 
-    began = time.perf_counter()
-    system = of_md(system, overrides, "benign")
-    twin = twin_of(parse(vary), system)
-    with frame.new_folder("benign", f"fork-{system.name}", out, system=system) as folder:
-        found = benign(twin, steps=steps, progress=progress)
-        summary = basics(system, found.window) | {"choice": vary, "difference": twin.difference}
-        summary |= {**plain(found), "seconds": time.perf_counter() - began}
-        frame.store(folder, summary, {})
-    return frame.finish(folder, report=report, result=found, progress=progress)
+    system = of_md(system, keep.pop("overrides", None), "benign")
+    twin = twin_of(parse(vary, "md"), system)
+    with frame.answering("benign", f"fork-{system.name}", system, **keep) as answer:
+        answer.result = found = benign(twin, steps=steps, progress=answer.log)
+        what = {"choice": vary, "difference": twin.difference}
+        answer.summary = basics(system, found.window) | what | plain(found)
+    return answer.outcome
 
 
 # -- pages ---------------------------------------------------------------------------------------------
@@ -359,7 +305,7 @@ def page_compare(view: View, verdict: Verdict) -> Page:
             ("fork", "Fork", "a stored decision differs"),
         )
     ]
-    different = differences(s) if s["differences"] else TEXTS("folders_0_causes")
+    different = differences(s["differences"]) if s["differences"] else TEXTS("folders_0_causes")
     sections = [Section("What was different", [different], terminal=True)]
     if s["decisions"]:
         rows = [

@@ -80,8 +80,7 @@ def agreeing(summary: Mapping[str, Any]) -> str:
 def _evidence(view: View) -> Iterator[str]:
     summary, decision = view.summary, view.summary["decision"]
     for reason in summary.get("reasons") or ():
-        text = reason.replace("the first run's", "A’s")
-        yield TEXTS("reason", text=text[:1].upper() + text[1:])
+        yield TEXTS(f"reason_{reason['code']}", **reason, unit=view.units.length)
     if decision is None:
         return
     values = {**decision, "subject": subject(summary), "unit": view.units.length}

@@ -175,7 +175,7 @@ def test_a_package_outside_adds_a_choice_and_its_broken_promise_is_a_finding(cry
     monkeypatch.setattr(metadata.EntryPoint, "load", lambda self: Promised)
     assert parse("promised") == Promised() == shipped("ball")["promised"]
     (row,) = screen(crystal, 20, [parse("promised")])
-    assert row.finding and row.held is False and row.seed == 0
+    assert row.finding and row.held is False and row.first_bit == 0
 
 
 # --- what a choice changes, before any step -----------------------------------------------------------------
@@ -444,14 +444,14 @@ def screened(word: str, system: System, steps: int) -> Screened:
 def test_what_must_hold_holds_to_the_last_bit(crystal: System, word: str):
     row = screened(word, crystal, 200)
     assert row.must_hold and row.held and not row.finding
-    assert (row.seed, row.fork, row.split, row.steps) == (None, None, None, 200)
+    assert (row.first_bit, row.fork, row.split, row.steps) == (None, None, None, 200)
 
 
 @pytest.mark.slow
 def test_the_same_choices_without_such_sums_do_not_hold(crystal: System):
     words = ("order", "relabel", "skin", "rotate", "format", "format=dense")
     rows = screen(crystal, 200, [parse(word) for word in words])
-    assert {row.seed for row in rows} == {1}
+    assert {row.first_bit for row in rows} == {1}
     assert not any(row.must_hold or row.held or row.finding for row in rows)
 
 
@@ -459,7 +459,7 @@ def test_the_same_choices_without_such_sums_do_not_hold(crystal: System):
 def test_another_noise_is_another_key_and_the_same_start():
     row = screened("noise", load(BATH, world="md"), 20)
     # the noise of step 0 moves the atoms of step 1
-    assert row.seed == 1 and "seed 12, not 11" in row.difference
+    assert row.first_bit == 1 and "seed 12, not 11" in row.difference
 
 
 def test_a_screen_ranks_by_fork_and_then_by_seed_with_what_does_not_apply_last(crystal: System):
@@ -472,7 +472,7 @@ def test_a_screen_ranks_by_fork_and_then_by_seed_with_what_does_not_apply_last(c
     first, start, order, lattice, noise = rows
     # sigma by 2e-4 moves every force: a pair crosses the cutoff another time soon
     assert first.fork is not None and 1 <= first.fork < 100
-    assert (start.seed, order.seed, lattice.seed) == (0, 1, None)
+    assert (start.first_bit, order.first_bit, lattice.first_bit) == (0, 1, None)
     assert noise.reason_unavailable is not None and noise.held is None and noise.steps == 0
     with pytest.raises(InputError, match="no choice to screen"):
         screen(crystal, 10, [])

@@ -166,7 +166,7 @@ def twin_of(choice: Choice, system: System | BallSystem) -> Twin:
     return made
 
 
-def parse(text: str) -> Choice:
+def parse(text: str, world: str | None = None) -> Choice:
     """A choice from a word.
 
     Args:
@@ -177,6 +177,7 @@ def parse(text: str) -> Choice:
             "iterations=+1:57:3" (more, step, ball), "contact=later:2" (of the second contact),
             "contact=57:0" (inverted at a step, for a ball). A last "@exact" gives both runs that reduction,
             where an order is what is chosen; "@alone" stops each ball by itself.
+        world: whose choices an error lists, "md" or "ball"; default those of both.
 
     Raises:
         InputError: no such choice, or an argument that it cannot have.
@@ -195,11 +196,13 @@ def parse(text: str) -> Choice:
         takes = {one.name for one in fields(kind)}  # type: ignore[arg-type]
         if (not role or "role" in takes) and (not both or "both" in takes):
             return kind.parse(argument, role, both or None)
-    known = dict.fromkeys([*CHOICES, *shipped("md"), *shipped("ball")])
+    worlds = _WORLDS if world is None else (world,)
+    families = [one for one in CHOICES if set(CHOICES[one].worlds) & set(worlds)]
+    known = dict.fromkeys([*families, *(name for one in worlds for name in shipped(one))])
     close = difflib.get_close_matches(text, known, n=3)
     near = f"Did you mean {' or '.join(close)}? " if close else ""
     raise InputError(
-        f"no choice {text!r}", remedy=f"{near}There are {', '.join(CHOICES)}; `mdnum fork` lists all"
+        f"no choice {text!r}", remedy=f"{near}There are {', '.join(families)}; `mdnum fork` lists all"
     )
 
 
