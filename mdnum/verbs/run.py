@@ -189,7 +189,7 @@ def _ledger(run: RunView) -> Iterator[Finding]:
         yield TEXTS.finding("EVENT_ALGEBRA", *lost, step=run.step(wrong[0]), steps=len(wrong))
     counted = int(run.series["entered"].sum(dtype=np.int64) + run.series["left"].sum(dtype=np.int64))
     wrong = np.flatnonzero(~run.flips.matches(run.series))
-    values = {"counted": counted, "listed": run.flips.total}
+    values: dict[str, Any] = {"counted": counted, "listed": run.flips.total}
     if counted != run.flips.total:
         yield TEXTS.finding("LEDGER_INCOMPLETE", **values)
     elif len(wrong):

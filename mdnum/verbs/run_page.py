@@ -435,7 +435,7 @@ def _ase(run: RunView) -> Iterator[Any]:
         return
     if ase.get("reference"):
         key = "compared_sampled" if "sampled" in ase else "compared"
-        yield TEXTS(key, reference=ase["reference"], sampled=ase.get("sampled"), atoms=view.summary["atoms"])
+        yield TEXTS(key, reference=ase["reference"], sampled=ase.get("sampled"), atoms=run.summary["atoms"])
     rows = [("energy", ase["energy_rel"], "relative")]
     if ase.get("force_max") is not None:
         scale = ase.get("force_scale")
