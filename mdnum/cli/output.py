@@ -129,10 +129,10 @@ def question(
             # looked at before a folder is listed anew, and said where nothing is worse
             wrong = [line for one in folders if one.is_dir() for line in RunFolder.open(one).noted()]
             stopped = False
-            with watched(remedy and (lambda: remedy({**given, **how}))) as progress:
+            with watched(lambda: remedy({**given, **how}) if remedy else None) as progress:
                 how["progress"] = progress
                 try:
-                    outcome = ask(**given, how=how)
+                    outcome: Any = ask(**given, how=how)
                 except KeyboardInterrupt as stop:
                     # what was found until then may be an answer
                     if (outcome := getattr(stop, "outcome", None)) is None:
