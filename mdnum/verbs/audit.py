@@ -33,11 +33,9 @@ from mdnum.verbs.frame import Outcome, Progress, Verb, View
 if TYPE_CHECKING:
     from ase import Atoms
 
-    from mdnum.audit.base import CheckResult, Observed
-    from mdnum.audit.check import AuditCheck
+    from mdnum.audit.base import AuditCheck, CheckResult, Observed
     from mdnum.audit.record import AuditState
-    from mdnum.audit.structures import LoadedCalculator
-    from mdnum.audit.subject import CalculatorSubject
+    from mdnum.audit.subject import CalculatorSubject, LoadedCalculator
 
 TEXTS = Texts(__file__)
 _SCRIPT = "reproduce.py"
@@ -141,7 +139,6 @@ def _ask_all(
 ) -> Outcome:
     """Asks the checks that are not done, keeping each answer, and finishes the folder."""
     from mdnum.audit.base import TIME_UP, TimeUp
-    from mdnum.audit.check import Settings
     from mdnum.audit.checks import CHECKS
     from mdnum.audit.subject import CalculatorSubject
     from mdnum.audit.thresholds import find_thresholds
@@ -155,11 +152,11 @@ def _ask_all(
     subject.meter.deadline = deadline
     if state.thresholds is not None:
         subject.known["thresholds"] = state.thresholds
-    settings = Settings(_internal(state.timestep, loaded.units), state.steps)
+    timestep = _internal(state.timestep, loaded.units)
     log = frame.logged(folder, progress)
     earlier, state.during, state.why = state.cut, None, ""
     for name in state.left:
-        check = CHECKS[name](settings)
+        check = CHECKS[name](timestep, state.steps)
         log(0, 0, {"phase": name})
         state.during = name
         try:
@@ -202,8 +199,7 @@ def _ask_all(
 
 def _ask(check: AuditCheck, subject: CalculatorSubject, log: frame.Progress) -> CheckResult:
     """A check's answer; where the calculator fails and it cannot continue, the failure as a finding."""
-    from mdnum.audit.base import CheckResult, finding
-    from mdnum.audit.subject import CalculatorError
+    from mdnum.audit.base import CalculatorError, CheckResult, finding
 
     try:
         return check(subject, log)
@@ -248,7 +244,7 @@ def _write_structures(folder: RunFolder, structures: Mapping[str, Atoms]) -> Non
 
 
 def _wanted(checks: str | Sequence[str] | None) -> list[str]:
-    from mdnum.audit.check import in_order
+    from mdnum.audit.base import in_order
     from mdnum.audit.checks import CHECKS
 
     if checks is None:
@@ -264,7 +260,8 @@ def _wanted(checks: str | Sequence[str] | None) -> list[str]:
 
 
 def _loaded(calculator: str | Callable[[], Any]) -> LoadedCalculator:
-    from mdnum.audit.structures import LoadedCalculator, load_calculator
+    from mdnum.audit.record import load_calculator
+    from mdnum.audit.subject import LoadedCalculator
 
     if isinstance(calculator, str):
         return load_calculator(calculator)
@@ -317,7 +314,7 @@ def _internal(timestep: float | None, given: units.Units) -> float | None:
 
 def _summary(state: AuditState) -> dict[str, Any]:
     """The content of summary.json, without what is judged."""
-    from mdnum.audit.verdict import answers
+    from mdnum.audit.base import answers
 
     atoms, given = state.atoms, units.get(state.units)
     said = answers(state.shown, state.checks)
@@ -407,7 +404,7 @@ def _says(result: CheckResult) -> str:
 
 def _by_cause(found: Sequence[Observed]) -> list[tuple[Observed, list[Observed]]]:
     """(finding, those that may follow from it) of each that is listed by itself."""
-    from mdnum.audit.verdict import heads
+    from mdnum.audit.base import heads
 
     above = heads([(one.code, one.severity) for one in found])
     return [
@@ -466,8 +463,7 @@ def _judge(view: AuditView) -> Verdict:
 
 def _headline(state: AuditState, found: Sequence[Finding]) -> str:
     """Both answers, what they do not rest on, and the worst that was found."""
-    from mdnum.audit.base import TIME_UP
-    from mdnum.audit.verdict import answers, largely_unasked, to_come
+    from mdnum.audit.base import TIME_UP, answers, largely_unasked, to_come
 
     said = answers(state.shown, state.checks)
     slugs = {question: answer.replace(" ", "_") for question, answer in said.items()}
