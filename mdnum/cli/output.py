@@ -138,7 +138,7 @@ def question(
                     if (outcome := getattr(stop, "outcome", None)) is None:
                         raise
                     stopped = True
-            if callable(outcome):
+            if not hasattr(outcome, "verdict"):
                 return outcome(as_json)
             print_lines(wrong)
             code = print_outcome(outcome, as_json=as_json)
