@@ -12,7 +12,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from mdnum.report.section import Page, Plot, Region, Section, Series, Table, pai
 from mdnum.report.words import typeset
 from mdnum.systems.load import shipped_folder
 from mdnum.verbs import frame
-from mdnum.verbs.frame import Outcome, Progress, Verb, View
+from mdnum.verbs.frame import Keep, Outcome, Verb, View
 
 __all__ = ["Claim", "Demo", "Plot", "Region", "Series", "Table", "demonstrate", "names", "table"]
 
@@ -86,16 +86,12 @@ def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> 
     return Table(tuple(columns), rows, title)
 
 
-def demonstrate(
-    name: str, *, out: str | Path | None = None, report: bool = True, progress: Progress | None = None
-) -> Outcome:
+def demonstrate(name: str, **keep: Unpack[Keep]) -> Outcome:
     """Run a demonstration, or all of them.
 
     Args:
         name: of one, or "all".
-        out: the new folder; default runs/demo-<name>-<n>.
-        report: whether to write report.html.
-        progress: called between demonstrations.
+        keep: see `frame.Keep`; without overrides.
 
     Returns:
         its numbers, checks and curves; `result` is the list of `Demo`.
@@ -107,14 +103,14 @@ def demonstrate(
     asked = names() if name == "all" else [_known(name)]
     done: dict[str, Demo] = {}
     for number, one in enumerate(asked):
-        frame.say(progress, f"demonstration {one}", number, len(asked))
+        frame.say(keep.get("progress"), f"demonstration {one}", number, len(asked))
         done[one] = load(one)()
     documents = [_document(one, demo) for one, demo in done.items()]
-    summary = documents[0] if name != "all" else {"demos": documents}
-    with frame.new_folder("demos", f"demo-{name}", out) as folder:
-        ok = all(demo.ok for demo in done.values())
-        frame.store(folder, {**summary, "ok": ok}, {"curves": _curves(done)})
-    return frame.finish(folder, report=report, result=list(done.values()), progress=progress)
+    with frame.answering("demos", f"demo-{name}", **keep) as answer:
+        summary = documents[0] if name != "all" else {"demos": documents}
+        answer.summary = {**summary, "ok": all(demo.ok for demo in done.values())}
+        answer.tables, answer.result = {"curves": _curves(done)}, list(done.values())
+    return answer.outcome
 
 
 # --- the scripts --------------------------------------------------------------------------------------

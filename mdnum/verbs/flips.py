@@ -8,7 +8,7 @@ import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from mdnum.store import RunFolder
 from mdnum.store.tables import TableStream
 from mdnum.verbs.flips_page import judge, page
 from mdnum.verbs.flips_shared import FlipsView, HeldRows, about, ending, plain_box, selected, stem
-from mdnum.verbs.frame import Outcome, Progress, Verb, finish, logged, new_folder, store
+from mdnum.verbs.frame import Keep, Outcome, Progress, Verb, answering
 
 if TYPE_CHECKING:
     from mdnum.trajectories.follow import Followed, Groups, Pass
@@ -52,9 +52,7 @@ def flips(
     between: tuple[str, str] | None = None,
     window: int = WINDOW,
     format: str | None = None,
-    out: str | Path | None = None,
-    report: bool = True,
-    progress: Progress | None = None,
+    **keep: Unpack[Keep],
 ) -> Outcome:
     """Finds which pairs entered or left a threshold between the frames of a file, and what follows.
 
@@ -72,9 +70,7 @@ def flips(
         window: frames within which a flip that is reversed is chatter, and up to which a stay outside is
             overlooked in an intermittent contact.
         format: of the files, where their names do not tell.
-        out: the new folder; default runs/flips-<name>-<n>.
-        report: write report.html.
-        progress: called now and then with what is done, of how much, and a dictionary of figures.
+        keep: see `frame.Keep`; without overrides.
 
     Raises:
         InputError: a file or an option cannot be used. A frame in the middle that cannot be read is no
@@ -93,7 +89,7 @@ def flips(
 
         _refuse_topology_first(trajectory, other, topology)
         a, b = (open_trajectory(path, topology, format=format) for path in (trajectory, other))
-        return compare(a, b, asked or _default_rules(a), between, out=out, report=report, progress=progress)
+        return compare(a, b, asked or _default_rules(a), between, **keep)
     opened = open_trajectory(trajectory, topology, format=format)
     asked = asked or _default_rules(opened)
     groups = selected(opened, between)
@@ -103,8 +99,8 @@ def flips(
     passes = follow(opened, asked, groups, resolution, rows.add)
     # no folder for a file whose first frame cannot be used
     found, began = next(passes), time.perf_counter()
-    with new_folder("flips", f"flips-{stem(opened)}", out) as folder:
-        log = logged(folder, progress)
+    with answering("flips", f"flips-{stem(opened)}", **keep) as answer:
+        folder, log = answer.folder, answer.log
         interrupted = rows.drain(folder, passes, found, opened.count or 0, log)
         read = time.perf_counter()
         frames = folder.read("frames")
@@ -115,7 +111,7 @@ def flips(
             for number, one in enumerate(found.rules)
         ]
         leaps = found.leaps
-        summary = {
+        answer.result, answer.summary = found, {
             **about(opened, "flips", between),
             "box": plain_box(sample[0].box),
             "frames": found.frames,
@@ -131,9 +127,7 @@ def flips(
             **ending(found.stopped, interrupted),
             "seconds": {"frames": read - began, "statistics": time.perf_counter() - read},
         }  # fmt: skip
-        store(folder, summary, {})
-        folder.drop_checkpoint()
-        return finish(folder, report=report, result=found, progress=progress)
+    return answer.outcome
 
 
 VERBS = {"flips": Verb(judge, page, FlipsView)}

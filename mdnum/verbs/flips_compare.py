@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 
@@ -20,7 +18,7 @@ from mdnum.trajectories.follow import atoms_of
 from mdnum.trajectories.resolution import infer
 from mdnum.trajectories.tracker import Tracker
 from mdnum.verbs.flips_shared import FlipsView, HeldRows, about, ending, name_of, resolution, selected, stem
-from mdnum.verbs.frame import Outcome, Progress, Verb, finish, logged, new_folder, store
+from mdnum.verbs.frame import Keep, Outcome, Verb, answering
 
 if TYPE_CHECKING:
     from mdnum.trajectories.rules import Rule
@@ -39,10 +37,7 @@ def compare(
     b: Trajectory,
     asked: tuple[Rule, ...],
     between: tuple[str, str] | None,
-    *,
-    out: str | Path | None = None,
-    report: bool = True,
-    progress: Progress | None = None,
+    **keep: Unpack[Keep],
 ) -> Outcome:
     """Where two trajectories diverge; see `mdnum.verbs.flips.flips`.
 
@@ -54,7 +49,7 @@ def compare(
             f"{a.name} has {a.atoms:,} atoms and {b.name} {b.atoms:,}",
             remedy="Compare trajectories of the same atoms",
         )
-    groups, began = selected(a, between), time.perf_counter()
+    groups = selected(a, between)
     resolutions = [infer(one.sample(), one.bits, one.format) for one in (a, b)]
     sets = [
         NeighborSets(rule, [
@@ -67,8 +62,8 @@ def compare(
     passes = follow_both(sets, atoms_of(groups), rows.add)
     # no folder for files whose first frames cannot be used
     found = next(passes)
-    with new_folder("flips-compare", f"flips-{stem(a)}", out) as folder:
-        log = logged(folder, progress)
+    with answering("flips-compare", f"flips-{stem(a)}", **keep) as answer:
+        folder, log = answer.folder, answer.log
         total = min((one.count for one in (a, b) if one.count is not None), default=0)
         interrupted = rows.drain(folder, passes, found, total, log)
         table = folder.read("apart")
@@ -79,28 +74,28 @@ def compare(
             }
             for one in sets
         ]  # fmt: skip
-        summary = {
-            **about(a, "flips-compare", between),
-            "other": name_of(b),
-            "other_file": str(b.path),
-            "other_format": b.format,
-            "same_species": _alike(a, b),
-            "rules": told,
-            "in_file": [one.count for one in (a, b)],
-            "times": [a.time, b.time],
-            "timed": a.time != "frame",
-            "interval": 1.0,
-            "resolution": resolutions[0],
-            "other_resolution": resolutions[1],
-            **{name: value for name, value in vars(found).items() if name != "stopped"},
-            # steps, units and numbers of frames are not compared with one another
-            "times_differ": found.times_differ if a.time == b.time else 0,
-            **ending(found.stopped, interrupted),
-            "seconds": time.perf_counter() - began,
-        }
-        store(folder, summary, {})
-        folder.drop_checkpoint()
-        return finish(folder, report=report, result=found, progress=progress)
+        answer.result, answer.summary = (
+            found,
+            {
+                **about(a, "flips-compare", between),
+                "other": name_of(b),
+                "other_file": str(b.path),
+                "other_format": b.format,
+                "same_species": _alike(a, b),
+                "rules": told,
+                "in_file": [one.count for one in (a, b)],
+                "times": [a.time, b.time],
+                "timed": a.time != "frame",
+                "interval": 1.0,
+                "resolution": resolutions[0],
+                "other_resolution": resolutions[1],
+                **{name: value for name, value in vars(found).items() if name != "stopped"},
+                # steps, units and numbers of frames are not compared with one another
+                "times_differ": found.times_differ if a.time == b.time else 0,
+                **ending(found.stopped, interrupted),
+            },
+        )
+    return answer.outcome
 
 
 def _alike(a: Trajectory, b: Trajectory) -> bool:
