@@ -13,8 +13,7 @@ from mdnum.report.finding import Texts
 from mdnum.report.words import listed, number, plain
 
 if TYPE_CHECKING:
-    from mdnum.trajectories.follow import Groups
-    from mdnum.trajectories.frame import Box
+    from mdnum.trajectories.tracker import Groups
     from mdnum.trajectories.trajectory import Trajectory
 
 TEXTS = Texts(Path(__file__).with_name("flips.py"))
@@ -67,11 +66,6 @@ def ending(stopped: InputError | None, interrupted: bool) -> dict[str, Any]:
         "interrupted": interrupted,
         "status": "stopped" if stopped is not None or interrupted else "complete",
     }
-
-
-def plain_box(box: Box) -> dict[str, Any]:
-    """A box as plain values."""
-    return {"matrix": np.asarray(box.matrix, float).tolist(), "pbc": np.asarray(box.pbc, bool).tolist()}
 
 
 class Written:

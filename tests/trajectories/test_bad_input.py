@@ -21,9 +21,9 @@ from MDAnalysisTests import datafiles
 import mdnum
 from mdnum.errors import InputError
 from mdnum.trajectories import NeighborFlips
+from mdnum.trajectories.binary import XtcFile
 from mdnum.trajectories.frame import Box, Frame, FrameError, UnreadableFrame, checked
 from mdnum.trajectories.source import open_trajectory, select
-from mdnum.trajectories.xtc import XtcFile
 
 warnings.filterwarnings("ignore", module="MDAnalysis")
 

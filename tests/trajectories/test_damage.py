@@ -18,6 +18,7 @@ from MDAnalysisTests import datafiles
 import mdnum
 from mdnum.errors import InputError
 from mdnum.trajectories import NeighborFlips
+from mdnum.trajectories.binary import head_of
 from mdnum.trajectories.frame import (
     Box,
     Frame,
@@ -26,10 +27,8 @@ from mdnum.trajectories.frame import (
     checked,
     far_out,
     leap,
-    smallest_radius,
 )
-from mdnum.trajectories.netcdf import head_of
-from mdnum.trajectories.rules import CutoffRule, Nearest, SpeciesCutoffs
+from mdnum.trajectories.rules import CutoffRule, Nearest, SpeciesCutoffs, smallest_radius
 from mdnum.trajectories.source import open_trajectory
 
 DLPOLY = Path(datafiles.PSF).parent / "dlpoly" / "HISTORY"
