@@ -15,8 +15,7 @@ from mdnum.store import RunFolder
 from mdnum.verbs.frame import Progress, View, asked_to_stop
 
 if TYPE_CHECKING:
-    from mdnum.trajectories.follow import Groups
-    from mdnum.trajectories.frame import Box
+    from mdnum.trajectories.tracker import Groups
     from mdnum.trajectories.trajectory import Trajectory
 
 # rows that wait to be handed over together: a call costs more than a row
@@ -71,11 +70,6 @@ def ending(stopped: InputError | None, interrupted: bool) -> dict[str, Any]:
         "interrupted": interrupted,
         "status": "stopped" if stopped is not None or interrupted else "complete",
     }
-
-
-def plain_box(box: Box) -> dict[str, Any]:
-    """A box as plain values."""
-    return {"matrix": np.asarray(box.matrix, float).tolist(), "pbc": np.asarray(box.pbc, bool).tolist()}
 
 
 class HeldRows:
