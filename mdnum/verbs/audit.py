@@ -22,7 +22,7 @@ from mdnum.errors import InputError
 from mdnum.plain import plain
 from mdnum.registry import unknown
 from mdnum.report.finding import Finding, Texts, Verdict, conclude
-from mdnum.report.section import Code, Key, Page, Plot, Section, Series, cell, pairs, records
+from mdnum.report.section import Code, Key, Page, Plot, Section, Series, cell, pairs, points_of, records
 from mdnum.report.words import count, heading, many, number
 from mdnum.store import RunFolder
 from mdnum.store.answers import Answers, take
@@ -359,23 +359,17 @@ def _summary(state: AuditState) -> dict[str, Any]:
 
 def _tables(state: AuditState) -> dict[str, dict[str, np.ndarray]]:
     """Points of the figures, and what checks recorded."""
-    rows: list[tuple[str, str, str, float, float]] = []
-    tables: dict[str, dict[str, np.ndarray]] = {}
+    lines = [
+        (result.name, f"{result.name}-{place}", label, chart.x, values)
+        for result in state.shown
+        for place, chart in enumerate(result.charts, 1)
+        for label, values in chart.lines.items()
+    ]
+    tables = {"curves": points_of(lines)} if lines else {}
     for result in state.shown:
-        for place, chart in enumerate(result.charts, 1):
-            for line, values in chart.lines.items():
-                points = zip(chart.x, values, strict=True)
-                rows += [(result.name, f"{result.name}-{place}", line, x, y) for x, y in points]
         for name, columns in result.recorded.items():
             if next(iter(columns.values()), ()):
                 tables[name] = {column: np.array(values) for column, values in columns.items()}
-    if rows:
-        columns = zip(*rows, strict=True)
-        names = ("part", "curve", "line", "x", "y")
-        tables["curves"] = {
-            name: np.array(column, float if name in "xy" else str)
-            for name, column in zip(names, columns, strict=True)
-        }
     return tables
 
 

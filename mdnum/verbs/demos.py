@@ -20,7 +20,7 @@ from mdnum.errors import InputError
 from mdnum.plain import plain
 from mdnum.registry import nearest
 from mdnum.report.finding import Texts, Verdict, conclude
-from mdnum.report.section import Page, Plot, Region, Section, Series, Table, pairs
+from mdnum.report.section import Page, Plot, Region, Section, Series, Table, pairs, points_of
 from mdnum.report.words import typeset
 from mdnum.systems.load import shipped_folder
 from mdnum.verbs import frame
@@ -109,7 +109,17 @@ def demonstrate(name: str, **keep: Unpack[Keep]) -> Outcome:
     with frame.answering("demos", f"demo-{name}", **keep) as answer:
         summary = documents[0] if name != "all" else {"demos": documents}
         answer.summary = {**summary, "ok": all(demo.ok for demo in done.values())}
-        answer.tables, answer.result = {"curves": _curves(done)}, list(done.values())
+        answer.tables, answer.result = (
+            {
+                "curves": points_of(
+                    (name, plot.name, line.label, line.x, line.y)
+                    for name, demo in done.items()
+                    for plot in demo.plots
+                    for line in plot.series
+                )
+            },
+            list(done.values()),
+        )
     return answer.outcome
 
 
@@ -173,24 +183,6 @@ def _document(name: str, demo: Demo) -> dict[str, Any]:
             {key: one[key] for key in ("label", "mark", "role", "dashed")} for one in plot["series"]
         ]
     return document
-
-
-def _curves(demos: Mapping[str, Demo]) -> dict[str, np.ndarray]:
-    """A row per point of every line of every plot."""
-    parts: list[tuple[str, str, str, Series]] = [
-        (name, plot.name, series.label, series)
-        for name, demo in demos.items()
-        for plot in demo.plots
-        for series in plot.series
-    ]
-    sizes = [len(series.x) for *_, series in parts]
-    columns = {
-        key: np.repeat(np.array([part[at] for part in parts], dtype=str), sizes)
-        for at, key in enumerate(("part", "curve", "line"))
-    }
-    for key in ("x", "y"):
-        columns[key] = np.concatenate([np.asarray(getattr(part[3], key), float) for part in parts] or [[]])
-    return columns
 
 
 def _plots(document: Mapping[str, Any], curves: Mapping[str, np.ndarray]) -> Iterator[Plot]:

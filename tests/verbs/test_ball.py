@@ -53,15 +53,10 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def three(file: Path, tmp_path_factory: pytest.TempPathFactory) -> Outcome:
     said: list[str] = []
-    made = bounce(
-        file,
-        out=tmp_path_factory.mktemp("runs") / "three",
-        against=["stop.rule=per-instance"],
-        report=False,
-        progress=lambda step, steps, info: said.append(info["phase"]),
-    )
-    assert said[0] == "compile"
-    assert "run" in said
+    note = lambda step, steps, info: said.append(info["phase"])  # noqa: E731
+    out = tmp_path_factory.mktemp("runs") / "three"
+    made = bounce(file, out=out, against=["stop.rule=per-instance"], report=False, progress=note)
+    assert said[0] == "compile" and "run" in said
     return made
 
 
@@ -407,13 +402,7 @@ def test_variants_of_a_finding(good: BallView):
 
 
 def test_findings_of_the_system_are_kept_and_own_ones_are_decided_again(good: BallView):
-    remark = {
-        "code": "STIFF",
-        "severity": "warning",
-        "title": "h √k is 1.95",
-        "text": "Near 2.",
-        "remedy": "",
-    }
+    remark = {"code": "STIFF", "severity": "warning", "title": "h √k is 1.95", "text": "Near 2."}
     stale = {**remark, "code": "SOLVER_CAP"}
     assert set(codes(altered(good, findings=[remark, stale]))) == {"STIFF"}
 
