@@ -11,7 +11,7 @@ import numpy as np
 from mdnum.errors import InputError
 from mdnum.report.browse import Browse, Column
 from mdnum.report.finding import Finding, Texts, Verdict, conclude
-from mdnum.report.section import Key, Page, Plot, Section, Series, Table, pairs
+from mdnum.report.section import Key, Page, Plot, Section, Series, Table, pairs, table_of
 from mdnum.report.words import count, many, number
 from mdnum.trajectories.follow import ComparedSide, NeighborSets, follow_both, growth_of
 from mdnum.trajectories.resolution import infer
@@ -353,31 +353,26 @@ def _keys(view: ComparisonView) -> Iterator[Key]:
 
 
 def _rules(view: ComparisonView) -> Table:
-    columns = ("inside", "sets differ from frame", "pairs then", "undecidable", "for certain from frame")
-    rows = []
-    for one in view.summary["rules"]:
-        first = one["first"] or {}
-        rows.append(
-            (view.rule(one), *(first.get(name) for name in ("frame", "pairs", "ambiguous")), one["certain"])
-        )
-    return Table(columns, rows)
+    never = dict.fromkeys(("frame", "pairs", "ambiguous"))
+    rows = [{**one, **(one["first"] or never)} for one in view.summary["rules"]]
+    return table_of(rows, {
+        "inside": view.rule, "sets differ from frame": "frame", "pairs then": "pairs",
+        "undecidable": "ambiguous", "for certain from frame": "certain",
+    })  # fmt: skip
 
 
 def _first_pairs(view: ComparisonView) -> Iterator[Table]:
     unit = f" ({view.unit})" if view.unit else ""
-    columns = ("pair", "inside in", f"r in A{unit}", "r in B", "margin in A", "margin in B")
+    columns: dict[str, Any] = {
+        "pair": lambda row: f"{row['i']}–{row['j']}", "inside in": lambda row: f"{row['inside']} only",
+        f"r in A{unit}": lambda row: f"{row['distance_a']:.10g}",
+        "r in B": lambda row: f"{row['distance_b']:.10g}",
+        "margin in A": "margin_a", "margin in B": "margin_b",
+    }  # fmt: skip
     for one in view.summary["rules"]:
-        rows = [
-            (
-                f"{row['i']}–{row['j']}", f"{row['inside']} only", f"{row['distance_a']:.10g}",
-                f"{row['distance_b']:.10g}", row["margin_a"], row["margin_b"],
-            )
-            for row in one["first_pairs"]
-        ]  # fmt: skip
-        if rows:
-            yield Table(
-                columns, rows, f"{view.rule(one)}: the first pairs to differ, {view.values(one)['first']}"
-            )
+        if one["first_pairs"]:
+            title = f"{view.rule(one)}: the first pairs to differ, {view.values(one)['first']}"
+            yield table_of(one["first_pairs"], columns, title)
 
 
 def _axis(
