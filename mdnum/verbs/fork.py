@@ -21,7 +21,7 @@ from mdnum.report.section import Figure, Key, Page, Section, Table, pairs, table
 from mdnum.report.svg import BAD, FIRST, MUTED, SECOND
 from mdnum.report.words import count, many, number
 from mdnum.verbs import frame
-from mdnum.verbs.fork_page import differences, page, size, took
+from mdnum.verbs.fork_page import differences, page, size
 from mdnum.verbs.fork_pair import PairQuestion, basics, check, followed, of_any, of_md
 from mdnum.verbs.fork_verdict import RANKING, TEXTS, judge, judge_benign, judge_compare, judge_screen
 from mdnum.verbs.frame import Keep, Outcome, View
@@ -233,7 +233,7 @@ def fork_benign(
 
 
 def _page(view: View, what: str, about: str, keys: list[Key], sections: list[Section]) -> Page:
-    rows = [*size(view), took(view.summary)]
+    rows = [*size(view), view.took]
     sections = [*sections, Section("What was run", [pairs(rows)])]
     return view.page(f"{view.name}: {what}", about, keys, sections)
 

@@ -14,7 +14,7 @@ from mdnum.report.section import Figure, Key, Page, Plot, Section, Series, curve
 from mdnum.report.svg import FIRST, MUTED
 from mdnum.report.words import count, many, number
 from mdnum.verbs import frame
-from mdnum.verbs.fork_page import size, took
+from mdnum.verbs.fork_page import size
 from mdnum.verbs.fork_pair import basics, is_ball, last_step, of_any, of_md
 from mdnum.verbs.frame import Answer, Keep, Outcome, View
 
@@ -229,7 +229,7 @@ def page_certify(view: View, verdict: Verdict) -> Page:
         f"largest distance from the exact place ({unit})", series, y_scale="log",
         caption=TEXTS("separations_caption"),
     )] * bool(series)  # fmt: skip
-    what = [*size(view), ("Exact", TEXTS("exact_ball" if ball else "exact_md")), took(s)]
+    what = [*size(view), ("Exact", TEXTS("exact_ball" if ball else "exact_md")), view.took]
     return view.page(f"{view.name}: precisions", TEXTS("certify_about"), keys, [
         Section("Ranking", [ranking, *_gains(s, roles)], terminal=True),
         Section("Steps kept", [figure, dtypes]),
@@ -390,7 +390,7 @@ def page_processes(view: View, verdict: Verdict) -> Page:
     return view.page(f"{view.name}: programs", TEXTS("programs_about"), keys, [
         Section("Programs", [*s["causes"], programs], terminal=True),
         Section("Separation from the reference", plots),
-        Section("What was run", [pairs([*size(view), ("Programs", TEXTS("programs")), took(s)])]),
+        Section("What was run", [pairs([*size(view), ("Programs", TEXTS("programs")), view.took])]),
     ])  # fmt: skip
 
 

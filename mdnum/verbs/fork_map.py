@@ -14,7 +14,7 @@ from mdnum.report.finding import Texts, Verdict, conclude
 from mdnum.report.section import Key, Page, Plot, Role, Section, Series, curves, pairs, positive, table_of
 from mdnum.report.words import count, many, number
 from mdnum.verbs import frame
-from mdnum.verbs.fork_page import size, took
+from mdnum.verbs.fork_page import size
 from mdnum.verbs.fork_pair import FEW_STEPS, basics, last_step, of_any, of_md
 from mdnum.verbs.frame import Keep, Outcome, View
 
@@ -221,7 +221,7 @@ def page_map(view: View, verdict: Verdict) -> Page:
     what = [
         *size(view), ("Number", f"{_with_unit(s['key'], unit)} from {s['low']!r} to {s['high']!r}{own}"),
         ("Loss", f"{_with_unit(s['loss'], s['loss_unit'])} of the last step"),
-        ("Program", TEXTS("program_compiles" if s["compiles"] else "program")), took(s),
+        ("Program", TEXTS("program_compiles" if s["compiles"] else "program")), view.took,
     ]  # fmt: skip
     stretches = table_of(left, {"from": lambda one: repr(one[0]), "to": lambda one: repr(one[1])})
     return view.page(f"{view.name}: along {s['key']}", TEXTS("map_about"), keys, [
@@ -397,7 +397,7 @@ def page_forecast(view: View, verdict: Verdict) -> Page:
         Section("Displacements that flip a decision", plots),
         Section("Decisions", [table_of(s[name], columns, title) for name, title in titles.items() if s[name]],
                 terminal=True),
-        Section("What was run", [pairs([*size(view), ("Direction", TEXTS("direction")), took(s)])]),
+        Section("What was run", [pairs([*size(view), ("Direction", TEXTS("direction")), view.took])]),
     ])  # fmt: skip
 
 
