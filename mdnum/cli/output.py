@@ -17,6 +17,7 @@ from mdnum.plain import plain
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from mdnum.report.finding import Finding
     from mdnum.report.section import Table
     from mdnum.verbs.frame import Outcome
 
@@ -29,12 +30,12 @@ _PIPE_WIDTH = 200
 # records that are easier to read side by side than as rows
 _FEW, _MANY = 3, 6
 _MOST_ROWS = 12
-_ALONE = inspect.Parameter.KEYWORD_ONLY
 
 # how a person should read a severity; the exit code is 1 for the last two
 _STYLE = {"info": "dim", "ok": "green", "warning": "yellow", "error": "bold red", "unsafe": "bold red"}
 
 JSON_OPTION = typer.Option(False, "--json", help="Print one JSON document instead of text.")
+NO_REPORT_OPTION = typer.Option(False, "--no-report", help="Do not write report.html.")
 SET_OPTION = typer.Option(
     None, "--set", metavar="KEY=VALUE", help="Override a key of the system file; repeatable."
 )
@@ -70,49 +71,92 @@ def parse_overrides(settings: Sequence[str] | None) -> dict[str, str]:
     return overrides
 
 
+def refuse_beside_resume(given: Mapping[str, Any], what: str) -> None:
+    """Refuses what a folder that is resumed has already.
+
+    Args:
+        given: what was typed, by option; None where nothing was.
+        what: is resumed.
+
+    Raises:
+        InputError: something was typed.
+    """
+    from mdnum.verbs.frame import refuse
+
+    asked = {name: value is not None for name, value in given.items()}
+    refuse(asked, f"of a new {what}", "Leave it out beside --resume, or begin in a new folder")
+
+
+def answered(
+    verb: Callable[..., Outcome],
+    *words: Any,
+    no_report: bool,
+    as_json: bool,
+    remedy: Callable[[], str | None] | None = None,
+    noted: Sequence[Path] = (),
+    **options: Any,
+) -> int:
+    """Calls a verb beside a progress bar and prints its answer; returns the exit code.
+
+    Args:
+        remedy: asked what to do after control-C.
+        noted: folders that are read; what is not as it was written there is said on stderr.
+        words, options: of the verb.
+
+    Raises:
+        Stopped: control-C ended it without an answer.
+    """
+    from mdnum.cli.progress import watched
+    from mdnum.store import RunFolder
+
+    read = dict.fromkeys(filter(None, (options.get("resume"), *noted)))
+    # looked at before the folder is listed anew, and said where nothing is worse
+    notes = [line for path in read if path.is_dir() for line in RunFolder.open(path).noted()]
+    stopped = False
+    with watched(remedy) as progress:
+        try:
+            outcome = verb(*words, report=not no_report, progress=progress, **options)
+        except KeyboardInterrupt as stop:
+            # what was found until then may be an answer
+            if (outcome := getattr(stop, "outcome", None)) is None:
+                raise
+            stopped = True
+    print_lines(notes)
+    code = print_outcome(outcome, as_json=as_json)
+    return EXIT_STOPPED if stopped or outcome.summary.get("interrupted") else code
+
+
 def changed(settings: list[str] | None = SET_OPTION) -> dict[str, Any]:
     """Changes to a system file, as a verb takes them."""
     return {"overrides": parse_overrides(settings)}
 
 
-def kept(
-    out: Path | None = typer.Option(
-        None, "-o", "--out", metavar="DIR", help="The new folder; runs/VERB-NAME-N by default."
-    ),
-    no_report: bool = typer.Option(False, "--no-report", help="Do not write report.html."),
-) -> dict[str, Any]:
-    """Where the answer goes, as a verb takes it."""
-    return {"out": out, "report": not no_report}
-
-
 def question(
-    *groups: Callable[..., dict[str, Any]], notes: Sequence[str] = ()
+    *groups: Callable[..., dict[str, Any]], noted: Sequence[str] = ()
 ) -> Callable[[Callable[..., Any]], Callable[..., int]]:
     """Makes a command of a function that asks a verb: with the options of these groups, printing its outcome.
 
     Args:
-        groups: functions whose parameters are options of the command too; what they return, and the progress,
-            the function gets in one dictionary, `how`.
-        notes: parameters that are folders whose damage is said on stderr.
+        groups: functions whose parameters are options of the command too; what they return, the new folder
+            and the progress are one dictionary of the function's, `how`.
+        noted: parameters that are folders to be read.
     """
 
     def decorate(ask: Callable[..., Any]) -> Callable[..., int]:
-        def command(*, as_json: bool, **given: Any) -> int:
-            from mdnum.cli.progress import watched
-
-            how: dict[str, Any] = {}
+        def command(*, out: Path | None, no_report: bool, as_json: bool, **given: Any) -> int:
+            how: dict[str, Any] = {"out": out}
             for group in groups:
                 how |= group(**{name: given.pop(name) for name in inspect.signature(group).parameters})
-            with watched() as progress:
-                outcome = ask(**given, how={**how, "progress": progress})
-            print_notes(*(given[name] for name in notes))
-            return print_outcome(outcome, as_json=as_json)
+            return answered(
+                lambda **keep: ask(**given, how={**how, **keep}), no_report=no_report, as_json=as_json,
+                noted=[given[name] for name in noted],
+            )  # fmt: skip
 
         whole: Any = command
-        named = [inspect.signature(one, eval_str=True).parameters for one in (ask, *groups)]
-        parameters = {name: each for one in named for name, each in one.items() if name != "how"}
-        parameters["as_json"] = inspect.Parameter("as_json", _ALONE, default=JSON_OPTION, annotation=bool)
-        whole.__signature__ = inspect.Signature([each.replace(kind=_ALONE) for each in parameters.values()])
+        sources = [inspect.signature(one, eval_str=True).parameters for one in (ask, *groups, _shared)]
+        parameters = {name: each for one in sources for name, each in one.items() if name != "how"}
+        alone = inspect.Parameter.KEYWORD_ONLY
+        whole.__signature__ = inspect.Signature([each.replace(kind=alone) for each in parameters.values()])
         whole.__annotations__ = {name: each.annotation for name, each in parameters.items()}
         whole.__name__, whole.__doc__ = ask.__name__, ask.__doc__
         return command
@@ -120,9 +164,28 @@ def question(
     return decorate
 
 
-def print_json(document: Mapping[str, Any]) -> None:
-    """The one JSON document of a verb, to stdout."""
+def _shared(
+    out: Path | None = typer.Option(
+        None, "-o", "--out", metavar="DIR", help="The new folder; runs/VERB-NAME-N by default."
+    ),
+    no_report: bool = NO_REPORT_OPTION,
+    as_json: bool = JSON_OPTION,
+) -> None:
+    """Options of every question."""
+
+
+def print_json(document: Mapping[str, Any]) -> int:
+    """The one JSON document of a verb, to stdout; returns the exit code of one that is fine."""
     say(printable(json.dumps(plain(document), indent=2, ensure_ascii=False, allow_nan=False), json_escape))
+    return EXIT_FINE
+
+
+def print_document(document: Mapping[str, Any], text: str, as_json: bool) -> int:
+    """A document as JSON, or what it comes to in words; returns the exit code of one that is fine."""
+    if as_json:
+        return print_json(document)
+    say(text)
+    return EXIT_FINE
 
 
 def say(text: str, *, err: bool = False) -> None:
@@ -153,16 +216,6 @@ def print_notes(*folders: str | Path) -> None:
 
     for folder in dict.fromkeys(map(Path, folders)):
         print_lines(RunFolder.open(folder).noted())
-
-
-def noted(folder: Path | None) -> list[str]:
-    """What is not as it was written in a folder that is gone on with: said when nothing worse was found.
-
-    It is looked at before the folder goes on and is listed anew.
-    """
-    from mdnum.store import RunFolder
-
-    return RunFolder.open(folder).noted() if folder is not None and folder.is_dir() else []
 
 
 def print_lines(lines: Iterable[str]) -> None:
@@ -225,30 +278,22 @@ def show(cell: Any) -> str:
     return str(cell)
 
 
-def field(finding: Any, name: str) -> str:
-    """A part of a finding, which is a mapping when read from a folder and a dataclass otherwise."""
-    value = finding.get(name) if isinstance(finding, Mapping) else getattr(finding, name, None)
-    return "" if value is None else str(value)
-
-
-def print_findings(findings: Iterable[Any]) -> None:
+def print_findings(findings: Iterable[Finding]) -> None:
     """Each finding as a title line, what was seen, and what to do."""
     from rich.text import Text
 
     out = console()
     for finding in findings:
-        severity = field(finding, "severity")
-        line = Text(severity, style=_STYLE.get(severity, ""))
-        line.append(f": {field(finding, 'title')}", style="bold")
+        line = Text(finding.severity, style=_STYLE.get(finding.severity, ""))
+        line.append(f": {finding.title}", style="bold")
         out.print(line)
-        for name in ("text", "remedy"):
-            if text := field(finding, name):
-                out.print(Text(f"  {text}"))
+        for text in filter(None, (finding.text, finding.remedy)):
+            out.print(Text(f"  {text}"))
 
 
-def exit_code(findings: Iterable[Any], *, ok: bool = True) -> int:
+def exit_code(findings: Iterable[Finding], *, ok: bool = True) -> int:
     """1 when a finding asks for attention or the check failed, else 0; information is no finding."""
-    matters = any(field(finding, "severity") in ("warning", "error") for finding in findings)
+    matters = any(finding.severity in ("warning", "error") for finding in findings)
     return EXIT_FINDINGS if matters or not ok else EXIT_FINE
 
 
@@ -291,31 +336,3 @@ def _print_part(table: Table) -> None:
     print_table(table.title, table.columns, rows)
     if len(table.rows) > shown:
         console().print(f"  and {len(table.rows) - shown} more, which report.html shows", markup=False)
-
-
-def answer(
-    folder: Path,
-    summary: Mapping[str, Any],
-    print_rows: Callable[[Mapping[str, Any]], None],
-    *,
-    as_json: bool,
-) -> int:
-    """What a folder says, as JSON or for people; returns the exit code.
-
-    Args:
-        print_rows: prints what stands between the headline and the findings.
-    """
-    findings = summary.get("findings", ())
-    code = exit_code(findings, ok=summary.get("status", "complete") == "complete")
-    if as_json:
-        print_json({"folder": folder, **summary})
-        return code
-    out = console()
-    # a comparison has a headline beside the word of its verdict, a run a verdict in words
-    if head := summary.get("headline") or summary.get("verdict"):
-        out.print(head, style="bold", markup=False)
-    print_rows(summary)
-    print_findings(findings)
-    report = folder / "report.html"
-    out.print(f"wrote {report if report.exists() else folder}", markup=False)
-    return code

@@ -9,7 +9,7 @@ from ase import Atoms
 from ase.geometry import complete_cell
 from jaxtyping import Int
 from numpy import ndarray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 #: Places at random, and atoms nearest to each whose energies and forces are compared.
 PLACES, ATOMS = 8, 32
@@ -34,7 +34,7 @@ def neighborhoods(
         (a cluster without periodicity, whose first atoms are the chosen ones; their numbers in the whole).
     """
     x, origin = _with_images(atoms, reach)
-    tree = cKDTree(x)
+    tree = KDTree(x)
     # coordinates as they are after a lattice vector is added carry rounding: a little more does no harm
     reach = reach * (1 + 1e-9)
     rng = np.random.default_rng(seed)

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, Unpack
 import numpy as np
 
 from mdnum.plain import plain
+from mdnum.report.drawing import FIRST, MUTED
 from mdnum.report.finding import Texts, Verdict, conclude
 from mdnum.report.section import Figure, Key, Page, Plot, Section, Series, curves, pairs, table_of
-from mdnum.report.svg import FIRST, MUTED
 from mdnum.report.words import count, many, number
 from mdnum.verbs import frame
 from mdnum.verbs.fork_page import size

@@ -55,7 +55,7 @@ def test_pair_potentials_meet_the_reference(potential: dict, cutoff: str, ase: b
     assert report.ok and report.worst["ok"]
     # measured 1e-16 to 2e-14; the promise is 1e-12 and 1e-10
     assert frame.energy_rel <= 1e-14 and frame.force_rel <= 1e-13 and frame.stress_rel <= 1e-13
-    assert codes(report) == ([] if ase else [("not-ase", "info")])
+    assert codes(report) == ([] if ase else [("NOT_ASE", "info")])
     json.dumps(plain(report))
 
 
@@ -103,7 +103,7 @@ def test_float32_is_compared_in_units_of_its_rounding(precision: dict):
     assert report.ok and report.precision == "float32"
     assert 1e-9 < frame.energy_rel < 1e-5  # not float64 in disguise
     assert 0.01 < frame.force_roundings < 5.0 and frame.energy_roundings < 5.0
-    assert codes(report) == [("narrow-precision", "info")]
+    assert codes(report) == [("NARROW_PRECISION", "info")]
 
 
 def test_a_force_in_sixteen_bits_has_rounded_terms_at_places_that_are_not():
@@ -147,7 +147,7 @@ def test_planted_faults_are_found(fault: dict):
     atoms = crystal()
     report = check_energy(Faulty(build(make(atoms, LENNARD_JONES, HARD)), **fault), {"initial": atoms})
     assert not report.ok
-    assert codes(report) == [("ase-disagrees", "error")]
+    assert codes(report) == [("ASE_DISAGREES", "error")]
 
 
 def test_wrong_constants_are_found_and_the_third_opinion_names_the_culprit():
@@ -186,7 +186,7 @@ def test_a_hot_crystal_follows_ase(cutoff: str):
     assert report.ok and len(report.position) == 61
     assert report.position[-1] <= 1e-12 and report.velocity[-1] <= 1e-11  # measured 4e-15 and 4e-14
     assert report.is_ase == (cutoff != "force-shifted")
-    assert codes(report) == ([] if report.is_ase else [("not-ase", "info")])
+    assert codes(report) == ([] if report.is_ase else [("NOT_ASE", "info")])
     json.dumps(plain(report))
     assert report.rows()[-1]["step"] == 60
 
@@ -207,7 +207,7 @@ def test_wrong_forces_show(change: dict):
     judge = reference(make(crystal(), {**LENNARD_JONES, **change}, SHORT))
     report = check_dynamics(make(crystal(), LENNARD_JONES, SHORT), steps=30, judge=judge)
     assert not report.ok and report.sudden is None
-    assert codes(report) == [("dynamics-differ", "error")]
+    assert codes(report) == [("DYNAMICS_DIFFER", "error")]
 
 
 def test_growth_and_sudden_steps():
