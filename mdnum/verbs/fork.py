@@ -21,7 +21,7 @@ from mdnum.report.section import Figure, Key, Page, Section, Table, pairs, table
 from mdnum.report.words import count, many, number
 from mdnum.verbs import frame
 from mdnum.verbs.fork_page import differences, page, size
-from mdnum.verbs.fork_pair import PairQuestion, basics, check, followed, of_any, of_md
+from mdnum.verbs.fork_pair import PairQuestion, basics, check, followed, of_md
 from mdnum.verbs.fork_verdict import RANKING, TEXTS, judge, judge_benign, judge_compare, judge_screen
 from mdnum.verbs.frame import Keep, Outcome, View
 
@@ -80,10 +80,10 @@ def fork(
         FolderError: the folder cannot be used.
     """
     from mdnum.forks.choices import parse, twin_of, world_of
-    from mdnum.systems import BallSystem
+    from mdnum.systems import BallSystem, load
 
-    system = of_any(system, keep.pop("overrides", None))
-    own = system.spec.fork
+    loaded: System | BallSystem = load(system, keep.pop("overrides", None))
+    own = loaded.spec.fork
     asked = PairQuestion(steps, split, repeats, counterfactual, back, lyapunov, minimal, pin)
     if own is not None:
         vary = own.vary if vary is None else vary
@@ -96,21 +96,21 @@ def fork(
                  "counterfactual": not counterfactual, "back": back is not None,
                  "pin": pin is not None}  # fmt: skip
         frame.refuse(given, "of one comparison, and all choices were asked for", "Give one choice to vary")
-        return fork_screen(system, steps=asked.steps, **keep)
-    if isinstance(system, BallSystem):
+        return fork_screen(loaded, steps=asked.steps, **keep)
+    if isinstance(loaded, BallSystem):
         remedy = 'A decision of a ball is overridden by itself by the choice "contact=STEP:BALL"'
         given = {"minimal": minimal, "pin": pin is not None}
-        frame.refuse(given, f"of molecular dynamics, and {system.name} is a ball", remedy)
-        system = system if asked.steps is None else system.for_steps(asked.steps)
+        frame.refuse(given, f"of molecular dynamics, and {loaded.name} is a ball", remedy)
+        loaded = loaded if asked.steps is None else loaded.for_steps(asked.steps)
     elif pin is not None:
         from mdnum.forks.replays import parse_pin
 
-        parse_pin(pin, len(system.atoms))
-    word, world = vary or "precision", world_of(system)
+        parse_pin(pin, len(loaded.atoms))
+    word, world = vary or "precision", world_of(loaded)
     choice = parse(word, world)
     labels = {"choice": word, "choice_about": choice.describe(world), "must_hold": choice.must_hold}
     frame.say(keep.get("progress"), "compile")
-    return followed(system, twin_of(choice, system), labels, asked, **keep)
+    return followed(loaded, twin_of(choice, loaded), labels, asked, **keep)
 
 
 def fork_screen(
@@ -129,20 +129,21 @@ def fork_screen(
         its result is a list of `mdnum.forks.screen.Screened`.
     """
     from mdnum.forks.screen import screen
+    from mdnum.systems import load
 
-    system = of_any(system, keep.pop("overrides", None))
-    if steps is None and system.spec.fork is not None:
-        steps = system.spec.fork.steps
+    loaded: System | BallSystem = load(system, keep.get("overrides"))
+    if steps is None and loaded.spec.fork is not None:
+        steps = loaded.spec.fork.steps
     check(PairQuestion(steps))
-    with frame.answering("screen", f"fork-{system.name}", system, **keep) as answer:
+    with frame.answering("screen", f"fork-{loaded.name}", loaded, **keep) as answer:
 
         def note(done: int, count: int, name: str) -> None:
             answer.log(done, count, {"phase": f"{name} ({done + 1} of {count})"})
 
-        answer.result = screen(system, steps, progress=note)
+        answer.result = screen(loaded, steps, progress=note)
         ran = [row for row in answer.result if row.reason_unavailable is None]
         left = [row for row in answer.result if row.reason_unavailable is not None]
-        answer.summary = basics(system, steps) | {
+        answer.summary = basics(loaded, steps) | {
             "ranking": [plain(row) | {"held": row.held} for row in ran],
             "not_applicable": [{"choice": row.choice, "reason": row.reason_unavailable} for row in left],
         }
@@ -219,7 +220,7 @@ def fork_benign(
     from mdnum.forks.benign import benign
     from mdnum.forks.choices import parse, twin_of
 
-    system = of_md(system, keep.pop("overrides", None), "benign")
+    system = of_md(system, keep.get("overrides"), "benign")
     twin = twin_of(parse(vary, "md"), system)
     with frame.answering("benign", f"fork-{system.name}", system, **keep) as answer:
         answer.result = found = benign(twin, steps=steps, progress=answer.log)

@@ -15,7 +15,7 @@ from mdnum.report.section import Figure, Key, Page, Plot, Section, Series, curve
 from mdnum.report.words import count, many, number
 from mdnum.verbs import frame
 from mdnum.verbs.fork_page import size
-from mdnum.verbs.fork_pair import basics, is_ball, last_step, of_any, of_md
+from mdnum.verbs.fork_pair import basics, last_step, of_md
 from mdnum.verbs.frame import Answer, Keep, Outcome, View
 
 if TYPE_CHECKING:
@@ -59,10 +59,10 @@ def fork_certify(
     """
     from mdnum.forks.exact.certify import certify
     from mdnum.forks.exact.program import unsupported
-    from mdnum.systems import build
+    from mdnum.systems import BallSystem, build, load
 
-    loaded: Any = of_any(system, keep.get("overrides"))
-    last, ball = last_step(loaded, steps), is_ball(loaded)
+    loaded = load(system, keep.get("overrides"))
+    last, ball = last_step(loaded, steps), isinstance(loaded, BallSystem)
     # what cannot be is refused before there is a folder; a ball takes no time
     found: Any = certify(loaded, last, policies, keep.get("progress")) if ball else None
     simulation: Any = None if ball else build(loaded)
