@@ -86,8 +86,7 @@ def test_a_system_is_varied(verb: Recorder, words):
         (("compare", "a", "b"), (Path("a"), Path("b")), {"replay": False, "report": True}),
     ],
 )
-def test_each_question_is_a_sub_command(verb: Recorder, monkeypatch, capsys, words, asked, further):
-    monkeypatch.setattr("mdnum.cli.output.print_notes", lambda *folders: None)
+def test_each_question_is_a_sub_command(verb: Recorder, capsys, words, asked, further):
     assert call("fork", *words) == 0
     ((*seen, options),) = verb.calls
     assert tuple(seen) == asked and further.items() <= options.items()

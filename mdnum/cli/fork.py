@@ -92,11 +92,11 @@ def _pair(
     return {name: value for name, value in given.items() if value is not None}
 
 
-_OF_A_SYSTEM = output.question(_horizon, output.changed, output.kept)
+_OF_A_SYSTEM = output.question(_horizon, output.changed)
 
 
 @fork.command()
-@output.question(_pair, output.changed, output.kept)
+@output.question(_pair, output.changed)
 def vary(
     system: str = SYSTEM_ARGUMENT,
     choice: str | None = typer.Option(
@@ -169,7 +169,7 @@ def map_(
 
 
 @fork.command()
-@output.question(_pair, output.kept, notes=("run_a", "run_b"))
+@output.question(_pair, noted=("run_a", "run_b"))
 def compare(
     run_a: Path = typer.Argument(metavar="RUN_A", help="A run folder."),
     run_b: Path = typer.Argument(metavar="RUN_B", help="The run folder to compare it with."),

@@ -10,7 +10,7 @@ import mdnum
 from mdnum.cli import output
 
 
-@output.question(output.changed, output.kept)
+@output.question(output.changed)
 def grad(
     system: str = output.SYSTEM_ARGUMENT,
     of: str | None = typer.Option(

@@ -30,7 +30,6 @@ _PIPE_WIDTH = 200
 # records that are easier to read side by side than as rows
 _FEW, _MANY = 3, 6
 _MOST_ROWS = 12
-_ALONE = inspect.Parameter.KEYWORD_ONLY
 
 # how a person should read a severity; the exit code is 1 for the last two
 _STYLE = {"info": "dim", "ok": "green", "warning": "yellow", "error": "bold red", "unsafe": "bold red"}
@@ -92,7 +91,7 @@ def changed(settings: list[str] | None = SET_OPTION) -> dict[str, Any]:
     return {"overrides": parse_overrides(settings)}
 
 
-def kept(
+def _kept(
     out: Path | None = typer.Option(
         None, "-o", "--out", metavar="DIR", help="The new folder; one in runs by default."
     ),
@@ -104,16 +103,16 @@ def kept(
 
 def question(
     *groups: Callable[..., dict[str, Any]],
-    notes: Sequence[str] = (),
+    noted: Sequence[str] = (),
     remedy: Callable[[Mapping[str, Any]], str | None] | None = None,
 ) -> Callable[[Callable[..., Any]], Callable[..., int]]:
     """Makes a command of a function that asks a verb: with the options of these groups, printing its outcome.
 
     Args:
-        groups: functions whose parameters are options of the command too; what they return, and the progress,
-            the function gets in one dictionary, `how`. It may return a function instead, which is called with
-            whether JSON was asked for.
-        notes: parameters that are folders whose damage is said on stderr.
+        groups: functions whose parameters are options of the command too; what they return, the new folder
+            and the progress are one dictionary of the function's, `how`. It may return a function instead of
+            an outcome, which is called with whether JSON was asked for.
+        noted: parameters that are folders to be read; what is not as it was written there is said on stderr.
         remedy: asked what to do after control-C, with everything that was given.
     """
 
@@ -123,9 +122,9 @@ def question(
             from mdnum.store import RunFolder
 
             how: dict[str, Any] = {}
-            for group in groups:
+            for group in (*groups, _kept):
                 how |= group(**{name: given.pop(name) for name in inspect.signature(group).parameters})
-            folders = dict.fromkeys(given[name] for name in notes if given[name] is not None)
+            folders = dict.fromkeys(given[name] for name in noted if given[name] is not None)
             # looked at before a folder is listed anew, and said where nothing is worse
             wrong = [line for one in folders if one.is_dir() for line in RunFolder.open(one).noted()]
             stopped = False
@@ -145,10 +144,11 @@ def question(
             return EXIT_STOPPED if stopped or outcome.summary.get("interrupted") else code
 
         whole: Any = command
-        named = [inspect.signature(one, eval_str=True).parameters for one in (ask, *groups)]
-        parameters = {name: each for one in named for name, each in one.items() if name != "how"}
-        parameters["as_json"] = inspect.Parameter("as_json", _ALONE, default=JSON_OPTION, annotation=bool)
-        whole.__signature__ = inspect.Signature([each.replace(kind=_ALONE) for each in parameters.values()])
+        sources = [inspect.signature(one, eval_str=True).parameters for one in (ask, *groups, _kept)]
+        parameters = {name: each for one in sources for name, each in one.items() if name != "how"}
+        alone = inspect.Parameter.KEYWORD_ONLY
+        parameters["as_json"] = inspect.Parameter("as_json", alone, default=JSON_OPTION, annotation=bool)
+        whole.__signature__ = inspect.Signature([each.replace(kind=alone) for each in parameters.values()])
         whole.__annotations__ = {name: each.annotation for name, each in parameters.items()}
         whole.__name__, whole.__doc__ = ask.__name__, ask.__doc__
         return command

@@ -64,7 +64,7 @@ def _resume_run(given: Mapping[str, Any]) -> str | None:
 
 
 @app.command()
-@output.question(output.changed, output.kept, notes=["resume"], remedy=_resume_run)
+@output.question(output.changed, noted=["resume"], remedy=_resume_run)
 def run(
     system: str | None = typer.Argument(
         None, metavar="SYSTEM", help="A name from `mdnum systems list`, or the path of a TOML file."
@@ -94,7 +94,7 @@ def run(
 
 
 @app.command()
-@output.question(output.changed, output.kept)
+@output.question(output.changed)
 def ball(
     system: str | None = typer.Argument(
         None, metavar="SYSTEM", help="A ball's name from `mdnum systems list`, or the path of a TOML file."
@@ -146,7 +146,7 @@ app.command()(grad)
 
 
 @app.command()
-@output.question(output.kept)
+@output.question()
 def flips(
     trajectory: str = typer.Argument(
         metavar="TRAJECTORY",
@@ -204,7 +204,7 @@ def _resume_audit(given: Mapping[str, Any]) -> str | None:
 
 
 @app.command()
-@output.question(output.kept, notes=["resume"], remedy=_resume_audit)
+@output.question(noted=["resume"], remedy=_resume_audit)
 def audit(
     calculator: str | None = typer.Argument(
         None, metavar="CALCULATOR",
@@ -247,7 +247,7 @@ def _resume_conform(given: Mapping[str, Any]) -> str:
 
 
 @app.command()
-@output.question(output.kept, notes=["resume"], remedy=_resume_conform)
+@output.question(noted=["resume"], remedy=_resume_conform)
 def conform(
     pairs: str | None = typer.Argument(
         None, metavar="[LIST]",

@@ -65,16 +65,8 @@ class MdnumCalculator(Calculator):
             )
         if potential is not None:
             self._template = System("calculator", _spec(potential, cutoff, units), None, Atoms())
-        elif isinstance(system, System):
-            if overrides:
-                raise InputError(
-                    "overrides change a system while it is loaded",
-                    remedy="Pass the name of the system, or load it with the overrides",
-                    where="MdnumCalculator",
-                )
-            self._template = system
         else:
-            self._template = systems.load(str(system), overrides, world="md")
+            self._template = systems.load(system or "", overrides, world="md")
         self._evaluator: Any = None
 
     @property

@@ -69,19 +69,9 @@ def _loaded(
     overrides: Mapping[str, Any] | None,
     against: Sequence[str | Mapping[str, Any]],
 ) -> BallSystem:
-    from mdnum.systems import BallSystem, System, load
+    from mdnum.systems import load
 
-    if isinstance(system, System):
-        raise InputError("this system is molecular dynamics", where=system.name, remedy="Use mdnum.run")
-    if isinstance(system, BallSystem):
-        if overrides:
-            raise InputError(
-                "overrides change a system while it is loaded",
-                remedy="Load it with the overrides, or give its name",
-                where=system.name,
-            )
-    else:
-        system = load(system, overrides, world="ball")
+    system = load(system, overrides, world="ball")
     for changes in against:
         system = system.against(_changes(changes) if isinstance(changes, str) else changes)
     return system

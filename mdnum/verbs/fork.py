@@ -6,6 +6,7 @@ are compared or followed again (`fork_folders`), or ensembles are (`fork_benign`
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
@@ -16,11 +17,11 @@ from mdnum.errors import InputError
 from mdnum.plain import plain
 from mdnum.report.drawing import BAD, FIRST, MUTED, SECOND, legend
 from mdnum.report.finding import Verdict
-from mdnum.report.section import Figure, Key, Page, Section, Table, pairs
+from mdnum.report.section import Figure, Key, Page, Section, Table, pairs, table_of
 from mdnum.report.words import count, many, number
 from mdnum.verbs import frame
 from mdnum.verbs.fork_page import differences, page, size
-from mdnum.verbs.fork_pair import PairQuestion, basics, check, followed, of_any, of_md
+from mdnum.verbs.fork_pair import PairQuestion, basics, check, followed, of_md
 from mdnum.verbs.fork_verdict import RANKING, TEXTS, judge, judge_benign, judge_compare, judge_screen
 from mdnum.verbs.frame import Keep, Outcome, View
 
@@ -79,10 +80,10 @@ def fork(
         FolderError: the folder cannot be used.
     """
     from mdnum.forks.choices import parse, twin_of, world_of
-    from mdnum.systems import BallSystem
+    from mdnum.systems import BallSystem, load
 
-    system = of_any(system, keep.pop("overrides", None))
-    own = system.spec.fork
+    loaded: System | BallSystem = load(system, keep.pop("overrides", None))
+    own = loaded.spec.fork
     asked = PairQuestion(steps, split, repeats, counterfactual, back, lyapunov, minimal, pin)
     if own is not None:
         vary = own.vary if vary is None else vary
@@ -95,21 +96,21 @@ def fork(
                  "counterfactual": not counterfactual, "back": back is not None,
                  "pin": pin is not None}  # fmt: skip
         frame.refuse(given, "of one comparison, and all choices were asked for", "Give one choice to vary")
-        return fork_screen(system, steps=asked.steps, **keep)
-    if isinstance(system, BallSystem):
+        return fork_screen(loaded, steps=asked.steps, **keep)
+    if isinstance(loaded, BallSystem):
         remedy = 'A decision of a ball is overridden by itself by the choice "contact=STEP:BALL"'
         given = {"minimal": minimal, "pin": pin is not None}
-        frame.refuse(given, f"of molecular dynamics, and {system.name} is a ball", remedy)
-        system = system if asked.steps is None else system.for_steps(asked.steps)
+        frame.refuse(given, f"of molecular dynamics, and {loaded.name} is a ball", remedy)
+        loaded = loaded if asked.steps is None else loaded.for_steps(asked.steps)
     elif pin is not None:
         from mdnum.forks.replays import parse_pin
 
-        parse_pin(pin, len(system.atoms))
-    word, world = vary or "precision", world_of(system)
+        parse_pin(pin, len(loaded.atoms))
+    word, world = vary or "precision", world_of(loaded)
     choice = parse(word, world)
     labels = {"choice": word, "choice_about": choice.describe(world), "must_hold": choice.must_hold}
     frame.say(keep.get("progress"), "compile")
-    return followed(system, twin_of(choice, system), labels, asked, **keep)
+    return followed(loaded, twin_of(choice, loaded), labels, asked, **keep)
 
 
 def fork_screen(
@@ -128,20 +129,21 @@ def fork_screen(
         its result is a list of `mdnum.forks.screen.Screened`.
     """
     from mdnum.forks.screen import screen
+    from mdnum.systems import load
 
-    system = of_any(system, keep.pop("overrides", None))
-    if steps is None and system.spec.fork is not None:
-        steps = system.spec.fork.steps
+    loaded: System | BallSystem = load(system, keep.get("overrides"))
+    if steps is None and loaded.spec.fork is not None:
+        steps = loaded.spec.fork.steps
     check(PairQuestion(steps))
-    with frame.answering("screen", f"fork-{system.name}", system, **keep) as answer:
+    with frame.answering("screen", f"fork-{loaded.name}", loaded, **keep) as answer:
 
         def note(done: int, count: int, name: str) -> None:
             answer.log(done, count, {"phase": f"{name} ({done + 1} of {count})"})
 
-        answer.result = screen(system, steps, progress=note)
+        answer.result = screen(loaded, steps, progress=note)
         ran = [row for row in answer.result if row.reason_unavailable is None]
         left = [row for row in answer.result if row.reason_unavailable is not None]
-        answer.summary = basics(system, steps) | {
+        answer.summary = basics(loaded, steps) | {
             "ranking": [plain(row) | {"held": row.held} for row in ran],
             "not_applicable": [{"choice": row.choice, "reason": row.reason_unavailable} for row in left],
         }
@@ -218,7 +220,7 @@ def fork_benign(
     from mdnum.forks.benign import benign
     from mdnum.forks.choices import parse, twin_of
 
-    system = of_md(system, keep.pop("overrides", None), "benign")
+    system = of_md(system, keep.get("overrides"), "benign")
     twin = twin_of(parse(vary, "md"), system)
     with frame.answering("benign", f"fork-{system.name}", system, **keep) as answer:
         answer.result = found = benign(twin, steps=steps, progress=answer.log)
@@ -231,44 +233,41 @@ def fork_benign(
 
 
 def _page(view: View, what: str, about: str, keys: list[Key], sections: list[Section]) -> Page:
-    rows = [*size(view), ("Took", f"{number(view.summary['seconds'], 2)} s")]
+    rows = [*size(view), view.took]
     sections = [*sections, Section("What was run", [pairs(rows)])]
-    title = f"{view.name}: {what}"
-    return Page(title, about, keys, sections, view.system_toml, view.folder.provenance)
+    return view.page(f"{view.name}: {what}", about, keys, sections)
 
 
 def page_screen(view: View, verdict: Verdict) -> Page:
     """The page of all choices side by side."""
-    s, rows = view.summary, view.summary["ranking"]
+    s, rows, left = view.summary, view.summary["ranking"], view.summary["not_applicable"]
     held = [row for row in rows if row["must_hold"]]
     kept = sum(row["first_bit"] is None for row in held)
     keys = [
-        Key("Choices", count(len(rows)), f"{count(len(s['not_applicable']))} more do not apply"),
+        Key("Choices", count(len(rows)), f"{count(len(left))} more do not apply"),
         Key("Fork", count(sum(row["fork"] is not None for row in rows)), f"in {many(s['steps'], 'step')}"),
         Key("Split", count(sum(row["split"] is not None for row in rows)), "beyond the tolerance"),
         Key("No bit differs", count(sum(row["first_bit"] is None for row in rows)), "the same trajectory"),
         Key("Must hold", f"{count(kept)} of {count(len(held))}", "held bit for bit"),
     ]
-    lines = [
-        (row["choice"], row["first_bit"], row["fork"], row["split"],
-         "" if not row["must_hold"] else "holds" if row["first_bit"] is None else "broken",
-         row["failed"] or row["difference"])
-        for row in rows
-    ]  # fmt: skip
-    bad = frozenset(k for k, row in enumerate(rows) if row in held and row["first_bit"] is not None)
-    columns = ("choice", "first bit", "fork", "split", "must hold", "difference")
+
+    def holds(row: Mapping[str, Any]) -> str:
+        return "" if not row["must_hold"] else "holds" if row["first_bit"] is None else "broken"
+
+    table = table_of(rows, {
+        "choice": "choice", "first bit": "first_bit", "fork": "fork", "split": "split", "must hold": holds,
+        "difference": lambda row: row["failed"] or row["difference"],
+    }, shown=100, bad=lambda row: holds(row) == "broken")  # fmt: skip
     alt = "; ".join(f"{row['choice']}: {count(row['fork'])}" for row in rows if row["fork"] is not None)
     figure = Figure(
         "ranking", TEXTS("ranking_caption"), f"Step at which each choice forks. {alt or 'None does'}.",
         lambda canvas: _ranking(rows, s["steps"], canvas), 0.9 + 0.24 * len(rows),
     )  # fmt: skip
-    sections = [
-        Section(RANKING, [TEXTS("ranking"), Table(columns, lines, shown=100, bad=bad), figure], terminal=True)
-    ]
-    if left := s["not_applicable"]:
-        table = Table(("choice", "reason"), [(row["choice"], row["reason"]) for row in left], shown=100)
-        sections.append(Section("Choices that do not apply", [table], terminal=True))
-    return _page(view, "all choices", TEXTS("screen_about"), keys, sections)
+    others = table_of(left, {"choice": "choice", "reason": "reason"}, shown=100)
+    return _page(view, "all choices", TEXTS("screen_about"), keys, [
+        Section(RANKING, [TEXTS("ranking"), table, figure], terminal=True),
+        Section("Choices that do not apply", [others] * bool(left), terminal=True),
+    ])  # fmt: skip
 
 
 def _ranking(rows: Any, steps: int, figure: Canvas) -> None:
@@ -306,20 +305,17 @@ def page_compare(view: View, verdict: Verdict) -> Page:
         )
     ]
     different = differences(s["differences"]) if s["differences"] else TEXTS("folders_0_causes")
-    sections = [Section("What was different", [different], terminal=True)]
-    if s["decisions"]:
-        rows = [
-            (flip["run"], "–".join(map(str, flip["subject"])), "yes" if flip["entered"] else "no",
-             flip["margin"], flip["bound"], flip["ambiguous"])
-            for flip in s["decisions"]
-        ]  # fmt: skip
-        label = "pair" if s["channel"] == "pair" else "ball"
-        columns = ("only in", label, "enters", "margin", "bound", "ambiguous")
-        sections.append(Section("Decisions at the fork", [Table(columns, rows)], terminal=True))
-    if s["iterations"]:
-        table = Table(("in A", "in B"), [s["iterations"]])
-        sections.append(Section("Iterations at the fork", [table], terminal=True))
-    return _page(view, "two runs", f"A: {s['a']}, B: {s['b']}", keys, sections)
+    decisions = table_of(s["decisions"], {
+        "only in": "run", s["channel"] if s["channel"] == "pair" else "ball":
+            lambda flip: "–".join(map(str, flip["subject"])),
+        "enters": "entered", "margin": "margin", "bound": "bound", "ambiguous": "ambiguous",
+    })  # fmt: skip
+    iterations = Table(("in A", "in B"), [s["iterations"]])
+    return _page(view, "two runs", f"A: {s['a']}, B: {s['b']}", keys, [
+        Section("What was different", [different], terminal=True),
+        Section("Decisions at the fork", [decisions] * bool(s["decisions"]), terminal=True),
+        Section("Iterations at the fork", [iterations] * bool(s["iterations"]), terminal=True),
+    ])  # fmt: skip
 
 
 def page_benign(view: View, verdict: Verdict) -> Page:
@@ -331,14 +327,13 @@ def page_benign(view: View, verdict: Verdict) -> Page:
         Key("Components", count(s["components"]), f"limit {number(s['limit'], 3)} standard deviations"),
         Key("Fails on A itself", f"{count(failed)} of {count(of)}", "verdicts on runs that were held out"),
     ]
-    sections = []
-    if s["failing"]:
-        table = Table(("feature", "standard deviations"), list(s["failing"].items()))
-        sections.append(Section("What tells B from A", [table], terminal=True))
-    scores = [(k + 1, *row) for k, row in enumerate(s["scores"])]
+    failing = Table(("feature", "standard deviations"), list(s["failing"].items()))
     names = tuple(f"component {k + 1}" for k in range(s["components"]))
-    sections.append(Section("Components", [TEXTS("components"), Table(("run", *names), scores)]))
-    return _page(view, f"{s['choice']}, benign?", str(s["difference"]), keys, sections)
+    scores = Table(("run", *names), [(k + 1, *row) for k, row in enumerate(s["scores"])])
+    return _page(view, f"{s['choice']}, benign?", str(s["difference"]), keys, [
+        Section("What tells B from A", [failing] * bool(s["failing"]), terminal=True),
+        Section("Components", [TEXTS("components"), scores]),
+    ])  # fmt: skip
 
 
 VERBS = {

@@ -14,8 +14,8 @@ from mdnum.report.finding import Texts, Verdict, conclude
 from mdnum.report.section import Figure, Key, Page, Plot, Section, Series, curves, pairs, table_of
 from mdnum.report.words import count, many, number
 from mdnum.verbs import frame
-from mdnum.verbs.fork_page import size, took
-from mdnum.verbs.fork_pair import basics, is_ball, last_step, of_any, of_md
+from mdnum.verbs.fork_page import size
+from mdnum.verbs.fork_pair import basics, last_step, of_md
 from mdnum.verbs.frame import Answer, Keep, Outcome, View
 
 if TYPE_CHECKING:
@@ -59,10 +59,10 @@ def fork_certify(
     """
     from mdnum.forks.exact.certify import certify
     from mdnum.forks.exact.program import unsupported
-    from mdnum.systems import build
+    from mdnum.systems import BallSystem, build, load
 
-    loaded: Any = of_any(system, keep.get("overrides"))
-    last, ball = last_step(loaded, steps), is_ball(loaded)
+    loaded = load(system, keep.get("overrides"))
+    last, ball = last_step(loaded, steps), isinstance(loaded, BallSystem)
     # what cannot be is refused before there is a folder; a ball takes no time
     found: Any = certify(loaded, last, policies, keep.get("progress")) if ball else None
     simulation: Any = None if ball else build(loaded)
@@ -229,7 +229,7 @@ def page_certify(view: View, verdict: Verdict) -> Page:
         f"largest distance from the exact place ({unit})", series, y_scale="log",
         caption=TEXTS("separations_caption"),
     )] * bool(series)  # fmt: skip
-    what = [*size(view), ("Exact", TEXTS("exact_ball" if ball else "exact_md")), took(s)]
+    what = [*size(view), ("Exact", TEXTS("exact_ball" if ball else "exact_md")), view.took]
     return view.page(f"{view.name}: precisions", TEXTS("certify_about"), keys, [
         Section("Ranking", [ranking, *_gains(s, roles)], terminal=True),
         Section("Steps kept", [figure, dtypes]),
@@ -390,7 +390,7 @@ def page_processes(view: View, verdict: Verdict) -> Page:
     return view.page(f"{view.name}: programs", TEXTS("programs_about"), keys, [
         Section("Programs", [*s["causes"], programs], terminal=True),
         Section("Separation from the reference", plots),
-        Section("What was run", [pairs([*size(view), ("Programs", TEXTS("programs")), took(s)])]),
+        Section("What was run", [pairs([*size(view), ("Programs", TEXTS("programs")), view.took])]),
     ])  # fmt: skip
 
 

@@ -14,8 +14,8 @@ from mdnum.report.finding import Texts, Verdict, conclude
 from mdnum.report.section import Key, Page, Plot, Role, Section, Series, curves, pairs, positive, table_of
 from mdnum.report.words import count, many, number
 from mdnum.verbs import frame
-from mdnum.verbs.fork_page import size, took
-from mdnum.verbs.fork_pair import FEW_STEPS, basics, last_step, of_any, of_md
+from mdnum.verbs.fork_page import size
+from mdnum.verbs.fork_pair import FEW_STEPS, basics, last_step, of_md
 from mdnum.verbs.frame import Keep, Outcome, View
 
 if TYPE_CHECKING:
@@ -69,31 +69,31 @@ def fork_map(
     """
     from mdnum.forks.boundaries import boundaries, checked
     from mdnum.forks.worlds import program_of
-    from mdnum.systems import BallSystem
+    from mdnum.systems import BallSystem, load
 
-    system = of_any(system, keep.get("overrides"))
-    if isinstance(system, BallSystem):
+    loaded: System | BallSystem = load(system, keep.get("overrides"))
+    if isinstance(loaded, BallSystem):
         if loss is not None:
             raise InputError("the loss of a ball is that of its system file", remedy="Leave out loss")
-        system = system if steps is None else system.for_steps(steps)
-        last, kind = last_step(system, steps), str(system.spec.loss.kind)
+        loaded = loaded if steps is None else loaded.for_steps(steps)
+        last, kind = last_step(loaded, steps), str(loaded.spec.loss.kind)
         lost = kind.replace("-", " "), "m²" if kind == "residual-penetration" else "m"
     else:
-        last = last_step(system, steps, FEW_STEPS)
-        lost = "mean squared displacement", f"{system.units.length}²"
+        last = last_step(loaded, steps, FEW_STEPS)
+        lost = "mean squared displacement", f"{loaded.units.length}²"
         if loss is not None:
             lost = getattr(loss, "__name__", "loss"), ""
     # what cannot be is refused before there is a folder
-    spelled = checked(program_of(system), key, low, high)
-    with frame.answering("map", f"fork-{system.name}", system, **keep) as answer:
+    spelled = checked(program_of(loaded), key, low, high)
+    with frame.answering("map", f"fork-{loaded.name}", loaded, **keep) as answer:
         answer.result = found = boundaries(
-            system, spelled.key, low, high, last, cells=cells, most=most, loss=loss, confirm=confirm,
+            loaded, spelled.key, low, high, last, cells=cells, most=most, loss=loss, confirm=confirm,
             progress=answer.log,
         )  # fmt: skip
         edges, intervals = [_row(edge) for edge in found.boundaries], plain(found.intervals)
         at = np.searchsorted([one["low"] for one in intervals], found.at, side="right") - 1
         jumps = [abs(edge.jump) for edge in found.boundaries if np.isfinite(edge.jump)]
-        answer.summary = basics(system, last) | {
+        answer.summary = basics(loaded, last) | {
             "key": spelled.key, "key_unit": spelled.unit, "value": spelled.value, "loss": lost[0],
             "loss_unit": lost[1], "low": found.low, "high": found.high, "histories": found.histories,
             "complete": found.complete, "resolution": found.resolution, "evaluations": found.evaluations,
@@ -221,7 +221,7 @@ def page_map(view: View, verdict: Verdict) -> Page:
     what = [
         *size(view), ("Number", f"{_with_unit(s['key'], unit)} from {s['low']!r} to {s['high']!r}{own}"),
         ("Loss", f"{_with_unit(s['loss'], s['loss_unit'])} of the last step"),
-        ("Program", TEXTS("program_compiles" if s["compiles"] else "program")), took(s),
+        ("Program", TEXTS("program_compiles" if s["compiles"] else "program")), view.took,
     ]  # fmt: skip
     stretches = table_of(left, {"from": lambda one: repr(one[0]), "to": lambda one: repr(one[1])})
     return view.page(f"{view.name}: along {s['key']}", TEXTS("map_about"), keys, [
@@ -397,7 +397,7 @@ def page_forecast(view: View, verdict: Verdict) -> Page:
         Section("Displacements that flip a decision", plots),
         Section("Decisions", [table_of(s[name], columns, title) for name, title in titles.items() if s[name]],
                 terminal=True),
-        Section("What was run", [pairs([*size(view), ("Direction", TEXTS("direction")), took(s)])]),
+        Section("What was run", [pairs([*size(view), ("Direction", TEXTS("direction")), view.took])]),
     ])  # fmt: skip
 
 

@@ -435,11 +435,6 @@ def size(view: View) -> list[tuple[str, str]]:
     return [*rows, ("Size", text + kind)]
 
 
-def took(s: Mapping[str, Any]) -> tuple[str, str]:
-    """A row on the time that it took."""
-    return "Took", f"{number(s['seconds'], 2)} s"
-
-
 def _what(view: View) -> Iterator[Any]:
     s, kind = view.summary, "split_ball" if "balls" in view.summary else "split_md"
     rows = [
@@ -456,7 +451,7 @@ def _what(view: View) -> Iterator[Any]:
         rows.append(("Counterfactual", TEXTS("no_counterfactual")))
     if s["count"] and s["count"]["pairs"] > 1:
         rows.append(("Chance", TEXTS("chance", repeats=s["count"]["pairs"] - 1, agreeing=agreeing(s))))
-    yield pairs([*rows, took(s)])
+    yield pairs([*rows, view.took])
     changed = s.get("differences") or [(key, *values) for key, values in s["changes"].items()]
     if changed:
         yield differences(changed, "" if s.get("differences") else "What differs in the system file")

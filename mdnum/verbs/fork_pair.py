@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
@@ -54,44 +53,15 @@ class PairQuestion:
 # -- what questions about forks share ------------------------------------------------------------------
 
 
-def of_any(
-    system: System | BallSystem | str | Path, overrides: Mapping[str, Any] | None
-) -> System | BallSystem:
-    """A system of either world.
-
-    Raises:
-        InputError: there is none, or it is loaded already and there are overrides.
-    """
-    from mdnum.systems import BallSystem, System, load
-
-    if not isinstance(system, System | BallSystem):
-        return load(system, overrides)
-    if overrides:
-        raise InputError(
-            "overrides change a system while it is loaded",
-            remedy="Load it with the overrides, or give its name",
-            where=system.name,
-        )
-    return system
-
-
-def is_ball(system: Any) -> bool:
-    """Whether a system, or what is there under a name, is a ball."""
-    from mdnum.systems import BallSystem, System
-    from mdnum.systems.load import world_of
-
-    if isinstance(system, System | BallSystem):
-        return isinstance(system, BallSystem)
-    return world_of(system) == "ball"
-
-
 def last_step(system: Any, steps: int | None, most: int | None = None) -> int:
     """The last step: the one asked for, else the system's own, but no more than `most`.
 
     Raises:
         InputError: steps below 1.
     """
-    own = (system.spec.integrator if is_ball(system) else system.spec.dynamics).steps
+    from mdnum.systems.load import world_of
+
+    own = (system.spec.integrator if world_of(system) == "ball" else system.spec.dynamics).steps
     last = steps if steps is not None else own if most is None else min(most, own)
     if last < 1:
         raise InputError(f"steps = {last}; expected at least 1")
@@ -108,8 +78,10 @@ def of_md(system: Any, overrides: Mapping[str, Any] | None, question: str, pairw
     Raises:
         InputError: it is a ball, has a many-body potential, or is no system.
     """
-    loaded: Any = of_any(system, overrides)
-    if is_ball(loaded):
+    from mdnum.systems import BallSystem, load
+
+    loaded = load(system, overrides)
+    if isinstance(loaded, BallSystem):
         raise InputError("this system is a ball", where=loaded.name, remedy=TEXTS(f"ball_{question}"))
     if pairwise and loaded.spec.cutoff is None:
         remedy = "Use a system with a pair potential"
@@ -122,7 +94,7 @@ def basics(system: System | BallSystem, steps: int | None) -> dict[str, Any]:
     from mdnum.systems import BallSystem
 
     spec: Any = system.spec
-    own = spec.integrator if is_ball(system) else spec.dynamics
+    own = spec.integrator if isinstance(system, BallSystem) else spec.dynamics
     last = own.steps if steps is None else steps
     head: dict[str, Any] = {"system": system.name, "about": spec.about}
     if isinstance(system, BallSystem):
@@ -179,7 +151,7 @@ def followed(
         answer.result = made
         answer.summary = basics(system, asked.steps) | dict(labels) | _numbers(made)
         answer.tables["separation"] = _separation(made)
-        own = _of_ball(made, answer.tables) if is_ball(system) else _of_md(made, asked, answer)
+        own = _of_md(made, asked, answer) if made.twin.a.streams else _of_ball(made, answer.tables)
         answer.summary |= own | _predicted(made, own) | further(made)
     return answer.outcome
 

@@ -29,6 +29,7 @@ from mdnum.errors import FolderError, InputError
 from mdnum.plain import plain
 from mdnum.report.finding import Finding, Verdict, restore
 from mdnum.report.section import Key, Page, Section
+from mdnum.report.words import number
 from mdnum.store import RunFolder
 from mdnum.store.files import default_folder
 
@@ -89,6 +90,11 @@ class View:
     def units(self) -> Units:
         """The unit system of all numbers in the folder."""
         return units.get(str(self.summary.get("units") or self.system.get("units") or "lj"))
+
+    @property
+    def took(self) -> tuple[str, str]:
+        """A row on the time that it took."""
+        return "Took", f"{number(self.summary['seconds'], 2)} s"
 
     def table(self, name: str) -> Mapping[str, np.ndarray]:
         """A table of the folder: arrays by column name."""

@@ -17,7 +17,7 @@ from mdnum.report.finding import Finding, Verdict, conclude
 from mdnum.report.words import listed, percent
 from mdnum.store.files import write_bytes
 from mdnum.verbs import frame, grad_page
-from mdnum.verbs.fork_pair import FEW_STEPS, basics, is_ball, last_step, of_any
+from mdnum.verbs.fork_pair import FEW_STEPS, basics, last_step
 from mdnum.verbs.frame import Answer, Keep, Outcome, Progress, Verb, View
 from mdnum.verbs.grad_page import TEXTS, by, closeness, digits_note, digits_of, magnitude, slope
 
@@ -89,6 +89,8 @@ def grad(
         NumericalError: the run blew up.
         FolderError: the folder cannot be used.
     """
+    from mdnum.systems.load import load, world_of
+
     if replicas < 0 or replicas == 1:
         raise InputError(f"replicas = {replicas}; a standard error takes at least 2")
     names, further = words(wrt), words(also)
@@ -97,7 +99,7 @@ def grad(
     if unknown:
         raise InputError(f"no part {unknown[0]!r} of a diagnosis", remedy=f"There are {', '.join(ALSO)}")
     further = ALSO if ALL in further else further
-    if is_ball(system):
+    if world_of(system) == "ball":
         whose = "of molecular dynamics: this system is a ball"
         frame.refuse({"--also": bool(further)}, whose, "Leave it out")
         remedy = "Use --methods randomized, an average over noise with its standard error"
@@ -108,7 +110,7 @@ def grad(
             _differentiated(ball, chosen, answer)
         return answer.outcome
 
-    md: Any = of_any(system, keep.get("overrides"))
+    md = load(system, keep.get("overrides"), world="md")
     problem, names = _problem(md, of, names, steps)
     chosen, left = plan(problem, names, asked, replicas)
     with frame.answering("grad", f"grad-{md.name}", md, **keep) as answer:
@@ -388,7 +390,7 @@ def _ball_system(
         raise InputError(f"no loss {of!r} of a ball", remedy=f"There are {', '.join(kinds)}")
     changes: dict[str, Any] = {} if of is None else {"loss.kind": of}
     changes |= {"gradient.of": list(names)} if names else {}
-    made: Any = of_any(system, overrides)
+    made = load(system, overrides, world="ball")
     known = ball.parameters(made.spec.contact.kind)
     unknown = [name for name in names if name not in known]
     if unknown or not (names or made.spec.gradient.of):

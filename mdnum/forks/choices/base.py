@@ -15,6 +15,7 @@ from mdnum.numerics import reductions
 from mdnum.program import Twin
 from mdnum.registry import Registry
 from mdnum.systems import BallSystem, System
+from mdnum.systems.load import world_of
 
 #: Reductions whose result does not depend on the order of their terms.
 ORDERLESS = ("exact", "fixed-point")
@@ -115,11 +116,6 @@ def choice(family: str | None):
         return made
 
     return add
-
-
-def world_of(system: Any) -> str:
-    """ "md" or "ball"."""
-    return "ball" if isinstance(system, BallSystem) else "md"
 
 
 def shipped(world: str) -> dict[str, Choice]:
