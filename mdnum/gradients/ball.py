@@ -23,7 +23,7 @@ from mdnum.ball.world import World
 from mdnum.errors import InputError, MdnumError
 from mdnum.gradients.dependence import dependence, follow
 from mdnum.gradients.problem import Gradient, Kind
-from mdnum.numerics.scaling import check_scale, scaled_gradient
+from mdnum.numerics.formats import check_scale, scaled_gradient
 from mdnum.registry import Registry
 
 
@@ -218,7 +218,7 @@ class ThroughIterations(BallMethod):
 
     Attributes:
         loss_scale: the reverse pass starts with it instead of 1 and the derivative is divided by it, so that
-            a narrow dtype does not lose it below its smallest number (`mdnum.numerics.scaling`); a power of
+            a narrow dtype does not lose it below its smallest number (`mdnum.numerics.formats`); a power of
             two.
     """
 

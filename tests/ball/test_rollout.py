@@ -7,11 +7,11 @@ from fractions import Fraction
 import numpy as np
 import pytest
 from ball import oracles
+from oracles import broken_alternations
 
 from mdnum import ball
 from mdnum.ball import rollout
 from mdnum.errors import InputError
-from mdnum.numerics.events import broken_alternations
 from mdnum.numerics.roles import RolePrecision
 
 WORLDS = {

@@ -8,7 +8,7 @@ import pytest
 from ase import Atoms
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from oracles import all_pairs, margins
+from oracles import all_pairs, broken_alternations, margins
 from rollout.harness import (
     assert_ledger_is_complete,
     frames_of,
@@ -20,7 +20,7 @@ from rollout.harness import (
 )
 
 from mdnum.md.neighbors import VerletList
-from mdnum.numerics import Ledger, broken_alternations
+from mdnum.numerics import Ledger
 from mdnum.rollout.checks import EnergyBudget
 from mdnum.systems import load
 
