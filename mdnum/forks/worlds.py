@@ -86,16 +86,6 @@ def changes(a: Any, b: Any) -> dict[str, list[Any]]:
     }
 
 
-def not_possible(system: Any, values: Mapping[str, Any], name: str) -> str | None:
-    """Why a system cannot have other values of some keys; None where it can."""
-    try:
-        program_of(varied(system, values, name))
-    except InputError as error:
-        # the choice is named where this is printed
-        return error.message.removeprefix(f"variant {name!r}: ")
-    return None
-
-
 def floats(system: Any) -> dict[str, float]:
     """The numbers of a system file that are floats and enter a step, by their dotted keys."""
     if isinstance(system, BallSystem):
