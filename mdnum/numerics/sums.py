@@ -122,7 +122,7 @@ def in_order(terms, add, start=None):
     return total
 
 
-class Loop(Reduction):
+class Serial(Reduction):
     """A reduction that adds term after term onto one number."""
 
     def places(self, terms: np.ndarray) -> list[int]:
@@ -131,7 +131,7 @@ class Loop(Reduction):
 
 
 @dataclass(frozen=True)
-class Sequential(Loop):
+class Sequential(Serial):
     """Term after term. Error: at most gamma_{n-1} * sum |terms| (Higham 2002, 4.4).
 
     Attributes:
@@ -232,7 +232,7 @@ class Pairwise(Blocked):
 
 
 @dataclass(frozen=True)
-class Permuted(Loop):
+class Permuted(Serial):
     """A loop over the terms in a random order: what atomic additions on a device do, made repeatable.
 
     Attributes:
@@ -289,7 +289,7 @@ class Twice(Reduction):
 
 
 @dataclass(frozen=True)
-class Sorted(Loop):
+class Sorted(Serial):
     """A loop over the terms by magnitude; equal magnitudes by sign, so no order of arrival matters.
 
     Smallest first loses least where all terms have one sign (Higham 2002, 4.2), largest first where they
@@ -458,7 +458,7 @@ def running_sum_table(
         raise InputError(f"terms of shape {terms.shape}", remedy="Give one axis with at least one term.")
     if not np.isfinite(terms.astype(np.float64)).all():
         raise InputError("a term is not finite, so the sum has no history")
-    if not isinstance(reduction, Loop):
+    if not isinstance(reduction, Serial):
         remedy = "Give sequential, reversed, permuted or sorted"
         raise InputError(f"{reduction} is no loop over the terms", remedy=remedy)
     with np.errstate(all="ignore"):
