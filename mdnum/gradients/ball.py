@@ -261,7 +261,7 @@ class ThroughIterations(BallMethod):
 
     Attributes:
         loss_scale: the reverse pass starts with it instead of 1 and the derivative is divided by it, so that
-            a narrow dtype does not lose it below its smallest number (`mdnum.numerics.scaling`); a power of
+            a narrow dtype does not lose it below its smallest number (`mdnum.numerics.formats`); a power of
             two.
     """
 

@@ -19,6 +19,7 @@ import numpy as np
 import pyarrow as pa
 
 from mdnum.errors import FolderError, MdnumError
+from mdnum.plain import plain
 from mdnum.store import checkpoint
 from mdnum.store import files as manifest
 from mdnum.store.checkpoint import FrameFile
@@ -242,10 +243,6 @@ class RunFolder:
             if file is not None:
                 file.close()
         self._log = self._lock = None
-
-    def write_system(self, toml: str) -> None:
-        """Writes system.toml, the fully resolved system."""
-        write_text(self.path / "system.toml", toml)
 
     def write_summary(self, summary: Mapping[str, Any]) -> None:
         """Writes summary.json (NaN and infinity, which JSON does not have, become null)."""
@@ -624,7 +621,7 @@ class RunFolder:
         self._lock = lock
 
     def _write_json(self, name: str, value: Mapping[str, Any]) -> None:
-        text = json.dumps(_plain(value), indent=2, ensure_ascii=False, allow_nan=False)
+        text = json.dumps(plain(value), indent=2, ensure_ascii=False, allow_nan=False)
         write_text(self.path / name, text + "\n")
 
     def _read_json(self, name: str) -> dict[str, Any]:
@@ -714,17 +711,3 @@ def _again(path: Path) -> str:
     if _came_to_nothing(path, [entry.name for entry in path.iterdir()]):
         return f"Nothing of it was kept: give the `{verb}` command again"
     return f"It cannot be continued: give the `{verb}` command again for another folder, or remove this one"
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if hasattr(value, "__array__"):
-        return _plain(np.asarray(value).tolist())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if isinstance(value, Path):
-        return str(value)
-    return value
