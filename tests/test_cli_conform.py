@@ -358,16 +358,7 @@ def test_an_examination_that_is_killed_is_resumed(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "ends.py").write_text(_ENDS)
     limits = "minimum-image,orthorhombic,all-axes"
-    asked = [
-        "conform",
-        "ends.py:nearest_image",
-        "--cases",
-        "5",
-        "--no-large",
-        "--no-report",
-        "--limits",
-        limits,
-    ]
+    asked = f"conform ends.py:nearest_image --cases 2 --no-large --no-report --limits {limits}".split()
     assert call(*asked, "-o", "whole") == 1
     (tmp_path / "armed").touch()
     done = subprocess.run(

@@ -22,13 +22,8 @@ from mdnum.references.conformance.peers import known
 from mdnum.references.oracle import PairSet, all_pairs, completed, exactly_inside, rounding_bound
 from mdnum.systems import System
 
-AGREES, AT_THE_CUTOFF, DIFFERS, FAILED, NOT_ASKED = (
-    "agrees",
-    "differs at the cutoff",
-    "differs",
-    "failed",
-    "not asked",
-)
+AGREES, AT_THE_CUTOFF, DIFFERS = "agrees", "differs at the cutoff", "differs"
+FAILED, NOT_ASKED = "failed", "not asked"
 _SINGLE = 2.0**-24
 _NEARBY = 3  # ulps either side of r_cut in which oriented pairs are placed
 
@@ -130,18 +125,15 @@ def own_searches(system: System) -> tuple[Search, ...]:
     dtype = system.spec.precision.decision
     unit = _SINGLE if "float32" in (dtype, system.spec.precision.state) else 2.0**-53
 
-    def own(name: str, search: Callable[..., Any], affords: float = 1.0) -> Search:
-        limits = ListLimits(minimum_image=True)
-        return Search(
-            PairList(
-                name, lambda: search, package="mdnum", full=False, unit=unit, limits=limits, affords=affords
-            )
-        )
-
-    return (
-        own("mdnum force loop", _force_loop(system)),
-        own("mdnum, host list", _listed("host", compare, dtype)),
-        own("mdnum, jax-md list", _listed("jax-md", compare, dtype), affords=0),
+    searches = {
+        "mdnum force loop": (_force_loop(system), 1.0),
+        "mdnum, host list": (_listed("host", compare, dtype), 1.0),
+        "mdnum, jax-md list": (_listed("jax-md", compare, dtype), 0.0),
+    }
+    own = {"package": "mdnum", "full": False, "unit": unit, "limits": ListLimits(minimum_image=True)}
+    return tuple(
+        Search(PairList(name, lambda search=search: search, affords=affords, **own))
+        for name, (search, affords) in searches.items()
     )
 
 
@@ -253,14 +245,11 @@ class PairsReport:
 
     def rows(self) -> list[dict[str, Any]]:
         """A row per search."""
+        counts = ("pairs", "missing", "extra", "borderline")
         return [
-            {
-                "search": one.name,
-                "version": one.version,
-                "pairs": None if one.note else one.pairs,
-                "missing": None if one.note else one.missing,
-                "extra": None if one.note else one.extra,
-                "borderline": None if one.note else one.borderline,
+            {"search": one.name, "version": one.version}
+            | {name: None if one.note else getattr(one, name) for name in counts}
+            | {
                 "stops counting": one.effective.stops if one.effective else None,
                 "compares": one.effective.comparison if one.effective else None,
                 "ms, first call": None if one.note else round(1e3 * one.seconds, 2),
@@ -325,10 +314,8 @@ def check_pairs(
             return replace(result, verdict=FAILED, note=note)
         missing, extra, borderline = counts.tolist()
         verdict = DIFFERS if missing or extra else AT_THE_CUTOFF if borderline else AGREES
-        return SearchResult(
-            search.name, search.listed.version, verdict, pairs, missing, extra, borderline, stops, seconds,
-            search.ours,
-        )  # fmt: skip
+        counted = {"pairs": pairs, "missing": missing, "extra": extra, "borderline": borderline}
+        return replace(result, verdict=verdict, effective=stops, seconds=seconds, **counted)
 
     return PairsReport(
         system.name,

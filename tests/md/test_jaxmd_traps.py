@@ -177,24 +177,6 @@ def test_a_cutoff_over_half_the_box_has_no_flag(md):
         jaxmd.PairSearch(tilted, ALWAYS, 2.5)
 
 
-@pytest.mark.nightly
-def test_vmap_of_update_rebuilds_every_time(md):
-    displacement, _ = md.space.periodic(jaxmd.scalar(6.0))
-    functions = md.partition.neighbor_list(
-        displacement, jaxmd.scalar(6.0), jaxmd.scalar(1.5), jaxmd.scalar(0.3)
-    )
-    points = jnp.asarray(random_points(20, np.eye(3) * 6.0))
-    found = functions.allocate(points)
-
-    def update(positions):
-        return found.update(positions).idx
-
-    one = str(jax.make_jaxpr(update)(points))
-    many = str(jax.make_jaxpr(jax.vmap(update))(jnp.stack([points, points])))
-    assert "cond[" in one
-    assert "cond[" not in many, mended("rebuilds under vmap", "lists may be rebuilt inside a batched loop")
-
-
 def test_the_cutoff_has_no_derivative(md):
     points = jnp.asarray([[0.0, 0, 0], [2.4, 0, 0]])
     neighbor = jaxmd.as_neighbor_list(np.array([[1], [0]]), np.asarray(points))

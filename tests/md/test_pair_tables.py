@@ -97,25 +97,18 @@ def test_the_host_search_finds_every_pair_once_from_both_ends(configuration):
     check(BUILDERS["host"], *configuration)
 
 
+@pytest.mark.parametrize("examples", [4, pytest.param(40, marks=pytest.mark.nightly)])
 @pytest.mark.jax_md
 @pytest.mark.filterwarnings("ignore:scatter inputs")
-@settings(max_examples=4)
-@given(configurations(most=25))
-def test_the_search_of_jax_md_finds_the_same(configuration):
-    positions, cell, radius = configuration
-    half = float(np.min(cell.widths)) / 2
-    check(BUILDERS["jax-md"], positions, cell, min(radius, 0.999 * half))
+def test_the_search_of_jax_md_finds_the_same(examples):
+    @settings(max_examples=examples)
+    @given(configurations(most=25 if examples < 10 else 60))
+    def finds(configuration):
+        positions, cell, radius = configuration
+        half = float(np.min(cell.widths)) / 2
+        check(BUILDERS["jax-md"], positions, cell, min(radius, 0.999 * half))
 
-
-@pytest.mark.nightly
-@pytest.mark.jax_md
-@pytest.mark.filterwarnings("ignore:scatter inputs")
-@settings(max_examples=40)
-@given(configurations())
-def test_the_search_of_jax_md_finds_the_same_in_many_boxes(configuration):
-    positions, cell, radius = configuration
-    half = float(np.min(cell.widths)) / 2
-    check(BUILDERS["jax-md"], positions, cell, min(radius, 0.999 * half))
+    finds()
 
 
 @pytest.mark.parametrize("bins", [5, 6, 7, 8, 10, 12])

@@ -298,8 +298,9 @@ def generated(positions, cell, pbc, r_cut):
 def test_only_an_exception_of_its_own_is_a_refusal(name: str, tmp_path: Path):
     (tmp_path / "refusals.py").write_text(_REFUSALS)
     (outcome,) = Session(load(f"{tmp_path / 'refusals.py'}:{name}")).ask(_TWO)
-    assert outcome.raised is not None
-    assert outcome.refused == (name in ("Kept", "says_so", "says_so_after", "compiled", "own_class"))
+    assert outcome.answer is None and (outcome.failure is None or outcome.failure.code == "RAISED")
+    refused = name in ("Kept", "says_so", "says_so_after", "compiled", "own_class")
+    assert (outcome.refused is not None) == (outcome.failure is None) == refused
 
 
 @pytest.mark.parametrize(
@@ -321,7 +322,7 @@ def test_an_exception_ends_where_its_frames_begin(message: str, words: str):
         raise RuntimeError(message)
 
     (outcome,) = Session(from_object(raises)).ask(_TWO)
-    assert outcome.raised == words
+    assert outcome.refused == words
 
 
 def test_words_that_end_a_string_do_not_end_the_script():
@@ -414,8 +415,9 @@ def test_a_process_that_crashes_or_hangs_is_a_failure(tmp_path: Path, monkeypatc
 
     session, one_atom = remote("crashes"), once("one", "few", [[0.0, 0, 0]], 4.0)
     assert session.ask(one_atom)[0].answer is not None
-    crashed = session.ask(_TWO)[0].crashed
-    assert crashed is not None and "SIGFPE" in crashed and crashed.endswith("bad alloc")
+    crashed = session.ask(_TWO)[0].failure
+    assert crashed is not None and crashed.code == "CRASHED"
+    assert "SIGFPE" in crashed.text and crashed.text.endswith("bad alloc")
     # and a new process answers the next question
     assert session.ask(one_atom)[0].answer is not None
     session.close()
@@ -429,7 +431,11 @@ def test_a_process_that_crashes_or_hangs_is_a_failure(tmp_path: Path, monkeypatc
             sequence("still", "motion", [at, at], 4.0) if name == "HangsLater" else _TWO
         )
         session.close()
-        assert (late in str(last.late)) if late else (last.late is None and last.answer is not None)
+        assert (
+            (last.failure.code == "NO_ANSWER" and late in last.failure.text)
+            if late
+            else last.answer is not None
+        )
         assert all(outcome.answer is not None for outcome in first)
     assert time.perf_counter() - began < 50
 
