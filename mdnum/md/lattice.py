@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int, UInt8
+from jaxtyping import Array, Float, Int
 
 from mdnum.errors import InputError
 from mdnum.md.cell import Cell
@@ -500,15 +500,7 @@ class LatticeForce(PairForce):
         """The decisions of a list at given positions, without forces."""
         return self.judge(positions).decide(tables)
 
-    def __call__(
-        self,
-        positions: Float[Array, "3 atoms"],
-        tables: Tables,
-        *,
-        decisions: bool,
-        given: UInt8[Array, "words atoms"] | None = None,
-        where: UInt8[Array, "words atoms"] | None = None,
-    ) -> Forces:
+    def __call__(self, positions, tables, *, decisions, given=None, where=None):
         """As `PairForce`: forces that are whole multiples of the unit of force.
 
         Where a pair is so close that its force would leave the range of exact sums, the energy is NaN.

@@ -268,10 +268,9 @@ def check_pairs(
 ) -> PairsReport:
     """Compare the pairs that every search finds inside the cutoff with brute force.
 
-    A system with a radius for each pair of species asks a search once per radius and keeps the pairs it
-    applies to. The oracle follows the comparison of the system file (`<` or `<=`), decided in rational
-    arithmetic near the threshold; a search that decides such a pair otherwise is "at the cutoff", which is
-    rounding or convention and not an error.
+    A search is asked once for each radius that pairs of species have. The oracle follows the comparison of
+    the system file, decided in rational arithmetic near the threshold; a search that decides such a pair
+    otherwise is "at the cutoff", which is rounding or convention and not an error.
 
     Args:
         system: what to check.
@@ -383,16 +382,12 @@ def effective_cutoff(
 ) -> EffectiveCutoff:
     """Bisect two-atom configurations to the last double that a search counts as inside r_cut.
 
-    The two atoms differ along x only and the first has x = 0, so their distance is the coordinate itself
-    and nothing is lost before the search sees it: what is measured is the search alone. In a periodic box
-    (5 r_cut wide) its own wrapping counts too.
+    The two atoms differ along x only and the first has x = 0, so their distance is the coordinate itself and
+    what is measured is the search alone; in a periodic box (5 r_cut wide) its own wrapping counts too.
 
     Args:
-        search: what to ask.
-        r_cut: the cutoff to ask for.
         periodic: in a periodic box, as in a simulation; else free atoms.
-        oriented: how many randomly oriented pairs to place within 3 ulps of r_cut; default what the
-            search can afford.
+        oriented: randomly oriented pairs to place within 3 ulps of r_cut; default what the search can afford.
         seed: of the orientations.
     Error: none, doubles are walked over one by one in the end; it assumes that a search which counts a
         distance counts the smaller ones (checked at relative distances of 1e-5).

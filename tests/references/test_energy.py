@@ -78,7 +78,7 @@ SILICON, COPPER = rattled("Si", "diamond", 5.43, 2), rattled("Cu", "fcc", 3.615,
     ],
 )
 def test_mixtures_and_many_body_potentials_meet_the_reference(atoms, tables: tuple, reference: str):
-    system = replace(make(atoms, *tables), folder=Path(__file__).parents[2] / "systems" / "copper")
+    system = replace(make(atoms, *tables), path=Path(__file__).parents[2] / "systems" / "copper" / "x.toml")
     report = check_energy(system, {"initial": atoms})
     assert report.ok and reference in report.reference
     assert report.frames[0].energy_rel <= 1e-12 and report.frames[0].force_rel <= 1e-11
