@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import mdnum
-from mdnum.audit.structures import load_calculator
+from mdnum.audit.record import load_calculator
 from mdnum.errors import InputError
 from mdnum.references.conformance.peers import load as load_list
 from mdnum.safe_path import python
