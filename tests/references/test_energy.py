@@ -14,8 +14,7 @@ from small_systems import KOB_ANDERSEN, LENNARD_JONES, crystal, make, mixture
 from mdnum.plain import plain
 from mdnum.references import energy_check
 from mdnum.references.ase_models import reference
-from mdnum.references.energy_check import _growth, _sudden, check_dynamics, check_energy
-from mdnum.references.neighborhoods import neighborhoods
+from mdnum.references.energy_check import _growth, _sudden, check_dynamics, check_energy, neighborhoods
 from mdnum.systems import build
 from mdnum.verbs.check import dynamics_findings, energy_findings
 
