@@ -110,37 +110,23 @@ class EnergyReport:
     def worst(self) -> dict[str, Any]:
         """The worst of all frames, in the names of summary.json's `ase`."""
         stress = [frame.stress_max for frame in self.frames if frame.stress_max is not None]
-        return {
-            "reference": self.reference,
-            "energy_rel": max(frame.energy_rel for frame in self.frames),
-            "force_max": max(frame.force_max for frame in self.frames),
-            "stress_max": max(stress) if stress else None,
-            "force_scale": max(frame.force_scale for frame in self.frames),
-            "ok": self.ok,
-            **({} if self.sampled is None else {"sampled": self.sampled}),
-        }
+        names = ("energy_rel", "force_max", "force_scale")
+        worst = {name: max(getattr(frame, name) for frame in self.frames) for name in names}
+        worst |= {"reference": self.reference, "stress_max": max(stress) if stress else None, "ok": self.ok}
+        return worst if self.sampled is None else {**worst, "sampled": self.sampled}
 
     def rows(self) -> list[dict[str, Any]]:
         """A row per frame."""
-        narrow = self.precision != "float64"
+        narrow = {"energy, roundings": "energy_roundings", "force, roundings": "force_roundings"}
+        columns = {
+            "energy": "energy", "energy, relative": "energy_rel", "force, largest": "force_max",
+            "force, relative": "force_rel", "stress, largest": "stress_max",
+            **(narrow if self.precision != "float64" else {}),
+            "against numpy": "energy_third", "ambiguous pairs": "ambiguous", "agrees": "ok",
+        }  # fmt: skip
         return [
-            {
-                "frame": frame.frame,
-                "reference": self.reference,
-                "energy": frame.energy,
-                "energy, relative": frame.energy_rel,
-                "force, largest": frame.force_max,
-                "force, relative": frame.force_rel,
-                "stress, largest": frame.stress_max,
-                **(
-                    {"energy, roundings": frame.energy_roundings, "force, roundings": frame.force_roundings}
-                    if narrow
-                    else {}
-                ),
-                "against numpy": frame.energy_third,
-                "ambiguous pairs": frame.ambiguous,
-                "agrees": frame.ok,
-            }
+            {"frame": frame.frame, "reference": self.reference}
+            | {title: getattr(frame, name) for title, name in columns.items()}
             for frame in self.frames
         ]
 
@@ -347,14 +333,13 @@ class _Scales:
             step = 1e-4 * form.r_cut
             energies[rows], forces[rows] = np.abs(u), np.abs(du)
             stiffness[rows] = np.abs(form(r[rows] + step)[1] - form(r[rows] - step)[1]) / (2 * step)
-        per_atom = np.zeros(len(atoms))
-        np.add.at(per_atom, i, (stiffness * shift) ** 2 + (12.0 * unit * forces) ** 2)
-        np.add.at(per_atom, j, (stiffness * shift) ** 2 + (12.0 * unit * forces) ** 2)
-        summed = np.zeros(len(atoms))
-        np.add.at(summed, i, energies)
+        squares = (stiffness * shift) ** 2 + (12.0 * unit * forces) ** 2
+        per_atom = np.bincount(i, squares, len(atoms)) + np.bincount(j, squares, len(atoms))
         # rounding of the terms adds at random, rounding of the running sums with their size
         energy_expected = np.sqrt(
-            ((forces * shift) ** 2).sum() + ((12.0 * unit * energies) ** 2).sum() + (unit * summed.sum()) ** 2
+            ((forces * shift) ** 2).sum()
+            + ((12.0 * unit * energies) ** 2).sum()
+            + (unit * energies.sum()) ** 2
         )
         force = max(largest_force, float(forces.max(initial=0.0)))
         return cls(
