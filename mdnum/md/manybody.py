@@ -104,8 +104,8 @@ class ManyBody(eqx.Module):
 # jax_md.quantity adds a length of 1e-7 to both lengths before it divides by them, which bends every cosine by
 # 1e-7 and the forces of rattled silicon by 3e-7. In units of 2^-24 Å it is 6e-15 Å, below rounding, and a
 # power of two costs no digit. (Not more: jax-md also takes two neighbors closer than 1e-5 of that unit for
-# one.) In float32 the offset is about one rounding, and 2^4 puts it below.
-_UNIT = {"float64": 2.0**24, "float32": 2.0**4}
+# one.)
+_UNIT = 2.0**24
 
 
 class StillingerWeber(ManyBody):
@@ -144,26 +144,25 @@ class StillingerWeber(ManyBody):
         return self.a * self.sigma
 
     def energy(self, positions, neighbor, cell):
-        unit = _UNIT[str(jnp.dtype(positions.dtype))]
         vector = displacement(cell, self.pbc)
 
         def apart(Ra, Rb, **_):
             # a padded slot may be the atom itself; at distance zero jax-md's derivatives by sigma, A and B
             # are NaN, and its mask comes after
-            d = vector(Ra, Rb) * unit
-            return jnp.where(jnp.all(d == 0), 2 * self.r_cut * unit, d)
+            d = vector(Ra, Rb) * _UNIT
+            return jnp.where(jnp.all(d == 0), 2 * self.r_cut * _UNIT, d)
 
         # numbers stay Python floats here: nothing on this path downcasts them, and they take R's dtype
         _, total = upstream().energy.stillinger_weber_neighbor_list(
             apart,
             1.0,
-            sigma=self.sigma * unit,
+            sigma=self.sigma * _UNIT,
             A=self.A,
             B=self.B,
             lam=self.strength,
             gamma=self.gamma,
             epsilon=self.epsilon,
-            cutoff=self.r_cut * unit,
+            cutoff=self.r_cut * _UNIT,
             neighbor_list_fn=lambda *_, **__: None,
         )
         # jax-md mixes dtypes; the result has the dtype of the positions all the same

@@ -30,11 +30,7 @@ _NEARBY = 3  # ulps either side of r_cut in which oriented pairs are placed
 
 @dataclass(frozen=True)
 class Search:
-    """A neighbor list, asked for pairs as a careful user would: in a box and with atoms as it wants them.
-
-    Attributes:
-        listed: the list, made anew at every question.
-    """
+    """A neighbor list, asked for pairs as a careful user would: in a box and with atoms as it wants them."""
 
     listed: PairList
 
@@ -196,8 +192,7 @@ class SearchResult:
         verdict: "agrees"; "differs at the cutoff": only within its own rounding; "differs"; "failed";
             "not asked": see note.
         pairs: pairs found inside the cutoff.
-        missing: pairs of the oracle that it does not have, beyond its rounding.
-        extra: pairs that the oracle does not have, beyond its rounding.
+        missing, extra: pairs that only the oracle has, or only the search, beyond its rounding.
         borderline: pairs decided otherwise than by real arithmetic, within its rounding.
         effective: the cutoff it acts on.
         seconds: time of the first search, compiling included.

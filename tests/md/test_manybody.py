@@ -7,7 +7,6 @@ from dataclasses import asdict
 from pathlib import Path
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -291,22 +290,6 @@ def test_any_jax_md_energy_function_runs_in_every_format(format):
     np.testing.assert_allclose(forces, atoms.get_forces(), rtol=0, atol=1e-13)
     np.testing.assert_allclose(stress, atoms.get_stress(voigt=False), rtol=0, atol=1e-15)
     assert math.isnan(potential.smoothness.energy_jump)
-
-
-def test_float32_positions_stay_float32():
-    atoms = crystal("Si", 2, 0.05)
-    for potential in (manybody.tersoff(), manybody.stillinger_weber()):
-        neighbor = jaxmd.as_neighbor_list(dense(atoms, 4.0), atoms.positions)
-        narrow = jnp.asarray(atoms.positions, jnp.float32)
-        with jax.numpy_dtype_promotion("standard"):
-            energy = eqx.filter_jit(potential.energy)(
-                narrow, neighbor, jnp.asarray(atoms.cell.array, jnp.float32)
-            )
-        wide = eqx.filter_jit(potential.energy)(
-            jnp.asarray(atoms.positions), neighbor, jnp.asarray(atoms.cell.array)
-        )
-        assert energy.dtype == jnp.float32
-        assert abs(float(energy) - float(wide)) <= 3e-6 * abs(float(wide))
 
 
 def test_setfl_keeps_every_digit(tmp_path):

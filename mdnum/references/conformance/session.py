@@ -64,12 +64,7 @@ class CallOutcome:
 
 
 class Session:
-    """Calls of one list, a kept one through its life.
-
-    Args:
-        tested: the list.
-        reuse: ask the same object in all cases, as a program that runs for long does.
-    """
+    """Calls of one list, a kept one through its life; with `reuse` one object is asked in all cases."""
 
     def __init__(self, tested: PairList, reuse: bool = False):
         self.tested, self.reuse = tested, reuse
@@ -253,11 +248,9 @@ def _value(name: ast.expr, place: TracebackType) -> Any:
 
 
 class RemoteSession:
-    """As `Session`, in another process; a new one after each that ended: a crash is a finding and not an end.
+    """As `Session`, of a list that `load` finds by its word, in another process.
 
-    Args:
-        tested: a list that `load` finds by its word.
-        reuse: ask one object in all cases.
+    A new one is started after each that ended: a crash is a finding and not an end.
     """
 
     def __init__(self, tested: PairList, reuse: bool = False):
@@ -381,11 +374,7 @@ def _received(stream: BinaryIO | Any) -> Any:
 
 
 def serve(word: str) -> None:
-    """Answers questions on stdin until there are no more: the other process of a `RemoteSession`.
-
-    Args:
-        word: what `load` finds the list by.
-    """
+    """Answers questions on stdin to the list of this word: the other process of a `RemoteSession`."""
     from mdnum.references.conformance.peers import load
 
     # a list may print: what it writes to stdout must not be taken for an answer

@@ -57,7 +57,6 @@ class Examiner:
     """Asks a list and judges its answers; finds out its conventions first.
 
     Args:
-        tested: the list.
         reuse: ask one object in all cases.
         apart: call it in a process of its own, which may crash.
 
@@ -142,10 +141,7 @@ class Examiner:
             report.padding = 1.0 if whole else (edge - crowd.r_cut) / _SKIN
 
     def unusable(self) -> str | None:
-        """Why nothing can be learned from it: no plain question had an answer that is one; None otherwise.
-
-        A refusal, a crash and a time without an answer are for the suite to report.
-        """
+        """Why no plain question had an answer that is one, but for what the suite reports; None otherwise."""
         reasons = [
             f"asked about {case.name}, {'it raised ' * (why.code == 'RAISED')}{why.text}"
             for case, outcome in self.opening
@@ -154,10 +150,7 @@ class Examiner:
         return reasons[0] if reasons and len(reasons) == len(self.opening) else None
 
     def failures(self, case: Case) -> tuple[Failure, ...]:
-        """What is wrong with the answers to a case, at the first step where anything is; empty if nothing.
-
-        A case beyond the limits is not asked.
-        """
+        """What is wrong with the answers to a case within the limits, at the first step where anything is."""
         return () if self.tested.limits.refusal(case) is not None else self.ask(case).failures
 
     def ask(self, case: Case) -> CaseResult:
@@ -420,12 +413,9 @@ Failures = Callable[[Case], Sequence[Failure]]
 
 
 def shrunk(failures: Failures, failed: Failed, deadline: Deadline | None = None) -> Failed:
-    """The smallest case found that fails with the same code.
+    """The smallest case found, before the deadline, that fails with the same code.
 
-    Args:
-        failures: asks the list; a new object of a kept list for each question.
-        failed: the case as it was met.
-        deadline: after which it is left as small as it is.
+    `failures` asks the list; a new object of a kept list for each question.
     """
     deadline = deadline or Deadline()
     sought, least = failed.worst.kind, min(1, failed.case.atoms)
