@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import functools
+
 import jax.numpy as jnp
 import mpmath
 import numpy as np
+import oracles
 import pytest
 
 from mdnum.md.cutoffs import CUTOFFS, AtCutoff, Cutoff, Level, Undecided, check
@@ -30,23 +33,12 @@ def bare(r):
 
 
 def closed_form(kind, r):
-    """The cut energy in arbitrary precision, written from the definition of each cutoff in the literature."""
-    r, rc, ro = mpmath.mpf(r), mpmath.mpf(R_CUT), mpmath.mpf(R_ONSET)
-    if kind == "hard":
+    """The cut energy in arbitrary precision."""
+    r, rc, ro = map(mpmath.mpf, (r, R_CUT, R_ONSET))
+    if CUTOFFS.parse(kind).switches and r < ro:
         return bare(r)
-    if kind == "shifted":
-        return bare(r) - bare(rc)
-    if kind == "force-shifted":
-        return bare(r) - bare(rc) - (r - rc) * mpmath.diff(bare, rc)
-    if r < ro:
-        return bare(r)
-    if kind == "switched":
-        # HOOMD-blue's xplor; jax_md.energy.multiplicative_isotropic_cutoff; ase LennardJones(smooth=True)
-        return bare(r) * (rc**2 - r**2) ** 2 * (rc**2 + 2 * r**2 - 3 * ro**2) / (rc**2 - ro**2) ** 3
-    t = (r - ro) / (rc - ro)
-    if kind == "quintic":
-        return bare(r) * (1 - 10 * t**3 + 15 * t**4 - 6 * t**5)
-    return bare(r) * (1 + mpmath.cos(mpmath.pi * t)) / 2
+    slope = functools.partial(mpmath.diff, bare)
+    return oracles.cut_energy(kind, r, rc, ro, bare, slope, mpmath.cos, mpmath.pi)
 
 
 @pytest.mark.parametrize("kind", KINDS)
