@@ -13,7 +13,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from mdnum.ball.rollout import BallRun, simulate
-from mdnum.ball.state import BallDecisions, BallRecord, BallState
+from mdnum.ball.step import BallDecisions, BallRecord, BallState
 from mdnum.ball.world import World
 
 #: Parameters of the start rather than of the world; a value moves the whole batch.

@@ -8,7 +8,8 @@ of summation; a rule per ball does neither.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from enum import IntEnum
+from typing import Any, NamedTuple, Protocol
 
 import equinox as eqx
 import jax
@@ -18,13 +19,49 @@ from jax import lax
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float, Int
 
-from mdnum.ball.state import Reason, Solve
 from mdnum.numerics.events import Threshold
 from mdnum.numerics.roles import RolePrecision
 from mdnum.numerics.sums import Pairwise, Reduction
 
 #: function(inputs, rest) -> (outputs, record); inputs and outputs are tuples of arrays of shape (balls,).
 Map = Callable[[tuple, Any], tuple[tuple, Any]]
+
+
+class Reason(IntEnum):
+    """What ended the solver of a step."""
+
+    NONE = 0
+    TOLERANCE = 1
+    CAP = 2
+    FIXED = 3
+    NOT_FINITE = 4
+    REST = 5
+
+    @property
+    def word(self) -> str:
+        """As people read it."""
+        return self.name.lower().replace("_", " ")
+
+
+class Solve(NamedTuple):
+    """The record of one iterative solve; shape () where one rule stops all balls, else (balls,).
+
+    Attributes:
+        iterations: how often it went on.
+        reason: a `Reason`.
+        residual: the residual at the last decision.
+        margin: threshold minus residual there: positive where the residual was low enough to stop.
+        before: the margin of the decision before, which was to go on; -inf where there was none.
+        history: residual at every decision, NaN where none was made, shape (max_iter + 1,), or (0,) unless
+            it was asked for; the largest over the balls where each ball has its own.
+    """
+
+    iterations: Int[Array, "..."]
+    reason: Int[Array, "..."]
+    residual: Float[Array, "..."]
+    margin: Float[Array, "..."]
+    before: Float[Array, "..."]
+    history: Float[Array, "decisions"]
 
 
 class StopRule(Protocol):

@@ -15,10 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mdnum.ball.contacts import Projection
 from mdnum.ball.problem import START, BallLoss, BallProblem, loss_of
 from mdnum.ball.rollout import BallRun
-from mdnum.ball.state import BallDecisions
+from mdnum.ball.step import BallDecisions, Projection
 from mdnum.ball.world import World
 from mdnum.errors import InputError, MdnumError
 from mdnum.gradients.dependence import dependence, follow

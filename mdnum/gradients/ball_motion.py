@@ -10,10 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mdnum.ball.contacts import Penalty, Projection
-from mdnum.ball.integrators import EventLocated
 from mdnum.ball.problem import START, BallProblem
-from mdnum.ball.state import BallDecisions, BallRecord, BallState
+from mdnum.ball.step import BallDecisions, BallRecord, BallState, EventLocated, Penalty, Projection
 from mdnum.ball.world import World
 from mdnum.errors import NumericalError
 from mdnum.gradients.ball import BallMethod, Used, origin, scaled, start_of, used

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mdnum.ball import contacts, integrators, limits, stopping
+from mdnum.ball import limits, step, stopping
 from mdnum.ball.problem import BallLoss, BallProblem, FinalHeight, MeanHeight, ResidualPenetration
 from mdnum.ball.world import World
 from mdnum.errors import InputError
@@ -21,10 +21,10 @@ from mdnum.systems.ball_system import BallSystem
 from mdnum.systems.load import load
 
 _INTEGRATORS: Mapping[str, Any] = {
-    "explicit-euler": integrators.ExplicitEuler,
-    "semi-implicit-euler": integrators.SemiImplicitEuler,
-    "velocity-verlet": integrators.BallVerlet,
-    "event-located": integrators.EventLocated,
+    "explicit-euler": step.ExplicitEuler,
+    "semi-implicit-euler": step.SemiImplicitEuler,
+    "velocity-verlet": step.BallVerlet,
+    "event-located": step.EventLocated,
 }
 _RULES: Mapping[str, Any] = {
     "sum": stopping.GlobalSum,
@@ -174,11 +174,11 @@ def control(table: ball.Control, h: float, steps: int) -> Float[np.ndarray, "ste
 def _contact(spec: ball.BallSpec) -> Any:
     match table := spec.contact:
         case ball.PenaltyContact():
-            return contacts.Penalty(table.k, table.damping, table.eps, smooth=table.eps > 0)
+            return step.Penalty(table.k, table.damping, table.eps, smooth=table.eps > 0)
         case ball.ProjectionContact():
-            return contacts.Projection(table.k, table.alpha, stop_rule(spec), table.restitution)
+            return step.Projection(table.k, table.alpha, stop_rule(spec), table.restitution)
         case ball.ImpactContact():
-            return contacts.Impact(table.restitution, table.rest_speed)
+            return step.Impact(table.restitution, table.rest_speed)
 
 
 def _integrator(spec: ball.BallSpec) -> Any:
@@ -186,9 +186,9 @@ def _integrator(spec: ball.BallSpec) -> Any:
     if table.kind != "implicit-midpoint":
         return _INTEGRATORS[table.kind](table.timestep)
     if isinstance(spec.contact, ball.PenaltyContact):
-        return integrators.ImplicitMidpoint(table.timestep, stop_rule(spec))
+        return step.ImplicitMidpoint(table.timestep, stop_rule(spec))
     # without a contact force a step is a formula, and nothing is solved
-    return integrators.ImplicitMidpoint(table.timestep)
+    return step.ImplicitMidpoint(table.timestep)
 
 
 def stop_rule(spec: ball.BallSpec) -> Any:
