@@ -190,22 +190,8 @@ def _chunk(world: World, state: BallState, imposed: Any, length: int, history: b
     return lax.scan(step, state, imposed, length=length)
 
 
-def _flips(
-    world: World,
-    made: int,
-    before: np.ndarray,
-    y: np.ndarray,
-    v: np.ndarray,
-    rows: dict[str, np.ndarray],
-) -> dict[str, np.ndarray]:
-    """The rows of the ledger of one chunk.
-
-    Args:
-        made: steps made before it.
-        before: contact decisions ahead of it.
-        y, v: the state ahead of it.
-        rows: its record.
-    """
+def _flips(world: World, made: int, before, y, v, rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The rows of the ledger of a chunk, from the steps, contacts and state before it and from its record."""
     contact = rows["contact"]
 
     def packed(bits: np.ndarray) -> np.ndarray:
@@ -445,17 +431,12 @@ def _unequal_counts(a: BallRun, b: BallRun, rows: int) -> np.ndarray:
     """Solves whose iterations differ, shape (rows, 1) where one rule stops all balls, else by ball."""
     counts = [run.iterations.reshape(run.steps, -1)[:rows] for run in (a, b)]
     differ = counts[0] != counts[1]
-    if not counts_alike(a, b):
+    if _counted(a) != _counted(b):
         # impacts are no iterations, and a run without a solver has stopped none: nothing to compare
         return np.zeros_like(differ)
     if a.iterations.ndim == b.iterations.ndim == 1:
         return differ
     return differ & (_solving(a, rows) | _solving(b, rows))
-
-
-def counts_alike(a: BallRun, b: BallRun) -> bool:
-    """Whether the iteration counts of two runs count the same, so that they can be compared."""
-    return _counted(a) == _counted(b)
 
 
 def _counted(run: BallRun) -> str:

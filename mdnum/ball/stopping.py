@@ -101,7 +101,6 @@ class _ToleranceRule(eqx.Module):
     max_iter: int = eqx.field(static=True, default=100)
 
     def threshold(self, first, iteration):
-        """The tolerance in the residual's dtype."""
         return jnp.broadcast_to(jnp.asarray(self.tol).astype(first.dtype), first.shape)
 
 
@@ -111,7 +110,6 @@ class GlobalSum(_ToleranceRule):
     reduction: Reduction = eqx.field(static=True, default=Pairwise())
 
     def measure(self, terms, accumulate, decision, zero):
-        """The sum in the dtype of sums."""
         return self.reduction(terms.astype(accumulate), zero).astype(decision)
 
 
@@ -119,7 +117,6 @@ class PerInstance(_ToleranceRule):
     """A residual for each ball: a ball stops when its own is low enough, whatever the others do."""
 
     def measure(self, terms, accumulate, decision, zero):
-        """Each ball's own term."""
         return terms.astype(decision)
 
 
@@ -127,7 +124,6 @@ class Maximum(_ToleranceRule):
     """One residual for the batch: the largest term. No sum, so no order of summation."""
 
     def measure(self, terms, accumulate, decision, zero):
-        """The largest term."""
         return jnp.max(terms).astype(decision)
 
 
@@ -159,7 +155,6 @@ class HysteresisStop(eqx.Module):
         return self.rule.max_iter
 
     def measure(self, terms, accumulate, decision, zero):
-        """As the rule inside."""
         return self.rule.measure(terms, accumulate, decision, zero)  # type: ignore[attr-defined]
 
     def threshold(self, first, iteration):
@@ -182,9 +177,8 @@ class FixedCount(eqx.Module):
         """The count."""
         return self.count
 
-    def measure(self, terms, accumulate, decision, zero):
-        """The largest term, for the record only."""
-        return jnp.max(terms).astype(decision)
+    # for the record only
+    measure = Maximum.measure
 
     def threshold(self, first, iteration):
         """Stops when the count is reached, and not before."""

@@ -440,7 +440,7 @@ def _check(twin: Twin) -> None:
         else np.empty(0)
         for one in (twin.a, twin.b)
     ]
-    if not np.array_equal(*keys):
+    if not np.array_equal(keys[0], keys[1]):
         raise InputError(
             "the runs have different noise, so they diverge at the first step whatever else they do",
             where="dynamics.seed",

@@ -110,19 +110,16 @@ class BoundaryMap:
     """A run as a piecewise function of a number.
 
     Attributes:
-        number: that was varied.
-        steps: last step of every run.
+        number, steps: that was varied, and the last step of every run.
         low, high: the interval that was searched.
-        intervals: with one history each, in order.
-        boundaries: between them, in order.
+        intervals, boundaries: with one history each and between them, in order.
         unresolved: stretches whose ends have different histories but were not searched to the last bit, and
             adjacent floats where a run fails on one side before anything is decided otherwise.
         complete: whether every float of the interval was run, so that nothing can hide.
         resolution: the longest stretch between two runs of one history; a pair of boundaries within it that
             cancel each other may be missed.
-        evaluations: runs made to find them.
+        evaluations, failed: runs made to find them, and those that ended in a blow-up or a runaway.
         at, loss, energy: of every run made, in order; at its last step.
-        failed: runs among them that ended in a blow-up or a runaway.
     """
 
     number: Number
@@ -219,8 +216,9 @@ class NumberLine:
         ]
         moved = (runs[1].x - runs[0].x).reshape(len(runs[0].x), -1)
         separation = float(np.sqrt(np.max(np.sum(moved**2, axis=1))))
-        bound = decision.bounds["A"]
-        return Boundary(*sides, decision.channel, step, decision.subject, bound, decision.also, separation)
+        low, high = sides
+        bound, also = decision.bounds["A"], decision.also
+        return Boundary(low, high, decision.channel, step, decision.subject, bound, also, separation)
 
 
 def boundaries(

@@ -385,7 +385,7 @@ def screen(
             Screened(choice.name, twin.difference, *date, choice.must_hold, None, found.steps, failed)
         )
 
-    def rank(row: Screened) -> tuple[bool, float, float, float]:
+    def rank(row: Screened) -> tuple[float, ...]:
         dates = (np.inf if date is None else date for date in (row.fork, row.first_bit, row.split))
         return row.reason_unavailable is not None, *dates
 

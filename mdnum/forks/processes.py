@@ -23,6 +23,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from threading import Lock, Timer
+from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
@@ -216,7 +217,7 @@ def _ran(variant: Variant, question: Mapping[str, Any], file: Path) -> tuple[Ran
     # a program cached by another variant must not answer for this one; these flags are a CPU's
     settings = {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "JAX_ENABLE_COMPILATION_CACHE": "false"}
     begin = time.perf_counter()
-    failed = _ask(asked, file.with_suffix(".json"), timeout=_TIMEOUT, **settings)
+    failed = _ask(asked, file.with_suffix(".json"), timeout=_TIMEOUT, settings=settings)
     seconds = time.perf_counter() - begin
     x = np.zeros(0) if failed else np.load(out)
     if not len(x):
@@ -430,7 +431,7 @@ def _ask(
     file: Path,
     heard: Callable[[str], None] = lambda line: None,
     timeout: float | None = None,
-    **settings: str,
+    settings: Mapping[str, str] = MappingProxyType({}),
 ) -> str:
     """Have a process answer a question; why it failed, "" where it did not.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar
@@ -13,7 +12,7 @@ from mdnum.errors import InputError
 from mdnum.forks.worlds import changes, program_of, varied
 from mdnum.numerics import reductions
 from mdnum.program import Twin
-from mdnum.registry import Registry
+from mdnum.registry import Registry, unknown
 from mdnum.systems import BallSystem, System
 
 #: Reductions whose result does not depend on the order of their terms.
@@ -195,12 +194,7 @@ def parse(text: str) -> Choice:
         takes = {one.name for one in fields(kind)}  # type: ignore[arg-type]
         if (not role or "role" in takes) and (not both or "both" in takes):
             return kind.parse(argument, role, both or None)
-    known = dict.fromkeys([*CHOICES, *shipped("md"), *shipped("ball")])
-    close = difflib.get_close_matches(text, known, n=3)
-    near = f"Did you mean {' or '.join(close)}? " if close else ""
-    raise InputError(
-        f"no choice {text!r}", remedy=f"{near}There are {', '.join(CHOICES)}; `mdnum fork` lists all"
-    )
+    raise unknown("choice", text, CHOICES)
 
 
 # --- for the choices ----------------------------------------------------------------------------------

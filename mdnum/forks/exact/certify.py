@@ -142,8 +142,8 @@ def certify(
     program, exact, rows = certifier(system, last, every, note)
     rows = _with_gains(rows, last)
     # one that never left comes before all that did
-    latest = {None: last + 1}
-    rows.sort(key=lambda row: (row.reason_unavailable is not None, -latest.get(row.horizon, row.horizon)))
+    horizons = {row.name: last + 1 if row.horizon is None else row.horizon for row in rows}
+    rows.sort(key=lambda row: (row.reason_unavailable is not None, -horizons[row.name]))
     return Certificate(last, program.timestep, exact, tuple(rows), _steps_per_bit(rows))
 
 

@@ -253,8 +253,10 @@ def unsupported(simulation: Simulation) -> InputError | None:
             None,
         ),
     )
-    found = next((rest for is_so, *rest in reasons if is_so), None)
-    return None if found is None else InputError(found[0], remedy=found[1], where=found[2])
+    errors = (
+        InputError(message, remedy=remedy, where=key) for is_so, message, remedy, key in reasons if is_so
+    )
+    return next(errors, None)
 
 
 class ExactProgram:
