@@ -20,9 +20,9 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
 from jax.interpreters import partial_eval
 
-from mdnum.ball.contacts import Projection
 from mdnum.ball.problem import BallLoss, BallProblem, loss_at
 from mdnum.ball.rollout import BallRun
+from mdnum.ball.step import Projection
 from mdnum.errors import InputError, MdnumError
 from mdnum.gradients.problem import Gradient, Kind
 from mdnum.registry import Registry
