@@ -73,6 +73,7 @@ class Loss(eqx.Module):
     name: ClassVar[str]
     label: ClassVar[str] = ""
     unit: ClassVar[str] = ""
+    of_single_frames: ClassVar[bool] = False
     every: int = eqx.field(static=True, default=1)
     first: int = eqx.field(static=True, default=0)
 
@@ -104,10 +105,6 @@ class Loss(eqx.Module):
         """Why it has no meaning in these surroundings; None where it has."""
         return None
 
-    @property
-    def of_single_frames(self) -> bool:
-        return False
-
 
 class _OfLast(Loss):
     """Of the last step alone."""
@@ -117,14 +114,6 @@ class _OfLast(Loss):
 
     def value(self, total, frames):
         return total
-
-
-class _OfFrames(Loss):
-    """A mean of what each frame shows by itself."""
-
-    @property
-    def of_single_frames(self) -> bool:
-        return True
 
 
 class Custom(Loss):
@@ -147,16 +136,10 @@ class Custom(Loss):
         return self.see(frame, origin, around)
 
     def value(self, total, frames):
-        value = self.conclude(total, frames)
-        if jax.tree.structure(value) != jax.tree.structure(0.0) or jnp.shape(value) != ():
-            raise InputError(
-                f"the loss has shape {jnp.shape(value)}; expected a scalar",
-                remedy="Reduce it, with a sum or a mean",
-            )
-        return jnp.asarray(value)
+        return self.conclude(total, frames)
 
     @property
-    def of_single_frames(self) -> bool:
+    def of_single_frames(self) -> bool:  # type: ignore[override]
         return self.single
 
 
@@ -194,28 +177,31 @@ class VelocityAutocorrelation(_OfLast):
         return _correlation(frame, origin)
 
 
-class MeanPotential(_OfFrames):
+class MeanPotential(Loss):
     """Potential energy of an atom, averaged over frames."""
 
     name, label, unit = "potential", "potential energy of an atom, averaged over steps", "{energy}"
+    of_single_frames = True
 
     def observe(self, frame, origin, around):
         return frame.potential / frame.x.shape[1]
 
 
-class MeanTemperature(_OfFrames):
+class MeanTemperature(Loss):
     """Kinetic temperature 2 K / (3 N kB), averaged over frames, K (or the units' temperature)."""
 
     name, label, unit = "temperature", "kinetic temperature, averaged over steps", "{temperature}"
+    of_single_frames = True
 
     def observe(self, frame, origin, around):
         return 2 * _kinetic(frame, around) / (3 * frame.x.shape[1] * around.kB)
 
 
-class MeanPressure(_OfFrames):
+class MeanPressure(Loss):
     """Pressure (2 K + virial) / (3 V), averaged over frames, energy/length³."""
 
     name, label, unit = "pressure", "pressure, averaged over steps", "{energy}/{length}³"
+    of_single_frames = True
 
     def observe(self, frame, origin, around):
         return (2 * _kinetic(frame, around) + frame.virial) / (3 * around.volume)
@@ -307,16 +293,15 @@ class GreenKuboDiffusion(Loss):
         return total
 
 
-class RadialDistribution(_OfFrames):
+class RadialDistribution(Loss):
     """A number made of g(r), the density of pairs against that of an ideal gas, averaged over frames.
 
-    Every distance is shared between the four nearest bins by cubic B-splines, which add up to one: no
-    pair is lost, and g(r) has two continuous derivatives by every position. All pairs are examined, row by
-    row, so that a frame costs of the order of atoms² operations and of atoms memory.
+    Every distance is shared between the four nearest bins by cubic B-splines, which add up to one: g(r) has
+    two continuous derivatives by every position. A frame costs of the order of atoms² operations and of atoms
+    memory.
 
     Attributes:
-        r_max: right edge of the last bin, length.
-        bins: number of bins of equal width, from 0.
+        r_max: right edge of the last bin, length. bins: of equal width, from 0.
         target: the loss is the mean squared difference from this, shape (bins,), or from the same in all.
         weights: the loss is the sum of g(r) with these weights instead, shape (bins,).
 
@@ -324,6 +309,7 @@ class RadialDistribution(_OfFrames):
     """
 
     name, label = "rdf", "mean squared difference of g(r) from 1"
+    of_single_frames = True
     r_max: float = eqx.field(static=True, kw_only=True)
     bins: int = eqx.field(static=True, kw_only=True, default=60)
     target: Float[Array, "*bins"] = eqx.field(kw_only=True, default_factory=lambda: jnp.ones((), jnp.float64))
@@ -447,9 +433,7 @@ def parse(text: str, simulation: Simulation, steps: int) -> Loss:
     """The loss that a text names.
 
     Args:
-        text: a name of `LOSSES`, with options behind a colon where others than the defaults are meant:
-            "potential:every=10,first=500".
-        simulation, steps: what it is a loss of.
+        text: a name of `LOSSES`, with options behind a colon: "potential:every=10,first=500".
 
     Raises:
         InputError: no such loss, or it has no such option.
