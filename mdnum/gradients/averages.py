@@ -24,7 +24,7 @@ from mdnum.gradients.adjoint import MODEL, SCALE, pull_back
 from mdnum.gradients.parameters import Cotangents
 from mdnum.gradients.problem import Gradient, Method, Problem, Progress, in_phase, pairs_only
 from mdnum.gradients.recorded import tape_of
-from mdnum.gradients.tape import KEPT, RunTape, frame_of
+from mdnum.gradients.tape import KEPT, RunTape, frame_of, listed
 from mdnum.md.cell import displacement
 from mdnum.md.cutoffs import Hard
 from mdnum.md.integrators import Langevin
@@ -208,12 +208,9 @@ def distances(
     """
     search = VerletList(BUILDERS["host"], RebuildRule(reach), simulation.r_cut)
     table = search.build(np.ascontiguousarray(x.T), simulation.cell)
-    slots, columns = np.nonzero(table.index < x.shape[1])
-    i, j = table.order[columns], table.order[table.index[slots, columns]]
-    once = i < j
-    i, j = i[once], j[once]
+    first, second, kinds = listed(simulation, table)
+    i, j = table.order[first], table.order[second]
     r = np.sqrt(sum(c * c for c in displacement(simulation.cell, x.T[i], x.T[j])))
-    kinds = simulation.type_of(i, j)
     beyond = [r[kinds == kind] - radius for kind, radius in enumerate(simulation.decider.r_cut)]
     return [one[np.abs(one) < reach] for one in beyond]
 

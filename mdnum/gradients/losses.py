@@ -79,10 +79,13 @@ class Loss(eqx.Module):
 
     def __check_init__(self):
         if self.every < 1 or self.first < 0:
-            raise InputError(
-                f"every = {self.every}, first = {self.first}; expected at least 1 and at least 0",
-                where=f"loss {self.name}",
+            raise self.wrong(
+                f"every = {self.every}, first = {self.first}; expected at least 1 and at least 0"
             )
+
+    def wrong(self, seen: str, remedy: str | None = None) -> InputError:
+        """The error for options that make no sense."""
+        return InputError(seen, remedy=remedy, where=f"loss {self.name}")
 
     @classmethod
     def named(cls, options: dict[str, Any], simulation: Simulation, steps: int) -> Loss:
@@ -236,11 +239,8 @@ class EinsteinDiffusion(Loss):
 
     def looks_at(self, steps, last):
         if last < self.first + self.every:
-            raise InputError(
-                f"a slope needs two frames, and up to step {last} there is one at most",
-                remedy="Run longer, or look earlier or more often",
-                where=f"loss {self.name}",
-            )
+            seen = f"a slope needs two frames, and up to step {last} there is one at most"
+            raise self.wrong(seen, "Run longer, or look earlier or more often")
         return super().looks_at(steps, last)
 
 
@@ -263,11 +263,8 @@ class GreenKuboDiffusion(Loss):
 
     def __check_init__(self):
         if self.first or self.until < self.every or self.until % self.every:
-            raise InputError(
-                f"first = {self.first}, every = {self.every}, until = {self.until}; expected 0, and a "
-                "positive multiple of every",
-                where=f"loss {self.name}",
-            )
+            seen = f"first = {self.first}, every = {self.every}, until = {self.until}"
+            raise self.wrong(f"{seen}; expected 0, and a positive multiple of every")
 
     @classmethod
     def named(cls, options, simulation, steps):
@@ -276,11 +273,8 @@ class GreenKuboDiffusion(Loss):
 
     def looks_at(self, steps, last):
         if last < self.until:
-            raise InputError(
-                f"the integral goes up to step {self.until}, the run to step {last}",
-                remedy="Run longer, or integrate less far",
-                where=f"loss {self.name}",
-            )
+            seen = f"the integral goes up to step {self.until}, the run to step {last}"
+            raise self.wrong(seen, "Run longer, or integrate less far")
         return super().looks_at(steps, last) & (steps <= self.until)
 
     def observe(self, frame, origin, around):
@@ -317,15 +311,10 @@ class RadialDistribution(Loss):
 
     def __check_init__(self):
         if not self.r_max > 0 or self.bins < 4:
-            raise InputError(
-                f"r_max = {self.r_max:g}, bins = {self.bins}; expected above 0, and at least 4",
-                where=f"loss {self.name}",
-            )
+            raise self.wrong(f"r_max = {self.r_max:g}, bins = {self.bins}; expected above 0, and at least 4")
         for name, given in (("target", self.target), ("weights", self.weights)):
             if given is not None and jnp.shape(given) not in ((), (self.bins,)):
-                raise InputError(
-                    f"{name} has shape {jnp.shape(given)}; expected ({self.bins},)", where=f"loss {self.name}"
-                )
+                raise self.wrong(f"{name} has shape {jnp.shape(given)}; expected ({self.bins},)")
 
     @classmethod
     def named(cls, options, simulation, steps):
@@ -353,10 +342,8 @@ class RadialDistribution(Loss):
         half = float(jnp.min(1 / jnp.linalg.norm(jnp.linalg.inv(around.matrix), axis=0))) / 2
         reach = self.r_max + 2 * self.width
         if reach > half:
-            return (
-                f"its last bin reaches to {reach:.4g}, beyond half the smallest box width {half:.4g}: make "
-                "r_max smaller"
-            )
+            seen = f"its last bin reaches to {reach:.4g}, beyond half the smallest box width {half:.4g}"
+            return f"{seen}: make r_max smaller"
         return None
 
     def observe(self, frame: LossFrame, origin: LossFrame, around: LossContext):

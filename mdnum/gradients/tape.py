@@ -154,9 +154,8 @@ class RunTape:
         self.total: Any = no_sums(loss, self.origin, self.around)
         self.frames = self.held = 0
         self._recorder = PairRecorder(simulation) if flips else None
-        self._starts: list[Start] = []
-        self._ledgers: list[Ledger | None] = []
-        self._kept: dict[int, TapeStretch] = {}
+        # stretches that are kept; of others what it takes to run them again
+        self._made: list[TapeStretch | tuple[Start, Ledger | None]] = []
         self._engine = Engine(simulation, steps, start=self.start)
         self._begin()
         for segment in self._engine.segments():
@@ -181,21 +180,20 @@ class RunTape:
                 f"was built, and the skin is {skin:.3g}",
                 remedy="Use a smaller time step if one step moves atoms that far, else a wider skin",
             )
-        self._starts.append(self._next)
-        self._ledgers.append(None if self._recorder is None else self._recorder.flips(segment))
-        stretch = stretch_of(segment, self._next, self._ledgers[-1])
+        ledger = None if self._recorder is None else self._recorder.flips(segment)
+        stretch = stretch_of(segment, self._next, ledger)
         self._observe(stretch)
         if self._each is not None:
             self._each(stretch)
-        if self.held + stretch.nbytes <= self.budget:
-            self._kept[len(self._starts) - 1] = stretch
-            self.held += stretch.nbytes
+        kept = self.held + stretch.nbytes <= self.budget
+        self._made.append(stretch if kept else (self._next, ledger))
+        self.held += stretch.nbytes if kept else 0
         self._next = resume_point(segment)
 
     @property
     def replayed(self) -> int:
         """Stretches that are run again in a reverse pass."""
-        return len(self._starts) - len(self._kept)
+        return sum(isinstance(one, tuple) for one in self._made)
 
     @property
     def jumps_unseen(self) -> bool:
@@ -212,21 +210,18 @@ class RunTape:
         return any(float(slope) != 0 for slope in jax.grad(at, argnums=(0, 1))(one, one))
 
     def __len__(self) -> int:
-        return len(self._starts)
+        return len(self._made)
 
-    def __getitem__(self, k: int) -> TapeStretch:
-        if k in self._kept:
-            return self._kept[k]
-        start = self._starts[k]
-        return stretch_of(self._engine.again(start), start, self._ledgers[k])
+    def _whole(self, one: TapeStretch | tuple[Start, Ledger | None]) -> TapeStretch:
+        return stretch_of(self._engine.again(one[0]), *one) if isinstance(one, tuple) else one
 
     def backward(self) -> Iterator[TapeStretch]:
         """The stretches, last first."""
-        return (self[k] for k in reversed(range(len(self._starts))))
+        return map(self._whole, reversed(self._made))
 
     def forward(self) -> Iterator[TapeStretch]:
         """The stretches, first one first."""
-        return (self[k] for k in range(len(self._starts)))
+        return map(self._whole, self._made)
 
     def seen(self, stretch: TapeStretch) -> Bool[np.ndarray, "room"]:
         """Rows that the loss looks at."""
@@ -358,6 +353,16 @@ def over_rows(
 def unsorted(a: Real[Any, "*rest atoms"], order: Int[Any, "atoms"]) -> Real[Array, "*rest atoms"]:
     """An array over the atoms of a list, in the user's order."""
     return jnp.zeros_like(a).at[..., order].set(a)
+
+
+def listed(simulation: Simulation, table: PairTable) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The pairs of a list, each once: first and second atom in the list's order, and pair type."""
+    slots, first = np.nonzero(table.index < len(table.order))
+    second = table.index[slots, first]
+    once = table.order[first] < table.order[second]
+    first, second = first[once], second[once]
+    kind = simulation.type_of(table.order[first], table.order[second])
+    return first, second, np.asarray(kind, np.int64)
 
 
 def frame_of(row, order: Int[Array, "atoms"], matrix: Float[Array, "3 3"]) -> LossFrame:

@@ -2,8 +2,8 @@
 
 A chunk is a fixed number of steps with one list, as a scan, so that reverse mode has a bound on what it
 keeps. What ends a list's life in a rollout ends the chunk early here: the rest of its steps do nothing. The
-host makes the next list at the positions that this program has reached. States between chunks are kept while
-memory lasts, then every second of them, and what lies between is run again.
+host makes the next list at the positions that this program has reached. States between chunks are kept, every
+second of them where there are too many, and what lies between is run again.
 
 Decisions are made by the program that is differentiated. Reverse mode needs another forward pass than a run
 does, and a compiler is free to round it otherwise; where it does, the gradient belongs to a trajectory that
@@ -12,11 +12,9 @@ nobody simulated, so every step's state and decisions are compared with those of
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -31,7 +29,7 @@ from mdnum.gradients import parameters
 from mdnum.gradients.losses import LossContext, LossFrame
 from mdnum.gradients.parameters import Cotangents, quantities, with_quantities
 from mdnum.gradients.problem import Method, Problem, Progress, independent, rounded
-from mdnum.gradients.tape import RunTape, fingerprint, frame_of, no_sums, surroundings, unsorted
+from mdnum.gradients.tape import KEPT, RunTape, fingerprint, frame_of, no_sums, surroundings, unsorted
 from mdnum.md.decide import Tables
 from mdnum.md.neighbors import PairTable
 from mdnum.rollout.engine import first_state
@@ -42,8 +40,6 @@ CHUNK = 16
 #: Bytes that the reverse function of a chunk may keep by a rough count, and what it keeps for each slot of a
 #: list and step by that count.
 _CHUNK_BYTES, _PER_SLOT = 2**28, 256
-#: Share of the free memory that may be planned with.
-_SHARE = 0.25
 
 
 class Inputs(NamedTuple):
@@ -304,11 +300,10 @@ class Unrolled(Method):
     """The derivative of the steps that ran, by JAX.
 
     Attributes:
-        snapshots: states that are kept, evenly spread, beside those between two of them; None: as many as
-            there is memory for.
+        budget: bytes of states that are kept, evenly spread; those between two of them are made again.
     """
 
-    snapshots: int | None = None
+    budget: int = KEPT
 
     name = "unrolled"
     description = "the derivative of the steps that ran, by JAX, in its own forward pass"
@@ -323,7 +318,7 @@ class Unrolled(Method):
         tell = progress or (lambda done, steps, phase: None)
         program = ChunkedProgram(problem)
         size = sum(leaf.nbytes for leaf in jax.tree.leaves(program.start[:2]))
-        room = max(1, free() // size if self.snapshots is None else self.snapshots)
+        room = max(1, self.budget // size)
         at, ends, kept, hop = program.start, [0], [program.start], 1
         while ends[-1] <= last:
             at = program.forward(at)
@@ -366,27 +361,6 @@ class Unrolled(Method):
         }  # fmt: skip
         notes = independent(problem, gradient, saltation=False)
         return self.result(float(value), gradient, notes, details)
-
-
-def free() -> int:
-    """Memory that may be planned with, bytes.
-
-    The kernel's estimate of what can be had without swapping, or the limit of the container where that is
-    less.
-    """
-    try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-        amount = next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable"))
-    except (OSError, StopIteration):
-        amount = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    group = Path("/sys/fs/cgroup")
-    try:
-        limit, used = ((group / name).read_text().strip() for name in ("memory.max", "memory.current"))
-    except OSError:
-        limit = used = "max"
-    if limit != "max":
-        amount = min(amount, int(limit) - int(used))
-    return int(_SHARE * max(amount, 0))
 
 
 #: A digest of the state, and one of the pairs inside, by step, whatever the order of atoms and lists.

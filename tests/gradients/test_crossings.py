@@ -42,17 +42,6 @@ def exact() -> dict[str, float]:
     return {name: float(sympy.diff(v, q).subs(at)) for name, q in names}
 
 
-@pytest.fixture(scope="module")
-def well():
-    """The final relative speed of the pair that leaves its well."""
-    simulation = build("pair/leaving-well")
-    steps = 2000
-    apart = simulation.positions[1] - simulation.positions[0]
-    axis = int(np.argmax(np.abs(apart)))
-    loss = Custom(see=lambda frame, *_: frame.v[axis, 1] - frame.v[axis, 0], first=steps)
-    return Problem(simulation, loss, steps), axis
-
-
 def along(gradient: dict[str, np.ndarray], axis: int) -> dict[str, float]:
     """By distance and relative speed: half of each atom's, since both move by halves."""
     return {

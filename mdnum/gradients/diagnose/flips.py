@@ -24,6 +24,7 @@ from mdnum.gradients.parameters import columns_of
 from mdnum.gradients.problem import Problem, Progress, in_phase
 from mdnum.gradients.recorded import GUARD, MOST, ReversePass, joined, passed, tape_of
 from mdnum.gradients.tangents import by_column, tangents
+from mdnum.gradients.tape import listed
 from mdnum.md.cell import HostCell
 from mdnum.program import Number
 from mdnum.rollout.program import MdProgram
@@ -229,12 +230,8 @@ def _forecast(problem: Problem, name: str, progress: Progress | None) -> dict[in
     for part in followed:
         stretch, moved = part.stretch, part.x
         assert moved is not None
-        table = stretch.table
-        slot, first = np.nonzero(table.index < len(table.order))
-        second = table.index[slot, first]
-        once = table.order[first] < table.order[second]
-        first, second = first[once], second[once]
-        radius = radii[simulation.type_of(table.order[first], table.order[second])]
+        first, second, kind = listed(simulation, stretch.table)
+        radius = radii[kind]
         for row in range(stretch.rows):
             x, dx = stretch.x[row].astype(np.float64), moved[row, 0].astype(np.float64)
             apart = np.stack(cell.displacement(x[:, first].T, x[:, second].T))

@@ -219,8 +219,8 @@ class ScalingWatch:
     def __init__(self, steps: int, format: str = "float16"):
         self.format = formats.format_of(format)
         self.steps, self.numbers = steps, 0
-        self.largest, self.smallest = np.zeros(steps + 1), np.full(steps + 1, np.inf)
-        self.overflow, self.underflow, self.subnormal = (np.zeros(steps + 1, np.int64) for _ in range(3))
+        self.table = {name: np.zeros(steps + 1, np.int64) for name in ("overflow", "underflow", "subnormal")}
+        self.table |= {"largest": np.zeros(steps + 1), "smallest": np.full(steps + 1, np.inf)}
         # how many numbers of each step have each binary exponent
         self.exponents = np.zeros((steps + 1, _HIGHEST - _LOWEST + 1), np.int32)
 
@@ -232,25 +232,25 @@ class ScalingWatch:
 
     def put(self, step: int, values: Float[np.ndarray, "numbers"]) -> None:
         """The cotangents of one step."""
-        form, size = self.format, np.abs(values)
+        form, size, table = self.format, np.abs(values), self.table
         self.numbers = len(values)
         there = size[np.isfinite(size) & (size > 0)]
         # half a unit in the last place beyond the largest rounds to infinity
         too_large = form.largest * (1 + 2.0 ** -(form.significand + 1))
-        self.overflow[step] = np.count_nonzero(~(size <= too_large))
-        self.underflow[step] = np.count_nonzero(there <= form.smallest_subnormal / 2)
-        self.subnormal[step] = np.count_nonzero(there < form.smallest_normal) - self.underflow[step]
+        table["overflow"][step] = np.count_nonzero(~(size <= too_large))
+        table["underflow"][step] = lost = np.count_nonzero(there <= form.smallest_subnormal / 2)
+        table["subnormal"][step] = np.count_nonzero(there < form.smallest_normal) - lost
         if len(there):
-            self.largest[step], self.smallest[step] = there.max(), there.min()
+            table["largest"][step], table["smallest"][step] = there.max(), there.min()
             place = np.clip(np.frexp(there)[1], _LOWEST, _HIGHEST) - _LOWEST
             self.exponents[step] = np.bincount(place, minlength=_HIGHEST - _LOWEST + 1)
         if not np.isfinite(size).all():
-            self.largest[step] = np.inf
+            table["largest"][step] = np.inf
 
     def result(self) -> Scaling:
         """The counts, with and without the best scale; exact but for numbers on an edge of a power of two."""
         form = self.format
-        largest = float(self.largest.max())
+        largest = float(self.table["largest"].max())
         there = self.exponents.sum(axis=1, dtype=np.int64)
         usable = 0 < largest < np.inf
         # the more is multiplied the less is lost, so the best scale is the largest that overflows nowhere
@@ -261,13 +261,12 @@ class ScalingWatch:
         lost = self.exponents[:, :end].sum(axis=1, dtype=np.int64)
         kept = 1 - lost.sum() / max(there.sum(), 1)
         worst = float(np.max(lost / np.maximum(there, 1)))
-        columns = {
-            "overflow": self.overflow, "underflow": self.underflow, "subnormal": self.subnormal,
-            "largest": self.largest, "smallest": self.smallest,
-            "scaled_overflow": np.zeros_like(self.overflow) if usable else self.overflow,
+        overflow = self.table["overflow"]
+        scaled = {
+            "scaled_overflow": np.zeros_like(overflow) if usable else overflow,
             "scaled_underflow": lost,
-        }  # fmt: skip
-        table = {name: column[::-1].copy() for name, column in columns.items()}
+        }
+        table = {name: column[::-1].copy() for name, column in (self.table | scaled).items()}
         scale = 2.0**power if usable and kept > 0.5 else float("nan")
         return Scaling(
             form.name, self.numbers, {"horizon": np.arange(self.steps + 1)} | table, scale, power, usable,

@@ -22,7 +22,7 @@ from jaxtyping import Float
 from mdnum.gradients.adjoint import AdjointCarry
 from mdnum.gradients.parameters import directions
 from mdnum.gradients.tangents import StretchTangents
-from mdnum.gradients.tape import Pace, TapeStretch
+from mdnum.gradients.tape import Pace, TapeStretch, listed
 from mdnum.md.cell import HostCell
 from mdnum.systems.build import Simulation
 
@@ -243,12 +243,8 @@ def hermite(
 
 def turning(simulation: Simulation, stretch: TapeStretch) -> Turns:
     """The turning points of pairs near their cutoff within a stretch, from distances and their rates."""
-    order, index = stretch.table.order, stretch.table.index
-    slots, i = np.nonzero(index < simulation.atoms)
-    j = index[slots, i]
-    once = order[i] < order[j]
-    i, j = i[once], j[once]
-    kind = np.asarray(simulation.type_of(order[i], order[j]), np.int64)
+    order = stretch.table.order
+    i, j, kind = listed(simulation, stretch.table)
     radius = np.asarray(simulation.decider.r_cut, np.float64)[kind]
     time = float(simulation.integrator.timestep)
     cell = HostCell(simulation.cell)

@@ -31,7 +31,7 @@ from mdnum.gradients.differences import in_float64, replica
 from mdnum.gradients.losses import Loss
 from mdnum.gradients.parameters import ParameterEntry, columns_of
 from mdnum.gradients.problem import Problem, Progress, in_phase
-from mdnum.gradients.recorded import GUARD, MOST, ReversePass, passed, radial_speed
+from mdnum.gradients.recorded import GUARD, MOST, ReversePass, joined, passed, radial_speed, weights
 from mdnum.gradients.tangents import StretchTangents, tangents
 from mdnum.gradients.tape import RunTape, TapeStretch, pace_of
 from mdnum.md.integrators import Langevin
@@ -479,14 +479,13 @@ def _missed(
 
 def _left_out(made: ReversePass) -> Limit | None:
     """Flips slower than the guard, where they would have weighed."""
-    slow = [one for one in made.crossings if one.grazing.any()]
-    left = sum(float(np.nansum(np.abs(one.weight[one.grazing]))) for one in slow)
-    applied = sum(float(np.sum(np.abs(one.weight[~one.grazing]))) for one in made.crossings)
+    found = weights(made.crossings)
+    left, applied = found["weight left out"], found["weight applied"]
     if not left > LEFT_OUT * (left + applied):
         return None
-    first = min(int(one.ledger.step[one.grazing].min()) for one in slow)
-    count = sum(int(one.grazing.sum()) for one in slow)
-    values = {"count": count, "first": first, "share": left / (left + applied)}
+    grazing = joined(made.crossings, "grazing")
+    first = int(joined(made.crossings, "step", ledger=True)[grazing].min())
+    values = {"count": found["grazing"], "first": first, "share": left / (left + applied)}
     return Limit(FLIPS, max(first - 1, 0), True, "grazing", values)
 
 

@@ -58,17 +58,9 @@ def test_two_zeros_agree():
     assert found.relative == 0.0 and found.meaning == "agree"
 
 
-@pytest.fixture(scope="module")
-def problem():
-    simulation = build("pair/leaving-well")
-    axis = int(np.argmax(np.abs(simulation.positions[1] - simulation.positions[0])))
-    loss = Custom(see=lambda frame, *_: frame.v[axis, 1] - frame.v[axis, 0], first=2000)
-    return Problem(simulation, loss, 2000)
-
-
 @pytest.mark.slow
-def test_the_particle_that_leaves_its_well_is_an_eighth_off_without_its_flip(problem):
-    found = agreement(problem, ("x0", "sigma"), ["symmetric", "event-aware", FiniteDifferences(levels=2)])
+def test_the_particle_that_leaves_its_well_is_an_eighth_off_without_its_flip(well):
+    found = agreement(well[0], ("x0", "sigma"), ["symmetric", "event-aware", FiniteDifferences(levels=2)])
     assert found.reference == "event-aware"
     by_name = {one.name: one for one in found.comparisons if one.method == "symmetric"}
     assert by_name["initial.positions"].relative == pytest.approx(0.125, abs=5e-3)
@@ -78,7 +70,8 @@ def test_the_particle_that_leaves_its_well_is_an_eighth_off_without_its_flip(pro
     assert shifted is not None and list(shifted.gradient) == ["potential.sigma"]
 
 
-def test_what_does_not_apply_is_listed_with_the_reason(problem):
+def test_what_does_not_apply_is_listed_with_the_reason(well):
+    problem, _ = well
     given = Gradient("event-aware", "", 0.0, {"initial.positions": np.ones((2, 3))}, kind="flow")
     words = ["event-aware", "finite-differences"]
     found = agreement(problem, ("x0",), words, known={"event-aware": given})
