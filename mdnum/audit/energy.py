@@ -17,7 +17,6 @@ import numpy as np
 from ase import Atoms
 from jaxtyping import Float
 
-from mdnum.audit.nve import NveRun, at
 from mdnum.audit.subject import CalculatorSubject
 from mdnum.audit.thresholds import PairThreshold
 from mdnum.trajectories.frame import Box, Frame
@@ -43,7 +42,38 @@ _SMALL = 1e-6
 _BLOCKS = 8
 
 Steps = Float[np.ndarray, "steps"]
+#: Energy, and force along the way, by the share of a step's straight way.
 Along = Callable[[float], tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class NveRun:
+    """A run at constant energy."""
+
+    timestep: float  # internal time (length * sqrt(mass / energy))
+    potential: Float[np.ndarray, "steps"]  # of every step, eV
+    kinetic: Float[np.ndarray, "steps"]  # of every step, eV
+    positions: Float[np.ndarray, "steps atoms 3"]  # never wrapped, Å
+    forces: Float[np.ndarray, "steps atoms 3"]  # of the calculator, without those of constraints, eV/Å
+    blown_up: bool  # whether it was stopped because the atoms flew apart
+
+    @property
+    def total(self) -> Float[np.ndarray, "steps"]:
+        """Energy of every step, eV."""
+        return self.potential + self.kinetic
+
+    @property
+    def time(self) -> Float[np.ndarray, "steps"]:
+        """Internal time of every step."""
+        return self.timestep * np.arange(len(self.potential))
+
+
+def at(like: Atoms, positions: Float[np.ndarray, "atoms 3"]) -> Atoms:
+    """The structure with its atoms somewhere else."""
+    there = like.copy()
+    there.set_constraint()
+    there.positions = positions
+    return there
 
 
 @dataclass(frozen=True)
@@ -51,26 +81,19 @@ class RunCrossing:
     """A pair that crossed a threshold between two steps.
 
     Attributes:
-        step: after it; the step before is one less.
         i, j, rank: the pair, as in a flip of `mdnum.trajectories`.
-        entered: whether it is inside afterwards.
-        threshold: its place among the thresholds.
-        distance: at `step`, Å.
-        margin: at `step`, Å.
-        share: of the step's straight way at which the distance is the threshold's.
-        slack: of the way to stay clear of it on either side.
     """
 
-    step: int
+    step: int  # after it; the step before is one less
     i: int
     j: int
     rank: int
-    entered: bool
-    threshold: int
-    distance: float
-    margin: float
-    share: float
-    slack: float
+    entered: bool  # whether it is inside afterwards
+    threshold: int  # its place among the thresholds
+    distance: float  # at `step`, Å
+    margin: float  # at `step`, Å
+    share: float  # of the step's straight way at which the distance is the threshold's
+    slack: float  # of the way to stay clear of it on either side
 
     @property
     def sign(self) -> float:
@@ -116,16 +139,13 @@ def crossings(run: NveRun, like: Atoms, thresholds: Sequence[PairThreshold]) -> 
 def _levels(thresholds: Sequence[PairThreshold], species: set[str]) -> list[list[int]]:
     """Thresholds in groups that have one for a pair of species at most: a rule has no room for more."""
     levels: list[list[int]] = []
+    seen: Counter[frozenset[str]] = Counter()
     for place, one in enumerate(thresholds):
-        if not set(one.species) <= species:
-            continue
-        key = frozenset(one.species)
-        for level in levels:
-            if all(frozenset(thresholds[other].species) != key for other in level):
-                level.append(place)
-                break
-        else:
-            levels.append([place])
+        if set(one.species) <= species:
+            level = seen[frozenset(one.species)]
+            seen[frozenset(one.species)] += 1
+            levels += [[]] if level == len(levels) else []
+            levels[level].append(place)
     return levels
 
 
@@ -176,14 +196,13 @@ def _images(vector: Float[np.ndarray, "3"], radius: float, box: Box) -> Float[np
 
 
 def along_step(subject: CalculatorSubject, run: NveRun, like: Atoms, step: int) -> Along:
-    """Energy, and force along the way, by the share of the straight way of a step."""
     start, way = run.positions[step - 1], run.positions[step] - run.positions[step - 1]
     known: dict[float, tuple[float, float]] = {}
 
     def asked(share: float) -> tuple[float, float]:
         if share not in known:
-            there = at(like, start + share * way)
-            known[share] = subject.energy(there), float(np.sum(subject.forces(there) * way))
+            energy, forces = subject.both(at(like, start + share * way))
+            known[share] = energy, float(np.sum(forces * way))
         return known[share]
 
     return asked
@@ -207,8 +226,7 @@ def account(
         crossed: those of this step, by their share.
         thresholds: as `crossings` was given them.
         smooth: order from which a threshold is passed without care: 2, for Simpson's rule takes a kink in the
-            force's slope as it takes the fourth power of the step; or 1 where there are too many kinks of the
-            force, which are as often on one side of the middle as on the other.
+            force's slope; or 1 where kinks of the force are too many, on either side of the middle alike.
 
     Returns:
         (jump of the energy at each crossing, 0 where it does not jump; change of the energy that neither a
@@ -255,34 +273,21 @@ def _unexplained(
 
 @dataclass(frozen=True)
 class HiddenJump:
-    """A place on the straight way of a step at which the energy jumps.
+    """A place on the straight way of a step at which the energy jumps."""
 
-    Attributes:
-        step: at its end.
-        share: of the way.
-        energy: after minus before, without the work done between, eV.
-        ties: (atom, k) whose k-th and next neighbors change places there.
-    """
-
-    step: int
-    share: float
-    energy: float
-    ties: tuple[tuple[int, int], ...]
+    step: int  # at its end
+    share: float  # of the way
+    energy: float  # after minus before, without the work done between, eV
+    ties: tuple[tuple[int, int], ...]  # (atom, k) whose k-th and next neighbors change places there
 
 
 @dataclass(frozen=True)
 class HiddenJumps:
-    """Jumps in the steps of a run whose energy does not add up.
+    """Jumps in the steps of a run whose energy does not add up."""
 
-    Attributes:
-        jumps: found in the steps that were searched.
-        steps: those, with what they left unexplained, eV.
-        candidates: steps that leave more unexplained than noise does.
-    """
-
-    jumps: tuple[HiddenJump, ...] = ()
-    steps: Mapping[int, float] = field(default_factory=dict)
-    candidates: tuple[int, ...] = ()
+    jumps: tuple[HiddenJump, ...] = ()  # found in the steps that were searched
+    steps: Mapping[int, float] = field(default_factory=dict)  # those, with what they left unexplained, eV
+    candidates: tuple[int, ...] = ()  # steps that leave more unexplained than noise does
 
     @property
     def share(self) -> float:
@@ -327,9 +332,7 @@ def hidden_jumps(
     """
     limit = max(40 * noise, _SMALL * probe.kT)
     large = np.abs(np.nan_to_num(rest)) > limit
-    candidates = [
-        int(step) for step in np.flatnonzero(large)[np.argsort(-np.abs(rest[large]), kind="stable")]
-    ]
+    candidates = np.flatnonzero(large)[np.argsort(-np.abs(rest[large]), kind="stable")].tolist()
     began = probe.meter.calls
     jumps: list[HiddenJump] = []
     searched: dict[int, float] = {}
@@ -353,9 +356,8 @@ def _within(
     parts = [(0.0, 1.0)]
     first = unexplained(0.0, 1.0)
     for level in range(_LEVELS):
-        halves = [
-            half for low, high in parts for half in ((low, 0.5 * (low + high)), (0.5 * (low + high), high))
-        ]
+        middles = [(low, 0.5 * (low + high), high) for low, high in parts]
+        halves = [half for low, middle, high in middles for half in ((low, middle), (middle, high))]
         sizes = [abs(unexplained(*half)) for half in halves]
         floor = max(limit, _FOLLOWED * max(max(sizes), abs(first) if level >= _SPREAD_AT else 0.0))
         parts = [half for half, size in zip(halves, sizes, strict=True) if size > floor]
@@ -389,21 +391,14 @@ def _exchanged(before: Atoms, after: Atoms) -> tuple[tuple[int, int], ...]:
 
 @dataclass(frozen=True)
 class EnergyBalance:
-    """Where the energy of a run went, step by step.
+    """Where the energy of a run went, step by step."""
 
-    Attributes:
-        crossed: flips at thresholds.
-        jumps: energy that the flips of each step brought, measured or by the mean of those measured, eV.
-        measured: crossings whose jump was measured, by place in `crossed`, and their jumps, eV.
-        rest: what neither flips nor the work of the forces explains; nan at steps that were left out, eV.
-        hidden: jumps in it.
-    """
-
-    crossed: Sequence[RunCrossing]
-    jumps: Steps
+    crossed: Sequence[RunCrossing]  # flips at thresholds
+    jumps: Steps  # energy that the flips of each step brought, measured or by the mean of those measured, eV
+    # crossings whose jump was measured, by place in `crossed`, and their jumps, eV
     measured: Mapping[int, float]
-    rest: Steps
-    hidden: HiddenJumps = field(default_factory=HiddenJumps)
+    rest: Steps  # what neither flips nor the work of the forces explains; nan at steps that were left out, eV
+    hidden: HiddenJumps = field(default_factory=HiddenJumps)  # jumps in it
 
     @property
     def elsewhere(self) -> Steps:
@@ -444,7 +439,6 @@ def balance(
 
     Args:
         probe: another object than the run's.
-        like: species and cell.
         limits: where flips happen.
         rng: picks the steps whose flips are measured where there are too many.
         noise: of the energy, eV.
@@ -459,27 +453,20 @@ def balance(
     stepped = len({one.step for one, order in zip(crossed, orders, strict=True) if order < 2})
     # a sample of steps is as good as all, unless it is a handful because each step has so many
     smooth = 2 if sharp <= _MEASURED or _MEASURED * stepped >= _ENOUGH * sharp else 1
-    careful = {
-        step: count for step, places in by_step.items() if (count := int((orders[places] < smooth).sum()))
-    }
-    chosen: set[int] = set()
-    afforded = 0
-    for step in rng.permutation(sorted(careful)):
-        if afforded < _MEASURED:
-            chosen.add(int(step))
-            afforded += careful[int(step)]
+    counts = {step: int((orders[places] < smooth).sum()) for step, places in by_step.items()}
+    careful = rng.permutation(sorted(step for step, count in counts.items() if count)).tolist()
+    before = np.cumsum([0, *(counts[step] for step in careful)])
+    left_out = {step for step, spent in zip(careful, before, strict=False) if spent >= _MEASURED}
     count = len(run.potential)
     rest = np.full(count, np.nan)
     rest[0] = 0.0
     measured: dict[int, float] = {}
     for step in range(1, count):
         places = by_step.get(step, [])
-        if step in careful and step not in chosen:
-            continue
-        jumped, rest[step] = account(
-            probe, run, like, step, [crossed[place] for place in places], limits, smooth
-        )
-        measured |= dict(zip(places, jumped, strict=True))
+        if step not in left_out:
+            here = [crossed[place] for place in places]
+            jumped, rest[step] = account(probe, run, like, step, here, limits, smooth)
+            measured |= dict(zip(places, jumped, strict=True))
     means = EnergyBalance(crossed, rest, measured, rest).means
     jumps = np.zeros(count)
     known: dict[int, list[float]] = {}
@@ -496,15 +483,10 @@ def balance(
 
 @dataclass(frozen=True)
 class Drift:
-    """How a quantity changes with time.
+    """How a quantity changes with time."""
 
-    Attributes:
-        slope: per unit of time.
-        error: standard error of it, from blocks.
-    """
-
-    slope: float
-    error: float
+    slope: float  # per unit of time
+    error: float  # standard error of it, from blocks
 
     @property
     def significant(self) -> bool:

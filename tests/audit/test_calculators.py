@@ -19,8 +19,9 @@ from scipy.spatial import KDTree
 
 from mdnum.audit.checks.state import Alone
 from mdnum.audit.noise import NoiseFloor
-from mdnum.audit.structures import LoadedCalculator, default_structure, load_calculator, read_structure
-from mdnum.audit.subject import CalculatorError, CalculatorSubject, only_trying
+from mdnum.audit.record import load_calculator
+from mdnum.audit.structures import default_structure, read_structure
+from mdnum.audit.subject import CalculatorError, CalculatorSubject, LoadedCalculator, only_trying
 from mdnum.errors import InputError
 
 

@@ -10,16 +10,14 @@ from ase.calculators.lj import LennardJones
 from audit import planted
 from audit.planted import Good, codes, subject, values
 
-from mdnum.audit.check import Settings
-from mdnum.audit.checks.dynamics import DynamicsCheck
+from mdnum.audit.checks.dynamics import DynamicsCheck, fitting_timestep, prepared, rigid, run
 from mdnum.audit.energy import Drift, account, crossings, drift, ratio, wandering
-from mdnum.audit.nve import fitting_timestep, prepared, rigid, rigid_bonds, run
 
 STEPS = 120
 
 
 def dynamics(make, atoms: Atoms, steps: int = STEPS, order: int | None = 4):
-    return DynamicsCheck(Settings(steps=steps))(subject(make, atoms, order))
+    return DynamicsCheck(steps=steps)(subject(make, atoms, order))
 
 
 def liquid() -> Atoms:
@@ -172,7 +170,7 @@ def test_half_the_time_step_takes_three_quarters_of_the_integrators_error():
 def test_a_run_that_flies_apart_is_told():
     atoms = bulk("Ar", "fcc", a=5.26, cubic=True)
     asked = subject(lambda: LennardJones(sigma=3.4, epsilon=0.01, rc=8.5), atoms, None)
-    assert codes(DynamicsCheck(Settings(60.0, STEPS))(asked)) == {"BLEW_UP": "error"}
+    assert codes(DynamicsCheck(60.0, STEPS)(asked)) == {"BLEW_UP": "error"}
 
 
 def test_atoms_that_feel_nothing_are_no_run():
@@ -219,11 +217,12 @@ def test_rigid_molecules_keep_their_shape():
     atoms = water.repeat((2, 1, 1))
     held = rigid(atoms)
     assert held is not None and held.get_removed_dof(atoms) == 6
-    assert rigid_bonds(atoms)[1].tolist() == [[3, 4], [3, 5], [4, 5]]
+    bonds = np.stack([held.first, held.second], axis=2)
+    assert bonds[:, 1].tolist() == [[3, 4], [3, 5], [4, 5]]
     assert rigid(liquid()) is None
     ours, theirs = atoms.copy(), atoms.copy()
     ours.set_constraint(held)
-    theirs.set_constraint(FixBondLengths(rigid_bonds(atoms).reshape(-1, 2), tolerance=1e-13))
+    theirs.set_constraint(FixBondLengths(bonds.reshape(-1, 2), tolerance=1e-13))
     rng = np.random.default_rng(0)
     momenta, moved = rng.standard_normal((6, 3)), atoms.positions + 0.02 * rng.standard_normal((6, 3))
     for one in (ours, theirs):

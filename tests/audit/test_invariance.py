@@ -11,7 +11,7 @@ from ase.calculators.lj import LennardJones
 from audit import planted
 from audit.planted import Good, but, chain, codes, crystal, subject
 
-from mdnum.audit import transformations
+from mdnum.audit.checks import invariance
 from mdnum.audit.checks.invariance import InvarianceCheck
 
 WATER = Atoms("OH2", [(0, 0, 0), (0.96, 0, 0), (-0.24, 0.93, 0)], cell=[4.0] * 3, pbc=True)
@@ -77,7 +77,7 @@ class Wide(Good):
 )
 def test_a_structure_with_room_does_not_hide_the_nearest_image(make, expected, monkeypatch):
     rng = np.random.default_rng(0)
-    monkeypatch.setattr(transformations, "all_of", lambda atoms, *_: transformations.narrow(atoms, rng))
+    monkeypatch.setattr(invariance, "all_of", lambda atoms, *_: invariance.narrow(atoms, rng))
     assert found(make, bulk("Ar", "fcc", a=3.9, cubic=True).repeat(2)) == expected
 
 
@@ -158,7 +158,7 @@ def test_every_way_is_the_same_structure():
     rng = np.random.default_rng(5)
     atoms = crystal()
     atoms.positions += rng.uniform(-0.05, 0.05, (len(atoms), 3))
-    for same in transformations.all_of(atoms, atoms, rng):
+    for same in invariance.all_of(atoms, atoms, rng):
         base = atoms if same.before is None else same.before
         before, after = (np.sort(neighbor_list("d", one, 4.3)) for one in (base, same.atoms))
         expected = np.sort(np.tile(before, same.copies))

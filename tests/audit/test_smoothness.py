@@ -10,14 +10,13 @@ from audit import laws
 from audit.laws import R_CUT, Capped, Pairwise, law, subject
 from audit.planted import codes, values
 
-from mdnum.audit import pairs, thresholds
+from mdnum.audit import structures, thresholds
 from mdnum.audit.checks.smoothness import SmoothnessCheck, reach, summary
-from mdnum.audit.crowds import cluster, crowd, gap
 from mdnum.audit.curve import Curve, find_jumps, smallest_steps
-from mdnum.audit.environments import EnvironmentWalks, Route, walk_surroundings
-from mdnum.audit.pairs import Pair
-from mdnum.audit.structures import default_structure, load_calculator
+from mdnum.audit.record import load_calculator
+from mdnum.audit.structures import Pair, default_structure
 from mdnum.audit.subject import CalculatorSubject
+from mdnum.audit.surroundings import EnvironmentWalks, Route, cluster, crowd, gap, walk_surroundings
 from mdnum.audit.thresholds import STEP, PairWalk, find_thresholds, walk, walk_pairs
 
 COPPER = Path(__file__).parents[2] / "systems" / "copper" / "cu.eam.alloy"
@@ -229,7 +228,7 @@ def test_the_smallest_step_is_reported():
 
 
 def test_pairs_that_were_not_walked_are_named(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(thresholds, "pairs", lambda subject: pairs.pairs(subject, most=1))
+    monkeypatch.setattr(thresholds, "pairs", lambda subject: structures.pairs(subject, most=1))
     mixed = laws.Atoms("ArKrArArKrArArKrArArKrAr", grid(3, 2, 2))
     result = checked(subject(lambda: Pairwise(laws.soft), mixed))
     assert result.numbers["pairs_not_walked"] == ["Ar-Kr", "Kr-Kr"]
@@ -277,7 +276,7 @@ def test_rounding_of_forces_within_a_particle_is_no_interaction():
             super().calculate(*args, **kwargs)
             self.results["forces"][-1, 0] += 2e-17
 
-    first, second = (pairs.trio("Ar", 3.1234, side) for side in (-1.0, 1.0))
+    first, second = (structures.trio("Ar", 3.1234, side) for side in (-1.0, 1.0))
     pair = Pair(("Ar", "Ar"), first, second, 0.0, False, "Ar3-Ar3")
     found = walk(subject(lambda: Residue(laws.soft), first + second), pair)
     assert found.cutoff == pytest.approx(R_CUT, rel=1e-2) and not codes(reach(found, laws.KT))

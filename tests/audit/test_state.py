@@ -13,13 +13,12 @@ from ase.calculators.tip4p import TIP4P
 from audit import planted
 from audit.planted import Good, but, chain, codes, crystal, subject, values
 
-from mdnum.audit import sequences
 from mdnum.audit.checks.forces import ForcesCheck
 from mdnum.audit.checks.invariance import InvarianceCheck
-from mdnum.audit.checks.state import Alone, StateCheck
+from mdnum.audit.checks.state import Alone, StateCheck, all_sequences
 from mdnum.audit.noise import NoiseFloor
-from mdnum.audit.structures import LoadedCalculator, default_structure, water
-from mdnum.audit.subject import CalculatorError
+from mdnum.audit.structures import default_structure, water
+from mdnum.audit.subject import CalculatorError, LoadedCalculator
 
 ROWS = "One object, asked again and again, beside new ones"
 
@@ -165,11 +164,12 @@ def test_what_nobody_answers_is_no_memory():
 
 def test_sequences_do_what_they_say():
     rng = np.random.default_rng(0)
-    sizes = [len(asked.atoms) for asked in sequences.sizes(crystal(), rng)]
+    found = all_sequences(crystal(), rng)
+    sizes = [len(asked.atoms) for asked in found["sizes"]]
     assert max(sizes) > len(crystal()) > min(sizes) and 2 in sizes
-    moved = [asked.atoms.positions for asked in sequences.slow_drift(crystal(), rng)]
+    moved = [asked.atoms.positions for asked in found["a slow drift"]]
     np.testing.assert_allclose(np.linalg.norm(np.diff(moved, axis=0), axis=2), 0.04, rtol=1e-9)
-    boxes = [asked.atoms for asked in sequences.wrapping(crystal(), rng)]
+    boxes = [asked.atoms for asked in found["wrapping"]]
     assert np.ptp(boxes[1].get_scaled_positions(wrap=False)) > 1
 
 
