@@ -299,10 +299,19 @@ class CalculatorSubject:
     def try_both(self, atoms: Atoms) -> Answered:
         """Energy and forces, or why there are none, where either is of interest; no structure is saved."""
         try:
-            with only_trying(self):
+            with self.trying():
                 return self.both(atoms)
         except CalculatorError as error:
             return error
+
+    @contextmanager
+    def trying(self) -> Iterator[None]:
+        """Failures are expected here (does it take two atoms without a cell?): no structure is saved."""
+        before, self.saving = self.saving, False
+        try:
+            yield
+        finally:
+            self.saving = before
 
     def again(self, atoms: Atoms, energy: float | None = None, forces: Forces | None = None) -> bool:
         """Asks this object a question that it has answered, of which `repeats` takes note.
@@ -439,38 +448,10 @@ class CalculatorSubject:
         self._saved += 1
         while (path := self.folder / f"failed-{self._saved}.extxyz").exists():
             self._saved += 1
-        write_text(path, exact_extxyz(atoms))
+        from mdnum.systems.structures import to_extxyz
+
+        write_text(path, to_extxyz(atoms))
         return path
-
-
-@contextmanager
-def only_trying(subject: CalculatorSubject) -> Iterator[None]:
-    """Failures are expected here (does it take two atoms without a cell?): no structure is saved."""
-    before, subject.saving = subject.saving, False
-    try:
-        yield
-    finally:
-        subject.saving = before
-
-
-def exact_extxyz(atoms: Atoms) -> str:
-    """A structure as extended XYZ without losing a bit (ASE's own writer keeps eight decimals).
-
-    Args:
-        atoms: any; of its arrays, symbols, positions, initial charges and initial magnetic moments are kept.
-    """
-    columns, arrays = ["species:S:1", "pos:R:3"], [atoms.positions]
-    for name in ("initial_charges", "initial_magmoms"):
-        if name in atoms.arrays:
-            arrays.append(np.asarray(atoms.arrays[name], np.float64).reshape(len(atoms), -1))
-            columns.append(f"{name}:R:{arrays[-1].shape[1]}")
-    lattice = " ".join(repr(float(x)) for x in atoms.cell.array.ravel())
-    periodic = " ".join("T" if yes else "F" for yes in atoms.pbc)
-    cell = f'Lattice="{lattice}" ' if atoms.cell.array.any() else ""
-    lines = [str(len(atoms)), f'{cell}Properties={":".join(columns)} pbc="{periodic}"']
-    for symbol, row in zip(atoms.get_chemical_symbols(), np.hstack(arrays), strict=True):
-        lines.append(" ".join([symbol, *(repr(float(x)) for x in row)]))
-    return "\n".join(lines) + "\n"
 
 
 @cache

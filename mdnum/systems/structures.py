@@ -328,26 +328,19 @@ def _nearest(
 
 def to_extxyz(atoms: Atoms) -> str:
     """Extended XYZ text that gives every float64 back bit for bit (ase's own writer keeps 8 decimals)."""
-    columns = ["species:S:1", "pos:R:3"]
-    if atoms.has("momenta"):
-        columns.append("momenta:R:3")
-    if atoms.has("masses"):
-        columns.append("masses:R:1")
-    comment = []
+    columns, arrays = ["species:S:1", "pos:R:3"], [atoms.positions]
+    for name in ("momenta", "masses", "initial_charges", "initial_magmoms"):
+        if atoms.has(name):
+            arrays.append(np.asarray(atoms.arrays[name], np.float64).reshape(len(atoms), -1))
+            columns.append(f"{name}:R:{arrays[-1].shape[1]}")
     cell = np.asarray(atoms.cell)
-    if cell.any():
-        comment.append(f'Lattice="{_numbers(cell.ravel())}"')
+    comment = [f'Lattice="{_numbers(cell.ravel())}"'] if cell.any() else []
     comment.append(f"Properties={':'.join(columns)}")
     comment.append(f'pbc="{" ".join("T" if flag else "F" for flag in atoms.pbc)}"')
-    arrays = [atoms.positions]
-    if atoms.has("momenta"):
-        arrays.append(atoms.get_momenta())
-    if atoms.has("masses"):
-        arrays.append(atoms.get_masses()[:, None])
-    rows = np.hstack(arrays)
     lines = [str(len(atoms)), " ".join(comment)]
     lines += [
-        f"{symbol} {_numbers(row)}" for symbol, row in zip(atoms.get_chemical_symbols(), rows, strict=True)
+        f"{symbol} {_numbers(row)}"
+        for symbol, row in zip(atoms.get_chemical_symbols(), np.hstack(arrays), strict=True)
     ]
     return "\n".join(lines) + "\n"
 

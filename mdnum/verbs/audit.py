@@ -248,10 +248,10 @@ def _keep_evidence(folder: RunFolder, loaded: LoadedCalculator, check: AuditChec
 
 
 def _write_structures(folder: RunFolder, structures: Mapping[str, Atoms]) -> None:
-    from mdnum.audit.subject import exact_extxyz
+    from mdnum.systems.structures import to_extxyz
 
     for name, atoms in structures.items():
-        write_text(subfolder(folder.path, "structures") / f"{name}.extxyz", exact_extxyz(atoms))
+        write_text(subfolder(folder.path, "structures") / f"{name}.extxyz", to_extxyz(atoms))
 
 
 def _wanted(checks: str | Sequence[str] | None) -> list[str]:
