@@ -16,8 +16,8 @@ import pytest
 from command_line import call, printed
 
 from mdnum.references.conformance.case import once
-from mdnum.references.conformance.loading import from_object
-from mdnum.references.conformance.results import Report
+from mdnum.references.conformance.judge import Report
+from mdnum.references.conformance.lists import from_object
 from mdnum.references.conformance.suite import examine
 from mdnum.report.finding import Finding, Verdict
 from mdnum.store import RunFolder

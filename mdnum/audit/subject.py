@@ -19,6 +19,7 @@ from jaxtyping import Float
 
 from mdnum.audit.base import CalculatorError, Meter, Observed, finding
 from mdnum.store.files import write_text
+from mdnum.systems.structures import to_extxyz
 from mdnum.units import METAL, Units
 
 #: A calculator that fails is asked hundreds of times; this many structures are kept.
@@ -448,10 +449,13 @@ class CalculatorSubject:
         self._saved += 1
         while (path := self.folder / f"failed-{self._saved}.extxyz").exists():
             self._saved += 1
-        from mdnum.systems.structures import to_extxyz
-
-        write_text(path, to_extxyz(atoms))
+        write_text(path, exact_extxyz(atoms))
         return path
+
+
+def exact_extxyz(atoms: Atoms) -> str:
+    """A structure as text without losing a bit: symbols, positions, initial charges and magnetic moments."""
+    return to_extxyz(atoms, ("initial_charges", "initial_magmoms"))
 
 
 @cache

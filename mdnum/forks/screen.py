@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from mdnum.errors import InputError
-from mdnum.forks.choices import Choice, shipped, twin_of, unavailable, world_of
+from mdnum.forks.choices import Choice, shipped, twin_or_reason, world_of
 from mdnum.forks.pair import fork
 from mdnum.systems import BallSystem, System
 
@@ -70,11 +70,10 @@ def screen(
     for done, choice in enumerate(choices):
         if progress is not None:
             progress(done, len(choices), choice.name)
-        reason = unavailable(choice, system)
-        if reason is not None:
-            rows.append(Screened(choice.name, reason, None, None, None, choice.must_hold, reason))
+        twin = twin_or_reason(choice, system)
+        if isinstance(twin, str):
+            rows.append(Screened(choice.name, twin, None, None, None, choice.must_hold, twin))
             continue
-        twin = twin_of(choice, system)
         found = fork(twin, steps, counterfactual=False, repeats=0)
         dates = found.dates
         failed = ", ".join(f"{word} of {name}" for name, word in found.failed.items())

@@ -8,11 +8,9 @@ of the energy. No tape is kept, and the decisions are those that the run acted o
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -21,8 +19,8 @@ from jaxtyping import Array, Float, UInt8
 from mdnum.errors import InputError
 from mdnum.gradients.parameters import quantities, with_quantities
 from mdnum.md.decide import PairDecider, Tables, displacements, halves_of, unpacked
-from mdnum.md.jaxmd import Format, NeighborList
-from mdnum.md.manybody import ManyBody, Smoothness
+from mdnum.md.manybody import EnergyFunction as EnergyFunction
+from mdnum.md.manybody import ManyBody
 from mdnum.md.neighbors import check_radius
 from mdnum.md.pairforce import ManyBodyForce, PairForce
 from mdnum.md.potentials import CutPotential, of_type
@@ -192,35 +190,6 @@ def _of_energy(force, x, tables, bits, onto_force, onto_energy, onto_virial, wan
         scale if SCALE in wanted else jnp.zeros_like(scale),
         -by_x.T.astype(x.dtype) if FORCE in wanted else jnp.zeros_like(x),
     )
-
-
-class EnergyFunction(ManyBody):
-    """An energy with parameters in any pytree, over a neighbor list of jax-md.
-
-    Attributes:
-        parameters: a pytree of arrays; each is a parameter `potential.parameters...` by its path.
-        function: (parameters, positions (atoms, 3), neighbor, cell (3, 3)) to energy, length and energy units
-            of the system. It must test r < r_cut itself.
-        r_cut: longest interaction radius, length.
-        format: the neighbor list format that it takes.
-        pbc: which axes are periodic.
-        name: for messages. smoothness: at r_cut. sources: papers.
-    """
-
-    parameters: Any
-    function: Callable[..., Array] = eqx.field(static=True)
-    r_cut: float = eqx.field(static=True)
-    format: Format = eqx.field(static=True, default="dense")
-    pbc: tuple[bool, bool, bool] = eqx.field(static=True, default=(True, True, True))
-    name: str = eqx.field(static=True, default="energy function")
-    smoothness: Smoothness = eqx.field(static=True, default=Smoothness(-1, float("nan"), float("nan")))
-    sources: tuple[str, ...] = eqx.field(static=True, default=())
-
-    def energy(
-        self, positions: Float[Array, "atoms 3"], neighbor: NeighborList, cell: Float[Array, "3 3"]
-    ) -> Float[Array, ""]:
-        """Potential energy; see ManyBody.energy."""
-        return self.function(self.parameters, positions, neighbor, cell)
 
 
 def with_potential(simulation: Simulation, potential: ManyBody) -> Simulation:

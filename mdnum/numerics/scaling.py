@@ -44,7 +44,7 @@ def scaled_gradient(function: Callable[..., Any], scale: float | Array, *args: A
     value, pullback = jax.vjp(lambda first: function(first, *args[1:]), args[0])
     (gradient,) = pullback(scale.astype(value.dtype))
     gradient = jax.tree.map(lambda g: g.astype(jnp.float64) / jnp.broadcast_to(scale, g.shape), gradient)
-    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(g)) for g in jax.tree.leaves(gradient)]))
+    finite = jnp.all(jnp.array([jnp.all(jnp.isfinite(g)) for g in jax.tree.leaves(gradient)], bool))
     return ScaledGradient(value, gradient, finite, scale)
 
 

@@ -15,14 +15,19 @@ from mdnum.numerics.roles import WIDE, carrier
 from mdnum.numerics.rounding import unit_roundoff
 from mdnum.references.ase_models import Reference, evaluate, independent, reference
 from mdnum.references.independent import Edges, PairModel, edges_of, pair_forms
+from mdnum.references.neighborhoods import neighborhoods
 from mdnum.references.oracle import rounding_bound
 from mdnum.systems import System, build, schema
+from mdnum.systems.build import Evaluation
 
 ENERGY_PAIR, FORCE, ENERGY_MANY_BODY = 1e-12, 1e-10, 1e-10
 """What float64 must meet: relative energy of pair and of many-body potentials; forces over their scale."""
 
 SOME_STEPS = 200
 """Steps to the later of the two frames compared by default."""
+
+SAMPLED = 10_000
+"""Larger systems are compared by a sample: groups of atoms with all their neighbors."""
 
 ROUNDINGS = 5.0
 """What narrower precision must meet: this many times the rounding expected of one typical number."""
@@ -85,8 +90,9 @@ class EnergyReport:
         is_ase: whether the reference is a class of ASE.
         conversion: what was done to make the conventions equal.
         precision: "float64", or the narrowest type in use.
-        frames: one comparison per frame.
+        frames: one comparison per frame, or per group of atoms in it where a sample was compared.
         ok: every frame within tolerance.
+        sampled: atoms of each frame that were compared; None for all.
     """
 
     system: str
@@ -96,6 +102,7 @@ class EnergyReport:
     precision: str
     frames: tuple[FrameComparison, ...]
     ok: bool
+    sampled: int | None = None
 
     @property
     def worst(self) -> dict[str, Any]:
@@ -108,6 +115,7 @@ class EnergyReport:
             "stress_max": max(stress) if stress else None,
             "force_scale": max(frame.force_scale for frame in self.frames),
             "ok": self.ok,
+            **({} if self.sampled is None else {"sampled": self.sampled}),
         }
 
     def rows(self) -> list[dict[str, Any]]:
@@ -148,6 +156,10 @@ def check_energy(
         frames: positions and cells to compare at, by name or in order; default the initial frame and the
             one after some steps, which a crystal needs to have forces at all.
         judge: instead of the reference chosen by `ase_models.reference`.
+
+    Of more than `SAMPLED` atoms with a pair potential, energies and forces of a few hundred are compared, at
+    random places by `neighborhoods`: an exact statement about those.
+
     Raises:
         InputError: the system cannot be built.
     """
@@ -157,9 +169,19 @@ def check_energy(
     third = independent(system) if judge.is_ase and system.spec.potential.kind != "eam" else None
     named = _named(frames, simulation)
     calculator, other = judge.make(), third.make() if third else None
-    compared = tuple(
-        _compare(name, atoms, simulation, system, calculator, other) for name, atoms in named.items()
-    )
+    compared: list[FrameComparison] = []
+    sampled: set[int] | None = None
+    for name, atoms in named.items():
+        whole, mine = _evaluated(atoms, simulation)
+        if system.spec.cutoff is None or len(whole) <= SAMPLED:
+            compared.append(_compare(name, whole, mine, simulation, system, calculator, other))
+            continue
+        sampled = set()
+        for cluster, chosen in neighborhoods(whole, simulation.r_cut):
+            of = f"{name}, around atom {chosen[0]}"
+            part = _part(mine, cluster, chosen, simulation.r_cut)
+            compared.append(_compare(of, cluster, part, simulation, system, calculator, other))
+            sampled |= set(chosen.tolist())
     precision = narrowest(system)
     return EnergyReport(
         system.name,
@@ -167,8 +189,9 @@ def check_energy(
         judge.is_ase,
         judge.conversion,
         precision,
-        compared,
+        tuple(compared),
         all(frame.ok for frame in compared),
+        None if sampled is None else len(sampled),
     )
 
 
@@ -202,16 +225,30 @@ def _named(frames: Mapping[str, Atoms] | Sequence[Atoms] | None, simulation: Any
     return {"initial": system.atoms, f"step {steps}": later}
 
 
-def _compare(
-    name: str, atoms: Atoms, simulation: Any, system: System, calculator: Any, other: Any
-) -> FrameComparison:
+def _evaluated(atoms: Atoms, simulation: Any) -> tuple[Atoms, Evaluation]:
+    """A frame as the state can hold it, and what mdnum makes of it."""
     positions = atoms.get_positions()
-    if system.spec.precision.state == "float32":
+    if simulation.system.spec.precision.state == "float32":
         positions = positions.astype(np.float32).astype(np.float64)  # both are to see what the state can hold
-    mine = simulation.evaluate(positions, np.asarray(atoms.cell))
-    stored = Atoms(numbers=atoms.numbers, positions=positions, cell=atoms.cell, pbc=system.atoms.pbc)
-    theirs = evaluate(calculator, stored)
-    third = evaluate(other, stored) if other is not None else None
+    pbc = simulation.system.atoms.pbc
+    stored = Atoms(numbers=atoms.numbers, positions=positions, cell=atoms.cell, pbc=pbc)
+    return stored, simulation.evaluate(positions, np.asarray(atoms.cell))
+
+
+def _part(mine: Evaluation, cluster: Atoms, chosen: ndarray, r_cut: float) -> Evaluation:
+    """Of an evaluation of the whole, what concerns the first atoms of a cluster; pairs are the cluster's."""
+    edges = edges_of(cluster, r_cut)
+    once = edges.i < edges.j
+    pairs = edges.i[once], edges.j[once], edges.r[once]
+    energies = mine.energies[chosen]
+    return Evaluation(float(energies.sum()), mine.forces[chosen], mine.stress, energies, lambda: pairs)
+
+
+def _compare(
+    name: str, stored: Atoms, mine: Evaluation, simulation: Any, system: System, calculator: Any, other: Any
+) -> FrameComparison:
+    theirs = _of_first(evaluate(calculator, stored), len(mine.forces))
+    third = _of_first(evaluate(other, stored), len(mine.forces)) if other is not None else None
 
     scale = _Scales.of(system, simulation, stored, mine, theirs)
     energy, energy_reference = float(mine.energy), theirs["energy"]
@@ -249,6 +286,15 @@ def _compare(
         scale.ambiguous,
         ok,
     )
+
+
+def _of_first(results: dict[str, Any], count: int) -> dict[str, Any]:
+    """Energy and forces of the first atoms alone, where there are more."""
+    if len(results["forces"]) == count:
+        return results
+    energies = results["energies"][:count]
+    forces = results["forces"][:count]
+    return {"energy": float(energies.sum()), "energies": energies, "forces": forces, "stress": None}
 
 
 def _over(difference: float, scale: float) -> float:

@@ -18,7 +18,7 @@ from mdnum import systems
 from mdnum.references.conformance.answer import read
 from mdnum.references.conformance.case import once
 from mdnum.references.conformance.lists import ListLimits, PairList
-from mdnum.references.conformance.loading import known
+from mdnum.references.conformance.peers import known
 from mdnum.references.oracle import PairSet, all_pairs, completed, exactly_inside, rounding_bound
 from mdnum.systems import System
 

@@ -83,6 +83,9 @@ class RunFolder:
         self._manifest: tuple[tuple[int, int], dict[str, list[str]]] | None = None
         self._began = time.monotonic()
         self._written = -math.inf
+        # what the last checkpoint took (s), making its state included; and when it was found due
+        self._cost = 0.0
+        self._asked: float | None = None
         # the state that came too soon after the last checkpoint, and the rows there were then
         self._pending: tuple[dict[str, Any], dict[str, int]] | None = None
 
@@ -191,10 +194,13 @@ class RunFolder:
         """Whether `checkpoint` would write now.
 
         The interval is 2 s at first and 1 % of the time the run has taken later on: a kill costs at
-        most that much, and a run of days has a thousand part files, not a hundred thousand.
+        most that much, and a run of days has a thousand part files, not a hundred thousand. It is never less
+        than fifty times what the last one took.
         """
         now = time.monotonic()
-        return now - self._written >= max(2.0, 0.01 * (now - self._began))
+        due = now - self._written >= max(2.0, 0.01 * (now - self._began), 50 * self._cost)
+        self._asked = now if due else None
+        return due
 
     def checkpoint(self, state: Mapping[str, Any], force: bool = False) -> bool:
         """Makes everything appended so far, and state, the point a killed run resumes from.
@@ -557,6 +563,7 @@ class RunFolder:
         return {name: stream.rows for name, stream in self._streams.items()}
 
     def _write_checkpoint(self, state: Mapping[str, Any]) -> None:
+        began = time.monotonic()
         # parts first, then the checkpoint that counts them: a kill in between only leaves rows to drop
         for stream in self._streams.values():
             stream.flush()
@@ -572,6 +579,8 @@ class RunFolder:
             stream.written = {}
         checkpoint.write(self.path / "checkpoint.npz", state, store, written)
         self._written = time.monotonic()
+        self._cost = self._written - (began if self._asked is None else self._asked)
+        self._asked = None
         self._pending = None
 
     def _read_checkpoint(self) -> tuple[dict[str, Any], dict[str, Any]]:

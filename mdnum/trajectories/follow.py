@@ -12,10 +12,10 @@ from jaxtyping import Int
 from mdnum.errors import InputError
 from mdnum.trajectories.compare import displacements
 from mdnum.trajectories.frame import Frame, checked, leap, smallest_radius
+from mdnum.trajectories.history import crossings
 from mdnum.trajectories.ledger import FlipTable, Members
 from mdnum.trajectories.resolution import Resolution
 from mdnum.trajectories.rules import Capped, CutoffRule, Rule, SpeciesCutoffs
-from mdnum.trajectories.stride import crossings
 from mdnum.trajectories.tracker import Tracker
 from mdnum.trajectories.trajectory import Trajectory
 

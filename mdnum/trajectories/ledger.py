@@ -115,12 +115,7 @@ class _Columns(NamedTuple):
 
 
 class LedgerRows:
-    """Makes the rows of frame after frame.
-
-    Args:
-        labels: numbers in the file of the atoms that take part.
-        atoms: of the file.
-    """
+    """Makes the rows of frame after frame; labels are the numbers in the file of the atoms that take part."""
 
     def __init__(self, labels: Int[np.ndarray, "participants"], atoms: int):
         self.labels, self.atoms = labels, atoms
@@ -135,15 +130,7 @@ class LedgerRows:
         thresholds: Thresholds,
         bound: float,
     ) -> FlipTable:
-        """The rows of one frame.
-
-        Args:
-            frame: its position among the frames examined.
-            changed: indices among the atoms that take part.
-            distances: now, and at the frame before, length.
-            thresholds: what they are compared with.
-            bound: how far a margin can be off, length.
-        """
+        """The rows of one frame from indices among the atoms that take part, and distances now and before."""
         count, ranks = len(changed.i), int(changed.rank.max(initial=0)) + 1
         if len(self._rows) < count:
             self._rows = np.empty((count + count // 8, 7))

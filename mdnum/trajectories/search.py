@@ -7,6 +7,7 @@ is decided again from the coordinates as stored (`lattice.square_of`), so every 
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from typing import NamedTuple
 
 import numba
@@ -14,17 +15,22 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mdnum.errors import InputError
-from mdnum.trajectories.bins import (
+from mdnum.trajectories.lattice import (
     DIRECTED,
     INSIDE,
     Candidates,
+    Participants,
+    Placed,
+    ReducedLattice,
     SearchLimits,
-    Sides,
     binned,
+    image_square,
     lattice_vector,
     meet,
+    near_squares,
+    own_images,
+    square_of,
 )
-from mdnum.trajectories.lattice import ReducedLattice, image_square, near_squares, own_images, square_of
 from mdnum.trajectories.rules import Capped, Nearest
 
 #: more pairs than this would take longer than anybody waits
@@ -37,14 +43,10 @@ _MOST_IMAGES_EACH, _MOST_REPEATED = 100, 2_000_000
 
 
 class Found(NamedTuple):
-    """What a search recorded, a row per pair, in no order.
-
-    Attributes:
-        i, j: atoms; i the center of a directed one, else either. A pair appears once for each of its images.
-    """
+    """What a search recorded, a row per pair, in no order; a pair appears once for each of its images."""
 
     kind: int  # `INSIDE` or `DIRECTED`
-    i: Int[np.ndarray, "pairs"]
+    i: Int[np.ndarray, "pairs"]  # the center of a directed one, else either
     j: Int[np.ndarray, "pairs"]
     value: Float[np.ndarray, "valued"]  # `DIRECTED`: squared distance
     open: int  # candidates that were decided from the coordinates as stored
@@ -60,6 +62,12 @@ class NeighborRows(NamedTuple):
     other: Int[np.ndarray, "pairs"]  # neighbors, in no order; an atom appears once for each of its images
     square: Float[np.ndarray, "stored"]  # squared distances, where the rule is directed; else empty
 
+    @classmethod
+    def room(cls, atoms: int, pairs: int, stored: int) -> NeighborRows:
+        """Room for so many."""
+        first, count = np.zeros((2, atoms), np.int64)
+        return cls(first, count, np.empty(pairs, np.int32), np.empty(stored))
+
     def pairs(self) -> tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]]:
         """(i, j) of all rows, one row after the other."""
         i = np.repeat(np.arange(len(self.first)), self.count)
@@ -68,35 +76,30 @@ class NeighborRows(NamedTuple):
 
 
 def search(
-    positions: Float[np.ndarray, "atoms 3"],
-    lattice: ReducedLattice,
-    sides: Sides,
-    radii: Float[np.ndarray, "species species"],
+    placed: Placed,
+    who: Participants,
     kind: int,
     *,
     band: float,
     bound: float,
-    guard: float,
     room: int = 0,
     open_room: int = 0,
 ) -> Found:
     """Look for pairs; images of an atom itself are left out, they are those of `lattice.own_images`.
 
     Args:
-        positions: as stored, anywhere, length.
-        radii: length by species; negative for pairs that are never inside.
         kind: what to record. `INSIDE`: pairs inside. `DIRECTED`: for each center everything within radius +
             band.
-        band: pairs this close to their radius are decided from the coordinates as stored, length.
+        band: pairs this close to their radius are decided from the coordinates as stored, length; at least
+            what rounding does to a distance.
         bound: pairs this close are counted as close, length; at most the band.
-        guard: how far the wrapped distance of a pair can be off, length; at most the band.
         room, open_room: pairs inside and pairs in the band to make room for, where it is known.
     Raises:
         InputError: more pairs than fit into memory.
     """
-    radius = float(radii.max(initial=0.0))
-    atoms = binned(positions, lattice, sides, radius + band, guard)
-    expected = _expected(lattice, len(atoms.center_order), len(atoms.order), radius)
+    radius, radii = who.radius, who.radii
+    atoms = binned(placed, who, radius + band)
+    expected = _expected(placed.lattice, len(atoms.center_order), len(atoms.order), radius)
     sure = max(room or int(1.1 * expected), 1024) if kind == INSIDE else 0
     # half of the pairs that are met are met twice
     share = 2.0 * (1.0 + band / radius) ** 3 if kind == DIRECTED else 6.0 * band / radius
@@ -109,8 +112,7 @@ def search(
             break
         _check_count(count + left, radius)
         sure, doubtful = (int(1.05 * (count + left)) if kind == INSIDE else 0), int(1.05 * left) + 1
-    square = np.where(radii >= 0, radii * radii, -1.0)
-    smallest = float(_settle(positions, atoms, kind, square, radii, bound, found))
+    smallest = float(_settle(placed.positions, atoms, kind, who.squares, radii, bound, found))
     inside, close = int(found.counts[0]), int(found.counts[2])
     if kind == INSIDE:
         return Found(kind, found.i[:inside], found.j[:inside], found.value[:0], left, close, smallest)
@@ -152,11 +154,7 @@ def _settle(x, atoms, kind, square, radius, bound, found):
 
 
 def _expected(lattice: ReducedLattice, centers: int, others: int, radius: float) -> float:
-    """About how many pairs there are, if atoms fill the box evenly; 0 where it has no end.
-
-    Raises:
-        InputError: a radius so large, in a box so small, that the pairs would not fit into memory or time.
-    """
+    """About how many pairs there are, if atoms fill the box evenly; 0 where it has no end."""
     if not lattice.periodic.all():
         return 0.0
     images = (4.0 / 3.0 * np.pi * radius**3) / lattice.volume
@@ -194,10 +192,7 @@ def _memory() -> float:
 
 def rows_of(found: Found, atoms: int) -> NeighborRows:
     """Pairs by their first atom, the lower one unless they are directed."""
-    rows = NeighborRows(
-        np.zeros(atoms, np.int64), np.zeros(atoms, np.int64), np.empty(len(found.i), np.int32),
-        np.empty(len(found.value)),
-    )  # fmt: skip
+    rows = NeighborRows.room(atoms, len(found.i), len(found.value))
     _into_rows(found, rows)
     return rows
 
@@ -226,48 +221,32 @@ def _into_rows(found, rows):
 
 
 class Chosen(NamedTuple):
-    """The neighbors of each center, nearest first.
-
-    Attributes:
-        last_in: distance under which a neighbor stays one: that of the first outside, or the radius.
-        first_out: distance under which another would be one: that of the last inside, or the radius.
-    """
+    """The neighbors of each center, nearest first."""
 
     rows: NeighborRows  # the squares are those of the neighbors
     close: int  # as of `Found`
     smallest: float
-    last_in: Float[np.ndarray, "atoms"]
-    first_out: Float[np.ndarray, "atoms"]
+    last_in: Float[np.ndarray, "atoms"]  # under which a neighbor stays one: the first outside, or the radius
+    first_out: Float[np.ndarray, "atoms"]  # under which another would be one: the last inside, or the radius
 
 
 def nearest(
-    positions: Float[np.ndarray, "atoms 3"],
-    lattice: ReducedLattice,
-    sides: Sides,
-    rule: Nearest | Capped,
-    *,
-    band: float,
-    bound: float,
-    guard: float,
+    placed: Placed, who: Participants, rule: Nearest | Capped, *, band: float, bound: float
 ) -> Chosen:
     """The nearest few of each center; arguments as of `search`."""
-    atoms, reach, centers = len(positions), rule.reach, sides.centers
-    both = sides.centers & sides.others
+    positions, lattice = placed.positions, placed.lattice
+    atoms, reach, centers = len(positions), rule.reach, who.centers
     # a distance that no pair exceeds: a lattice has no end
     everything = np.inf
     if not lattice.periodic.any():
         everything = float(np.linalg.norm(np.ptp(positions, axis=0))) * (1 + 1e-9) + 1e-300 if atoms else 0.0
-    radius = reach if np.isfinite(reach) else _guess(positions, lattice, sides, rule.most, everything)
-    made = NeighborRows(
-        np.zeros(atoms, np.int64), np.zeros(atoms, np.int64), np.zeros(0, np.int32), np.zeros(0)
-    )
+    radius = reach if np.isfinite(reach) else _guess(placed, who, rule.most, everything)
+    made = NeighborRows.room(atoms, 0, 0)
     last_in, first_out = np.full(atoms, reach), np.full(atoms, reach)
     close, smallest, one = 0, np.inf, np.zeros(atoms, np.int64)
     while True:
-        found = search(
-            positions, lattice, Sides(centers, sides.others, one), np.array([[radius]]), DIRECTED,
-            band=band, bound=bound, guard=guard,
-        )  # fmt: skip
+        asked = replace(who, centers=centers, species=one, radii=np.array([[radius]]))
+        found = search(placed, asked, DIRECTED, band=band, bound=bound)
         rows, own = rows_of(found, atoms), own_images(lattice, radius + band)
         room = min(int(centers.sum()) * rule.most, len(rows.other) + 2 * len(own) * int(centers.sum()))
         part = made._replace(other=np.empty(room, np.int32), square=np.empty(room))
@@ -275,20 +254,9 @@ def nearest(
         # a free direction ends somewhere; along a lattice there is always one more
         complete = np.isfinite(reach) or radius >= everything
         written, near, least, short = _choose(
-            rows,
-            part,
-            own,
-            centers,
-            both,
-            rule.most,
-            reach,
-            bound,
-            complete,
-            radius,
-            last_in,
-            first_out,
+            rows, part, own, centers, who.both, rule.most, reach, bound, complete, radius, last_in, first_out,
             lacking,
-        )
+        )  # fmt: skip
         made.first[centers & ~lacking] += len(made.other)
         made = made._replace(
             other=np.concatenate([made.other, part.other[:written]]),
@@ -348,12 +316,12 @@ def _choose(
     return written, close, smallest, short
 
 
-def _guess(positions, lattice: ReducedLattice, sides: Sides, most: int, everything: float) -> float:
+def _guess(placed: Placed, who: Participants, most: int, everything: float) -> float:
     """A radius in which most atoms have enough neighbors."""
-    candidates = int(sides.others.sum())
+    lattice, candidates = placed.lattice, int(who.others.sum())
     if not candidates:
         return 1.0 if not np.isfinite(everything) else max(everything, 1e-300)
-    extent = np.ptp(positions @ lattice.inverse, axis=0)
+    extent = np.ptp(placed.positions @ lattice.inverse, axis=0)
     extent = np.where(lattice.periodic, 1.0, np.maximum(extent, 1e-3 * max(extent.max(), 1e-12)))
     volume = float(np.prod(extent)) * lattice.volume
     radius = (3.0 * (1.6 * most + 8) * volume / (4.0 * np.pi * candidates)) ** (1 / 3)
@@ -373,11 +341,7 @@ class Changed(NamedTuple):
 
 
 def compared(before: NeighborRows, now: NeighborRows, room: int) -> Changed:
-    """Every decision that differs, pair by pair and image by image.
-
-    Args:
-        room: decisions to make room for.
-    """
+    """Every decision that differs, pair by pair and image by image; room is made for so many at first."""
     while True:
         made = Changed._make(np.empty(room, kind) for kind in (np.int64, np.int64, np.int64, np.bool_))
         total = _compared(before, now, made)
@@ -411,27 +375,17 @@ def _compared(old, new, made):
     return total
 
 
-def exchanged(
-    before: Found,
-    now: Found,
-    old: tuple[Float[np.ndarray, "atoms 3"], ReducedLattice],
-    new: tuple[Float[np.ndarray, "atoms 3"], ReducedLattice],
-    species: Int[np.ndarray, "atoms"],
-    radii: Float[np.ndarray, "species species"],
-) -> Changed:
+def exchanged(before: Found, now: Found, old: Placed, new: Placed, who: Participants) -> Changed:
     """The same where no pair has more than one image within reach: nothing is sorted or looked up.
 
-    Every pair of one frame is measured at the other.
-
-    Args:
-        before, now: pairs inside.
-        old, new: positions and lattice at the frame before and now.
-        species, radii: as of `search`.
+    Every pair inside at one frame is measured at the other.
     """
-    square, parts = np.where(radii >= 0, radii * radii, -1.0), []
-    for found, (positions, lattice) in ((before, new), (now, old)):
+    parts = []
+    for found, at in ((before, new), (now, old)):
         chosen = np.empty(len(found.i) + 1, np.int32)
-        chosen = chosen[: _outside(positions, lattice, species, square, found.i, found.j, chosen)]
+        chosen = chosen[
+            : _outside(at.positions, at.lattice, who.species, who.squares, found.i, found.j, chosen)
+        ]
         ids = (found.i[chosen].astype(np.int64), found.j[chosen].astype(np.int64))
         parts.append((*ids, np.zeros(len(chosen), np.int64), np.full(len(chosen), found is now)))
     return Changed._make(np.concatenate(columns) for columns in zip(*parts, strict=True))
@@ -459,15 +413,19 @@ def _outside(x, lattice, species, square, i, j, chosen):
 
 
 def image_distances(
-    positions: Float[np.ndarray, "atoms 3"],
-    lattice: ReducedLattice,
+    placed: Placed,
     i: Int[np.ndarray, "pairs"],
     j: Int[np.ndarray, "pairs"],
     rank: Int[np.ndarray, "pairs"],
+    directed: bool = False,
 ) -> Float[np.ndarray, "pairs"]:
-    """Distances to the images that have `rank` nearer ones, length; inf where there are not so many."""
+    """Distances to the images that have `rank` nearer ones, length; inf where there are not so many.
+
+    Of a directed rule both of a ± pair of images of an atom itself are neighbors.
+    """
     out = np.empty(len(i))
-    _image_distances(positions, lattice, i, j, rank, out)
+    rank = np.where(i == j, rank // 2, rank) if directed else rank
+    _image_distances(placed.positions, placed.lattice, i, j, rank, out)
     return out
 
 

@@ -22,8 +22,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from mdnum.trajectories.history import Contacts, History, Sums, contacts, mended
-from mdnum.trajectories.stride import Strides, doublings
+from mdnum.trajectories.history import Contacts, History, Strides, Sums, contacts, doublings, mended
 from mdnum.trajectories.topology import AtomTable
 
 #: Stays from which the share that is inside again is taken: all of them in most files.

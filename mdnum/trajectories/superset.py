@@ -23,9 +23,18 @@ import numba
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from mdnum.trajectories.bins import BAND, Candidates, SearchLimits, Sides, binned, lattice_vector, meet
-from mdnum.trajectories.lattice import ReducedLattice
-from mdnum.trajectories.search import exact_square
+from mdnum.trajectories.lattice import (
+    BAND,
+    Candidates,
+    Participants,
+    Placed,
+    ReducedLattice,
+    SearchLimits,
+    binned,
+    lattice_vector,
+    meet,
+)
+from mdnum.trajectories.search import Changed, exact_square
 
 #: a skin is meant to last this many frames; shorter than the least, a fresh search is as good
 FRAMES, FEWEST = 24.0, 4.0
@@ -76,43 +85,24 @@ class Superset:
         return self.gone + clear < self.skin and lattice.narrowest >= 2.0 * (radius + self.skin)
 
 
-class Examined(NamedTuple):
-    """What the pairs that were due turned out to be."""
-
-    i: Int[np.ndarray, "flips"]  # of the pairs that flipped
-    j: Int[np.ndarray, "flips"]
-    entered: Bool[np.ndarray, "flips"]  # what they became
-    close: int  # pairs within the bound of their threshold
-    smallest: float  # smallest |margin|; at least the horizon where it is not known
-    count: int  # pairs that were examined
-
-
 @numba.njit(cache=True, nogil=True, inline="always")
 def shift_code(n0, n1, n2):
     """Three integers from -1 to 1 as one: no other brings a wrapped atom within half a box's width."""
     return (n0 + 1) * 9 + (n1 + 1) * 3 + (n2 + 1)
 
 
-def displaced(
-    before: Float[np.ndarray, "atoms 3"],
-    old: ReducedLattice,
-    now: Float[np.ndarray, "atoms 3"],
-    new: ReducedLattice,
-    home: Int[np.ndarray, "atoms 3"],
-    radius: float,
-) -> float:
+def displaced(before: Placed, now: Placed, home: Int[np.ndarray, "atoms 3"], radius: float) -> float:
     """How much nearer or further two atoms at most `radius` apart can have come between two frames, length.
 
-    Args:
-        home: lattice vectors taken off each atom; those that atoms were moved by in between are added.
-        radius: length.
+    To home, the lattice vectors taken off each atom, those that atoms were moved by in between are added.
     """
+    old, new = before.lattice, now.lattice
     same = old.vectors is new.vectors or np.array_equal(old.vectors, new.vectors)
     strain, stretch = np.eye(3), 0.0
     if not same:
         strain = old.inverse @ np.linalg.inv(new.inverse)
         stretch = float(np.abs(np.linalg.svd(strain, compute_uv=False) - 1.0).max())
-    most, second = _displaced(before, now, strain, not same, new, home)
+    most, second = _displaced(before.positions, now.positions, strain, not same, new, home)
     return float(np.sqrt(most) + np.sqrt(second)) + radius * stretch
 
 
@@ -156,12 +146,8 @@ def _displaced(before, now, strain, strained, lattice, home):
 def skin_for(inc: float, radius: float, clear: float, lattice: ReducedLattice, pairs: int) -> float:
     """A skin that lasts, length; 0 where none would last long enough to be worth it.
 
-    Args:
-        inc: how far two atoms come in a frame, length.
-        radius: largest one, length.
-        clear: what the list must hold at any time, length.
-        lattice: of the frame.
-        pairs: inside.
+    Two atoms come by inc in a frame, about so many pairs are inside the radius, and those within clear of it
+    must be listed at any time.
     """
     room = min(LARGEST * radius, 0.499999 * lattice.narrowest - radius)
     # a shell of this thickness on either side of the radius holds so many
@@ -172,29 +158,14 @@ def skin_for(inc: float, radius: float, clear: float, lattice: ReducedLattice, p
 
 
 def listed(
-    positions: Float[np.ndarray, "atoms 3"],
-    lattice: ReducedLattice,
-    sides: Sides,
-    radii: Float[np.ndarray, "species species"],
-    skin: float,
-    *,
-    guard: float,
-    pairs: int,
-    spare: Superset | None = None,
+    placed: Placed, who: Participants, skin: float, pairs: int, spare: Superset | None = None
 ) -> Superset:
     """A list made at this frame; no direction may repeat so soon that a pair has two images in it.
 
-    Args:
-        positions, lattice, sides, radii, guard: as of `search`.
-        skin: length.
-        pairs: inside, about.
-        spare: a list that is not needed any more: its memory is used again.
+    About so many pairs are inside; the memory of a spare list, which is not needed any more, is used again.
     """
-    radius = float(radii.max(initial=0.0))
-    atoms, limits = (
-        binned(positions, lattice, sides, radius + skin, guard),
-        SearchLimits.of(radii, BAND, skin),
-    )
+    radius = who.radius
+    atoms, limits = binned(placed, who, radius + skin), SearchLimits.of(who.radii, BAND, skin)
     # twice the inner shell: the outer one holds more
     room = int(pairs * ((1 + skin / radius) ** 3 - (1 - skin / radius) ** 3) * 1.1) + 4096
     held = Listed.room(0) if spare is None else spare.pairs
@@ -216,7 +187,7 @@ def listed(
                 new[:count] = old[:count]
             held = larger
         groups = Groups(start[first : first + GROUPS + 1], earliest[first : first + GROUPS])
-        _store(positions, atoms, radii, skin, guard, found, groups, held)
+        _store(placed.positions, atoms, who.radii, skin, placed.rounding, found, groups, held)
     return Superset(skin, held, Groups(start, earliest), atoms.home)
 
 
@@ -259,16 +230,8 @@ def _store(x, atoms, radius, skin, guard, found, of, held):
 
 
 def examine(
-    superset: Superset,
-    positions: Float[np.ndarray, "atoms 3"],
-    lattice: ReducedLattice,
-    sides: Sides,
-    radii: Float[np.ndarray, "species species"],
-    *,
-    bound: float,
-    horizon: float,
-    guard: float,
-) -> Examined:
+    superset: Superset, placed: Placed, who: Participants, *, bound: float, horizon: float, guard: float
+) -> tuple[Changed, int, float]:
     """Examine the pairs that are due at the odometer's reading, and those that can be nearest.
 
     Args:
@@ -276,10 +239,12 @@ def examine(
         bound: pairs this close are counted, length.
         horizon: the smallest |margin| is known up to here, length.
         guard: how far a distance in following coordinates can be off, length.
+    Returns:
+        (pairs that flipped, how many are within the bound, the smallest |margin|).
     """
-    pairs, frame = superset.pairs, _Frame.of(positions, superset.home, lattice, sides.species, radii)
+    pairs, frame = superset.pairs, _Frame.of(placed, superset.home, who)
     flip = np.empty(int(superset.groups.start[-1]), np.int64)
-    counts, smallest = np.zeros(3, np.int64), np.inf
+    counts, smallest = np.zeros(2, np.int64), np.inf
     slack = 1e-6 * superset.skin + guard
     # mostly the pairs at hand hold the nearest of all; where they may not, those that can be are due too
     seen = max(bound, 0.02 * superset.last)
@@ -292,10 +257,8 @@ def examine(
             frame, pairs, superset.groups, superset.gone, limit, bound, guard, slack, flip, counts, smallest
         )
     k = flip[: int(counts[0])]
-    return Examined(
-        pairs.i[k].astype(np.int64), pairs.j[k].astype(np.int64), pairs.inside[k], int(counts[1]),
-        float(smallest), int(counts[2]),
-    )  # fmt: skip
+    i, j = pairs.i[k].astype(np.int64), pairs.j[k].astype(np.int64)
+    return Changed(i, j, np.zeros(len(k), np.int64), pairs.inside[k]), int(counts[1]), float(smallest)
 
 
 class _Frame(NamedTuple):
@@ -311,11 +274,11 @@ class _Frame(NamedTuple):
     square: Float[np.ndarray, "species species"]
 
     @classmethod
-    def of(cls, positions, home, lattice: ReducedLattice, species, radii) -> _Frame:
-        followed, shifts = np.empty_like(positions), np.empty((27, 3))
-        _follow(positions, home, lattice.vectors, followed, shifts)
-        square = np.where(radii >= 0, radii * radii, -1.0)
-        return cls(positions, followed, shifts, home, lattice.vectors, species, radii, square)
+    def of(cls, placed: Placed, home: np.ndarray, who: Participants) -> _Frame:
+        x, vectors = placed.positions, placed.lattice.vectors
+        followed, shifts = np.empty_like(x), np.empty((27, 3))
+        _follow(x, home, vectors, followed, shifts)
+        return cls(x, followed, shifts, home, vectors, who.species, who.radii, who.squares)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -336,13 +299,13 @@ def _follow(x, home, vectors, followed, shifts):
 
 @numba.njit(cache=True, nogil=True)
 def _evaluate(frame, pairs, groups, gone, limit, bound, guard, slack, flip, counts, smallest):
-    """Examine the pairs that are due; flips go into `flip`, numbers into (flips, close, examined)."""
+    """Examine the pairs that are due; flips go into `flip`, numbers into (flips, close)."""
     start, earliest, inside = groups.start, groups.earliest, pairs.inside
     x, home, vectors, species = frame.positions, frame.home, frame.vectors, frame.species
     radius, square, followed, shifts = frame.radius, frame.square, frame.followed, frame.shifts
     block = 1024
     chosen, margins, y = np.empty(block + 1, np.uint32), np.empty(block), np.empty((4, block))
-    flips, close, examined = counts[0], counts[1], counts[2]
+    flips, close = counts[0], counts[1]
     # margins up to here are computed from the coordinates as stored: all that are counted or compared
     near = max(bound, smallest) + guard
     for g in range(earliest.shape[0]):
@@ -373,10 +336,9 @@ def _evaluate(frame, pairs, groups, gone, limit, bound, guard, slack, flip, coun
                     inside[begin + k] = yes
                     flip[flips] = begin + k
                     flips += 1
-            examined += kept
             first_due = min(first_due, _least(due_here))
         earliest[g] = first_due
-    counts[0], counts[1], counts[2] = flips, close, examined
+    counts[0], counts[1] = flips, close
     return smallest
 
 

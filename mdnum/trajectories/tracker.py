@@ -7,12 +7,19 @@ from dataclasses import dataclass, replace
 
 import numba
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from mdnum.errors import InputError
-from mdnum.trajectories.bins import INSIDE, Sides, binned
 from mdnum.trajectories.frame import Box, Frame
-from mdnum.trajectories.lattice import ReducedLattice, lattice_of, own_images
+from mdnum.trajectories.lattice import (
+    INSIDE,
+    Participants,
+    Placed,
+    ReducedLattice,
+    binned,
+    lattice_of,
+    own_images,
+)
 from mdnum.trajectories.ledger import FlipTable, LedgerRows, Members, Thresholds
 from mdnum.trajectories.rules import Capped, CutoffRule, Nearest, Rule, SpeciesCutoffs
 from mdnum.trajectories.search import (
@@ -34,40 +41,13 @@ HORIZON = 0.02
 
 
 @dataclass(frozen=True)
-class Participants:
-    """The atoms that take part in a rule, numbered among themselves.
+class Moment(Placed):
+    """One frame as it was decided."""
 
-    Attributes:
-        radii: by species, length; negative for pairs that are never inside.
-    """
-
-    labels: Int[np.ndarray, "participants"]  # their numbers in the file
-    sides: Sides  # who is asked for neighbors, and who can be one
-    radii: Float[np.ndarray, "species species"]
-    both: Bool[np.ndarray, "participants"]  # atoms on both sides: images of themselves can be their neighbors
-    own: Int[np.ndarray, "species"]  # how many of those there are, by species
-
-    @property
-    def radius(self) -> float:
-        """Largest radius, length."""
-        return float(self.radii.max(initial=0.0))
-
-
-@dataclass(frozen=True)
-class Moment:
-    """One frame as it was decided.
-
-    Attributes:
-        found: pairs inside; None where they have not been searched for, or the rule is directed.
-    """
-
-    positions: Float[np.ndarray, "atoms 3"]  # of the atoms that take part, length
-    lattice: ReducedLattice  # of its box
-    rounding: float  # how far a distance can be off through float64, length
     own: Int[np.ndarray, "species"]  # images of an atom itself that are inside, by species
     last_in: Float[np.ndarray, "limits"]  # thresholds of each atom, where the rule is directed
     first_out: Float[np.ndarray, "limits"]
-    found: Found | None = None
+    found: Found | None = None  # pairs inside; None where not searched for, or the rule is directed
     rows: NeighborRows | None = None  # neighbors, where the rule is directed
 
 
@@ -158,7 +138,7 @@ class Tracker:
             found = now.found or self._searched(now)
             i, j = found.i.astype(np.int64), found.j.astype(np.int64)
         # each atom as often as images of its own are inside; directed rules list them with the others
-        own = np.repeat(np.arange(len(self._who.both)), self._who.both * now.own[self._who.sides.species])
+        own = np.repeat(np.arange(len(self._who.both)), self._who.both * now.own[self._who.species])
         i, j = np.concatenate([i, own]), np.concatenate([j, own])
         first, second = self._who.labels[i], self._who.labels[j]
         if not self.rule.directed:
@@ -166,7 +146,8 @@ class Tracker:
         order = np.argsort(first * np.int64(max(self._atoms, 1)) + second)
         first, second = first[order], second[order]
         rank = ranks(first, second)
-        return Members(first, second, rank, self._distances(now, i[order], j[order], rank))
+        distances = image_distances(now, i[order], j[order], rank, self.rule.directed)
+        return Members(first, second, rank, distances)
 
     def thresholds(self) -> tuple[Float[np.ndarray, "atoms"], Float[np.ndarray, "atoms"]]:
         """Of a directed rule, by atom of the file at the last frame, length; nan for atoms that do not look.
@@ -183,21 +164,7 @@ class Tracker:
 
     def _moment(self, frame: Frame) -> Moment:
         """A frame that can be decided on."""
-        positions, largest = self._checked(frame)
-        lattice, radius = self._lattice_of(frame.box), self._who.radius
-        rounding = lattice.rounding(largest, radius if np.isfinite(radius) else 4.0 * largest)
-        if np.isfinite(radius) and rounding > 1e-3 * radius:
-            raise InputError(
-                f"coordinates up to {largest:.3g} with a cutoff of {radius:g}: float64 cannot resolve them",
-                remedy="Check the unit, and that the file's coordinates are not broken",
-                where=f"frame {frame.index}",
-            )
-        none = np.zeros(0)
-        return Moment(positions, lattice, rounding, np.zeros(len(self._who.radii), np.int64), none, none)
-
-    def _checked(self, frame: Frame) -> tuple[np.ndarray, float]:
-        """Positions of the atoms that take part, and the largest coordinate."""
-        atoms = len(frame.positions)
+        where, atoms = f"frame {frame.index}", len(frame.positions)
         if self._atoms < 0:
             self._atoms = atoms
             self._who = _participants(self.rule, self._first, self._second, self._species, atoms)
@@ -208,7 +175,7 @@ class Tracker:
             raise InputError(
                 f"{atoms} atoms, {self._atoms} in the frames before",
                 remedy="Split the trajectory where the number of atoms changes",
-                where=f"frame {frame.index}",
+                where=where,
             )
         positions, largest = _taken(frame.positions, self._who.labels)
         if not np.isfinite(largest):
@@ -217,9 +184,18 @@ class Tracker:
             raise InputError(
                 f"atom {int(self._who.labels[at])} is at {positions[at].tolist()}",
                 remedy="Stop before this frame (a slice of the file), and find out why the run broke",
-                where=f"frame {frame.index}",
+                where=where,
             )
-        return positions, largest
+        lattice, radius = self._lattice_of(frame.box), self._who.radius
+        rounding = lattice.rounding(largest, radius if np.isfinite(radius) else 4.0 * largest)
+        if np.isfinite(radius) and rounding > 1e-3 * radius:
+            raise InputError(
+                f"coordinates up to {largest:.3g} with a cutoff of {radius:g}: float64 cannot resolve them",
+                remedy="Check the unit, and that the file's coordinates are not broken",
+                where=where,
+            )
+        none = np.zeros(0)
+        return Moment(positions, lattice, rounding, np.zeros(len(self._who.radii), np.int64), none, none)
 
     def _lattice_of(self, box: Box) -> ReducedLattice:
         last = self._box
@@ -234,26 +210,24 @@ class Tracker:
 
     def _decided(self, now: Moment) -> Moment:
         """The same with its neighbors searched for, and their numbers noted."""
-        rule, bound = self.rule, self.bound + now.rounding
+        rule, bound, who = self.rule, self.bound + now.rounding, self._who
         if isinstance(rule, Nearest | Capped):
             reach = rule.reach if np.isfinite(rule.reach) else 0.0
-            made = nearest(
-                now.positions, now.lattice, self._who.sides, rule,
-                band=max(bound, HORIZON * reach, 4 * now.rounding), bound=bound, guard=now.rounding,
-            )  # fmt: skip
+            made = nearest(now, who, rule, band=max(bound, HORIZON * reach, 4 * now.rounding), bound=bound)
             self.pairs, self.near = len(made.rows.other), made.close
             self.min_margin = made.smallest if made.smallest <= HORIZON * rule.reach else np.inf
             return replace(now, rows=made.rows, last_in=made.last_in, first_out=made.first_out)
-        found, who = self._searched(now), self._who
+        found = self._searched(now)
         smallest, self.near, own = found.smallest, found.close, now.own.copy()
         squares = own_images(now.lattice, who.radius * (1.0 + HORIZON) + bound)
+        owners = np.bincount(who.species[who.both], minlength=len(who.radii))
         for kind, radius in enumerate(np.diag(who.radii)):
-            if radius >= 0 and who.own[kind]:
+            if radius >= 0 and owners[kind]:
                 own[kind] = int((squares < radius * radius).sum())
                 margins = np.abs(radius - np.sqrt(squares))
-                self.near += int((margins <= bound).sum()) * int(who.own[kind])
+                self.near += int((margins <= bound).sum()) * int(owners[kind])
                 smallest = min(smallest, float(margins.min(initial=np.inf)))
-        self.pairs = len(found.i) + int((own * who.own).sum())
+        self.pairs = len(found.i) + int((own * owners).sum())
         self.min_margin = smallest if smallest <= HORIZON * who.radius else np.inf
         return replace(now, found=found, own=own)
 
@@ -263,10 +237,10 @@ class Tracker:
 
     def _searched(self, moment: Moment) -> Found:
         """The pairs inside at a moment, searched for again."""
-        bound, guard = self.bound + moment.rounding, moment.rounding
+        bound = self.bound + moment.rounding
         found = search(
-            moment.positions, moment.lattice, self._who.sides, self._who.radii, INSIDE,
-            band=max(bound, HORIZON * self._who.radius, 4 * guard), bound=bound, guard=guard,
+            moment, self._who, INSIDE,
+            band=max(bound, HORIZON * self._who.radius, 4 * moment.rounding), bound=bound,
             room=int(1.1 * (self.pairs + self._open)), open_room=int(1.2 * self._open),
         )  # fmt: skip
         self._open = found.open
@@ -277,16 +251,14 @@ class Tracker:
     def _from_list(self, before: Moment, now: Moment) -> FlipTable | None:
         """The flips that a list gives; None where none would be worth its making."""
         who, radius, bound = self._who, self._who.radius, self.bound + now.rounding
-        clear = max(bound, HORIZON * radius)
+        horizon = HORIZON * radius
+        clear = max(bound, horizon)
         # what rounding adds to every distance
         slack = 8.0 * max(before.rounding, now.rounding)
 
-        def moved(home: np.ndarray, reach: float) -> float:
-            return displaced(before.positions, before.lattice, now.positions, now.lattice, home, reach)
-
         def advanced(held: Superset) -> bool:
             """Whether a list serves once its odometer has been read."""
-            held.last = moved(held.home, radius + 2.0 * held.skin)
+            held.last = displaced(before, now, held.home, radius + 2.0 * held.skin)
             held.gone += held.last + slack
             return held.serves(now.lattice, radius, clear)
 
@@ -294,27 +266,20 @@ class Tracker:
             self._spare, self._list = self._list, None
         if self._list is None:
             # made at the frame before, if it serves now and will for a while
-            pace = moved(np.zeros((len(now.positions), 3), np.int64), 1.5 * radius)
+            pace = displaced(before, now, np.zeros((len(now.positions), 3), np.int64), 1.5 * radius)
             skin = skin_for(pace, radius, clear, before.lattice, self.pairs)
             if not skin > 0:
                 return None
-            made = listed(
-                before.positions, before.lattice, who.sides, who.radii, skin, guard=before.rounding,
-                pairs=self.pairs, spare=self._spare,
-            )  # fmt: skip
-            self._spare = None
+            made, self._spare = listed(before, who, skin, self.pairs, self._spare), None
             if not advanced(made):
                 return None
             self._list = made
-        horizon = HORIZON * radius
-        seen = examine(
-            self._list, now.positions, now.lattice, who.sides, who.radii,
-            bound=bound, horizon=horizon, guard=slack,
-        )  # fmt: skip
-        self.pairs += 2 * int(seen.entered.sum()) - len(seen.entered)
-        self.near, self.min_margin = seen.close, seen.smallest if seen.smallest <= horizon else np.inf
-        rank = np.zeros(len(seen.i), np.int64)
-        return self._table(before, now, Changed(seen.i, seen.j, rank, seen.entered))
+        changed, self.near, smallest = examine(
+            self._list, now, who, bound=bound, horizon=horizon, guard=slack
+        )
+        self.pairs += 2 * int(changed.entered.sum()) - len(changed.entered)
+        self.min_margin = smallest if smallest <= horizon else np.inf
+        return self._table(before, now, changed)
 
     def _flips(self, before: Moment, now: Moment) -> FlipTable:
         """The flips between two moments that were searched for, or can be."""
@@ -322,15 +287,11 @@ class Tracker:
         reach = who.radius + 8.0 * max(before.rounding, now.rounding)
         if not self.rule.directed and all(one.lattice.narrowest >= 2.000002 * reach for one in (before, now)):
             # no pair has two images inside, nor one that rounding could miss
-            changed = exchanged(
-                before.found or self._searched(before), now.found or self._searched(now),
-                (before.positions, before.lattice), (now.positions, now.lattice),
-                who.sides.species, who.radii,
-            )  # fmt: skip
-            return self._table(before, now, changed)
+            found = before.found or self._searched(before), now.found or self._searched(now)
+            return self._table(before, now, exchanged(*found, before, now, who))
         parts = [compared(self._rows(before), self._rows(now), self.pairs // 2 + 4096)]
         for kind in np.flatnonzero(before.own != now.own):
-            atoms = np.flatnonzero(who.both & (who.sides.species == kind))
+            atoms = np.flatnonzero(who.both & (who.species == kind))
             low, high = sorted((int(before.own[kind]), int(now.own[kind])))
             i = np.repeat(atoms, high - low)
             entered = np.full(len(i), bool(now.own[kind] > before.own[kind]))
@@ -339,19 +300,14 @@ class Tracker:
 
     def _table(self, before: Moment, now: Moment, changed: Changed) -> FlipTable:
         """The flips as columns, from indices among the atoms that take part."""
-        distances = [self._distances(one, changed.i, changed.j, changed.rank) for one in (now, before)]
+        directed, who = self.rule.directed, self._who
+        ids = (changed.i, changed.j, changed.rank, directed)
         thresholds = Thresholds(
-            self.rule.directed, self._who.sides.species, self._who.radii,
-            now.last_in, now.first_out, before.last_in, before.first_out,
-        )  # fmt: skip
+            directed, who.species, who.radii, now.last_in, now.first_out, before.last_in, before.first_out
+        )
         bound = self.bound + max(before.rounding, now.rounding)
-        return self._ledger.flips(self.frames, changed, (distances[0], distances[1]), thresholds, bound)
-
-    def _distances(self, moment: Moment, i, j, rank) -> np.ndarray:
-        if self.rule.directed:
-            # both of a ± pair are neighbors of an atom
-            rank = np.where(i == j, rank // 2, rank)
-        return image_distances(moment.positions, moment.lattice, i, j, rank)
+        distances = image_distances(now, *ids), image_distances(before, *ids)
+        return self._ledger.flips(self.frames, changed, distances, thresholds, bound)
 
 
 def _participants(
@@ -361,11 +317,7 @@ def _participants(
     species: np.ndarray | None,
     atoms: int,
 ) -> Participants:
-    """Number the atoms that take part, in the order of the file.
-
-    Raises:
-        InputError: an atom that is not there; as many species as atoms are expected.
-    """
+    """Number the atoms that take part, in the order of the file."""
     first = np.arange(atoms) if first is None else first
     second = first if second is None else second
     for name, chosen in (("first", first), ("second", second)):
@@ -396,9 +348,7 @@ def _participants(
     else:
         kinds = np.zeros(len(labels), np.int64)
         radii = np.array([[float(rule.radius if isinstance(rule, CutoffRule) else rule.reach)]])
-    both = centers & others
-    own = np.bincount(kinds[both], minlength=len(radii))
-    return Participants(labels, Sides(centers, others, kinds), radii, both, own)
+    return Participants(labels, centers, others, kinds, radii)
 
 
 def _by_place(who: Participants, frame: Frame) -> Participants:
@@ -406,13 +356,12 @@ def _by_place(who: Participants, frame: Frame) -> Participants:
     x, largest = _taken(frame.positions, who.labels)
     if not np.isfinite(largest) or not who.radius > 0:
         return who
-    sides, everyone = who.sides, np.ones(len(x), bool)
-    around = Sides(everyone, everyone, sides.species)
-    order = binned(x, lattice_of(frame.box), around, who.radius, 0.0).order
-    others = sides.others[order]
-    centers = others if sides.centers is sides.others else sides.centers[order]
-    ordered = Sides(centers, others, sides.species[order])
-    return replace(who, labels=who.labels[order], sides=ordered, both=who.both[order])
+    everyone = np.ones(len(x), bool)
+    around = replace(who, centers=everyone, others=everyone)
+    order = binned(Placed(x, lattice_of(frame.box), 0.0), around, who.radius).order
+    others = who.others[order]
+    centers = others if who.centers is who.others else who.centers[order]
+    return Participants(who.labels[order], centers, others, who.species[order], who.radii)
 
 
 def _taken(positions: np.ndarray, labels: np.ndarray) -> tuple[Float[np.ndarray, "taken 3"], float]:

@@ -10,7 +10,8 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -44,18 +45,6 @@ _BOLTZMANN = 8.617333262e-5
 #: A unit of a system with dimensions where text has one: not in the name of a file.
 _UNIT = re.compile(r"(?<![\w./])(m?)eV(?![A-Za-z0-9_]|\.\w)|Å(?![A-Za-z0-9_])")
 _ROLES = ("first", "second", "third", "bad", "muted", "ink")
-
-
-class AuditStopped(KeyboardInterrupt):
-    """Somebody pressed control-C after a check was done: what had been found is in the folder.
-
-    Args:
-        outcome: the audit without the checks that were not done.
-    """
-
-    def __init__(self, outcome: Outcome):
-        super().__init__("stopped")
-        self.outcome = outcome
 
 
 def audit(
@@ -101,7 +90,7 @@ def audit(
     Raises:
         InputError: no such calculator, structure or check; something that a resumed audit has already.
         FolderError: the folder cannot be used.
-        AuditStopped: a KeyboardInterrupt came after a check was done; what was found till then has been
+        frame.Interrupted: control-C was pressed after a check was done; what was found till then has been
             written, its page included, and is the exception's `outcome`.
     """
     from mdnum.audit.record import AuditState, encoded, kept
@@ -195,7 +184,7 @@ def _ask_all(
         state.during = next(iter(state.left), None)
         answers.save()
         summary = plain(_summary(state))
-        _judge(View(folder, summary, state)).store(folder, summary)
+        _judge(AuditView(folder, summary, given=state)).store(folder, summary)
     if state.cut is not None and state.during is None:
         state.cut = None
     answers.save()
@@ -204,7 +193,7 @@ def _ask_all(
         folder, report=report, result={one.name: one for one in state.shown}, progress=progress
     )
     if state.why == "stopped":
-        raise AuditStopped(outcome)
+        raise frame.Interrupted(outcome)
     return outcome
 
 
@@ -248,10 +237,10 @@ def _keep_evidence(folder: RunFolder, loaded: LoadedCalculator, check: AuditChec
 
 
 def _write_structures(folder: RunFolder, structures: Mapping[str, Atoms]) -> None:
-    from mdnum.systems.structures import to_extxyz
+    from mdnum.audit.subject import exact_extxyz
 
     for name, atoms in structures.items():
-        write_text(subfolder(folder.path, "structures") / f"{name}.extxyz", to_extxyz(atoms))
+        write_text(subfolder(folder.path, "structures") / f"{name}.extxyz", exact_extxyz(atoms))
 
 
 def _wanted(checks: str | Sequence[str] | None) -> list[str]:
@@ -437,9 +426,27 @@ def _finding(one: Observed, section: str, cause: str) -> Finding:
     return made if made.text else replace(made, text=TEXTS("invariance_finding", **one.values))
 
 
-def _judge(view: View) -> Verdict:
+@dataclass(frozen=True)
+class AuditView(View):
+    """The folder of an audit.
+
+    Attributes:
+        given: what it has found, where that is known; it is read otherwise.
+    """
+
+    given: AuditState | None = None
+
+    @cached_property
+    def state(self) -> AuditState:
+        """What was found."""
+        from mdnum.audit.record import kept
+
+        return kept(self.folder) if self.given is None else self.given
+
+
+def _judge(view: AuditView) -> Verdict:
     """Findings, errors first, and both answers in one sentence."""
-    state: AuditState = view.extra
+    state = view.state
     given, titles = units.get(state.units), {}
     for result in state.shown:
         titles |= {id(one): result.title for one in result.findings}
@@ -509,8 +516,8 @@ def _unfinished(state: AuditState, headline: str, time_up: str) -> str:
 # -- how it is shown -------------------------------------------------------------------------------
 
 
-def _page(view: View, verdict: Verdict) -> Page:
-    state, summary = view.extra, view.summary
+def _page(view: AuditView, verdict: Verdict) -> Page:
+    state, summary = view.state, view.summary
     given = units.get(state.units)
     found = [f"{one['title']} ({_ways(one)}): {one['says']}" for one in summary["parts"]]
     sections = [Section("What each check found", found, terminal=True)]
@@ -599,10 +606,4 @@ def _subject(summary: Mapping[str, Any], given: units.Units) -> Iterator[tuple[s
     yield "Took", f"{cell(summary['seconds'])} s"
 
 
-def _load(folder: RunFolder) -> AuditState:
-    from mdnum.audit.record import kept
-
-    return kept(folder)
-
-
-VERBS = {"audit": Verb(_judge, _page, load=_load)}
+VERBS = {"audit": Verb(_judge, _page, AuditView)}

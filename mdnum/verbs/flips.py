@@ -16,9 +16,8 @@ from mdnum.errors import InputError
 from mdnum.store import RunFolder
 from mdnum.store.tables import TableStream
 from mdnum.verbs.flips_page import judge, page
-from mdnum.verbs.flips_shared import about, ending, plain_box, selected, stem
-from mdnum.verbs.frame import Outcome, Progress, Verb, finish, logged, new_folder, store
-from mdnum.verbs.interrupt import asked_to_stop
+from mdnum.verbs.flips_shared import FlipsView, about, ending, plain_box, selected, stem
+from mdnum.verbs.frame import Outcome, Progress, Verb, asked_to_stop, finish, logged, new_folder, store
 
 if TYPE_CHECKING:
     from mdnum.trajectories.follow import Followed, Groups, Pass
@@ -146,7 +145,7 @@ def flips(
         return finish(folder, report=report, result=found, progress=progress)
 
 
-VERBS = {"flips": Verb(judge, page)}
+VERBS = {"flips": Verb(judge, page, FlipsView)}
 
 
 # ---- what is asked for
@@ -388,8 +387,8 @@ def _rule_told(
 
 def _counted(total: Statistics) -> dict[str, Any]:
     """Plain values of what was counted, lengths of time in frames."""
+    from mdnum.trajectories.history import between_frames
     from mdnum.trajectories.statistics import Lifetime
-    from mdnum.trajectories.stride import between_frames
 
     durations, chatter = total.durations, total.chatter
     between = between_frames(total.strides)

@@ -15,10 +15,9 @@ import numpy as np
 
 from mdnum.errors import InputError
 from mdnum.plain import plain
-from mdnum.report.drawing import legend
+from mdnum.report.drawing import BAD, FIRST, MUTED, SECOND, legend
 from mdnum.report.finding import Verdict
 from mdnum.report.section import Figure, Key, Page, Section, Table, pairs
-from mdnum.report.svg import BAD, FIRST, MUTED, SECOND
 from mdnum.report.words import count, many, number
 from mdnum.verbs import frame
 from mdnum.verbs.fork_page import differences, page, size

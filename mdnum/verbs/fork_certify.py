@@ -11,9 +11,9 @@ import numpy as np
 
 from mdnum.errors import InputError
 from mdnum.plain import plain
+from mdnum.report.drawing import FIRST, MUTED
 from mdnum.report.finding import Texts, Verdict, conclude
 from mdnum.report.section import Figure, Key, Page, Plot, Role, Section, Series, Table, pairs
-from mdnum.report.svg import FIRST, MUTED
 from mdnum.report.words import count, many, number, typeset
 from mdnum.verbs import frame
 from mdnum.verbs.fork_page import size

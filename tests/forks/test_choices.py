@@ -16,7 +16,7 @@ from forks.harness import CRYSTAL, crystal_system, made
 from mdnum.errors import InputError
 from mdnum.forks import Twin, fork
 from mdnum.forks.choices import CHOICES, Choice, parse, shipped, unavailable
-from mdnum.forks.choices.frames import exact_images
+from mdnum.forks.choices.start import exact_images
 from mdnum.forks.reordered import ShuffledBuilder
 from mdnum.forks.screen import Screened, screen
 from mdnum.forks.worlds import flat, varied
@@ -94,7 +94,7 @@ def test_arguments_are_read_and_written_alike(word: str):
         ("noise@exact", "no choice"),
         ("stop=never", "no rule"),
         ("max_iter=0", "0 change nothing"),
-        ("iterations=1:2:3:4", "more:step:ball"),
+        ("iterations=1:2:3:4", "not a whole number"),
         ("contact=x", "whole"),
         ("contact=earlier:0", "count from 1"),
     ],

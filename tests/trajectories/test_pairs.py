@@ -13,9 +13,8 @@ from trajectories.boxes import atoms, boxes
 
 from mdnum.errors import InputError
 from mdnum.trajectories import search as pairs
-from mdnum.trajectories.bins import grid_for
 from mdnum.trajectories.frame import Box, Frame
-from mdnum.trajectories.lattice import image_square, lattice_of, own_images
+from mdnum.trajectories.lattice import grid_for, image_square, lattice_of, own_images
 from mdnum.trajectories.rules import CutoffRule
 from mdnum.trajectories.tracker import HORIZON, Tracker
 

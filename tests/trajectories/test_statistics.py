@@ -14,7 +14,16 @@ from hypothesis import strategies as st
 from trajectories.membership import ledger, random_membership, stays
 
 from mdnum.trajectories.frame import Box, Frame
-from mdnum.trajectories.history import Contacts, History, contacts, mended
+from mdnum.trajectories.history import (
+    Contacts,
+    History,
+    Strides,
+    between_frames,
+    contacts,
+    crossings,
+    doublings,
+    mended,
+)
 from mdnum.trajectories.statistics import (
     Busiest,
     Chatter,
@@ -27,7 +36,6 @@ from mdnum.trajectories.statistics import (
     residence,
     survival,
 )
-from mdnum.trajectories.stride import Strides, between_frames, crossings, doublings
 
 seeds = st.integers(0, 10**6)
 

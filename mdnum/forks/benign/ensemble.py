@@ -13,7 +13,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from mdnum.forks.reordered import ShuffledSimulation
+from mdnum.forks.reordered import ReorderedSimulation
 from mdnum.md.cell import displacement
 from mdnum.md.neighbors import BUILDERS, RebuildRule, VerletList
 from mdnum.rollout.engine import FAILURES, Engine, Segment, Start, first_state, resume_point
@@ -263,7 +263,7 @@ def planted(a: Simulation) -> tuple[Change, ...]:
         other = "float32" if a.policy.dtype("force") == np.float64 else "float64"
         rounded = replace(a, policy=replace(a.policy, force=other))
         changes.append(Change(f"forces in {other}", False, rounded))
-    changes.append(Change("pairs in another order", False, ShuffledSimulation.of(a, 1)))
+    changes.append(Change("pairs in another order", False, ReorderedSimulation.of(a, 1)))
     changes.append(Change(f"lists by {search}", False, replace(a, builder=search), once=True))
     return tuple(changes)
 

@@ -18,10 +18,9 @@ from typing import Any, ClassVar
 import pytest
 
 from mdnum.references.conformance import questions
-from mdnum.references.conformance.case import AREAS, Case, once
-from mdnum.references.conformance.catalog import gas
-from mdnum.references.conformance.lists import ListLimits, PairList
-from mdnum.references.conformance.loading import from_object, load
+from mdnum.references.conformance.case import AREAS, Case, gas, once
+from mdnum.references.conformance.lists import ListLimits, PairList, from_object
+from mdnum.references.conformance.peers import load
 from mdnum.references.conformance.reproduction import script
 from mdnum.references.conformance.suite import Examiner, examine
 

@@ -143,7 +143,7 @@ class Case:
 
     def equals(self, other: Case) -> bool:
         """Whether another case has the same numbers."""
-        return (self.r_cut, self.skin) == (other.r_cut, other.skin) and all(
+        return (self.pbc, self.r_cut, self.skin) == (other.pbc, other.r_cut, other.skin) and all(
             np.array_equal(a.positions, b.positions) and np.array_equal(a.cell, b.cell)
             for a, b in zip(self.stills, other.stills, strict=True)
         )
@@ -199,3 +199,13 @@ def _among(pairs: PairSet, atoms: ndarray) -> PairSet:
     shift[i > j] *= -1
     i, j = np.minimum(i, j), np.maximum(i, j)
     return PairSet(i, j, shift, pairs.distance, pairs.inside, pairs.exact).select(i >= 0)
+
+
+def gas(count: int, cell, seed: int, low: float = 0.0, high: float = 1.0) -> ndarray:
+    """Coordinates drawn evenly from a range of fractions of a cell."""
+    return np.random.default_rng(seed).uniform(low, high, (count, 3)) @ matrix(cell)
+
+
+def grid(count: int) -> ndarray:
+    """Integer places, count along each edge."""
+    return np.stack(np.meshgrid(*[np.arange(count)] * 3, indexing="ij"), -1).reshape(-1, 3)

@@ -12,9 +12,8 @@ from pprint import pformat
 import numpy as np
 
 from mdnum.references.conformance import answer
-from mdnum.references.conformance.judge import Conventions
+from mdnum.references.conformance.judge import Conventions, Failed
 from mdnum.references.conformance.lists import PairList
-from mdnum.references.conformance.results import Failed
 
 _PRINTED = 60  # atoms whose coordinates are written out
 
@@ -154,7 +153,7 @@ def script(
     usual = case.r_cut + (2 * case.skin if case.skin else 0.5 * case.r_cut)
     reach = (usual if reach is None else reach) if superset else case.r_cut
     title = f"{tested.name}{f' {tested.version}' if tested.version else ''}: {worst.text}"
-    case_words = f"Found by: {failed.asked.name}, at its step {worst.step}."
+    case_words = f"Found by: {failed.case.name}, at its step {worst.step}."
     # an exception may quote code, whose strings must not end this one
     title = title.replace("\\", "/").replace('"""', "'''")
     parts = [

@@ -9,7 +9,6 @@ import linecache
 import os
 import pickle
 import signal
-import struct
 import subprocess
 import sys
 import tempfile
@@ -38,7 +37,6 @@ FEW, CALL, LONG, START = 1000, 45.0, 120.0, 120.0
 #: A process that used less than this share of the time waits for something that does not come; and one that
 #: has had this many times its seconds by the clock is not waited for, whatever else the machine does.
 _IDLE, _MOST = 0.05, 10.0
-_SIZE = struct.Struct("<Q")
 #: Modules, beside Python's own, whose exceptions are about a call that the list made, not about its input.
 _BORROWED = frozenset({"numpy", "scipy", "numba", "pandas", "torch", "jax", "jaxlib", "cupy", "ctypes"})
 
@@ -304,7 +302,7 @@ class RemoteSession:
     def _start(self) -> subprocess.Popen[bytes]:
         self._from = self._printed.seek(0, os.SEEK_END)
         self._process = subprocess.Popen(
-            python("-m", "mdnum.references.conformance.loading", self.tested.word),
+            python("-m", __name__, self.tested.word),
             env=environment(),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -376,27 +374,25 @@ def _processor_seconds(process: int) -> float | None:
 
 
 def _send(stream: BinaryIO | Any, message: Any) -> None:
-    data = pickle.dumps(message, protocol=pickle.HIGHEST_PROTOCOL)
-    stream.write(_SIZE.pack(len(data)) + data)
+    pickle.dump(message, stream, protocol=pickle.HIGHEST_PROTOCOL)
     stream.flush()
 
 
 def _received(stream: BinaryIO | Any) -> Any:
-    head = stream.read(_SIZE.size)
-    size = _SIZE.unpack(head)[0] if len(head) == _SIZE.size else -1
-    data = stream.read(max(size, 0))
-    if len(data) != size:
-        raise EOFError
-    return pickle.loads(data)
+    try:
+        return pickle.load(stream)
+    except pickle.UnpicklingError as error:  # cut short
+        raise EOFError from error
 
 
-def serve(load: Any, word: str) -> None:
-    """CaseAnswers questions on stdin until there are no more: the other process of a `RemoteSession`.
+def serve(word: str) -> None:
+    """Answers questions on stdin until there are no more: the other process of a `RemoteSession`.
 
     Args:
-        load: finds a list by a word.
-        word: of the list.
+        word: what `load` finds the list by.
     """
+    from mdnum.references.conformance.peers import load
+
     # a list may print: what it writes to stdout must not be taken for an answer
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
@@ -427,3 +423,10 @@ def serve(load: Any, word: str) -> None:
         except MemoryError as error:
             _send(answers, CallOutcome(raised=f"MemoryError: {error}"))
         _send(answers, None)
+
+
+if __name__ == "__main__":
+    # by its real name, under which outcomes are pickled
+    from mdnum.references.conformance import session
+
+    session.serve(sys.argv[1])

@@ -16,14 +16,22 @@ import pytest
 
 from mdnum.errors import InputError
 from mdnum.references.conformance import NeighborListConformance, reproduction
-from mdnum.references.conformance.case import AREAS, once, sequence
-from mdnum.references.conformance.catalog import catalog, crowds, gas, lattice
-from mdnum.references.conformance.judge import Failure
-from mdnum.references.conformance.lists import ListLimits
-from mdnum.references.conformance.loading import from_object, installed, known, load
+from mdnum.references.conformance.case import AREAS, gas, once, sequence
+from mdnum.references.conformance.judge import Failed, Failure
+from mdnum.references.conformance.lists import ListLimits, from_object
 from mdnum.references.conformance.motions import motions, movers
-from mdnum.references.conformance.questions import PLACES, SHAPES, SIZES, drawn, questions
-from mdnum.references.conformance.results import Failed, alike
+from mdnum.references.conformance.peers import installed, known, load
+from mdnum.references.conformance.questions import (
+    PLACES,
+    SHAPES,
+    SIZES,
+    alike,
+    catalog,
+    crowds,
+    drawn,
+    lattice,
+    questions,
+)
 from mdnum.references.conformance.session import RemoteSession, Session
 from mdnum.references.conformance.suite import Examiner, distinct, examine
 
@@ -360,7 +368,7 @@ def test_what_is_wrong_otherwise_is_not_taken_for_single_precision(kind: str):
 def test_what_fails_only_after_other_questions_is_reported_once():
     def failed(atoms: int, alone: bool) -> Failed:
         case = once(f"{atoms}", "few", gas(atoms, 4.0, 0), 4.0)
-        return Failed(case, (Failure("MISSING", "a pair"),), alone, asked=case)
+        return Failed(case, (Failure("MISSING", "a pair"),), alone)
 
     kept = distinct([failed(9, False), failed(2, False), failed(1, False), failed(2, True), failed(7, True)])
     assert {(one.case.atoms, one.alone) for one in kept} == {(1, False), (2, True), (7, True)}
