@@ -33,7 +33,7 @@ MINIMAL = {
         {"i": 3, "j": 9, "differs": [[410, None]]},
     ],
     "proven": True, "fork_alone": False, "candidates": 77, "tests": 23, "horizon": 1652,
-    "reason": "fewest",
+    "code": "proven", "reason": "2 pairs are enough.",
 }  # fmt: skip
 PINNED = {
     "pin": "fork", "pairs": [[3, 4]], "first": FORK, "last": FORK + 6, "split": None, "free": 1321,
