@@ -13,7 +13,7 @@ from command_line import call, printed
 
 from mdnum.errors import InputError
 from mdnum.gradients import Problem, parameters
-from mdnum.gradients.ensemble import Ensemble, SmoothedDifferences
+from mdnum.gradients.differences import Ensemble, SmoothedDifferences
 from mdnum.gradients.losses import parse
 from mdnum.store import RunFolder
 from mdnum.systems import build

@@ -13,7 +13,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from mdnum.ball.rollout import BallRun, simulate
-from mdnum.ball.state import BallDecisions, BallRecord, BallState
+from mdnum.ball.step import BallDecisions, BallRecord, BallState
 from mdnum.ball.world import World
 from mdnum.numerics.formats import check_scale, scaled_gradient
 

@@ -24,7 +24,7 @@ from mdnum.store import checkpoint
 from mdnum.store import files as manifest
 from mdnum.store.checkpoint import FrameFile
 from mdnum.store.files import SUBFOLDERS, disk_errors, opened, read_text, refuse_link, write_text
-from mdnum.store.tables import COLUMNS, TABLES, VERBS, TableStream
+from mdnum.store.tables import COLUMNS, TABLES, VERBS, TableStream, as_numpy
 
 if TYPE_CHECKING:
     from ase import Atoms
@@ -364,7 +364,7 @@ class RunFolder:
         empty = [key for key in table.column_names if table[key].null_count]
         if empty:
             raise FolderError(f"column {empty[0]!r} of table {name!r} has gaps", where=str(self.path))
-        return {key: table[key].to_numpy() for key in table.column_names}
+        return {key: as_numpy(table[key]) for key in table.column_names}
 
     def rows(self, name: str) -> int:
         """Rows of a table that `table` gives."""

@@ -394,12 +394,34 @@ class TableStream:
 
 
 def _array(values: Any, kind: pa.DataType) -> pa.Array:
-    # a private copy: arrow would otherwise share the caller's memory until the flush
+    # by its buffers, since pa.array imports pandas, which takes half a second; and of a private copy: arrow
+    # would otherwise share the caller's memory until the flush
     values = np.array(values)
     if pa.types.is_string(kind):
-        return pa.array(values.tolist(), kind)
-    # NaN stays NaN (from_pandas would make it null); a float that is no integer is refused by the cast
-    return pa.array(values, from_pandas=False).cast(kind) if values.size else pa.array([], kind)
+        texts = [text.encode() for text in values.tolist()]
+        offsets = np.cumsum([0, *map(len, texts)], dtype=np.int32)
+        return pa.StringArray.from_buffers(len(texts), pa.py_buffer(offsets), pa.py_buffer(b"".join(texts)))
+    held = np.packbits(values, bitorder="little") if values.dtype == bool else np.ascontiguousarray(values)
+    given = pa.from_numpy_dtype(values.dtype)
+    # a float that is no integer is refused by the cast
+    return pa.Array.from_buffers(given, len(values), [None, pa.py_buffer(held)]).cast(kind)
+
+
+def as_numpy(column: pa.Array | pa.ChunkedArray) -> np.ndarray:
+    """A column without gaps as numpy, by its buffers: `to_numpy` imports pandas."""
+    parts = column.chunks if isinstance(column, pa.ChunkedArray) else [column]
+    if pa.types.is_string(column.type):
+        return np.array([text for part in parts for text in part.to_pylist()], object)
+    kind = np.dtype(column.type.to_pandas_dtype())
+    read = [np.zeros(0, kind)]
+    for part in filter(len, parts):
+        if pa.types.is_boolean(column.type):
+            bits = np.frombuffer(part.buffers()[1], np.uint8)
+            values = np.unpackbits(bits, bitorder="little").astype(bool)
+        else:
+            values = np.frombuffer(part.buffers()[1], kind)
+        read.append(values[part.offset :][: len(part)])
+    return np.concatenate(read)
 
 
 @contextmanager
