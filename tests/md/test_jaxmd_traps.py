@@ -300,7 +300,7 @@ def test_pair_search_equals_ase_in_any_cell(pbc, tilt):
 @pytest.mark.nightly
 def test_pair_search_grows_when_atoms_crowd():
     cell = np.eye(3) * 15.0
-    search = jaxmd.PairSearch(cell, ALWAYS, 3.0, capacity_multiplier=1.0)
+    search = jaxmd.PairSearch(cell, ALWAYS, 3.0)
     sparse = random_points(200, cell)
     crowded = sparse.copy()
     crowded[:60] = 7.0 + np.random.default_rng(5).random((60, 3))
