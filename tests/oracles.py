@@ -117,6 +117,21 @@ def recomputed_flips(frames, cell, pbc, r_cut, compare="r2 <"):
     return rows, counts
 
 
+def broken_alternations(ledger) -> int:
+    """Rows that repeat the direction of the same subject's flip before: 0 for a complete ledger.
+
+    A decision that turned yes can only turn no next, so a missed flip of a subject that flips again
+    leaves two equal directions in a row.
+    """
+    if not len(ledger):
+        return 0
+    keys = tuple(ledger.subject[:, k] for k in range(ledger.subject.shape[1]))
+    order = np.lexsort((ledger.step, *keys))
+    subject, entered = ledger.subject[order], ledger.entered[order]
+    same = np.all(subject[1:] == subject[:-1], axis=1)
+    return int(np.sum(same & (entered[1:] == entered[:-1])))
+
+
 def cut_energy(kind, r, rc, ro, u, slope, cos=np.cos, pi=np.pi):
     """A pair energy u(r) that ends at rc, from the definition of each cutoff in the literature.
 
