@@ -1,4 +1,4 @@
-"""Means over replicas, wide differences, another precision and another program, against what they must be."""
+"""Differences, means over replicas, another precision and another program, against what they must be."""
 
 from __future__ import annotations
 
@@ -10,8 +10,17 @@ from ase.build import bulk
 from small_systems import LENNARD_JONES, crystal, make
 
 from mdnum.errors import InputError
-from mdnum.gradients.differences import FiniteDifferences, ShadowDifferences
-from mdnum.gradients.ensemble import Ensemble, Replicas, SmoothedDifferences, replica
+from mdnum.gradients.differences import (
+    Ensemble,
+    FiniteDifferences,
+    Replicas,
+    ShadowDifferences,
+    SmoothedDifferences,
+    choose_step,
+    noise_of,
+    replica,
+    richardson,
+)
 from mdnum.gradients.losses import Custom, MeanSquaredDisplacement, MeanTemperature
 from mdnum.gradients.problem import Gradient, Method, Problem
 from mdnum.gradients.recorded import EventAware, Surrogate, Symmetric
@@ -97,15 +106,14 @@ def test_wide_differences_of_a_melt_agree_with_the_flow_and_not_with_the_steps()
 
 
 @pytest.mark.slow
-def test_the_shadow_of_a_narrow_run_has_the_derivative_of_a_wide_one():
+def test_the_shadow_of_a_narrow_run_has_the_derivative_of_a_wide_one(smooth):
     cutoff = {"kind": "quintic", "radius": 2.2, "onset": 1.8}
-    wide = build(make(crystal(), LENNARD_JONES, cutoff))
     narrow = dict.fromkeys(("state", "force", "decision", "accumulate"), "float32")
     problem = Problem(
         build(make(crystal(), LENNARD_JONES, cutoff, precision=narrow)), MeanSquaredDisplacement(), 30
     )
     shadow = ShadowDifferences(levels=2)(problem, ("sigma",))
-    true = Symmetric()(replace(problem, simulation=wide), ("sigma",))
+    true = Symmetric()(replace(problem, simulation=smooth), ("sigma",))
     assert float(shadow.gradient["potential.sigma"]) == pytest.approx(
         float(true.gradient["potential.sigma"]), rel=1e-6
     )
@@ -115,7 +123,7 @@ def test_the_shadow_of_a_narrow_run_has_the_derivative_of_a_wide_one():
         float(true.gradient["potential.sigma"]), rel=1e-4
     )
     with pytest.raises(InputError, match="no wider format"):
-        ShadowDifferences()(replace(problem, simulation=wide), ("sigma",))
+        ShadowDifferences()(replace(problem, simulation=smooth), ("sigma",))
 
 
 @pytest.mark.slow
@@ -133,3 +141,43 @@ def test_a_surrogate_is_the_gradient_of_the_switched_system(hard):
     assert "switched twin" in found.notes["potential.sigma"]
     with pytest.raises(InputError, match="no force jump"):
         Surrogate()(twin, ("sigma",))
+
+
+# --- noise and steps, on functions whose noise and derivatives are known ----------------------------
+
+
+@pytest.mark.parametrize("noise", [1e-12, 1e-6])
+@pytest.mark.parametrize("slope", [0.0, 3.0])
+def test_the_noise_of_many_draws_is_found_within_a_factor_of_a_few(noise, slope):
+    rng = np.random.default_rng(1)
+    found = [
+        noise_of(2.0 + slope * np.arange(7) * 1e-14 + noise * rng.standard_normal(7)) for _ in range(300)
+    ]
+    assert np.quantile(found, 0.05) > noise / 4
+    assert np.quantile(found, 0.95) < 4 * noise
+
+
+def test_without_noise_there_is_none():
+    assert noise_of(np.full(7, 1.25)) == 0
+
+
+@pytest.mark.parametrize("stiffness", [1.0, 1e3, 1e5])
+@pytest.mark.parametrize("noise", [1e-15, 1e-9])
+def test_the_step_shrinks_to_where_the_function_is_straight(stiffness, noise):
+    """exp(k (q - 1)): the step that balances noise and truncation goes with one over k."""
+    rng = np.random.default_rng(2)
+
+    def f(q: float) -> float:
+        # too wide a step ends in infinity, as a run may
+        with np.errstate(over="ignore"):
+            return float(np.exp(stiffness * (q - 1.0)) + noise * rng.standard_normal())
+
+    chosen = choose_step(f, 1.0, 1e-2, 64 * 2.2e-16)
+    # the argument is rounded too
+    least = max(noise, 2.2e-16, stiffness * 1.1e-16)
+    best = (3 * least) ** (1 / 3) / stiffness
+    assert min(best, 1e-2) / 20 < chosen.size <= 1e-2
+    assert chosen.size < 20 * best or chosen.size == 1e-2
+    found = richardson(f, 1.0, 2 * chosen.size, 3)
+    # a few times the error that no choice of a step with three values on each side avoids
+    assert abs(found.value - stiffness) < 30 * stiffness * least ** (2 / 3)
