@@ -13,14 +13,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mdnum.trajectories.frame import Frame
-from mdnum.trajectories.ledger import FlipTable, Members
+from mdnum.trajectories.ledger import Columns, FlipTable, Members
 
 # a pair's three numbers are packed into one where they fit: sorting one column is ten times as fast
 _ROOM = 2**62
@@ -145,7 +145,7 @@ def _grouped(columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 
 
 @dataclass(frozen=True)
-class Contacts:
+class Contacts(Columns):
     """Stays inside, sorted by (i, j, rank, begin).
 
     The frames say no more than that a pair was inside at `begin`, ..., `end - 1`: it entered some time
@@ -167,9 +167,6 @@ class Contacts:
     end: Int[np.ndarray, "stays"]
     began: Bool[np.ndarray, "stays"]
     ended: Bool[np.ndarray, "stays"]
-
-    def __len__(self) -> int:
-        return len(self.i)
 
     @property
     def length(self) -> Int[np.ndarray, "stays"]:
@@ -208,8 +205,7 @@ def mended(stays: Contacts, gap: int) -> Contacts:
     joined = same & (stays.begin[1:] - stays.end[:-1] <= gap)
     heads = np.flatnonzero(np.concatenate([[True], ~joined]))
     tails = np.flatnonzero(np.concatenate([~joined, [True]]))
-    values = {name: column[heads] for name, column in vars(stays).items()}
-    return Contacts(**values | {"end": stays.end[tails], "ended": stays.ended[tails]})
+    return replace(stays[heads], end=stays.end[tails], ended=stays.ended[tails])
 
 
 # ---- between the frames

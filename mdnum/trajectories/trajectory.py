@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -166,6 +166,17 @@ class Trajectory(ABC):
     @abstractmethod
     def _frame(self, number: int, raw: Any) -> Frame:
         """A frame from what `_raw` gave."""
+
+    def _guarded(self, numbers: Iterator[int], get: Callable[[int], Any]) -> Iterator[tuple[int, Any]]:
+        """Frames by number as a reader gives them, up to None; what it raises is an unreadable frame."""
+        for number in numbers:
+            try:
+                raw = get(number)
+            except self._fails as error:
+                raise self._unreadable(number, error) from error
+            if raw is None:
+                return
+            yield number, raw
 
     def _first(self) -> tuple[int, Any]:
         """The first of the file."""
