@@ -21,7 +21,7 @@ from MDAnalysis.core.groups import AtomGroup, UpdatingAtomGroup
 from MDAnalysis.core.universe import Universe
 
 from mdnum.errors import InputError
-from mdnum.trajectories.frame import FrameError, UnreadableFrame, check_frame
+from mdnum.trajectories.frame import FrameCheck, FrameError, UnreadableFrame
 from mdnum.trajectories.ledger import FlipTable, Members
 from mdnum.trajectories.mdanalysis_source import LibraryFrames, left_over
 from mdnum.trajectories.resolution import Resolution, infer
@@ -164,14 +164,14 @@ class NeighborFlips(AnalysisBase):
                 )
             self._second = np.unique(np.asarray(second.indices, np.int64))
         self.rules = _rules_of(r_cut, rule)
-        self._radius = smallest_radius(self.rules)
         self._species = None
         if any(one.needs_species for one in self.rules):
             self._species = [str(one) for one in AtomTable.of(group.universe.atoms).species]
             for one in self.rules:
                 # refuses a species that no atom has
                 one.table(self._species)
-        self._seen = atoms_of((self._first, self._second))
+        seen = atoms_of((self._first, self._second))
+        self._check = FrameCheck(seen, radius=smallest_radius(self.rules), bits=32)
         if bound is not None and not (math.isfinite(bound) and bound >= 0):
             raise InputError(
                 f"bound = {bound!r}; expected a length of 0 or more, Å",
@@ -179,11 +179,9 @@ class NeighborFlips(AnalysisBase):
             )
         self._bound = bound
         self._resolution: Resolution | None = None
-        self._pbc: np.ndarray | None = None
         self._numbers = np.zeros(0, np.int64)
         self._at = 0
         self._trackers: list[Tracker] = []
-        self._names: np.ndarray | None = None
         self._library: LibraryFrames | None = None
         self._done, self._reading = 0, True
         self._to_the_end = False
@@ -247,7 +245,7 @@ class NeighborFlips(AnalysisBase):
                 break
         if sample:
             self._resolution = infer(sample, 32, formats_of(self._trajectory)[0])
-            self._pbc = sample[0].box.pbc
+            self._check.pbc = sample[0].box.pbc
         self._library = None
         return groups
 
@@ -261,7 +259,7 @@ class NeighborFlips(AnalysisBase):
         """The frames as the library reads them, opened when they are asked for in this process."""
         if self._library is None:
             self._library = LibraryFrames(self._trajectory)
-            self._names = self._library.labels(0)
+            self._check.labels = self._library.labels(0)
         return self._library
 
     def _compute(self, indexed_frames: np.ndarray, verbose: Any = None, **kwargs: Any) -> NeighborFlips:
@@ -319,11 +317,10 @@ class NeighborFlips(AnalysisBase):
 
     def _examined(self, ts: Any) -> tuple[float, list[FlipTable]]:
         """(how far a distance can be off, flips of each rule) at a timestep."""
-        frame = self.library.frame(ts, int(ts.frame))
-        check_frame(frame, self._seen, self._pbc, None, self._names, radius=self._radius, bits=32)
+        frame = self._check(self.library.frame(ts, int(ts.frame)))
         bound = self._bound or 0.0
         if self._bound is None and self._resolution is not None:
-            bound = self._resolution.bound(frame, self._seen)
+            bound = self._resolution.bound(frame, self._check.atoms)
         try:
             # a margin among the nearest is the difference of two distances
             return bound, [one.step(frame, bound=bound * (1 + one.rule.directed)) for one in self._trackers]

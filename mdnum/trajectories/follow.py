@@ -11,10 +11,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from mdnum.errors import InputError
-from mdnum.trajectories.frame import Box, Frame, checked, leap
+from mdnum.trajectories.frame import Box, Chosen, Frame, FrameCheck, leap
 from mdnum.trajectories.history import crossings
 from mdnum.trajectories.lattice import Placed, lattice_of
 from mdnum.trajectories.ledger import FlipTable, Members
@@ -41,7 +41,7 @@ _SAME_TIME = 1e-6
 
 def _usable(
     files: Sequence[Trajectory],
-    atoms: Int[np.ndarray, "atoms"] | None,
+    atoms: Chosen,
     rules: Sequence[Rule],
     step: Callable[..., Any],
     found: Pass | Compared,
@@ -55,7 +55,7 @@ def _usable(
         InputError: the first frame cannot be read or used: there is nothing to keep.
     """
     radius = smallest_radius(rules)
-    streams = [checked(one.frames(), atoms, str(one.path), radius=radius, bits=one.bits) for one in files]
+    streams = [map(FrameCheck(atoms, str(one.path), radius, one.bits), one.frames()) for one in files]
     while True:
         try:
             frames = [frame for one in streams if (frame := next(one, None)) is not None]
@@ -292,7 +292,7 @@ def same_lattice(one: Box, other: Box, tolerance: float) -> bool:
     return bool(np.abs(b - whole @ a).max() <= tolerance and abs(round(np.linalg.det(whole))) == 1)
 
 
-def separation(one: Frame, other: Frame, atoms: Int[np.ndarray, "chosen"] | None = None) -> Separation:
+def separation(one: Frame, other: Frame, atoms: Chosen = None) -> Separation:
     """The separation of two frames; only of these atoms, where they are given."""
     moved, whole = _displaced(one, other)
     if atoms is not None:
@@ -464,7 +464,7 @@ class Compared:
     stopped: InputError | None = None
 
 
-def follow_both(sets: list[NeighborSets], atoms: np.ndarray | None, sink: Sink) -> Iterator[Compared]:
+def follow_both(sets: list[NeighborSets], atoms: Chosen, sink: Sink) -> Iterator[Compared]:
     """Reads both once, in step, yielding the same `Compared` after each frame; only these atoms matter.
 
     The sink takes rows of "apart" and "differing".
