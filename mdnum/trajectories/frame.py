@@ -28,13 +28,9 @@ Chosen = Int[np.ndarray, "chosen"] | None
 
 @dataclass(frozen=True)
 class Box:
-    """Lattice vectors, and the directions in which they repeat.
+    """Lattice vectors, and the directions in which they repeat."""
 
-    Attributes:
-        matrix: lattice vectors as rows, length; rows of directions that do not repeat do not matter.
-        pbc: which of them repeat.
-    """
-
+    # rows, length; those of directions that do not repeat do not matter
     matrix: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.zeros((3, 3)))
     pbc: Bool[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3, bool))
 
@@ -50,23 +46,14 @@ class Box:
 
 @dataclass(frozen=True)
 class Frame:
-    """Positions at one moment.
+    """Positions at one moment."""
 
-    Attributes:
-        index: number of the frame in its file, from 0.
-        time: in the file's unit; the index where the file has no times.
-        positions: length; those of all atoms of the file.
-        box: the box of this frame.
-        velocities: length per time, where the file has them.
-        labels: names, elements or types of the atoms, where the file has them in every frame.
-    """
-
-    index: int
-    time: float
-    positions: Float[np.ndarray, "atoms 3"]
+    index: int  # number of the frame in its file, from 0
+    time: float  # in the file's unit; the index where the file has no times
+    positions: Float[np.ndarray, "atoms 3"]  # of all atoms of the file, length
     box: Box
-    velocities: Float[np.ndarray, "atoms 3"] | None = None
-    labels: np.ndarray | None = None
+    velocities: Float[np.ndarray, "atoms 3"] | None = None  # length per time, where the file has them
+    labels: np.ndarray | None = None  # names, elements or types, where the file has them in every frame
 
 
 class FrameError(InputError):

@@ -46,27 +46,17 @@ class Sums:
 
 @dataclass(frozen=True)
 class History:
-    """Pairs that were ever inside or flipped, each with its flips in the order of frames.
+    """Pairs that were ever inside or flipped, each with its flips in the order of frames."""
 
-    Attributes:
-        i, j, rank: the pairs, sorted, each once; see `ledger.Members`.
-        inside: whether each was inside at the first frame.
-        rows: flips of pair p are rows `rows[p]` to `rows[p + 1]` of what follows.
-        frame: position among the frames examined, from 1.
-        entered: whether the pair is inside at that frame.
-        ambiguous: whether the file's resolution may have made each flip.
-        frames: frames examined.
-    """
-
-    i: Int[np.ndarray, "pairs"]
+    i: Int[np.ndarray, "pairs"]  # the pairs, sorted, each once; see `ledger.Members`
     j: Int[np.ndarray, "pairs"]
     rank: Int[np.ndarray, "pairs"]
-    inside: Bool[np.ndarray, "pairs"]
-    rows: Int[np.ndarray, "pairs_and_one"]
-    frame: Int[np.ndarray, "flips"]
-    entered: Bool[np.ndarray, "flips"]
-    ambiguous: Bool[np.ndarray, "flips"]
-    frames: int
+    inside: Bool[np.ndarray, "pairs"]  # at the first frame
+    rows: Int[np.ndarray, "pairs_and_one"]  # flips of pair p are rows[p] to rows[p + 1] of what follows
+    frame: Int[np.ndarray, "flips"]  # position among the frames examined, from 1
+    entered: Bool[np.ndarray, "flips"]  # whether the pair is inside at that frame
+    ambiguous: Bool[np.ndarray, "flips"]  # whether the file's resolution may have made the flip
+    frames: int  # examined
 
     @classmethod
     def of(
@@ -150,23 +140,15 @@ class Contacts(Columns):
 
     The frames say no more than that a pair was inside at `begin`, ..., `end - 1`: it entered some time
     between the frames `begin - 1` and `begin`, and it may have been outside for a while between two frames.
-
-    Attributes:
-        i, j, rank: the pair; see `ledger.Members`.
-        begin: first frame inside, a position among the frames examined.
-        end: first frame outside again; the number of frames where that was not seen.
-        began: whether the pair was seen to enter. If not the stay is censored on the left: it is older than
-            it looks.
-        ended: whether it was seen to leave. If not the stay is censored on the right: it goes on.
     """
 
-    i: Int[np.ndarray, "stays"]
+    i: Int[np.ndarray, "stays"]  # the pair; see `ledger.Members`
     j: Int[np.ndarray, "stays"]
     rank: Int[np.ndarray, "stays"]
-    begin: Int[np.ndarray, "stays"]
-    end: Int[np.ndarray, "stays"]
-    began: Bool[np.ndarray, "stays"]
-    ended: Bool[np.ndarray, "stays"]
+    begin: Int[np.ndarray, "stays"]  # first frame inside, a position among the frames examined
+    end: Int[np.ndarray, "stays"]  # first frame outside again; the number of frames where that was not seen
+    began: Bool[np.ndarray, "stays"]  # whether it was seen to enter, else it is older (censored on the left)
+    ended: Bool[np.ndarray, "stays"]  # whether it was seen to leave, else it goes on (censored on the right)
 
     @property
     def length(self) -> Int[np.ndarray, "stays"]:

@@ -51,31 +51,20 @@ _WIDE = 4.0
 
 @dataclass(frozen=True)
 class Resolution:
-    """The resolution of the positions in a file.
+    """The resolution of the positions in a file."""
 
-    Attributes:
-        kind: "grid" (decimals of a length), "fractions" (decimals of the box's vectors), "float32",
-            "float64", or "unknown" where every coordinate looked at is 0 (bounds are then those of float32).
-        step: of the grid: length for "grid", a pure number for "fractions"; 0 for floats. Where digits are
-            counted, that of the largest coordinate it was found from.
-        digits: significant digits of every number, where it is these that are fixed; else 0.
-        bits: width of a coordinate as the reader hands it over, 32 or 64.
-        frames: frames it was found from.
-        moved: whether atoms moved between them. Where none did, the grid may be the structure's and not the
-            file's.
-        box: step of the box's lengths, length, and of its angles, degrees, where the format rounds them.
-        told: whether the coordinates determine it. Where they are all 0, a grid is that which the format has
-            as a rule.
-    """
-
+    # "grid" (decimals of a length), "fractions" (decimals of the box's vectors), "float32", "float64", or
+    # "unknown" where every coordinate looked at is 0 (bounds are then those of float32)
     kind: str
+    # of the grid: length for "grid", a pure number for "fractions"; 0 for floats. Where digits are counted,
+    # that of the largest coordinate it was found from
     step: float
-    bits: int
-    frames: int
-    moved: bool = True
-    box: tuple[float, float] = (0.0, 0.0)
-    digits: int = 0
-    told: bool = True
+    bits: int  # width of a coordinate as the reader hands it over, 32 or 64
+    frames: int  # that it was found from
+    moved: bool = True  # whether atoms moved between them; else the grid may be the structure's
+    box: tuple[float, float] = (0.0, 0.0)  # step of the box's lengths, and of its angles, degrees
+    digits: int = 0  # significant digits of every number, where it is these that are fixed
+    told: bool = True  # whether the coordinates determine it; where all are 0, it is the format's usual one
 
     def bound(self, frame: Frame, atoms: Chosen = None) -> float:
         """How far a distance in this frame can be from that of the positions before they were written.
